@@ -1,0 +1,1 @@
+"""The language both sides of the wire speak."""

@@ -1,0 +1,10 @@
+"""Names for the array types that cross function borders. Shapes stand in the docstrings."""
+
+import numpy as np
+import numpy.typing as npt
+
+Float = npt.NDArray[np.float64]
+Int = npt.NDArray[np.int64]
+Bool = npt.NDArray[np.bool_]
+Code = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint8]

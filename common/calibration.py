@@ -1,0 +1,279 @@
+"""Typed files of calib_json: load, validate, save atomically. An unknown key is refused with file and key.
+
+A rig is a JSON file, not a class: cameras, markers, depth model and hand are data. Units stand in the key
+names where they are not SI. The JSON schema of each file is exported to docs/ from these types.
+"""
+
+import os
+import re
+import tempfile
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+from common.arrays import Float
+from common.errors import CalibrationError
+
+Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
+Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
+Vector3 = tuple[Number, Number, Number]
+Quaternion = tuple[Number, Number, Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+Hsv = tuple[
+    Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
+]
+Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=48)]
+
+
+StructT = TypeVar("StructT", bound=Struct)
+
+
+class _File(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=False):
+    """Base of every calibration type."""
+
+
+class Intrinsics(_File, frozen=True):
+    """Pinhole and distortion, OpenCV's convention; distortion = k1, k2, p1, p2, k3."""
+
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Number
+    cy_px: Number
+    distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class HsvRange(_File, frozen=True):
+    """Colour of one marker in OpenCV's HSV (H 0-179); hsv_low[0] > hsv_high[0] wraps through 0."""
+
+    hsv_low: Hsv
+    hsv_high: Hsv
+
+
+class CameraCalibration(_File, frozen=True):
+    """cameras/<name>.json: mode, exposure, optics and marker colours of one camera."""
+
+    version: Literal[1]
+    name: Name
+    width_px: Annotated[int, Meta(ge=16, le=16384)]
+    height_px: Annotated[int, Meta(ge=16, le=16384)]
+    frame_rate_hz: Positive
+    exposure_us: Positive
+    analogue_gain: Positive
+    colour_gains: tuple[Positive, Positive]
+    row_time_us: NonNegative
+    intrinsics: Intrinsics | None = None
+    markers: dict[Name, HsvRange] | None = None
+
+
+class PowerLawCalibration(_File, frozen=True):
+    """Depth D = k x^z with x = u_left - u_right [px] (Kalbfleisch's corrected depth)."""
+
+    k_m: Positive
+    z: Annotated[float, Meta(ge=-3.0, lt=0.0)]
+
+
+class AffineDisparityCalibration(_File, frozen=True):
+    """Disparity x = a / D + x0 [px]."""
+
+    a_m_px: Positive
+    x0_px: Number
+
+
+class LaserPlane(_File, frozen=True):
+    """Plane normal . X = offset in the wrist camera's frame."""
+
+    normal: Vector3
+    offset_m: Number
+
+
+class Laser(_File, frozen=True):
+    """Laser line of the wrist device, as far as known, in the wrist camera's frame."""
+
+    origin: Vector3 | None = None
+    forward: Vector3 | None = None
+    right: Vector3 | None = None
+    fan_rad: Positive | None = None
+    baseline: Positive | None = None
+
+
+class RigCalibration(_File, frozen=True):
+    """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand."""
+
+    version: Literal[1]
+    name: Name
+    kind: Literal["markers", "wrist"]
+    cameras: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=32)]
+    hand: Name
+    markers: Markers = ("thumb", "index", "middle", "ring", "little", "back")
+    T_rig_camera: dict[Name, Matrix4] = {}
+    depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
+    power_law: PowerLawCalibration | None = None
+    affine_disparity: AffineDisparityCalibration | None = None
+    laser_plane: LaserPlane | None = None
+    laser: Laser | None = None
+    T_camera_palm: Matrix4 | None = None
+    led: tuple[Vector3, ...] | None = None
+    imu: dict[str, object] | None = None
+
+    def camera_pose(self, camera: str) -> Float:
+        """`T_rig_camera` (4, 4) [m] of one camera."""
+        return np.array(self.T_rig_camera[camera], dtype=np.float64)
+
+
+class RestJoint(_File, frozen=True):
+    """One joint of the flat hand, palm frame; OpenXR axes: -z along the bone to the tip, +y dorsal."""
+
+    position_m: Vector3
+    orientation_wxyz: Quaternion
+
+
+class MarkerMount(_File, frozen=True):
+    """Where a painted cap sits: the joint it is fixed to (or palm_frame) and its centroid in that frame."""
+
+    joint: str
+    offset_m: Vector3
+
+
+Span = tuple[Number, Number]
+
+
+class FingerLimits(_File, frozen=True):
+    """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP."""
+
+    abduction_rad: Span
+    flexion_rad: Span
+    pip_rad: Span
+    dip_rad: Span
+
+
+class Limits(_File, frozen=True):
+    """Limits of the five fingers."""
+
+    thumb: FingerLimits
+    index: FingerLimits
+    middle: FingerLimits
+    ring: FingerLimits
+    little: FingerLimits
+
+
+class Couplings(_File, frozen=True):
+    """Natural relations between angles. `dip_per_pip` None: the DIP is free."""
+
+    dip_per_pip: NonNegative | None = 2.0 / 3.0
+    mcp_per_pip: NonNegative = 0.54
+
+
+class HandProfile(_File, frozen=True):
+    """hands/<name>.json: bone geometry of one hand, its markers, and optionally radii, limits and couplings."""
+
+    version: Literal[1]
+    name: Name
+    side: Literal["left", "right"]
+    rest_joints: dict[str, RestJoint]
+    markers: dict[Name, MarkerMount]
+    radius_m: dict[str, Positive] | None = None
+    limits_rad: Limits | None = None
+    couplings: Couplings | None = None
+
+
+def load(path: Path, kind: type[StructT]) -> StructT:
+    """Read one calibration file.
+
+    Raises:
+        CalibrationError: Missing, not JSON, a key unknown, missing or out of range, or parts that
+            contradict each other. The text names the file and the key.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise CalibrationError(f"{path}: cannot read: {error.strerror}") from error
+    return parse(raw, kind, str(path))
+
+
+def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
+    """Decode JSON bytes as `kind`; `where` names the source in errors.
+
+    Raises:
+        CalibrationError: As `load`.
+    """
+    try:
+        value = msgspec.json.decode(raw, type=kind)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise CalibrationError(f"{where}: {error}") from error
+    check(value, where)
+    return value
+
+
+def check(value: Struct, where: str) -> None:
+    """Refuse what the types alone cannot: parts of one file that contradict each other.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    if isinstance(value, RigCalibration):
+        _check_rig(value, where)
+    elif isinstance(value, CameraCalibration):
+        for name, colour in (value.markers or {}).items():
+            for i, letter in ((1, "S"), (2, "V")):
+                if colour.hsv_low[i] > colour.hsv_high[i]:
+                    raise CalibrationError(
+                        f"{where}: markers.{name}: {letter} of hsv_low is above hsv_high (only H may wrap)"
+                    )
+
+
+def _check_rig(rig: RigCalibration, where: str) -> None:
+    if len(set(rig.cameras)) != len(rig.cameras):
+        raise CalibrationError(f"{where}: cameras: a name stands twice")
+    if len(set(rig.markers)) != len(rig.markers):
+        raise CalibrationError(f"{where}: markers: a name stands twice")
+    if rig.kind == "wrist":
+        return
+    for camera in rig.cameras:
+        if camera not in rig.T_rig_camera:
+            raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
+        pose = rig.camera_pose(camera)
+        if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) or np.linalg.det(pose[:3, :3]) < 0:
+            raise CalibrationError(f"{where}: T_rig_camera.{camera}: upper left 3x3 is not a rotation")
+        if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+            raise CalibrationError(f"{where}: T_rig_camera.{camera}: last row must be 0 0 0 1")
+    if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
+        raise CalibrationError(f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing")
+
+
+def save(path: Path, value: Struct) -> None:
+    """Write a calibration file atomically: a reader sees the old file or the new one, never half.
+
+    Raises:
+        CalibrationError: The folder is missing, read-only or full; the old file is untouched.
+    """
+    check(value, str(path))
+    text = compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()) + "\n"
+    temporary = None
+    try:
+        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = Path(file.name)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise CalibrationError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def compact_numbers(text: str) -> str:
+    """Put arrays of plain numbers on one line, so that a calibration file stays readable."""
+    return re.sub(r"\[[\s\d.,eE+-]+\]", lambda m: "[" + ", ".join(m[0][1:-1].replace(",", " ").split()) + "]", text)
+
+
+def schema(kind: type[Struct]) -> bytes:
+    """JSON schema of one file type, formatted."""
+    return msgspec.json.format(msgspec.json.encode(msgspec.json.schema(kind)), indent=1)

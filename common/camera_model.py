@@ -1,0 +1,94 @@
+"""A camera as geometry: point -> pixel and pixel -> ray, with OpenCV's distortion k1, k2, p1, p2, k3."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import CameraCalibration
+from common.errors import CalibrationError
+from common.geometry import invert, transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraModel:
+    """Intrinsics and place of one camera.
+
+    Attributes:
+        matrix: Camera matrix (3, 3) [px].
+        distortion: k1, k2, p1, p2, k3 (5,).
+        T_rig_camera: Camera frame -> rig frame (4, 4) [m].
+        width_px, height_px: Image size.
+        row_time_ns: Time from one row to the next [ns] (rolling shutter; 0: global).
+    """
+
+    matrix: Float
+    distortion: Float
+    T_rig_camera: Float
+    width_px: int
+    height_px: int
+    row_time_ns: float
+
+    @classmethod
+    def of(cls, camera: CameraCalibration, T_rig_camera: Float) -> "CameraModel":
+        """Build from a camera file and the camera's place in the rig.
+
+        Raises:
+            CalibrationError: The camera file has no intrinsics yet.
+        """
+        k = camera.intrinsics
+        if k is None:
+            raise CalibrationError(
+                f"camera {camera.name!r} has no 'intrinsics': run `phalanx-master calibrate intrinsics`"
+            )
+        matrix = np.array([[k.fx_px, 0.0, k.cx_px], [0.0, k.fy_px, k.cy_px], [0.0, 0.0, 1.0]])
+        return cls(
+            matrix=matrix,
+            distortion=np.array(k.distortion, dtype=np.float64),
+            T_rig_camera=np.asarray(T_rig_camera, dtype=np.float64),
+            width_px=camera.width_px,
+            height_px=camera.height_px,
+            row_time_ns=camera.row_time_us * 1e3,
+        )
+
+    @property
+    def centre(self) -> Float:
+        """Optical centre (3,) [m], rig frame."""
+        return self.T_rig_camera[:3, 3]
+
+    def project(self, points: Float) -> Float:
+        """Pixels (..., 2) in the distorted image of points (..., 3) [m] in the rig frame.
+
+        NaN where the point is NaN or not in front of the camera.
+        """
+        camera = transform(invert(self.T_rig_camera), np.asarray(points, dtype=np.float64))
+        z = np.where(camera[..., 2] > 1e-9, camera[..., 2], np.nan)
+        return self.distort(camera[..., :2] / z[..., None])
+
+    def distort(self, normalized: Float) -> Float:
+        """Pixels (..., 2) of normalized image points (..., 2) (x/z, y/z)."""
+        k1, k2, p1, p2, k3 = self.distortion
+        x, y = normalized[..., 0], normalized[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        u = self.matrix[0, 0] * xd + self.matrix[0, 2]
+        v = self.matrix[1, 1] * yd + self.matrix[1, 2]
+        return np.stack([u, v], axis=-1)
+
+    def undistort(self, uv: Float) -> Float:
+        """Normalized image points (..., 2) (x/z, y/z) of pixels (..., 2); NaN stays NaN."""
+        uv = np.asarray(uv, dtype=np.float64)
+        flat = np.ascontiguousarray(uv.reshape(-1, 1, 2))
+        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
+        points = cv2.undistortPointsIter(flat, self.matrix, self.distortion, None, None, criteria)
+        return np.where(np.isnan(uv), np.nan, np.asarray(points).reshape(uv.shape))
+
+    def ray(self, uv: Float) -> Float:
+        """Unit ray directions (..., 3) in the rig frame through pixels (..., 2); NaN stays NaN."""
+        xy = self.undistort(uv)
+        direction = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
+        direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
+        return direction @ self.T_rig_camera[:3, :3].T

@@ -1,0 +1,41 @@
+"""The one exception tree.
+
+    PhalanxError
+    ├── CalibrationError   a JSON file is missing, broken, or says something impossible
+    ├── RecordingError     a recording folder cannot be read or written
+    ├── CameraError        a camera is gone, or refused a setting
+    ├── MessageError       bytes that are not a message of ours
+    ├── BusError           the bus cannot be opened, or nobody answers
+    └── FitError           observations do not determine the value asked for
+
+A bad datagram raises nothing: `common.datagram` counts it by reason. `ValueError` stays
+what it is everywhere: the caller passed something of the wrong shape or range.
+"""
+
+
+class PhalanxError(Exception):
+    """Base of every error a user can cause or mend; its text names the thing and the fix."""
+
+
+class CalibrationError(PhalanxError):
+    """A calibration file is missing, broken or impossible. The text names file and key."""
+
+
+class RecordingError(PhalanxError):
+    """A recording folder is incomplete or unreadable."""
+
+
+class CameraError(PhalanxError):
+    """A camera is gone or refused a setting. Never answered with a fake camera."""
+
+
+class MessageError(PhalanxError):
+    """Bytes that do not decode to one of our messages."""
+
+
+class BusError(PhalanxError):
+    """The bus could not be opened, or a peer did not answer in time."""
+
+
+class FitError(PhalanxError):
+    """The observations do not determine the value, or contradict each other."""

@@ -1,0 +1,128 @@
+"""A recording of raw frames: a folder with recording.json, frames.csv and PNG files.
+
+The slave's recorder writes it, the replay camera and the offline solver read it.
+"""
+
+import csv
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+from msgspec import Struct
+
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.errors import CalibrationError, RecordingError
+
+MANIFEST = "recording.json"
+FRAMES = "frames.csv"
+COLUMNS = ("camera", "seq", "t_ns", "illumination", "file")
+
+
+class Illumination(StrEnum):
+    """What lit a frame."""
+
+    NONE = "none"
+    AMBIENT = "ambient"
+    LASER = "laser"
+    LED = "led"
+
+
+class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """recording.json: the calibration a recording was made with, and how to read it.
+
+    Attributes:
+        cameras: Camera name -> the camera file's content.
+        rig: The rig file's content; `rigs` where there are several.
+        clicks: Camera -> marker -> (u, v) [px] of a pixel on that marker in the first frame.
+        continuous: False: frames are unrelated poses, each solved afresh.
+    """
+
+    version: Literal[1]
+    kind: Literal["markers", "wrist", "both"]
+    cameras: dict[str, CameraCalibration]
+    rig: RigCalibration | None = None
+    rigs: tuple[RigCalibration, ...] = ()
+    clicks: dict[str, dict[str, tuple[float, float]]] = {}
+    continuous: bool = True
+    note: str = ""
+
+    def marker_rig(self) -> RigCalibration:
+        """The marker rig of this recording.
+
+        Raises:
+            RecordingError: There is none.
+        """
+        for rig in (self.rig, *self.rigs):
+            if rig is not None and rig.kind == "markers":
+                return rig
+        raise RecordingError(f"{MANIFEST}: no rig of kind 'markers'")
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRow:
+    """One line of frames.csv; `t_ns` is the middle of the exposure of row 0."""
+
+    camera: str
+    seq: int
+    t_ns: int
+    illumination: Illumination
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class FrameRecording:
+    """An opened recording: its folder, manifest and frame table, in the order of the file."""
+
+    folder: Path
+    manifest: Manifest
+    rows: tuple[FrameRow, ...]
+
+    def frames_of(self, camera: str) -> tuple[FrameRow, ...]:
+        """Rows of one camera, by `t_ns`.
+
+        Raises:
+            RecordingError: The recording has no such camera.
+        """
+        if camera not in self.manifest.cameras:
+            known = ", ".join(sorted(self.manifest.cameras))
+            raise RecordingError(f"{self.folder}: no camera {camera!r}; it has {known}")
+        return tuple(sorted((row for row in self.rows if row.camera == camera), key=lambda row: row.t_ns))
+
+
+def open_recording(folder: Path) -> FrameRecording:
+    """Read manifest and frame table; the images stay on disk.
+
+    Raises:
+        RecordingError: A file is missing or broken; the text names file, line and column.
+    """
+    try:
+        manifest = load(folder / MANIFEST, Manifest)
+    except CalibrationError as error:
+        raise RecordingError(str(error)) from error
+    path = folder / FRAMES
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != COLUMNS:
+                raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")
+            rows = tuple(_row(path, number, line) for number, line in enumerate(reader, 2))
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+    unknown = {row.camera for row in rows} - manifest.cameras.keys()
+    if unknown:
+        raise RecordingError(f"{path}: camera {min(unknown)!r} is not in {MANIFEST}")
+    return FrameRecording(folder, manifest, rows)
+
+
+def _row(path: Path, number: int, line: dict[str, str]) -> FrameRow:
+    try:
+        return FrameRow(
+            camera=line["camera"],
+            seq=int(line["seq"]),
+            t_ns=int(line["t_ns"]),
+            illumination=Illumination(line["illumination"]),
+            file=line["file"],
+        )
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path}: line {number}: {error}") from error

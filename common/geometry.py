@@ -1,0 +1,126 @@
+"""Rigid transforms, quaternions (wxyz) and small fits. `T_a_b` maps coordinates in b to coordinates in a."""
+
+import numpy as np
+
+from common.arrays import Float
+
+
+def quaternion_to_matrix(q_wxyz: Float) -> Float:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4), normalised first."""
+    q = np.asarray(q_wxyz, dtype=np.float64)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+
+
+def matrix_to_quaternion(rotation: Float) -> Float:
+    """Unit quaternions (..., 4) wxyz with w >= 0 of rotation matrices (..., 3, 3).
+
+    Takes the numerically largest of the four classic forms (Shepperd, 1978), so it is
+    exact also near half turns.
+    """
+    m = np.asarray(rotation, dtype=np.float64)
+    trace = np.trace(m, axis1=-2, axis2=-1)
+    d = np.diagonal(m, axis1=-2, axis2=-1)
+    squares = np.concatenate([(1 + trace)[..., None], 1 + 2 * d - trace[..., None]], axis=-1)
+    s = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
+    p = [m[..., 2, 1] + m[..., 1, 2], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1]]
+    forms = np.stack(
+        [
+            np.stack([squares[..., 0], s[0], s[1], s[2]], -1),
+            np.stack([s[0], squares[..., 1], p[2], p[1]], -1),
+            np.stack([s[1], p[2], squares[..., 2], p[0]], -1),
+            np.stack([s[2], p[1], p[0], squares[..., 3]], -1),
+        ],
+        axis=-2,
+    )
+    best = np.argmax(squares, axis=-1)[..., None, None]
+    q = np.take_along_axis(forms, np.broadcast_to(best, (*best.shape[:-1], 4)), axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., :1] < 0, -q, q)
+
+
+def rotation_vector_to_matrix(vector: Float) -> Float:
+    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues' formula)."""
+    angle = float(np.linalg.norm(vector))
+    k = skew(vector)
+    if angle < 1e-8:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * (k @ k)
+
+
+def skew(vector: Float) -> Float:
+    """Matrix (3, 3) with `skew(a) @ b == cross(a, b)`."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def axis_rotation(axis: int, angle: float) -> Float:
+    """Rotation (3, 3) by `angle` [rad] about coordinate axis 0 (x), 1 (y) or 2 (z)."""
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+def transform(T_a_b: Float, points_b: Float) -> Float:
+    """Points (..., 3) from frame b to frame a by the rigid transform (4, 4)."""
+    return points_b @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def invert(T_a_b: Float) -> Float:
+    """The inverse `T_b_a` (4, 4) of a rigid transform."""
+    inverse = np.eye(4)
+    inverse[:3, :3] = T_a_b[:3, :3].T
+    inverse[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return inverse
+
+
+def rigid(rotation: Float, translation: Float) -> Float:
+    """Rigid transform (4, 4) of a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def fit_rigid(points_a: Float, points_b: Float, weight: Float | None = None) -> Float:
+    """Least-squares `T_a_b` (4, 4) with points_a ~ T_a_b points_b, both (N, 3) (Kabsch, 1976).
+
+    Args:
+        points_a: Points in frame a.
+        points_b: The same points in frame b.
+        weight: (N,) non-negative weights; None: all one.
+    """
+    w = np.ones(len(points_a)) if weight is None else weight
+    w = w / w.sum()
+    mean_a, mean_b = w @ points_a, w @ points_b
+    u, _, vt = np.linalg.svd(((points_a - mean_a) * w[:, None]).T @ (points_b - mean_b))
+    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
+    rotation = u @ flip @ vt
+    return rigid(rotation, mean_a - rotation @ mean_b)
+
+
+def intersect_plane(origin: Float, direction: Float, normal: Float, offset: float) -> Float:
+    """Where rays meet the plane `normal . X = offset`.
+
+    Args:
+        origin: Ray origins (..., 3) [m].
+        direction: Ray directions (..., 3), any length.
+        normal: Plane normal (3,).
+        offset: Plane offset along the normal [m].
+
+    Returns:
+        Points (..., 3) [m]; NaN where the ray is parallel to the plane or meets it behind its origin.
+    """
+    along = direction @ normal
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = (offset - origin @ normal) / along
+    t = np.where((np.abs(along) > 1e-12 * np.linalg.norm(direction, axis=-1)) & (t > 0), t, np.nan)
+    return origin + t[..., None] * direction

@@ -1,0 +1,215 @@
+"""Messages that cross a process boundary. Arrays are read-only; NaN means "not seen".
+
+On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
+travels as itself and a message costs no Python loop. `decode` is the only way in: whatever
+it returns has the right shapes and no infinity. Every field is described in docs/wire.md.
+"""
+
+from enum import IntEnum
+from typing import Annotated, TypeAlias, cast
+
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+
+from common.arrays import Bool, Code, Float
+from common.errors import MessageError
+
+WIRE_VERSION = 1
+MAX_MARKERS = 48
+JOINT_COUNT = 26
+FINGER_COUNT = 5
+
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+TimeNs = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
+Finite = Annotated[float, Meta(ge=-1e18, le=1e18)]
+
+
+class Source(IntEnum):
+    """Where the pose of one joint comes from."""
+
+    NONE = 0
+    MEASURED = 1
+    SOLVED = 2
+    HELD = 3
+    WRIST = 4
+
+
+class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
+    """Base of all messages: immutable, tagged with its own name, unknown fields refused."""
+
+
+class MarkerDetections(Message, frozen=True, eq=False, tag=True):
+    """What one camera saw in one frame.
+
+    Attributes:
+        camera: Camera name, a member of the rig's `cameras`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of this camera; a gap is a dropped frame.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the frame was handed to the slave [ns], same clock as `t_ns`.
+        uv: Marker centroids (M, 2) [px], distorted image, (0, 0) = centre of the top-left pixel.
+        area: Blob areas (M,) [px^2].
+        quality: Confidence (M,) in 0..1: 1 is a whole, unambiguous, well exposed marker.
+            A row that is NaN in all three was not seen.
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    uv: Float
+    area: Float
+    quality: Float
+
+    def __post_init__(self) -> None:
+        m = len(self.area)
+        if m > MAX_MARKERS:
+            raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
+        _freeze(self, "uv", np.float64, (m, 2))
+        _freeze(self, "area", np.float64, (m,))
+        _freeze(self, "quality", np.float64, (m,))
+
+
+class HandPose(Message, frozen=True, eq=False, tag=True):
+    """One hand at one instant, in the joint order of XR_EXT_hand_tracking (26 joints).
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: The instant at which the pose holds [ns], master's clock.
+        position_m: Joint positions (26, 3) [m], rig frame.
+        orientation_wxyz: Joint orientations (26, 4), unit quaternions, joint -> rig frame,
+            OpenXR axes (-z along the bone to the tip, +y dorsal).
+        radius_m: Joint radii (26,) [m].
+        valid: (26,) the pose of the joint may be used.
+        tracked: (26,) the joint is observed now, not inferred. Tracked implies valid.
+        cov_m2: Position covariance (26, 3, 3) [m^2], rig frame. NaN: unknown.
+        source: (26,) `Source` codes.
+        angles_rad: (5, 4) [rad]: abduction, flexion (MCP; thumb CMC), PIP (thumb MCP),
+            DIP (thumb IP), zero in the profile's rest pose.
+        markers_m: Filtered cap centroids (M, 3) [m], rig frame. NaN: not seen.
+        markers_raw_m: The same before the filter.
+        latency_ns: From the hand-over of the last contributing frame to its slave, to
+            the publication of this pose [ns]; 0 in an offline run.
+    """
+
+    hand: Name
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+    radius_m: Float
+    valid: Bool
+    tracked: Bool
+    cov_m2: Float
+    source: Code
+    angles_rad: Float
+    markers_m: Float
+    markers_raw_m: Float
+    latency_ns: TimeNs = 0
+
+    def __post_init__(self) -> None:
+        j = JOINT_COUNT
+        m = self.markers_m.size // 3
+        if m > MAX_MARKERS:
+            raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
+        _freeze(self, "position_m", np.float64, (j, 3))
+        _freeze(self, "orientation_wxyz", np.float64, (j, 4))
+        _freeze(self, "radius_m", np.float64, (j,))
+        _freeze(self, "valid", np.bool_, (j,))
+        _freeze(self, "tracked", np.bool_, (j,))
+        _freeze(self, "cov_m2", np.float64, (j, 3, 3))
+        _freeze(self, "source", np.uint8, (j,))
+        _freeze(self, "angles_rad", np.float64, (FINGER_COUNT, 4))
+        _freeze(self, "markers_m", np.float64, (m, 3))
+        _freeze(self, "markers_raw_m", np.float64, (m, 3))
+
+
+class Health(Message, frozen=True, eq=False, tag=True):
+    """What a process counted since it started.
+
+    Attributes:
+        source: Process name: a camera, or "master".
+        session: Random id of the process.
+        t_ns: Moment of the report [ns], clock of the source.
+        counts: Event name -> how often (frames, dropped, refused by reason, ...).
+        gauges: Quantity name with its unit -> value now (rate_hz, offset_us, ...).
+    """
+
+    source: Name
+    session: Count
+    t_ns: TimeNs
+    counts: Annotated[dict[Name, Count], Meta(max_length=64)]
+    gauges: Annotated[dict[Name, Finite], Meta(max_length=64)]
+
+
+class Command(Message, frozen=True, eq=False, tag=True):
+    """An order to one process, answered by a `Health` of that process.
+
+    Attributes:
+        target: Process name.
+        verb: What to do; each process documents its verbs ("report", "stop").
+    """
+
+    target: Name
+    verb: Name
+
+
+AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
+_DECODER = msgspec.msgpack.Decoder(
+    MarkerDetections | HandPose | Health | Command, dec_hook=lambda kind, raw: _from_bytes(kind, raw)
+)
+
+
+def encode(message: Message) -> bytes:
+    """Return the message as msgpack bytes."""
+    return _ENCODER.encode(message)
+
+
+def decode(data: bytes | memoryview) -> AnyMessage:
+    """Return the message in `data`.
+
+    Raises:
+        MessageError: The bytes are not exactly one message of ours: broken msgpack,
+            unknown type or field, wrong shape, an infinity, a number out of range.
+    """
+    try:
+        return cast(AnyMessage, _DECODER.decode(data))
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise MessageError(f"not a message: {error}") from error
+
+
+def _to_bytes(array: object) -> bytes:
+    if not isinstance(array, np.ndarray):
+        raise NotImplementedError(f"cannot encode {type(array)}")
+    return cast(bytes, np.ascontiguousarray(array).tobytes())
+
+
+_WIRE_DTYPE = {Float: np.dtype("<f8"), Bool: np.dtype("?"), Code: np.dtype("u1")}
+
+
+def _from_bytes(kind: type, raw: object) -> object:
+    if not isinstance(raw, bytes):
+        raise ValueError("array is not bytes")
+    dtype = _WIRE_DTYPE[kind]
+    if len(raw) % dtype.itemsize:
+        raise ValueError("array is cut")
+    return np.frombuffer(raw, dtype)
+
+
+def _freeze(message: Message, field: str, dtype: type[np.generic], shape: tuple[int, ...]) -> None:
+    """Give `field` its shape, refuse an infinity, and make it read-only (copied if it was not)."""
+    array = np.asarray(getattr(message, field), dtype=dtype)
+    try:
+        array = array.reshape(shape)
+    except ValueError as error:
+        raise ValueError(f"{field}: shape {array.shape}, expected {shape}") from error
+    if dtype is np.float64 and np.isinf(array).any():
+        raise ValueError(f"{field}: infinite value")
+    if array.flags.writeable:
+        array = array.copy()
+        array.flags.writeable = False
+    msgspec.structs.force_setattr(message, field, array)

@@ -1,0 +1,54 @@
+"""The one table of streams: what travels, by which path, under which key, how often, recorded or not."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from common.messages import Command, HandPose, Health, MarkerDetections, Message
+
+
+class Path(StrEnum):
+    """How a stream travels."""
+
+    DATAGRAM = "datagram"  # sealed UDP: a lost message never delays the next
+    ZENOH = "zenoh"  # reliable link: control and outputs
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One row of the table.
+
+    Attributes:
+        message: Type that travels.
+        path: Datagram or zenoh.
+        key: Key on the zenoh bus, with {name} for the sender or target; None for datagrams.
+        rate_hz: Nominal rate; 0 for "when asked".
+        recorded: Whether the message recorder keeps it.
+    """
+
+    message: type[Message]
+    path: Path
+    key: str | None
+    rate_hz: float
+    recorded: bool
+
+
+STREAMS = {
+    "markers": Stream(MarkerDetections, Path.DATAGRAM, None, 90.0, True),
+    "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", 90.0, True),
+    "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", 1.0, True),
+    "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", 0.0, False),
+}
+
+ALIVE_KEY = "phalanx/alive/{name}"
+
+
+def key_of(stream: str, name: str) -> str:
+    """Return the zenoh key of `stream` for the sender or target `name`.
+
+    Raises:
+        ValueError: The stream travels as datagrams and has no key.
+    """
+    key = STREAMS[stream].key
+    if key is None:
+        raise ValueError(f"stream {stream!r} travels as datagrams, it has no key")
+    return key.format(name=name)

@@ -1,0 +1,1 @@
+"""Starts and orchestrates processes by their command lines; imports none of the packages it starts."""

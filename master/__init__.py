@@ -1,0 +1,1 @@
+"""On the PC: messages in, hands out."""

@@ -1,0 +1,1 @@
+"""From 3D markers to joint angles: joints, finger, fabrik, hand."""

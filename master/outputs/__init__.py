@@ -1,0 +1,1 @@
+"""Where solved hands go: one seam, one file per sink."""

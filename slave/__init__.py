@@ -1,0 +1,1 @@
+"""Beside the sensor: light in, small messages out."""

@@ -1,0 +1,1 @@
+"""Cameras: one seam, one file per driver."""

@@ -1,0 +1,1 @@
+"""Coloured markers in one image: classify, blobs, roi, detector."""
