@@ -1,0 +1,303 @@
+"""One hand: 26 OpenXR joints, bones, limits, couplings, and forward kinematics from a profile's rest pose.
+
+Angles (5, 4) [rad] are zero in the rest pose; fingers thumb, index, middle, ring, little; columns abduction,
+flexion (MCP; thumb CMC), PIP (thumb MCP), DIP (thumb IP). A flexion by a is a rotation by -a about the
+joint's own +x; an abduction is a rotation about the palm's +y, positive towards the thumb:
+
+    fingers   R_MCP = R_y(s a_abd) R_rest R_x(-a_flex)          s = +1 right hand, -1 left hand
+    thumb     R_CMC = R_rest R_y(s a_abd) R_x(-a_flex)          in the joint's own frame, no twist
+
+All five fingers are the same chain of four joints (root, two hinges, tip), so forward kinematics is four
+stacked products and no loop over fingers.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.calibration import Couplings, FingerLimits, HandProfile, Limits
+from common.errors import CalibrationError
+from common.geometry import quaternion_to_matrix
+
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+WEBXR_JOINTS = (
+    "wrist",
+    "thumb-metacarpal",
+    "thumb-phalanx-proximal",
+    "thumb-phalanx-distal",
+    "thumb-tip",
+    *(
+        f"{finger}-finger-{part}"
+        for finger in ("index", "middle", "ring", "pinky")
+        for part in ("metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip")
+    ),
+)
+JOINTS = ("palm", *WEBXR_JOINTS)
+PALM, WRIST = 0, 1
+MIDDLE_METACARPAL, MIDDLE_PROXIMAL = 11, 12
+METACARPALS = (6, 11, 16, 21)
+CHAINS = np.array([[2, 3, 4, 5], [7, 8, 9, 10], [12, 13, 14, 15], [17, 18, 19, 20], [22, 23, 24, 25]])
+FINGER_JOINTS = ((2, 3, 4, 5), (6, 7, 8, 9, 10), (11, 12, 13, 14, 15), (16, 17, 18, 19, 20), (21, 22, 23, 24, 25))
+PALM_FRAME = "palm_frame"
+TIPS = CHAINS[:, 3]
+
+_NO_TWIST = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandJoints:
+    """Where the joints are.
+
+    Attributes:
+        position_m: (..., 26, 3) [m], rig frame.
+        rotation: (..., 26, 3, 3), joint frame -> rig frame.
+        T_rig_palm: (..., 4, 4) palm frame -> rig frame.
+    """
+
+    position_m: Float
+    rotation: Float
+    T_rig_palm: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mount:
+    """Where a marker sits: joint index (None: the palm frame) and centroid in that frame (3,) [m]."""
+
+    joint: int | None
+    offset_m: Float
+
+    @property
+    def finger(self) -> int | None:
+        """Finger (0 thumb ... 4 little) whose chain carries the marker, or None."""
+        rows = np.flatnonzero((CHAINS == self.joint).any(axis=1)) if self.joint is not None else ()
+        return int(rows[0]) if len(rows) else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandModel:
+    """A hand profile as arrays, checked.
+
+    Attributes:
+        profile: The file it was built from.
+        rest_position_m: (26, 3) [m], palm frame.
+        rest_rotation: (26, 3, 3), joint frame -> palm frame.
+        radius_m: (26,) [m].
+        limits_rad: (5, 4, 2) low and high of every angle.
+        dip_per_pip: Coupling of index ... little, or None where the DIP is free.
+        mcp_per_pip: Natural flexion, a prior only.
+        mounts: Marker name -> where it sits.
+        side_sign: +1 right, -1 left.
+        bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
+        turn: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
+    """
+
+    profile: HandProfile
+    rest_position_m: Float
+    rest_rotation: Float
+    radius_m: Float
+    limits_rad: Float
+    dip_per_pip: float | None
+    mcp_per_pip: float
+    mounts: dict[str, Mount]
+    side_sign: float
+    bone_m: Float
+    turn: Float
+
+    @classmethod
+    def of(cls, profile: HandProfile) -> "HandModel":
+        """Build and check.
+
+        Raises:
+            CalibrationError: A joint or marker is missing or unknown, a bone has no length, limits are crossed.
+        """
+        where = f"hand {profile.name!r}"
+        position, rotation = _rest(profile, where)
+        bone = np.empty((5, 3, 3))
+        turn = np.empty((5, 3, 3, 3))
+        for f, chain in enumerate(CHAINS):
+            for k, (a, b) in enumerate(zip(chain[:-1], chain[1:], strict=True)):
+                bone[f, k] = rotation[a].T @ (position[b] - position[a])
+                turn[f, k] = rotation[a].T @ rotation[b]
+        if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
+            raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
+        couplings = profile.couplings or Couplings()
+        return cls(
+            profile=profile,
+            rest_position_m=position,
+            rest_rotation=rotation,
+            radius_m=_radii(profile, where),
+            limits_rad=_limits(profile.limits_rad or preset_limits("K"), where),
+            dip_per_pip=couplings.dip_per_pip,
+            mcp_per_pip=couplings.mcp_per_pip,
+            mounts=_mounts(profile, where),
+            side_sign=1.0 if profile.side == "right" else -1.0,
+            bone_m=bone,
+            turn=turn,
+        )
+
+    def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
+        """Joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad]; any matching leading axes."""
+        T = np.asarray(T_rig_palm, dtype=np.float64)
+        angles = np.asarray(angles_rad, dtype=np.float64)
+        R_palm, lead = T[..., :3, :3], angles.shape[:-2]
+        position = np.empty((*lead, 26, 3))
+        rotation = np.empty((*lead, 26, 3, 3))
+        position[...] = self.rest_position_m
+        rotation[...] = self.rest_rotation
+        frame = self.root_rotation(angles)
+        point = np.broadcast_to(self.rest_position_m[CHAINS[:, 0]], (*lead, 5, 3))
+        rotation[..., CHAINS[:, 0], :, :] = frame
+        for k in range(3):
+            point = point + np.einsum("...ij,...j->...i", frame, self.bone_m[:, k])
+            frame = frame @ self.turn[:, k]
+            if k < 2:
+                frame = frame @ _flex(angles[..., 2 + k])
+            position[..., CHAINS[:, k + 1], :] = point
+            rotation[..., CHAINS[:, k + 1], :, :] = frame
+        position = position @ np.swapaxes(R_palm, -1, -2) + T[..., None, :3, 3]
+        return HandJoints(position, R_palm[..., None, :, :] @ rotation, T)
+
+    def root_rotation(self, angles_rad: Float) -> Float:
+        """Rotations (..., 5, 3, 3) of the MCPs (thumb: CMC) in the palm frame."""
+        swing = _rotate(1, self.side_sign * angles_rad[..., 0])
+        rest = self.rest_rotation[CHAINS[:, 0]]
+        before = np.concatenate([rest[:1], np.broadcast_to(_NO_TWIST, (4, 3, 3))])
+        after = np.concatenate([_NO_TWIST[None], rest[1:]])
+        return before @ swing @ after @ _flex(angles_rad[..., 1])
+
+    def marker_points(self, joints: HandJoints, names: tuple[str, ...]) -> Float:
+        """Cap centroids (..., M, 3) [m] in the rig frame.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of that name.
+        """
+        points: list[Float] = []
+        for name in names:
+            mount = self.mount(name)
+            if mount.joint is None:
+                R, p = joints.T_rig_palm[..., :3, :3], joints.T_rig_palm[..., :3, 3]
+            else:
+                R, p = joints.rotation[..., mount.joint, :, :], joints.position_m[..., mount.joint, :]
+            points.append(p + R @ mount.offset_m)
+        return np.stack(points, axis=-2)
+
+    def mount(self, name: str) -> Mount:
+        """Where marker `name` sits.
+
+        Raises:
+            CalibrationError: The profile does not know it.
+        """
+        if name not in self.mounts:
+            known = ", ".join(self.mounts)
+            raise CalibrationError(f"hand {self.profile.name!r}: no marker {name!r} under 'markers'; it has {known}")
+        return self.mounts[name]
+
+    def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
+        """Whether each of the angles (..., 5, 4) is inside its limits."""
+        low, high = self.limits_rad[..., 0], self.limits_rad[..., 1]
+        return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
+
+
+def preset_limits(preset: Literal["K", "D"]) -> Limits:
+    """Joint limits of Kalbfleisch (K) or Digits (D), relative to the rest pose."""
+    k = preset == "K"
+    abduction = 15.0 if k else 20.0
+    thumb = _degrees((-20.0, 50.0), (-15.0, 50.0), (-10.0, 60.0), (-15.0, 85.0))
+
+    def finger(spread: float) -> FingerLimits:
+        flexion, pip, dip = (90.0, 110.0, 90.0) if k else (100.0, 120.0, 101.0)
+        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip))
+
+    side = finger(abduction)
+    return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
+
+
+def preset_couplings(preset: Literal["K", "D"]) -> Couplings:
+    """DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion."""
+    return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
+
+
+def _degrees(
+    abduction: tuple[float, float], flexion: tuple[float, float], pip: tuple[float, float], dip: tuple[float, float]
+) -> FingerLimits:
+    def span(value: tuple[float, float]) -> tuple[float, float]:
+        return float(np.radians(value[0])), float(np.radians(value[1]))
+
+    return FingerLimits(
+        abduction_rad=span(abduction), flexion_rad=span(flexion), pip_rad=span(pip), dip_rad=span(dip)
+    )
+
+
+def _rotate(axis: int, angle: Float) -> Float:
+    """Rotations (..., 3, 3) about coordinate axis 0 or 1."""
+    c, s = np.cos(angle), np.sin(angle)
+    matrix = np.zeros((*angle.shape, 3, 3))
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix[..., axis, axis] = 1.0
+    matrix[..., i, i] = matrix[..., j, j] = c
+    matrix[..., i, j], matrix[..., j, i] = -s, s
+    return matrix
+
+
+def _flex(angle: Float) -> Float:
+    return _rotate(0, -angle)
+
+
+def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:
+    joints = profile.rest_joints
+    for name in WEBXR_JOINTS:
+        if name not in joints:
+            raise CalibrationError(f"{where}: rest_joints: {name!r} is missing")
+    unknown = joints.keys() - set(WEBXR_JOINTS)
+    if unknown:
+        raise CalibrationError(f"{where}: rest_joints: unknown joint {min(unknown)!r}")
+    position = np.array([joints[name].position_m for name in WEBXR_JOINTS])
+    quaternion = np.array([joints[name].orientation_wxyz for name in WEBXR_JOINTS])
+    if (np.abs(np.linalg.norm(quaternion, axis=-1) - 1) > 1e-2).any():
+        raise CalibrationError(f"{where}: rest_joints: an orientation_wxyz is not a unit quaternion")
+    rotation = quaternion_to_matrix(quaternion)
+    middle = WEBXR_JOINTS.index("middle-finger-metacarpal")
+    palm = position[[middle, middle + 1]].mean(axis=0)
+    return np.vstack([palm, position]), np.concatenate([rotation[:1], rotation])
+
+
+# Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
+_RADIUS_SHARE = {"wrist": 0.5, "metacarpal": 0.3, "proximal": 0.2, "intermediate": 0.175, "distal": 0.16, "tip": 0.145}
+
+
+def _radii(profile: HandProfile, where: str) -> Float:
+    joints = profile.rest_joints
+    unknown = (profile.radius_m or {}).keys() - set(JOINTS)
+    if unknown:
+        raise CalibrationError(f"{where}: radius_m: unknown joint {min(unknown)!r}")
+    a, b = (np.array(joints[f"middle-finger-phalanx-{part}"].position_m) for part in ("proximal", "intermediate"))
+    length = float(np.linalg.norm(b - a))
+    default = [length * _RADIUS_SHARE["metacarpal"]]
+    default += [length * _RADIUS_SHARE[name.rsplit("-", 1)[-1]] for name in WEBXR_JOINTS]
+    given = profile.radius_m or {}
+    return np.array([given.get(name, value) for name, value in zip(JOINTS, default, strict=True)])
+
+
+def _limits(limits: Limits, where: str) -> Float:
+    table = np.array(
+        [
+            [getattr(getattr(limits, finger), f"{angle}_rad") for angle in ("abduction", "flexion", "pip", "dip")]
+            for finger in FINGERS
+        ]
+    )
+    crossed = np.argwhere(table[..., 0] > table[..., 1])
+    if len(crossed):
+        raise CalibrationError(f"{where}: limits_rad.{FINGERS[crossed[0][0]]}: low is above high")
+    return table
+
+
+def _mounts(profile: HandProfile, where: str) -> dict[str, Mount]:
+    mounts: dict[str, Mount] = {}
+    for name, mount in profile.markers.items():
+        if mount.joint != PALM_FRAME and mount.joint not in WEBXR_JOINTS:
+            raise CalibrationError(f"{where}: markers.{name}.joint: unknown joint {mount.joint!r}")
+        joint = None if mount.joint == PALM_FRAME else JOINTS.index(mount.joint)
+        mounts[name] = Mount(joint, np.array(mount.offset_m))
+    return mounts
