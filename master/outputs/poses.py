@@ -1,0 +1,113 @@
+"""Many poses as arrays: what poses.npz holds, and what pictures, viewers and scores read."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float, Int
+from common.messages import FINGER_COUNT, JOINT_COUNT, HandPose
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Poses:
+    """T poses of one hand, row by row; fields as in `HandPose`.
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: (T,) [ns].
+        position_m: (T, 26, 3) [m], rig frame.
+        orientation_wxyz: (T, 26, 4).
+        radius_m: (T, 26) [m].
+        valid, tracked: (T, 26).
+        cov_m2: (T, 26, 3, 3) [m^2].
+        source: (T, 26) `Source` codes.
+        angles_rad: (T, 5, 4) [rad].
+        markers_m, markers_raw_m: (T, M, 3) [m], after and before the filter.
+        latency_ns: (T,) [ns]; 0 in an offline run.
+    """
+
+    hand: str
+    t_ns: Int
+    position_m: Float
+    orientation_wxyz: Float
+    radius_m: Float
+    valid: Bool
+    tracked: Bool
+    cov_m2: Float
+    source: Code
+    angles_rad: Float
+    markers_m: Float
+    markers_raw_m: Float
+    latency_ns: Int
+
+    def __post_init__(self) -> None:
+        """Refuse arrays that do not fit together.
+
+        Raises:
+            ValueError: Naming the array, its shape or type, and what is expected.
+        """
+        dtype = record(self.markers_m.shape[1] if self.markers_m.ndim == 3 else 0)
+        for name in dtype.names or ():
+            array = getattr(self, name)
+            kind, shape = dtype[name].base, (len(self.t_ns), *dtype[name].shape)
+            if array.shape != shape or array.dtype != kind:
+                raise ValueError(f"{name}: {array.dtype} {array.shape}, expected {kind} {shape}")
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    @property
+    def marker_count(self) -> int:
+        """M."""
+        return self.markers_m.shape[1]
+
+    @classmethod
+    def of(cls, poses: Sequence[HandPose]) -> "Poses":
+        """Stack poses of one hand; at least one.
+
+        Raises:
+            ValueError: No pose, or poses of different hands or marker counts.
+        """
+        if not poses:
+            raise ValueError("no poses to stack")
+        if len({(pose.hand, len(pose.markers_m)) for pose in poses}) > 1:
+            raise ValueError("poses of different hands or marker counts")
+        dtype = record(len(poses[0].markers_m))
+        arrays = {
+            name: np.array([getattr(pose, name) for pose in poses], dtype=dtype[name].base)
+            for name in dtype.names or ()
+        }
+        return cls(hand=poses[0].hand, **arrays)
+
+    def pose(self, index: int) -> HandPose:
+        """Row `index` as the message it came from."""
+        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "hand"}
+        times = {name: int(arrays.pop(name)) for name in ("t_ns", "latency_ns")}
+        return HandPose(hand=self.hand, **arrays, **times)
+
+    def rows(self, start: int, stop: int) -> "Poses":
+        """Rows start..stop-1, without copying."""
+        arrays = {f.name: getattr(self, f.name)[start:stop] for f in fields(self) if f.name != "hand"}
+        return Poses(hand=self.hand, **arrays)
+
+
+def record(marker_count: int) -> np.dtype[np.void]:
+    """One row of poses.npz as a structured type: the one place that fixes names, types and shapes."""
+    j, m = JOINT_COUNT, marker_count
+    return np.dtype(
+        [
+            ("t_ns", "<i8"),
+            ("position_m", "<f8", (j, 3)),
+            ("orientation_wxyz", "<f8", (j, 4)),
+            ("radius_m", "<f8", (j,)),
+            ("valid", "?", (j,)),
+            ("tracked", "?", (j,)),
+            ("cov_m2", "<f8", (j, 3, 3)),
+            ("source", "u1", (j,)),
+            ("angles_rad", "<f8", (FINGER_COUNT, 4)),
+            ("markers_m", "<f8", (m, 3)),
+            ("markers_raw_m", "<f8", (m, 3)),
+            ("latency_ns", "<i8"),
+        ]
+    )

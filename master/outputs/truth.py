@@ -1,0 +1,37 @@
+"""What the hand really did, row by row beside the poses, where a simulation or a recording knows it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import MIDDLE_METACARPAL, MIDDLE_PROXIMAL
+from master.outputs.poses import Poses
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """True joints and caps at the instants of T poses. NaN: unknown there.
+
+    Attributes:
+        joints_m: (T, 26, 3) [m], rig frame.
+        markers_m: (T, M, 3) [m], centroids of the painted caps, rig frame.
+    """
+
+    joints_m: Float
+    markers_m: Float
+
+    @classmethod
+    def of_webxr(cls, joints_m: Float, markers_m: Float) -> "Truth":
+        """From the 25 WebXR joints (T, 25, 3) of a rendered recording; the palm is derived."""
+        palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
+        return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m)
+
+    def joint_error_m(self, poses: Poses) -> Float:
+        """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""
+        error = np.linalg.norm(poses.position_m - self.joints_m, axis=-1)
+        return np.where(poses.valid, error, np.nan)[:, 1:]
+
+    def marker_error_m(self, poses: Poses) -> Float:
+        """Distance (T, M) [m] of the unfiltered caps; NaN where not seen."""
+        return np.linalg.norm(poses.markers_raw_m - self.markers_m, axis=-1)
