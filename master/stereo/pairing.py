@@ -1,0 +1,212 @@
+"""All cameras brought to one instant: which frames belong together, and where each marker was then.
+
+An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent. It is
+*complete* when every other camera has delivered a frame at or after it, so that tracks can be interpolated; it
+is emitted then, or when the message time has passed its deadline, with whatever there is. Message time is the
+newest capture time seen: no clock is read here, so a replay pairs exactly as the live run did.
+
+Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
+than the back of the hand. A track is carried to the instant by the polynomial through up to three neighbouring
+sightings. The error this leaves is added to the marker's pixel sigma; sideways error Dt v turns into a depth
+error D v Dt / B, the largest error of an unsynchronised rig.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from common.messages import MarkerDetections
+
+HISTORY = 8
+SILENT_DEADLINES = 8
+# What a hand can do that a polynomial does not know, at half a metre from a 500 px lens.
+_SPEED_PX_S = 500.0
+_ACCELERATION_PX_S2 = 1.0e4
+_JERK_PX_S3 = 2.0e5
+_FLOOR_PX, _DOUBT_PX = 0.1, 0.6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Instant:
+    """Every marker in every camera at one moment.
+
+    Attributes:
+        t_ns: The moment, master's clock.
+        uv: (C, M, 2) [px], distorted image; NaN: that camera does not see that marker then.
+        sigma_px: (C, M) standard deviation per axis, time error included.
+        area: (C, M) [px^2] of the nearest sighting.
+        ready_t_ns: When the last contributing frame was handed to its slave.
+        missing: (C,) cameras that had no frame in time.
+    """
+
+    t_ns: int
+    uv: Float
+    sigma_px: Float
+    area: Float
+    ready_t_ns: int
+    missing: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sighting:
+    centre_ns: int
+    t_ns: Float  # (M,) capture time of each marker's row, relative to nothing: float64 of ns since the first frame
+    uv: Float
+    sigma_px: Float
+    area: Float
+    ready_t_ns: int
+
+
+class Pairing:
+    """Push machine. Holds the last few sightings of each camera and the instants not yet emitted."""
+
+    def __init__(
+        self,
+        cameras: dict[str, CameraModel],
+        frame_rate_hz: dict[str, float],
+        *,
+        policy: Literal["interpolate", "predict"] = "interpolate",
+        continuous: bool = True,
+    ) -> None:
+        """Take the cameras in the rig's order; the first that speaks leads.
+
+        Args:
+            cameras: Camera name -> model.
+            frame_rate_hz: Nominal rates; the slowest sets deadline and largest bridgeable gap.
+            policy: Wait for the other cameras and interpolate, or predict at once.
+            continuous: False: frames are unrelated poses, nothing is carried from one to another.
+        """
+        self._names = tuple(cameras)
+        self._cameras = tuple(cameras.values())
+        period_ns = int(1e9 / min(frame_rate_hz[name] for name in self._names))
+        self._deadline_ns = int(1.25 * period_ns)
+        self._gap_ns = int(2.5 * period_ns)
+        self._policy, self._continuous = policy, continuous
+        self._seen: tuple[deque[_Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
+        self._pending: deque[int] = deque()
+        self._origin_ns: int | None = None
+        self._newest_ns = -(2**63)
+        self._emitted_ns = -(2**63)
+
+    def push(self, message: MarkerDetections) -> list[Instant]:
+        """Take one camera's detections; return the instants that became complete or due, oldest first.
+
+        Raises:
+            ValueError: The camera is not of this rig (ingest lets no such message pass).
+        """
+        index = self._names.index(message.camera)
+        camera = self._cameras[index]
+        if self._origin_ns is None:
+            self._origin_ns = message.t_ns
+        half = 0.5 * (camera.height_px - 1) * camera.row_time_ns
+        centre_ns = message.t_ns + round(half)
+        rows = np.where(np.isnan(message.uv[:, 1]), 0.5 * (camera.height_px - 1), message.uv[:, 1])
+        self._seen[index].append(
+            _Sighting(
+                centre_ns=centre_ns,
+                t_ns=(message.t_ns - self._origin_ns) + camera.row_time_ns * rows,
+                uv=message.uv,
+                sigma_px=_FLOOR_PX + _DOUBT_PX * (1.0 - message.quality),
+                area=message.area,
+                ready_t_ns=message.ready_t_ns,
+            )
+        )
+        self._newest_ns = max(self._newest_ns, centre_ns)
+        if index == self._leader() and centre_ns > self._emitted_ns:
+            self._pending.append(centre_ns)
+        return self._emit(flush=False)
+
+    def flush(self) -> list[Instant]:
+        """At the end of a recording: emit what is still waiting."""
+        return self._emit(flush=True)
+
+    def _leader(self) -> int:
+        silent = SILENT_DEADLINES * self._deadline_ns
+        for index, seen in enumerate(self._seen):
+            if seen and self._newest_ns - seen[-1].centre_ns <= silent:
+                return index
+        return 0
+
+    def _emit(self, *, flush: bool) -> list[Instant]:
+        out: list[Instant] = []
+        while self._pending:
+            t_ns = self._pending[0]
+            due = self._newest_ns - t_ns > self._deadline_ns
+            if not (flush or due or self._complete(t_ns)):
+                break
+            self._pending.popleft()
+            self._emitted_ns = t_ns
+            out.append(self._at(t_ns))
+        return out
+
+    def _complete(self, t_ns: int) -> bool:
+        silent = SILENT_DEADLINES * self._deadline_ns
+        for seen in self._seen:
+            if not seen:
+                return False
+            newest = seen[-1].centre_ns
+            if newest >= t_ns:
+                if newest == t_ns or not self._continuous or len(seen) > 1:
+                    continue
+                return False
+            if t_ns - newest > silent:
+                continue
+            if self._policy == "interpolate" or t_ns - newest > self._deadline_ns:
+                return False
+        return True
+
+    def _at(self, t_ns: int) -> Instant:
+        count, markers = len(self._names), len(self._seen[self._leader()][-1].area)
+        uv = np.full((count, markers, 2), np.nan)
+        sigma = np.full((count, markers), np.nan)
+        area = np.full((count, markers), np.nan)
+        missing = np.ones(count, dtype=bool)
+        ready = 0
+        assert self._origin_ns is not None
+        for c in range(count):
+            near = self._neighbours(c, t_ns)
+            if near:
+                missing[c] = False
+                uv[c], sigma[c], area[c] = _carry(near, float(t_ns - self._origin_ns))
+                ready = max(ready, *(s.ready_t_ns for s in near))
+        return Instant(t_ns, uv, sigma, area, ready, missing)
+
+    def _neighbours(self, camera: int, t_ns: int) -> list[_Sighting]:
+        """Up to three sightings around the instant, nearest first, each at most a gap from the next."""
+        seen = sorted(self._seen[camera], key=lambda s: abs(s.centre_ns - t_ns))
+        reach = self._gap_ns if self._continuous else self._deadline_ns // 2
+        near = [s for s in seen if abs(s.centre_ns - t_ns) <= reach]
+        return near[:3] if self._continuous else near[:1]
+
+
+def _carry(near: list[_Sighting], t: float) -> tuple[Float, Float, Float]:
+    """Position (M, 2), sigma (M,) and area (M,) at time `t` [ns since the origin], nearest sighting first.
+
+    A marker the nearest sighting does not hold is not seen. Lagrange's weights through the sightings that do:
+    three -> parabola, two -> line, one -> held where it was.
+    """
+    uv = np.full_like(near[0].uv, np.nan)
+    sigma = np.full_like(near[0].area, np.nan)
+    times = np.stack([s.t_ns for s in near])
+    seen = np.stack([np.isfinite(s.uv).all(axis=1) for s in near])
+    order = np.cumprod(seen, axis=0).sum(axis=0)  # sightings in a row, from the nearest on
+    for n in range(1, len(near) + 1):
+        use = order == n
+        if not use.any():
+            continue
+        tn = times[:n, use]
+        away = np.abs(t - tn) * 1e-9
+        weights = np.ones_like(tn)
+        for i in range(n):
+            for j in range(n):
+                if i != j:
+                    weights[i] *= (t - tn[j]) / (tn[i] - tn[j])
+        uv[use] = sum(weights[i][:, None] * near[i].uv[use] for i in range(n))
+        noise = sum((weights[i] * near[i].sigma_px[use]) ** 2 for i in range(n))
+        unknown = (_SPEED_PX_S, _ACCELERATION_PX_S2 / 2, _JERK_PX_S3 / 6)[n - 1] * np.prod(away, axis=0)
+        sigma[use] = np.sqrt(noise + unknown**2)
+    return uv, sigma, near[0].area
