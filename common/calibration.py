@@ -170,7 +170,7 @@ class Couplings(_File, frozen=True):
 
 
 class HandProfile(_File, frozen=True):
-    """hands/<name>.json: bone geometry of one hand, its markers, and optionally radii, limits and couplings."""
+    """hands/<name>.json: bones and markers of one hand, optionally radii, limits and couplings."""
 
     version: Literal[1]
     name: Name
@@ -238,12 +238,17 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
         pose = rig.camera_pose(camera)
-        if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4) or np.linalg.det(pose[:3, :3]) < 0:
+        if (
+            not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4)
+            or np.linalg.det(pose[:3, :3]) < 0
+        ):
             raise CalibrationError(f"{where}: T_rig_camera.{camera}: upper left 3x3 is not a rotation")
         if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
             raise CalibrationError(f"{where}: T_rig_camera.{camera}: last row must be 0 0 0 1")
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
-        raise CalibrationError(f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing")
+        raise CalibrationError(
+            f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
+        )
 
 
 def save(path: Path, value: Struct) -> None:
@@ -271,7 +276,9 @@ def save(path: Path, value: Struct) -> None:
 
 def compact_numbers(text: str) -> str:
     """Put arrays of plain numbers on one line, so that a calibration file stays readable."""
-    return re.sub(r"\[[\s\d.,eE+-]+\]", lambda m: "[" + ", ".join(m[0][1:-1].replace(",", " ").split()) + "]", text)
+    return re.sub(
+        r"\[[\s\d.,eE+-]+\]", lambda m: "[" + ", ".join(m[0][1:-1].replace(",", " ").split()) + "]", text
+    )
 
 
 def schema(kind: type[Struct]) -> bytes:

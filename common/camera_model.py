@@ -1,6 +1,8 @@
 """A camera as geometry: point -> pixel and pixel -> ray, with OpenCV's distortion k1, k2, p1, p2, k3."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -9,6 +11,8 @@ from common.arrays import Float
 from common.calibration import CameraCalibration
 from common.errors import CalibrationError
 from common.geometry import invert, transform
+
+_CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,10 +85,10 @@ class CameraModel:
     def undistort(self, uv: Float) -> Float:
         """Normalized image points (..., 2) (x/z, y/z) of pixels (..., 2); NaN stays NaN."""
         uv = np.asarray(uv, dtype=np.float64)
-        flat = np.ascontiguousarray(uv.reshape(-1, 1, 2))
-        criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
-        points = cv2.undistortPointsIter(flat, self.matrix, self.distortion, None, None, criteria)
-        return np.where(np.isnan(uv), np.nan, np.asarray(points).reshape(uv.shape))
+        if uv.size == 0:
+            return uv.copy()
+        points = _undistort(np.ascontiguousarray(uv.reshape(-1, 1, 2)), self.matrix, self.distortion)
+        return np.where(np.isnan(uv), np.nan, points.reshape(uv.shape))
 
     def ray(self, uv: Float) -> Float:
         """Unit ray directions (..., 3) in the rig frame through pixels (..., 2); NaN stays NaN."""
@@ -92,3 +96,11 @@ class CameraModel:
         direction = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
         direction = direction / np.linalg.norm(direction, axis=-1, keepdims=True)
         return direction @ self.T_rig_camera[:3, :3].T
+
+
+def _undistort(uv: Float, matrix: Float, distortion: Float) -> Float:
+    """`cv2.undistortPoints` to convergence; OpenCV 5 merged what 4 calls `undistortPointsIter` into it."""
+    of_opencv_4 = cast(Callable[..., Float] | None, getattr(cv2, "undistortPointsIter", None))
+    if of_opencv_4 is not None:
+        return of_opencv_4(uv, matrix, distortion, None, None, _CRITERIA)
+    return np.asarray(cv2.undistortPoints(uv, matrix, distortion, criteria=_CRITERIA), dtype=np.float64)

@@ -39,7 +39,7 @@ def matrix_to_quaternion(rotation: Float) -> Float:
         axis=-2,
     )
     best = np.argmax(squares, axis=-1)[..., None, None]
-    q = np.take_along_axis(forms, np.broadcast_to(best, (*best.shape[:-1], 4)), axis=-2)[..., 0, :]
+    q: Float = np.take_along_axis(forms, np.broadcast_to(best, (*best.shape[:-1], 4)), axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     return np.where(q[..., :1] < 0, -q, q)
 

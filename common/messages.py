@@ -185,7 +185,7 @@ def decode(data: bytes | memoryview) -> AnyMessage:
 def _to_bytes(array: object) -> bytes:
     if not isinstance(array, np.ndarray):
         raise NotImplementedError(f"cannot encode {type(array)}")
-    return cast(bytes, np.ascontiguousarray(array).tobytes())
+    return np.ascontiguousarray(cast(Float | Bool | Code, array)).tobytes()
 
 
 _WIRE_DTYPE = {Float: np.dtype("<f8"), Bool: np.dtype("?"), Code: np.dtype("u1")}

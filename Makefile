@@ -1,0 +1,62 @@
+# Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
+.DEFAULT_GOAL := help
+.PHONY: help install demo test check bench clean
+.DELETE_ON_ERROR:
+
+PYTHON ?=
+DEMO_SECONDS ?= 30
+DEMO_ARGS ?=
+TEST_ARGS ?=
+BENCH_ARGS ?=
+
+BIN := .venv/bin
+STAMP := .venv/.installed
+# Fits: 3.11-3.13, and able to make a virtual environment (Debian splits ensurepip off into python3-venv).
+FITS := import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+
+help: ## list the targets
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS="$$(printf '\t')" read -r target text; do printf '  make %-9s %s\n' "$$target" "$$text"; done
+	@echo "  variables: PYTHON=python3.12  DEMO_SECONDS=30  DEMO_ARGS='--headless'  TEST_ARGS='-k geometry'  BENCH_ARGS=..."
+
+install: $(STAMP) ## make .venv with everything in it, in the locked versions
+	@echo "ready: $(BIN)/phalanx --help"
+
+demo: $(STAMP) ## two simulated cameras and the master as live processes on this machine
+	@mkdir -p out/demo
+	@headless=; [ -n "$${DISPLAY-}$${WAYLAND_DISPLAY-}" ] || headless=--headless; \
+	  exec $(BIN)/phalanx demo $$headless --seconds $(DEMO_SECONDS) --json out/demo/summary.json $(DEMO_ARGS)
+
+test: check ## check, then all tests
+	@$(BIN)/python -m pytest -n 2 --dist loadfile $(TEST_ARGS)
+
+check: $(STAMP) ## lint, format and strict types
+	@$(BIN)/ruff check
+	@$(BIN)/ruff format --check
+	@$(BIN)/python -m pyright --pythonpath $(BIN)/python
+
+bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
+	@$(BIN)/python -m bench $(BENCH_ARGS)
+
+clean: ## remove .venv, out/ and caches
+	rm -rf .venv out .pytest_cache .ruff_cache .hypothesis
+
+# A virtual environment moved or half made is worse than none: any change of the inputs makes it afresh.
+$(STAMP): pyproject.toml constraints.txt
+	@set -eu; found=; \
+	for python in $(if $(PYTHON),"$(PYTHON)",python3 python3.13 python3.12 python3.11); do \
+	  if "$$python" -c '$(FITS)' >/dev/null 2>&1; then found="$$python"; break; fi; \
+	done; \
+	if [ -z "$$found" ]; then \
+	  echo "make: no fitting Python$(if $(PYTHON), in PYTHON=$(PYTHON)): Phalanx needs 3.11, 3.12 or 3.13 with venv (Debian: apt install python3-venv);" >&2; \
+	  echo "      name one: make install PYTHON=/path/to/python3.12" >&2; exit 1; \
+	fi; \
+	echo "installing into .venv with $$("$$found" -V) ..."; \
+	rm -rf .venv; \
+	if command -v uv >/dev/null 2>&1; then \
+	  uv venv --quiet --python "$$found" .venv; pip="uv pip install --quiet --python $(BIN)/python"; \
+	else \
+	  "$$found" -m venv .venv; pip="$(BIN)/python -m pip install --quiet --disable-pip-version-check"; \
+	fi; \
+	$$pip -c constraints.txt hatchling; \
+	$$pip -c constraints.txt --no-build-isolation -e '.[master,dev]'
+	@touch $@
