@@ -1,0 +1,183 @@
+"""Depth from the raw disparity of a parallel pair, and the position that follows from depth and centroid.
+
+Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectified. Three laws (K16, K17,
+I3):
+
+    ideal     D = f B / x, f = width / (2 tan(fov / 2))   pinhole, perfectly parallel cameras
+    power     D = k x^z                                   fitted; holds on the axis only (I3)
+    affine    x = a / D + x0                              fitted; a = f B, x0 = yaw misalignment as disparity
+
+Every law maps both ways and gives its own sensitivity |dD/dx|, of which the error budget is made. The full
+stereo model is `master.stereo.triangulate`.
+"""
+
+from dataclasses import dataclass
+from math import isfinite, pi, tan
+from typing import Protocol
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.geometry import transform
+
+
+class DepthLaw(Protocol):
+    """Depth <-> disparity; arrays of any shape, NaN where not seen or impossible."""
+
+    def depth(self, disparity: Float) -> Float:
+        """Depth [m] along the reference camera's axis of disparities [px]."""
+        ...
+
+    def disparity(self, depth: Float) -> Float:
+        """Disparity [px] of depths [m]."""
+        ...
+
+    def metres_per_pixel(self, depth: Float) -> Float:
+        """|dD/dx| [m/px] at depths [m]: what one pixel of disparity error costs."""
+        ...
+
+
+def _positive(values: Float) -> Float:
+    values = np.asarray(values, dtype=np.float64)
+    return np.where(values > 0.0, values, np.nan)
+
+
+@dataclass(frozen=True, slots=True)
+class PowerLaw:
+    """D = k x^z (K17; the published pair is k = 45.433 m, z = -1.035)."""
+
+    k_m: float
+    z: float
+
+    @classmethod
+    def of(cls, calibration: PowerLawCalibration) -> "PowerLaw":
+        """From the rig file's `power_law`."""
+        return cls(calibration.k_m, calibration.z)
+
+    def depth(self, disparity: Float) -> Float:
+        """Depth [m]; NaN where the disparity is NaN or not positive."""
+        return self.k_m * _positive(disparity) ** self.z
+
+    def disparity(self, depth: Float) -> Float:
+        """Disparity [px]; NaN where the depth is NaN or not positive."""
+        return (_positive(depth) / self.k_m) ** (1.0 / self.z)
+
+    def metres_per_pixel(self, depth: Float) -> Float:
+        """|dD/dx| = |z| D / x [m/px]."""
+        return -self.z * _positive(depth) / self.disparity(depth)
+
+
+@dataclass(frozen=True, slots=True)
+class AffineDisparity:
+    """x = a / D + x0 (I3): focal length times baseline, and the disparity of an infinitely far point."""
+
+    a_m_px: float
+    x0_px: float
+
+    @classmethod
+    def of(cls, calibration: AffineDisparityCalibration) -> "AffineDisparity":
+        """From the rig file's `affine_disparity`."""
+        return cls(calibration.a_m_px, calibration.x0_px)
+
+    def depth(self, disparity: Float) -> Float:
+        """Depth [m]; NaN where the disparity is NaN or not above x0."""
+        return self.a_m_px / _positive(np.asarray(disparity, dtype=np.float64) - self.x0_px)
+
+    def disparity(self, depth: Float) -> Float:
+        """Disparity [px]; NaN where the depth is NaN or not positive."""
+        return self.a_m_px / _positive(depth) + self.x0_px
+
+    def metres_per_pixel(self, depth: Float) -> Float:
+        """|dD/dx| = D^2 / a [m/px]."""
+        return _positive(depth) ** 2 / self.a_m_px
+
+
+def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDisparity:
+    """The law of perfectly parallel pinhole cameras (K16): affine with a = f B and x0 = 0.
+
+    Args:
+        baseline_m: Distance of the optical centres [m].
+        fov_rad: Horizontal field of view [rad] over the whole width.
+        width_px: Image width [px].
+
+    Raises:
+        ValueError: Not a camera.
+    """
+    if not (isfinite(baseline_m) and baseline_m > 0.0 and 0.0 < fov_rad < pi and width_px > 0):
+        raise ValueError(f"not a stereo pair: baseline {baseline_m} m, view {fov_rad} rad, {width_px} px")
+    return AffineDisparity(baseline_m * width_px / (2.0 * tan(fov_rad / 2.0)), 0.0)
+
+
+def depth_law(rig: RigCalibration) -> DepthLaw | None:
+    """The law the rig file asks for; None when it asks for full stereo triangulation.
+
+    Raises:
+        CalibrationError: The named law has no numbers, or the rig has not exactly two cameras.
+    """
+    if rig.depth_model == "stereo":
+        return None
+    if len(rig.cameras) != 2:
+        raise CalibrationError(
+            f"rig {rig.name!r}: depth_model {rig.depth_model!r} needs two cameras, cameras has"
+            f" {len(rig.cameras)}: use 'stereo'"
+        )
+    if rig.depth_model == "power_law" and rig.power_law is not None:
+        return PowerLaw.of(rig.power_law)
+    if rig.depth_model == "affine_disparity" and rig.affine_disparity is not None:
+        return AffineDisparity.of(rig.affine_disparity)
+    raise CalibrationError(f"rig {rig.name!r}: depth_model is {rig.depth_model!r} but the key is missing")
+
+
+def position_at_depth(camera: CameraModel, uv: Float, depth: Float) -> Float:
+    """Where a centroid of the reference camera is, given its depth (K18): the undistorted ray, scaled.
+
+    Args:
+        camera: The camera to whose axis the depth belongs.
+        uv: Centroids (..., 2) [px], distorted image. NaN: not seen.
+        depth: Depth along the camera's optical axis (...) [m]. NaN: unknown.
+
+    Returns:
+        Points (..., 3) [m], rig frame, right-handed; a row is all NaN where uv or depth is.
+    """
+    xy = camera.undistort(uv)
+    z = np.asarray(depth, dtype=np.float64)[..., None]
+    return transform(camera.T_rig_camera, np.concatenate([xy * z, z + 0.0 * xy[..., :1]], axis=-1))
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBudget:
+    """What spoils a depth [m], one standard cause each, at one distance.
+
+    Attributes:
+        per_pixel_m: One whole pixel of disparity, D^2 / (f B) for the ideal law (I4).
+        centroid_m: Both centroids' noise, sqrt(2) sigma |dD/dx|.
+        sync_m: Sideways motion between the two exposures, D v dt / B (I5).
+    """
+
+    per_pixel_m: float
+    centroid_m: float
+    sync_m: float
+
+
+def error_budget(
+    law: DepthLaw, depth_m: float, baseline_m: float, *, sigma_px: float, speed_m_s: float, skew_s: float
+) -> ErrorBudget:
+    """Depth errors to expect at `depth_m` (K16, I4, I5).
+
+    Args:
+        law: Depth law of the rig.
+        depth_m: Distance [m].
+        baseline_m: Distance of the optical centres [m].
+        sigma_px: Centroid noise of one camera, per axis [px].
+        speed_m_s: Sideways speed of the marker [m/s].
+        skew_s: Time between the two exposures that nobody corrects [s].
+    """
+    step = float(law.metres_per_pixel(np.array(depth_m)))
+    return ErrorBudget(
+        per_pixel_m=step,
+        centroid_m=2.0**0.5 * sigma_px * step,
+        sync_m=depth_m * speed_m_s * abs(skew_s) / baseline_m,
+    )
