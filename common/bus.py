@@ -184,7 +184,7 @@ class _Hub:
         self.lock = threading.Lock()
         self.inboxes: dict[Inbox, tuple[str, str]] = {}
         self.handlers: dict[str, Handler] = {}
-        self.names: dict["LoopbackBus", set[str]] = {}
+        self.names: dict[LoopbackBus, set[str]] = {}
 
 
 class LoopbackBus:
@@ -238,7 +238,9 @@ class LoopbackBus:
             handler = self._hub.handlers.get(command.target)
             names = ", ".join(sorted(self._hub.handlers)) or "nobody"
         if handler is None:
-            raise BusError(f"no answer from {command.target!r} to {command.verb!r}: it is not on the bus ({names} is)")
+            raise BusError(
+                f"no answer from {command.target!r} to {command.verb!r}: it is not on the bus ({names} is)"
+            )
         request = decoded(encode(command), Command)
         assert isinstance(request, Command)  # we encoded it ourselves
         try:

@@ -155,7 +155,9 @@ class OffsetEstimator:
     `steps` counts such restarts, `refused` impossible echoes.
     """
 
-    def __init__(self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 1_000_000) -> None:
+    def __init__(
+        self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 1_000_000
+    ) -> None:
         """Keep at most `capacity` echoes of `window_ns`; a jump above `step_ns` is a step."""
         self._window_ns = window_ns
         self._step_ns = step_ns

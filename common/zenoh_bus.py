@@ -1,0 +1,267 @@
+"""The bus between processes, over zenoh: the only file that knows zenoh.
+
+The master listens, everybody else connects to it; there is no router and no discovery, so a
+process sees only the one it is connected to (and, on the master, everybody). What zenoh does by
+default and must not do here: listen on every interface, join any peer of the network by multicast
+or gossip, notice a pulled cable after 10 s, come back to a restarted master after 4 s, take
+messages of 1 GiB. Links are reliable (tcp, tls, quic): on bare udp its handshake can stay silent.
+
+Samples and commands are read from zenoh's fifo by one thread each, never in a callback on
+zenoh's own threads.
+"""
+
+import json
+import logging
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import zenoh
+
+from common.bus import ANY, Handler, Inbox, Subscription, decoded, payload_of, stream_key
+from common.errors import BusError, PhalanxError
+from common.messages import Command, Health, Message, encode
+from common.streams import ALIVE_KEY, key_of
+
+SCHEMES = ("tcp", "tls", "quic")
+LEASE_MS = 1000
+RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
+MAX_MESSAGE_BYTES = 1 << 20
+ASK_AGAIN_S = 0.05
+LIVELINESS_TIMEOUT_S = 0.5
+FIFO_DEPTH = 64
+
+_LOG = logging.getLogger(__name__)
+
+
+class ZenohBus:
+    """One process on the bus (see `common.bus.Bus`).
+
+    Holds the zenoh session and everything declared on it. An unreachable peer does not delay the
+    constructor by more than half a second; zenoh goes on trying, and everything declared here
+    holds again once the peer is back.
+    """
+
+    def __init__(self, listen: str | None, connect: str | None) -> None:
+        """Listen on an endpoint, connect to one, or both; for example `tcp/127.0.0.1:47802`.
+
+        Raises:
+            BusError: An endpoint is malformed or not tcp, tls or quic, or its address is taken.
+        """
+        ends = (("listening on", listen), ("connecting to", connect))
+        self._where = ", ".join(f"{what} {endpoint}" for what, endpoint in ends if endpoint)
+        try:
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(_settings(listen, connect))))
+        except zenoh.ZError as error:
+            raise BusError(
+                f"cannot open the bus ({self._where or 'no endpoint'}): {error}. Is the address taken or mistyped?"
+            ) from error
+        self._inboxes: list[Inbox] = []
+        self._undeclare: list[Callable[[], None]] = []
+        self._lock = threading.Lock()
+        self._closed = False
+
+    @property
+    def peers(self) -> int:
+        """Number of processes this one is connected to now."""
+        return 0 if self._closed else len(self._session.info.peers_zid())
+
+    def publish(self, stream: str, name: str, message: Message) -> None:
+        """Send to every matching subscription; dropped when the link is congested."""
+        self._check_open()
+        self._session.put(
+            stream_key(stream, name),
+            payload_of(stream, message),
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=True,
+        )
+
+    def subscribe(self, stream: str, name: str = ANY, depth: int = 16) -> Subscription:
+        """Receive a stream (see `Bus.subscribe`)."""
+        self._check_open()
+        key = stream_key(stream, name)
+        undeclare: list[Callable[[], None]] = []
+
+        def forget(inbox: Inbox) -> None:
+            undeclare[0]()
+            with self._lock:
+                if inbox in self._inboxes:
+                    self._inboxes.remove(inbox)
+
+        inbox = Inbox(stream, depth, forget)
+        subscriber = self._session.declare_subscriber(key, zenoh.handlers.FifoChannel(FIFO_DEPTH))
+        undeclare.append(_quietly(subscriber))
+        # The handler by itself: a thread that waits in `subscriber.recv` would block `undeclare`.
+        handler = subscriber.handler
+        _start(f"bus {key}", lambda: inbox.put(handler.recv().payload.to_bytes()))
+        with self._lock:
+            self._inboxes.append(inbox)
+        return inbox
+
+    def serve(self, name: str, handler: Handler) -> None:
+        """Answer every command for `name`, one after the other, on a thread of the bus."""
+        self._check_open()
+        queryable = self._session.declare_queryable(
+            key_of("command", name), zenoh.handlers.FifoChannel(FIFO_DEPTH)
+        )
+        queries = queryable.handler
+
+        def answer_next() -> None:
+            # A query is finished, and the asker told so, when it is left: never keep one while waiting.
+            with queries.recv() as query:
+                _answer(query, handler)
+
+        _start(f"bus command {name}", answer_next)
+        with self._lock:
+            self._undeclare.append(_quietly(queryable))
+
+    def ask(self, command: Command, timeout_s: float) -> Health:
+        """Ask, waiting for the target to appear until `timeout_s` is over (see `Bus.ask`)."""
+        self._check_open()
+        deadline = time.monotonic() + timeout_s
+        key = key_of("command", command.target)
+        payload = encode(command)
+        while (left_s := deadline - time.monotonic()) > 0:
+            replies = self._session.get(
+                key, zenoh.handlers.FifoChannel(FIFO_DEPTH), timeout=left_s, payload=payload
+            )
+            for reply in replies:
+                if reply.ok is not None:
+                    return _health(command, reply.ok.payload.to_bytes())
+                text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
+                if text == "Timeout":  # zenoh's own word for a target that took the query and kept silent
+                    break
+                raise BusError(f"{command.target!r} refused {command.verb!r}: {text}")
+            # Nobody there yet looks the same as nothing to say: ask again, it costs nothing.
+            time.sleep(max(0.0, min(ASK_AGAIN_S, deadline - time.monotonic())))
+        raise BusError(self._silence(command, timeout_s))
+
+    def announce(self, name: str) -> None:
+        """Declare the liveliness token of `name`; it dies with this process."""
+        self._check_open()
+        token = self._session.liveliness().declare_token(ALIVE_KEY.format(name=name))
+        with self._lock:
+            self._undeclare.append(_quietly(token))
+
+    def alive(self) -> frozenset[str]:
+        """Return the announced names of the connected processes and of this one."""
+        if self._closed:
+            return frozenset()
+        replies = self._session.liveliness().get(
+            ALIVE_KEY.format(name=ANY), zenoh.handlers.FifoChannel(FIFO_DEPTH), timeout=LIVELINESS_TIMEOUT_S
+        )
+        keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        return frozenset(key.rsplit("/", 1)[-1] for key in keys)
+
+    def close(self) -> None:
+        """Leave the bus: every thread ends, every declaration goes. Safe to call twice."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
+            inboxes, undeclare = list(self._inboxes), list(self._undeclare)
+        for inbox in inboxes:
+            inbox.close()
+        for forget in undeclare:
+            forget()
+        try:
+            self._session.close()
+        except zenoh.ZError as error:
+            _LOG.warning("bus: closing: %s", error)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise BusError("the bus is closed")
+
+    def _silence(self, command: Command, timeout_s: float) -> str:
+        """Say why nobody may have answered."""
+        text = (
+            f"no answer from {command.target!r} to {command.verb!r} within {timeout_s:g} s ({self._where}): "
+        )
+        if self.peers == 0:
+            return text + "no process is connected. Is the master running, and is this its bus endpoint?"
+        names = ", ".join(sorted(self.alive())) or "none announced"
+        return text + f"{self.peers} connected, alive: {names}. Is the target running and named so?"
+
+
+def _settings(listen: str | None, connect: str | None) -> dict[str, object]:
+    """Return zenoh's configuration: everything that is not safe or quick by default is set here."""
+    endpoints = [endpoint for endpoint in (listen, connect) if endpoint is not None]
+    for endpoint in endpoints:
+        if endpoint.split("/", 1)[0] not in SCHEMES:
+            raise BusError(
+                f"bus endpoint {endpoint!r}: must begin with {', '.join(s + '/' for s in SCHEMES)}"
+            )
+    return {
+        "mode": "peer",
+        "listen": {"endpoints": [listen] if listen else [], "exit_on_failure": True},
+        "connect": {
+            "endpoints": [connect] if connect else [],
+            "timeout_ms": -1,  # 0 would try once and give up for ever; either way `open` returns after 0.5 s
+            "exit_on_failure": False,
+            "retry": RETRY,
+        },
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+        "transport": {
+            "link": {
+                "protocols": list(SCHEMES),
+                "tx": {"lease": LEASE_MS},
+                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
+            }
+        },
+    }
+
+
+def _start(name: str, step: Callable[[], None]) -> None:
+    """Repeat `step` on a thread until zenoh closes what it reads from."""
+
+    def run() -> None:
+        try:
+            while True:
+                step()
+        except zenoh.ZError:
+            return
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+
+
+def _answer(query: zenoh.Query, handler: Handler) -> None:
+    payload = query.payload
+    command = decoded(payload.to_bytes(), Command) if payload is not None else None
+    if not isinstance(command, Command):
+        query.reply_err(b"not a command")
+        return
+    try:
+        query.reply(query.key_expr, encode(handler(command)))
+    except (PhalanxError, ValueError) as error:
+        query.reply_err(str(error).encode())
+    except Exception as error:  # noqa: BLE001
+        # A fault in one handler must not make the process deaf to every later command.
+        _LOG.exception("command %s of %s failed", command.verb, command.target)
+        query.reply_err(f"internal fault: {error!r}".encode())
+
+
+def _health(command: Command, payload: bytes) -> Health:
+    health = decoded(payload, Health)
+    if not isinstance(health, Health):
+        raise BusError(
+            f"{command.target!r} answered {command.verb!r} with something that is not a health report"
+        )
+    return health
+
+
+class _Declared(Protocol):
+    def undeclare(self) -> object: ...
+
+
+def _quietly(declared: _Declared) -> Callable[[], None]:
+    """Return an undeclaration that is safe to call when the session is gone already."""
+
+    def run() -> None:
+        try:
+            declared.undeclare()
+        except zenoh.ZError:
+            return
+
+    return run

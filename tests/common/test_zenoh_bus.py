@@ -1,0 +1,166 @@
+"""What only the bus between processes can get wrong: absent peers, restarts, listening too widely."""
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from common.errors import BusError
+from common.messages import Command, Health
+from common.zenoh_bus import ZenohBus
+from tests.network_helpers import free_endpoint, health, until
+
+
+def listening_sockets() -> set[str]:
+    """Local addresses (hex) of every TCP socket of this process that listens."""
+    inodes: set[str] = set()
+    for link in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(link.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:["):
+            inodes.add(target[8:-1])
+    rows: list[list[str]] = []
+    for table in ("/proc/self/net/tcp", "/proc/self/net/tcp6"):
+        path = Path(table)
+        if path.exists():
+            rows += [line.split() for line in path.read_text().splitlines()[1:]]
+    return {row[1] for row in rows if row[3] == "0A" and row[9] in inodes}
+
+
+def test_nothing_listens_that_was_not_asked_for() -> None:
+    before = listening_sockets()
+    endpoint = free_endpoint()
+    port = int(endpoint.rsplit(":", 1)[1])
+    client = ZenohBus(None, endpoint)
+    try:
+        assert listening_sockets() == before
+        master = ZenohBus(endpoint, None)
+        try:
+            assert listening_sockets() - before == {f"0100007F:{port:04X}"}  # 127.0.0.1 and nothing else
+        finally:
+            master.close()
+    finally:
+        client.close()
+
+
+def test_an_absent_master_neither_blocks_nor_stays_unnoticed() -> None:
+    bus = ZenohBus(None, free_endpoint())
+    try:
+        assert bus.peers == 0
+        with pytest.raises(BusError, match=r"no process is connected\. Is the master running"):
+            bus.ask(Command("master", "report"), timeout_s=0.2)
+        bus.publish("health", "left", health("left"))  # into the void, without an error
+    finally:
+        bus.close()
+
+
+def test_everything_declared_holds_again_after_the_master_restarts() -> None:
+    endpoint = free_endpoint()
+    slave = ZenohBus(None, endpoint)
+    slave.serve("left", lambda command: health(command.target, 3))
+    slave.announce("left")
+    inbox = slave.subscribe("health", "master")
+    try:
+        for _ in range(2):
+            master = ZenohBus(endpoint, None)
+            try:
+                assert master.ask(Command("left", "report"), timeout_s=5).counts == {"frames": 3}
+                assert until(lambda bus=master: "left" in bus.alive())
+
+                def heard(bus: ZenohBus = master) -> bool:
+                    bus.publish("health", "master", health("master"))
+                    return inbox.get(0.05) is not None
+
+                assert until(heard)
+            finally:
+                master.close()
+            assert until(lambda: slave.peers == 0)
+    finally:
+        slave.close()
+
+
+KILLED = """
+import sys, time
+from common.zenoh_bus import ZenohBus
+bus = ZenohBus(None, sys.argv[1])
+bus.announce("left")
+time.sleep(60)
+"""
+
+
+def test_a_killed_process_leaves_the_list_of_the_living() -> None:
+    endpoint = free_endpoint()
+    master = ZenohBus(endpoint, None)
+    process = subprocess.Popen([sys.executable, "-c", KILLED, endpoint], cwd=Path(__file__).parents[2])
+    try:
+        assert until(lambda: master.alive() == {"left"}, timeout_s=20)
+        process.kill()
+        assert until(lambda: not master.alive())
+    finally:
+        process.kill()
+        process.wait()
+        master.close()
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["udp/127.0.0.1:1", "127.0.0.1:47802", "tcp/nonsense", "tcp/127.0.0.1:99999999"]
+)
+def test_a_wrong_endpoint_is_an_error_that_names_it(endpoint: str) -> None:
+    with pytest.raises(BusError, match=endpoint):
+        ZenohBus(endpoint, None)
+
+
+def test_a_taken_address_is_an_error() -> None:
+    endpoint = free_endpoint()
+    first = ZenohBus(endpoint, None)
+    try:
+        with pytest.raises(BusError, match="taken"):
+            ZenohBus(endpoint, None)
+    finally:
+        first.close()
+
+
+def test_a_handler_that_fails_is_reported_and_goes_on_serving() -> None:
+    endpoint = free_endpoint()
+    master = ZenohBus(endpoint, None)
+    slave = ZenohBus(None, endpoint)
+    calls: list[str] = []
+
+    def handler(command: Command) -> Health:
+        calls.append(command.verb)
+        if len(calls) == 1:
+            raise KeyError("a fault of ours")
+        return health("left")
+
+    slave.serve("left", handler)
+    try:
+        with pytest.raises(BusError, match="internal fault: KeyError"):
+            master.ask(Command("left", "report"), timeout_s=5)
+        assert master.ask(Command("left", "report"), timeout_s=5).source == "left"
+    finally:
+        slave.close()
+        master.close()
+
+
+def test_a_target_that_never_answers_is_a_timeout_that_names_the_living() -> None:
+    endpoint = free_endpoint()
+    master = ZenohBus(endpoint, None)
+    slave = ZenohBus(None, endpoint)
+    slave.announce("left")
+
+    def sleepy(command: Command) -> Health:
+        time.sleep(1.0)
+        return health(command.target)
+
+    slave.serve("left", sleepy)
+    assert until(lambda: "left" in master.alive())
+    try:
+        with pytest.raises(BusError, match="alive: left"):
+            master.ask(Command("left", "report"), timeout_s=0.3)
+    finally:
+        slave.close()
+        master.close()

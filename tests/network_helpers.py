@@ -1,0 +1,36 @@
+"""What the network tests share: free addresses, patience, and messages to send."""
+
+import socket
+import time
+from collections.abc import Callable
+
+from common.messages import Health
+
+
+def free_endpoint() -> str:
+    """Return a zenoh endpoint on 127.0.0.1 that nobody listens on."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def free_udp_port() -> int:
+    """Return a UDP port that nobody is bound to."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("0.0.0.0", 0))
+        return int(probe.getsockname()[1])
+
+
+def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
+    """Wait until `condition` holds; False if it never did."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def health(source: str, frames: int = 0) -> Health:
+    """Return a small message."""
+    return Health(source, 1, 2, {"frames": frames}, {"rate_hz": 60.0})
