@@ -1,0 +1,310 @@
+"""The house rules that a machine can check. Every guard is shown a planted violation first, so that it bites."""
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("common", "slave", "master", "deploy")
+OURS = frozenset(PACKAGES)
+DRIVERS = frozenset({"serial", "smbus2", "picamera2", "libcamera"})
+
+# Who may not import whom. `rerun` in master and the drivers in slave have files of their own, see ONLY_IN.
+FORBIDDEN: dict[str, frozenset[str]] = {
+    "common": frozenset({"slave", "master", "deploy", "rerun"}) | DRIVERS,
+    "slave": frozenset({"master", "deploy", "rerun"}),
+    "master": frozenset({"slave", "deploy"}) | DRIVERS,
+    "deploy": frozenset({"common", "slave", "master", "rerun", "zenoh"}) | DRIVERS,
+}
+# The only files that know a library.
+ONLY_IN: dict[str, tuple[str, ...]] = {
+    "zenoh": ("common/zenoh_bus.py",),
+    "rerun": ("master/outputs/rerun*.py",),
+    "serial": ("slave/imu/*.py",),
+    "smbus2": ("slave/imu/*.py",),
+    "picamera2": ("slave/cameras/picamera2*.py",),
+    "libcamera": ("slave/cameras/picamera2*.py",),
+}
+NEVER = frozenset({"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"})
+# Import name -> name in pyproject.toml, where they differ. picamera2 and libcamera come with the Pi's system.
+DISTRIBUTION = {
+    "cv2": "opencv-python-headless",
+    "zenoh": "eclipse-zenoh",
+    "serial": "pyserial",
+    "rerun": "rerun-sdk",
+}
+SYSTEM = frozenset({"picamera2", "libcamera"})
+# Files of common that the slave never loads may use what only the PC has.
+PC_ONLY = {"common/recording.py": frozenset({"mcap"})}
+# Calls that touch the world; none may run because a module is imported.
+DEVICES = frozenset(
+    {
+        "open",
+        "socket",
+        "create_connection",
+        "VideoCapture",
+        "Serial",
+        "SMBus",
+        "Picamera2",
+        "Thread",
+        "Process",
+        "Popen",
+        "run",
+        "sleep",
+        "read_text",
+        "read_bytes",
+        "write_text",
+        "write_bytes",
+        "mkdir",
+        "setNumThreads",
+        "basicConfig",
+        "seed",
+        "spawn",
+        "init",
+    }
+)
+
+
+def sources(package: str) -> list[tuple[str, str]]:
+    """(path below the root, text) of every file of one package."""
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files, f"no files under {package}/: the check would pass on nothing"
+    return [(path.relative_to(ROOT).as_posix(), path.read_text()) for path in files]
+
+
+def imported(text: str) -> Iterator[str]:
+    """Top-level names of all imports, also those inside functions."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.split(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
+            yield node.module.split(".")[0]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in {
+            "__import__",
+            "importlib.import_module",
+        }:
+            yield from (
+                str(arg.value).split(".")[0] for arg in node.args[:1] if isinstance(arg, ast.Constant)
+            )
+
+
+def wrong_side(path: str, text: str) -> set[str]:
+    """Imports that this package, or this file, may not have."""
+    names = set(imported(text))
+    strangers = {
+        name
+        for name, files in ONLY_IN.items()
+        if name in names and not any(fnmatch(path, file) for file in files)
+    }
+    return (names & (FORBIDDEN[path.split("/")[0]] | NEVER)) | strangers
+
+
+def undeclared(path: str, text: str) -> set[str]:
+    """Third-party imports that pyproject.toml does not promise to this package."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    promised = [*project["dependencies"]]
+    if path.startswith(("master/", "deploy/")):
+        promised += project["optional-dependencies"]["master"]
+    have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())
+    names = set(imported(text)) - OURS - sys.stdlib_module_names
+    return {name for name in names if DISTRIBUTION.get(name, name) not in have}
+
+
+def relative_imports(path: str, text: str) -> set[str]:
+    """`from . import x`."""
+    nodes = ast.walk(ast.parse(text))
+    return {ast.unparse(node) for node in nodes if isinstance(node, ast.ImportFrom) and node.level > 0}
+
+
+def bare_excepts(path: str, text: str) -> set[str]:
+    """`except:` and `except BaseException:` that do not raise again."""
+    return {
+        f"line {node.lineno}"
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.ExceptHandler)
+        and (node.type is None or ast.unparse(node.type) == "BaseException")
+        and not any(isinstance(inner, ast.Raise) for inner in ast.walk(node))
+    }
+
+
+def prints(path: str, text: str) -> set[str]:
+    """`print` outside the command lines."""
+    if path.endswith("__main__.py"):
+        return set()
+    return {
+        f"line {node.lineno}"
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
+    }
+
+
+def globals_written(path: str, text: str) -> set[str]:
+    """`global x`: state that belongs to no object."""
+    return {ast.unparse(node) for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Global)}
+
+
+def import_time_work(path: str, text: str) -> set[str]:
+    """Statements of a module that do something when it is imported: loops, bare calls, devices."""
+    found: set[str] = set()
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.If) and "__name__" in ast.unparse(node.test):
+            continue
+        if isinstance(node, (ast.For, ast.While, ast.With)):
+            found.add(f"line {node.lineno}: {type(node).__name__}")
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
+            found.add(f"line {node.lineno}: {ast.unparse(node)}")
+        for call in _calls_now(node):
+            if ast.unparse(call.func).split(".")[-1] in DEVICES:
+                found.add(f"line {call.lineno}: {ast.unparse(call)}")
+    return found
+
+
+def _calls_now(node: ast.AST) -> Iterator[ast.Call]:
+    """Calls made when `node` is executed: bodies of functions and lambdas wait."""
+    if isinstance(node, ast.Call):
+        yield node
+    waits: set[ast.AST] = set()
+    if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        waits = set(node.body)
+    elif isinstance(node, ast.Lambda):
+        waits = {node.body}
+    for child in ast.iter_child_nodes(node):
+        if child not in waits:
+            yield from _calls_now(child)
+
+
+Guard = Callable[[str, str], set[str]]
+
+# guard, file it is planted in, violation, and a neighbour that is allowed
+PLANTED: list[tuple[Guard, str, str, str]] = [
+    (wrong_side, "common/x.py", "def late():\n    from master.stereo import depth\n", "import common.clock"),
+    (wrong_side, "common/x.py", "import rerun as rr", "import re"),
+    (wrong_side, "common/bus.py", "import zenoh", "import common.zenoh_bus"),
+    (wrong_side, "slave/app.py", "from master import ingest", "from common import bus"),
+    (wrong_side, "slave/app.py", "import serial", "import common"),
+    (wrong_side, "slave/app.py", "from smbus2 import SMBus", "import slave.imu"),
+    (wrong_side, "slave/cameras/v4l2.py", "from picamera2 import Picamera2", "import cv2"),
+    (wrong_side, "master/app.py", "import slave.app", "import master.ingest"),
+    (
+        wrong_side,
+        "master/app.py",
+        "importlib.import_module('slave.app')",
+        "importlib.import_module('master.app')",
+    ),
+    (wrong_side, "master/app.py", "import rerun", "import master.outputs.rerun"),
+    (wrong_side, "master/app.py", "if True:\n    import pickle", "import json"),
+    (wrong_side, "deploy/demo.py", "import common.clock", "import subprocess"),
+    (undeclared, "slave/app.py", "import typer", "import cv2, numpy, msgspec"),
+    (undeclared, "master/app.py", "import scipy.optimize", "import typer, rerun"),
+    (relative_imports, "slave/app.py", "from . import cameras", "from slave import cameras"),
+    (
+        bare_excepts,
+        "slave/app.py",
+        "try:\n    x()\nexcept:\n    pass",
+        "try:\n    x()\nexcept OSError:\n    pass",
+    ),
+    (
+        bare_excepts,
+        "slave/app.py",
+        "try:\n    x()\nexcept BaseException:\n    pass",
+        "try:\n    x()\nexcept:\n    raise",
+    ),
+    (prints, "slave/app.py", "def f():\n    print('x')", "def f():\n    log.info('x')"),
+    (globals_written, "slave/app.py", "def f():\n    global x\n    x = 1", "def f():\n    x = 1"),
+    (
+        import_time_work,
+        "slave/app.py",
+        "camera = cv2.VideoCapture(0)",
+        "def f():\n    return cv2.VideoCapture(0)",
+    ),
+    (import_time_work, "slave/app.py", "class A:\n    s = socket.socket()", "class A:\n    n = max(1, 2)"),
+    (import_time_work, "slave/app.py", "def f(s=open('x')): ...", "f = lambda: open('x')"),
+    (import_time_work, "slave/app.py", "main()", "if __name__ == '__main__':\n    main()"),
+    (import_time_work, "slave/app.py", "for i in x:\n    f(i)", "y = [f(i) for i in x]"),
+]
+GUARDS: list[Guard] = list(dict.fromkeys(guard for guard, *_ in PLANTED))
+
+
+@pytest.mark.parametrize(("guard", "path", "violation", "neighbour"), PLANTED)
+def test_the_guard_bites_a_planted_violation_only(
+    guard: Guard, path: str, violation: str, neighbour: str
+) -> None:
+    assert guard(path, violation)
+    assert not guard(path, neighbour)
+
+
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        ("zenoh", "common/zenoh_bus.py"),
+        ("rerun", "master/outputs/rerun_viewer.py"),
+        ("smbus2", "slave/imu/icm20948.py"),
+        ("picamera2", "slave/cameras/picamera2.py"),
+    ],
+)
+def test_the_one_file_of_a_library_may_use_it(name: str, path: str) -> None:
+    assert not wrong_side(path, f"import {name}")
+
+
+def test_only_the_command_line_prints() -> None:
+    assert not prints("slave/__main__.py", "print('x')")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+@pytest.mark.parametrize("guard", GUARDS, ids=lambda guard: guard.__name__)
+def test_package_keeps_the_rule(guard: Guard, package: str) -> None:
+    wrong = {path: bad for path, text in sources(package) if (bad := guard(path, text))}
+    assert not wrong
+
+
+QUIET = """
+import importlib, sys, threading
+def refuse(event, arguments):
+    if event in {"socket.__new__", "subprocess.Popen", "os.system", "os.fork", "os.posix_spawn"}:
+        raise RuntimeError(f"an import did {event} {arguments}")
+sys.addaudithook(refuse)
+for name in sys.argv[1:]:
+    importlib.import_module(name)
+    assert threading.active_count() == 1, f"{name} started a thread"
+"""
+
+
+def import_in_silence(modules: list[str], path: Path) -> subprocess.CompletedProcess[str]:
+    """Import `modules` in a process where sockets, processes and threads are refused."""
+    environment = os.environ | {"PYTHONPATH": str(path)}
+    command = [sys.executable, "-c", QUIET, *modules]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_importing_every_module_touches_nothing(package: str) -> None:
+    # Drivers of hardware and the viewer load foreign libraries, which may do what they like.
+    foreign = {pattern for patterns in ONLY_IN.values() for pattern in patterns}
+    modules = [
+        path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        for path, _ in sources(package)
+        if not any(fnmatch(path, pattern) for pattern in foreign)
+    ]
+    result = import_in_silence(modules, ROOT)
+    assert result.returncode == 0, result.stderr
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "import socket; s = socket.socket()",
+        "import threading; threading.Thread(target=threading.Event().wait, daemon=True).start()",
+        "import subprocess; subprocess.run(['true'])",
+    ],
+)
+def test_the_silence_is_broken_by_a_planted_module(line: str, tmp_path: Path) -> None:
+    (tmp_path / "planted.py").write_text(line + "\n")
+    assert import_in_silence(["planted"], tmp_path).returncode != 0
