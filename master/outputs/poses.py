@@ -82,9 +82,13 @@ class Poses:
 
     def pose(self, index: int) -> HandPose:
         """Row `index` as the message it came from."""
-        arrays = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "hand"}
-        times = {name: int(arrays.pop(name)) for name in ("t_ns", "latency_ns")}
-        return HandPose(hand=self.hand, **arrays, **times)
+        times = ("t_ns", "latency_ns")
+        arrays = {
+            f.name: getattr(self, f.name)[index] for f in fields(self) if f.name not in ("hand", *times)
+        }
+        return HandPose(
+            hand=self.hand, t_ns=int(self.t_ns[index]), latency_ns=int(self.latency_ns[index]), **arrays
+        )
 
     def rows(self, start: int, stop: int) -> "Poses":
         """Rows start..stop-1, without copying."""

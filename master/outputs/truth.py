@@ -27,6 +27,10 @@ class Truth:
         palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
         return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m)
 
+    def rows(self, start: int, stop: int) -> "Truth":
+        """Rows start..stop-1, without copying."""
+        return Truth(self.joints_m[start:stop], self.markers_m[start:stop])
+
     def joint_error_m(self, poses: Poses) -> Float:
         """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""
         error = np.linalg.norm(poses.position_m - self.joints_m, axis=-1)
@@ -35,3 +39,11 @@ class Truth:
     def marker_error_m(self, poses: Poses) -> Float:
         """Distance (T, M) [m] of the unfiltered caps; NaN where not seen."""
         return np.linalg.norm(poses.markers_raw_m - self.markers_m, axis=-1)
+
+
+def mean_known(values: Float) -> Float:
+    """Mean (T,) over the second axis of (T, K), NaN values left out; NaN where none is known."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=1)
+    total = np.where(known, values, 0.0).sum(axis=1)
+    return np.divide(total, count, out=np.full(len(values), np.nan), where=count > 0)

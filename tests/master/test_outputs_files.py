@@ -116,7 +116,7 @@ def test_full_disk_is_a_clear_error_and_leaves_nothing_half_written(
 def test_a_disk_that_fills_while_tracking_is_reported_by_write(tmp_path: Path) -> None:
     sink = PosesFile(tmp_path / "poses.npz", "default-right", 6)
     sink._spool.close()
-    sink._spool = Path("/dev/full").open("r+b", buffering=0)
+    sink._spool = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115
     with pytest.raises(RecordingError, match="No space left"):
         sink.write(random_pose(0))
     sink.close()  # the run may still end in good order
@@ -152,14 +152,14 @@ def _wrong_shape(path: Path) -> None:
     with np.load(path) as data:
         arrays = dict(data)
     arrays["valid"] = np.ones((1, 25), bool)
-    np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez(path, **arrays)
 
 
 def _pickled(path: Path) -> None:
     with np.load(path) as data:
         arrays = dict(data)
     arrays["valid"] = np.array([{}], dtype=object)
-    np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
+    np.savez(path, **arrays)
 
 
 @pytest.mark.parametrize("spoil", [Path.unlink, _cut, _junk, _keyless, _wrong_shape, _pickled])

@@ -1,0 +1,238 @@
+"""The viewer, in a process of its own: reads hands and health from the bus and never slows the tracking.
+
+It only subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses
+pictures, not poses. The native and the web viewer are child processes that listen on 127.0.0.1 only, with
+a memory limit and with their makers' usage statistics switched off (docs/viewer.md).
+"""
+
+import logging
+import os
+import tempfile
+import threading
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Literal
+
+import rerun as rr
+
+from common.arrays import Image
+from common.bus import Bus, Subscription
+from common.calibration import CameraCalibration, RigCalibration
+from common.clock import now_ns
+from common.errors import PhalanxError, RecordingError
+from common.hand_model import HandModel
+from common.messages import HandPose, Health, MarkerDetections
+from master.outputs.poses import Poses
+from master.outputs.rerun_blueprint import blueprint
+from master.outputs.rerun_process import ViewerProcess
+from master.outputs.rerun_scene import RerunScene
+from master.outputs.truth import Truth
+
+Mode = Literal["spawn", "web", "save"]
+
+_APPLICATION = "phalanx"
+_BATCH_S = 0.033  # poses shown together: one redraw of a 30 Hz screen
+_IDLE_S = 0.1
+_FLUSH_PERIOD_NS = 1_000_000_000
+_FLUSH_TIMEOUT_S = 5.0
+_DEPTH = 256
+_ROWS_A_CHUNK = 512
+
+_log = logging.getLogger(__name__)
+
+
+def run_viewer(
+    bus: Bus,
+    rig: RigCalibration,
+    cameras: Mapping[str, CameraCalibration],
+    hand: HandModel,
+    *,
+    mode: Mode,
+    path: Path | None,
+    stop: threading.Event,
+    web_port: int = 9090,
+    on_ready: Callable[[str], None] = _log.info,
+) -> int:
+    """Show what is on the bus until `stop` is set or the viewer's window is closed.
+
+    Args:
+        bus: Where stream "hand" and "health" are published; only read, and left open.
+        rig, cameras, hand: What is tracked; `cameras` by name, with intrinsics.
+        mode: "spawn" a window, serve the "web" viewer on 127.0.0.1, or "save" an .rrd.
+        path: The .rrd of mode "save"; None otherwise.
+        stop: Set from another thread or a signal handler.
+        web_port: TCP port of the web page on 127.0.0.1.
+        on_ready: Told once where the result is to be seen (an address or a file).
+
+    Returns:
+        Number of poses shown.
+
+    Raises:
+        RecordingError: The .rrd cannot be written.
+        PhalanxError: The viewer did not start (no display?) or takes no data any more.
+        BusError: The bus is closed.
+        ValueError: Mode and `path` do not fit.
+    """
+    if (mode == "save") != (path is not None):
+        raise ValueError(f"mode {mode!r} with path {path}: a path belongs to mode 'save' and only to it")
+    hands, reports = bus.subscribe("hand", depth=_DEPTH), bus.subscribe("health", depth=_DEPTH)
+    try:
+        with _opened(mode, path, web_port, on_ready) as (recording, alive):
+            recording.send_blueprint(blueprint(rig, live=mode != "save", with_truth=False))
+            scene = RerunScene(recording, rig, cameras, hand)
+            return _pump(scene, recording, hands, reports, lambda: alive() and not stop.is_set())
+    finally:
+        hands.close()
+        reports.close()
+
+
+def write_rrd(
+    path: Path,
+    poses: Poses,
+    rig: RigCalibration,
+    cameras: Mapping[str, CameraCalibration],
+    hand: HandModel,
+    detections: Mapping[str, Iterable[MarkerDetections]] | None = None,
+    truth: Truth | None = None,
+    images: Iterable[tuple[str, int, Image | bytes]] = (),
+) -> None:
+    """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.
+
+    Args:
+        path: The file; replaced only by a complete one.
+        poses: The run.
+        rig, cameras, hand: What was tracked.
+        detections: Camera -> its frames in the order of time, on the clock of the poses.
+        truth: Row by row with `poses`.
+        images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
+
+    Raises:
+        RecordingError: The file cannot be written; nothing half written is left.
+    """
+    with _saved(path) as recording:
+        recording.send_blueprint(blueprint(rig, live=False, with_truth=truth is not None))
+        scene = RerunScene(recording, rig, cameras, hand)
+        for start in range(0, len(poses), _ROWS_A_CHUNK):
+            stop = min(start + _ROWS_A_CHUNK, len(poses))
+            scene.log_poses(poses.rows(start, stop), truth.rows(start, stop) if truth is not None else None)
+        for frames in (detections or {}).values():
+            scene.log_detections(frames)
+        for camera, t_ns, image in images:
+            scene.log_image(camera, image, t_ns)
+
+
+def _pump(
+    scene: RerunScene,
+    recording: rr.RecordingStream,
+    hands: Subscription,
+    reports: Subscription,
+    go_on: Callable[[], bool],
+) -> int:
+    """Move messages from the bus to the scene while `go_on`, and the last ones after it."""
+    shown, flush_ns, going = 0, now_ns(), True
+    while going:
+        going = go_on()
+        for poses in _by_hand(_drain(hands)):
+            scene.log_poses(poses)
+            shown += len(poses)
+        while (health := reports.get(0.0)) is not None:
+            if isinstance(health, Health):
+                # A health report has the clock of its sender; the timeline has the master's.
+                at_ns = scene.last_t_ns
+                scene.log_health(health, health.t_ns if at_ns is None else at_ns)
+        if now_ns() - flush_ns > _FLUSH_PERIOD_NS:
+            # The SDK queues without bound towards a viewer that hangs; one second's data is the bound here.
+            _flush(recording)
+            flush_ns = now_ns()
+    return shown
+
+
+def _drain(hands: Subscription) -> list[HandPose]:
+    """Wait for a pose, then take what arrives until the next redraw."""
+    batch: list[HandPose] = []
+    end_ns = now_ns() + round(_IDLE_S * 1e9)
+    while (left_ns := end_ns - now_ns()) > 0:
+        message = hands.get(left_ns * 1e-9)
+        if message is None:
+            break
+        if isinstance(message, HandPose):
+            if not batch:
+                end_ns = now_ns() + round(_BATCH_S * 1e9)
+            batch.append(message)
+    return batch
+
+
+def _by_hand(batch: list[HandPose]) -> Iterator[Poses]:
+    """One `Poses` for each hand (and marker count) in the batch."""
+    groups: dict[tuple[str, int], list[HandPose]] = {}
+    for pose in batch:
+        groups.setdefault((pose.hand, len(pose.markers_m)), []).append(pose)
+    return map(Poses.of, groups.values())
+
+
+@contextmanager
+def _opened(
+    mode: Mode, path: Path | None, web_port: int, on_ready: Callable[[str], None]
+) -> Generator[tuple[rr.RecordingStream, Callable[[], bool]], None, None]:
+    """The recording of one mode, and whether somebody still looks at it."""
+    if path is not None:
+        with _saved(path) as recording:
+            on_ready(f"recording to {path}")
+            yield recording, lambda: True
+        return
+    with ViewerProcess(web_port if mode == "web" else None) as viewer:
+        recording = rr.RecordingStream(_APPLICATION)
+        # The port was seen open: connecting to a dead viewer would block for seconds.
+        recording.connect_grpc(viewer.url)
+        on_ready(viewer.address)
+        try:
+            yield recording, viewer.alive
+            if viewer.alive():
+                _flush(recording)
+        except PhalanxError:
+            if viewer.alive():
+                raise
+            _log.info("the viewer was closed")
+        finally:
+            recording.disconnect()
+
+
+@contextmanager
+def _saved(path: Path) -> Generator[rr.RecordingStream, None, None]:
+    """A recording into `path`, which appears under its name only when it is complete."""
+    temporary = None
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".rrd")
+        os.close(handle)
+        temporary = Path(name)
+        recording = rr.RecordingStream(_APPLICATION)
+        recording.save(temporary)
+        try:
+            yield recording
+            _flush(recording)
+        finally:
+            recording.disconnect()
+        if not rr.chunk.RrdReader(temporary).recordings():
+            raise RecordingError(f"{path}: the file came out empty; free the disk or choose another folder")
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except (OSError, RuntimeError) as error:
+        raise RecordingError(f"{path}: cannot write: {error}") from error
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _flush(recording: rr.RecordingStream) -> None:
+    """Wait until everything is written or received.
+
+    Raises:
+        PhalanxError: It is not taken: disk full, or a viewer that hangs.
+    """
+    try:
+        recording.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+    except (RuntimeError, TimeoutError) as error:
+        raise PhalanxError(
+            f"Rerun does not take the data (disk full, or the viewer hangs): {error}"
+        ) from error

@@ -1,0 +1,293 @@
+"""What the viewer shows: poses, detections, images and health as entities of one Rerun recording.
+
+Poses are logged as columns, a batch at a time, so that a live viewer (2 or 3 poses a batch) and a file
+of a whole run take the same path. Every row stands on the timeline "capture" at its `t_ns`.
+The scene holds the times of the last second (rate) and of the last image of each camera (10 Hz limit).
+
+    about                                text: what the colours mean
+    world/cameras/CAM                    place, pinhole, image; /detections: centroids
+    world/hand/HAND/skeleton             5 finger strips and the palm, coloured by source
+    world/hand/HAND/joints               valid joints, bright = tracked; /at_limit: angle at its limit
+    world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips
+    world/markers/raw, filtered          caps before and after the filter
+    world/rays/CAM                       camera centre to each cap
+    world/truth/skeleton, markers        where a truth is known
+    plots/...                            latency, rate, jitter, error, PIP angles, counts, health
+"""
+
+from collections.abc import Iterable, Mapping
+from typing import cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from common.arrays import Bool, Float, Image, Int
+from common.calibration import CameraCalibration, RigCalibration
+from common.camera_model import CameraModel
+from common.geometry import matrix_to_quaternion
+from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
+from common.messages import Health, MarkerDetections, Source
+from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
+from master.outputs.poses import Poses
+from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
+from master.outputs.truth import Truth, mean_known
+
+IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
+_PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its centre
+_STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
+_STRIP_SOURCE = (*TIPS.tolist(), WRIST)
+_HINGE_OF_ANGLE = np.array(
+    [[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS]
+)  # joint that angle (5, 4) turns
+_PIP = 2
+_JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
+_AT_LIMIT_RAD = np.deg2rad(0.5)
+_JPEG_QUALITY = 80
+
+
+class RerunScene:
+    """Logs one rig and its hands to `recording`, which belongs to the caller."""
+
+    def __init__(
+        self,
+        recording: rr.RecordingStream,
+        rig: RigCalibration,
+        cameras: Mapping[str, CameraCalibration],
+        hand: HandModel,
+    ) -> None:
+        """Log what never changes: frames, frusta, names and colours of plots.
+
+        Raises:
+            CalibrationError: A camera of the rig has no intrinsics.
+        """
+        self._rec = recording
+        self._rig = rig
+        self._hand = hand
+        self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
+        self._recent_ns: Int = np.empty(0, np.int64)
+        self._image_ns: dict[str, int] = {}
+        recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
+        recording.log("about", rr.TextDocument(legend(), media_type="text/markdown"), static=True)
+        for name, model in self._models.items():
+            self._log_camera(name, model)
+        for i, name in enumerate(rig.markers):
+            self._name_series(f"plots/jitter_mm/{name}", name, series_rgb(i))
+        for i, name in enumerate(FINGERS):
+            self._name_series(f"plots/pip_deg/{name}", name, series_rgb(i))
+
+    @property
+    def last_t_ns(self) -> int | None:
+        """Time of the newest pose logged, or None."""
+        return int(self._recent_ns[-1]) if len(self._recent_ns) else None
+
+    def log_poses(self, poses: Poses, truth: Truth | None = None) -> None:
+        """Log a batch of poses of one hand, in the order of time, and their truth row by row."""
+        if not len(poses):
+            return
+        root = rr.new_entity_path([WORLD, "hand", poses.hand])
+        self._log_hand(root, poses)
+        self._log_markers(poses)
+        self._log_plots(poses)
+        if truth is not None:
+            self._log_truth(poses, truth)
+
+    def log_detections(self, detections: Iterable[MarkerDetections]) -> None:
+        """Log the centroids that one camera saw, in its image; frames in the order of time."""
+        frames = list(detections)
+        if not frames:
+            return
+        uv = np.array([frame.uv for frame in frames]) + _PIXEL_CENTRE
+        seen = _seen(uv)
+        colours = np.broadcast_to(self._marker_colours(uv.shape[1]), seen.shape)
+        self._send(
+            f"{camera_path(frames[0].camera)}/detections",
+            np.array([frame.t_ns for frame in frames], np.int64),
+            rr.Points2D.columns(positions=uv[seen], colors=colours[seen], radii=np.full(seen.sum(), 4.0)),
+            seen.sum(axis=1),
+        )
+
+    def log_image(self, camera: str, image: Image | bytes, t_ns: int) -> bool:
+        """Show an image of a camera; more than 10 a second are left out.
+
+        Args:
+            camera: A camera of the rig.
+            image: (H, W, 3) BGR, (H, W) grey, or a whole JPEG file as bytes.
+            t_ns: Capture time [ns].
+
+        Returns:
+            Whether it was logged.
+        """
+        last = self._image_ns.get(camera)
+        if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
+            return False
+        self._image_ns[camera] = t_ns
+        if isinstance(image, bytes):
+            jpeg = image
+        else:
+            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns, "ns"))
+        self._rec.log(camera_path(camera), rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        return True
+
+    def log_health(self, health: Health, t_ns: int) -> None:
+        """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""
+        for name, value in [*health.counts.items(), *health.gauges.items()]:
+            path = rr.new_entity_path(["plots", "health", health.source, name])
+            self._scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
+
+    def _log_camera(self, name: str, model: CameraModel) -> None:
+        pose, path = model.T_rig_camera, camera_path(name)
+        matrix = model.matrix.copy()
+        matrix[:2, 2] += _PIXEL_CENTRE
+        pinhole = rr.Pinhole(
+            image_from_camera=matrix,
+            resolution=(model.width_px, model.height_px),
+            camera_xyz=rr.ViewCoordinates.RDF,
+            image_plane_distance=0.08,
+        )
+        self._rec.log(
+            path, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), pinhole, static=True
+        )
+
+    def _log_hand(self, root: str, poses: Poses) -> None:
+        valid, at = poses.valid, poses.position_m
+        shown = np.stack([valid[:, list(strip)].all(axis=1) for strip in _STRIPS], axis=1)
+        palette = pack([SOURCE_RGB[source] for source in Source])
+        # A code that this version does not know is shown like "no pose".
+        colours = palette[np.where(poses.source < len(palette), poses.source, 0)]
+        strips = _strips(at, shown)
+        strip_colours = colours[:, _STRIP_SOURCE][shown]
+        self._send(
+            f"{root}/skeleton",
+            poses.t_ns,
+            rr.LineStrips3D.columns(strips=strips, colors=strip_colours, radii=np.full(len(strips), 0.0018)),
+            shown.sum(axis=1),
+        )
+        colours = np.where(poses.tracked, colours, dim(colours))
+        radii = (poses.radius_m * _JOINT_SHOWN)[valid]
+        self._points(f"{root}/joints", poses.t_ns, at, valid, colours, radii)
+        limit = self._at_limit(poses.angles_rad) & valid
+        red = np.full(limit.shape, pack([LIMIT_RGB])[0])
+        self._points(f"{root}/at_limit", poses.t_ns, at, limit, red, (poses.radius_m * 0.55)[limit])
+        self._log_uncertainty(f"{root}/uncertainty", poses)
+
+    def _at_limit(self, angles_rad: Float) -> Bool:
+        """Joints (T, 26) one of whose angles has reached its limit; a fixed angle does not count."""
+        low, high = self._hand.limits_rad[..., 0], self._hand.limits_rad[..., 1]
+        reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
+        reached &= high - low > 2 * _AT_LIMIT_RAD
+        joints = np.zeros((len(angles_rad), 26), np.bool_)
+        for finger, angle in np.ndindex(5, 4):
+            joints[:, _HINGE_OF_ANGLE[finger, angle]] |= reached[:, finger, angle]
+        return joints
+
+    def _log_uncertainty(self, path: str, poses: Poses) -> None:
+        cov = poses.cov_m2[:, TIPS]
+        known = np.isfinite(cov).all(axis=(-1, -2)) & poses.valid[:, TIPS]
+        variance, axes = np.linalg.eigh(cov[known])
+        axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a mirror image is no rotation
+        wxyz = matrix_to_quaternion(axes)
+        ellipsoids = rr.Ellipsoids3D.columns(
+            centers=poses.position_m[:, TIPS][known],
+            half_sizes=2.0 * np.sqrt(np.maximum(variance, 0.0)),
+            quaternions=np.roll(wxyz, -1, axis=-1),
+            colors=np.full(known.sum(), pack([TRUTH_RGB])[0]),
+        )
+        self._send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
+
+    def _log_markers(self, poses: Poses) -> None:
+        colours = np.broadcast_to(self._marker_colours(poses.marker_count), poses.markers_m.shape[:2])
+        for name, at, radius in (("raw", poses.markers_raw_m, 0.0025), ("filtered", poses.markers_m, 0.004)):
+            seen = _seen(at)
+            tint = dim(colours) if name == "raw" else colours
+            self._points(f"{WORLD}/markers/{name}", poses.t_ns, at, seen, tint, radius)
+        raw = poses.markers_raw_m
+        seen = _seen(raw)
+        for name, model in self._models.items():
+            rays = [np.stack([model.centre, point]) for point in raw[seen]]
+            columns = rr.LineStrips3D.columns(
+                strips=rays,
+                radii=np.full(len(rays), 0.0003),
+                colors=np.full(len(rays), pack([RAY_RGB], alpha=110)[0]),
+            )
+            self._send(rr.new_entity_path([WORLD, "rays", name]), poses.t_ns, columns, seen.sum(axis=1))
+
+    def _log_plots(self, poses: Poses) -> None:
+        t = poses.t_ns
+        if poses.latency_ns.any():  # all zero: an offline run, which has none
+            self._scalars("plots/latency_ms", t, poses.latency_ns * 1e-6)
+        self._scalars("plots/rate_hz", t, self._rate_hz(t))
+        step: Float = np.sqrt(((poses.markers_raw_m - poses.markers_m) ** 2).sum(axis=-1)) * 1e3
+        for m in range(poses.marker_count):
+            name = self._rig.markers[m] if m < len(self._rig.markers) else f"marker-{m}"
+            self._scalars(rr.new_entity_path(["plots", "jitter_mm", name]), t, step[:, m])
+        for f, name in enumerate(FINGERS):
+            self._scalars(f"plots/pip_deg/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
+        self._scalars("plots/seen/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64))
+        markers = _seen(poses.markers_raw_m).sum(axis=1)
+        self._scalars("plots/seen/markers", t, markers.astype(np.float64))
+
+    def _log_truth(self, poses: Poses, truth: Truth) -> None:
+        t, at = poses.t_ns, truth.joints_m
+        known = np.stack([np.isfinite(at[:, list(strip)]).all(axis=(1, 2)) for strip in _STRIPS], axis=1)
+        strips = _strips(at, known)
+        grey = np.full(len(strips), pack([TRUTH_RGB])[0])
+        columns = rr.LineStrips3D.columns(strips=strips, colors=grey, radii=np.full(len(strips), 0.0008))
+        self._send(f"{WORLD}/truth/skeleton", t, columns, known.sum(axis=1))
+        seen = _seen(truth.markers_m)
+        grey = np.full(seen.shape, pack([TRUTH_RGB])[0])
+        self._points(f"{WORLD}/truth/markers", t, truth.markers_m, seen, grey, 0.002)
+        for name, error in (("joints", truth.joint_error_m(poses)), ("markers", truth.marker_error_m(poses))):
+            self._scalars(f"plots/error_mm/{name}", t, mean_known(error) * 1e3)
+
+    def _rate_hz(self, t_ns: Int) -> Float:
+        """Poses per second (T,) over the second that ends at each row; NaN for the very first."""
+        times = np.concatenate([self._recent_ns, t_ns])
+        rows = np.arange(len(self._recent_ns), len(times))
+        first = np.searchsorted(times, times[rows] - 1_000_000_000)
+        span = (times[rows] - times[first]).astype(np.float64) * 1e-9
+        self._recent_ns = times[times > times[-1] - 1_000_000_000]
+        return np.divide(rows - first, span, out=np.full(len(rows), np.nan), where=span > 0)
+
+    def _marker_colours(self, count: int) -> npt.NDArray[np.uint32]:
+        return pack([series_rgb(i) for i in range(count)])
+
+    def _points(
+        self,
+        path: str,
+        t_ns: Int,
+        at: Float,
+        shown: Bool,
+        colours: npt.NDArray[np.uint32],
+        radii: Float | float,
+    ) -> None:
+        each = np.broadcast_to(radii, shown.sum())
+        columns = rr.Points3D.columns(positions=at[shown], colors=colours[shown], radii=each)
+        self._send(path, t_ns, columns, shown.sum(axis=1))
+
+    def _scalars(self, path: str, t_ns: Int, values: Float) -> None:
+        known = ~np.isnan(values)
+        if known.any():
+            self._send(path, t_ns[known], rr.Scalars.columns(scalars=values[known]), None)
+
+    def _send(self, path: str, t_ns: Int, columns: rr.ComponentColumnList, lengths: Int | None) -> None:
+        """Send rows at `t_ns`; `lengths` (T,) instances each (0 clears the last row), None: one each."""
+        index = rr.TimeColumn(TIMELINE, duration=cast("list[np.timedelta64]", t_ns.astype("timedelta64[ns]")))
+        parts = columns if lengths is None else columns.partition(lengths)
+        self._rec.send_columns(path, [index], parts)
+
+    def _name_series(self, path: str, name: str, rgb: Rgb) -> None:
+        self._rec.log(path, rr.SeriesLines(names=name, colors=[rgb]), static=True)
+
+
+def _seen(points: Float) -> Bool:
+    """Which of the points (..., D) are not NaN, (...)."""
+    return np.asarray(~np.isnan(points).any(axis=-1), np.bool_)
+
+
+def _strips(at: Float, shown: Bool) -> list[Float]:
+    """Line strips of joints (T, 26, 3), for every (row, strip) shown (T, 6), in that order."""
+    rows, strips = np.nonzero(shown)
+    return [at[i, list(_STRIPS[k])] for i, k in zip(rows.tolist(), strips.tolist(), strict=True)]
