@@ -20,7 +20,8 @@ from common.errors import CalibrationError
 Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
 Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
+# The look-ahead: in Python `$` also matches before a final line feed, and names become file names.
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
 Vector3 = tuple[Number, Number, Number]
 Quaternion = tuple[Number, Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
@@ -102,6 +103,14 @@ class Laser(_File, frozen=True):
     baseline: Positive | None = None
 
 
+class FilterCalibration(_File, frozen=True):
+    """The 1 € filter of the 3D markers: cut-off at rest, its rise per speed [Hz per m/s], cut-off of the speed."""
+
+    min_cutoff_hz: Positive = 6.0
+    beta: NonNegative = 120.0
+    d_cutoff_hz: Positive = 6.0
+
+
 class RigCalibration(_File, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand."""
 
@@ -115,6 +124,8 @@ class RigCalibration(_File, frozen=True):
     depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
     power_law: PowerLawCalibration | None = None
     affine_disparity: AffineDisparityCalibration | None = None
+    pairing: Literal["interpolate", "predict"] = "interpolate"
+    filter: FilterCalibration = FilterCalibration()
     laser_plane: LaserPlane | None = None
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
@@ -255,13 +266,17 @@ def save(path: Path, value: Struct) -> None:
     """Write a calibration file atomically: a reader sees the old file or the new one, never half.
 
     Raises:
-        CalibrationError: The folder is missing, read-only or full; the old file is untouched.
+        CalibrationError: The folder is missing, read-only or full, or the value would not come back
+            as it is (a NaN, a number out of range); the old file is untouched.
     """
-    check(value, str(path))
     text = compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()) + "\n"
+    if parse(text.encode(), type(value), str(path)) != value:
+        raise CalibrationError(f"{path}: a NaN, or a list in place of a tuple, would not come back as it is")
     temporary = None
     try:
-        with tempfile.NamedTemporaryFile("w", dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+        with tempfile.NamedTemporaryFile(
+            "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
+        ) as file:
             temporary = Path(file.name)
             file.write(text)
             file.flush()
@@ -274,11 +289,17 @@ def save(path: Path, value: Struct) -> None:
         raise CalibrationError(f"{path}: cannot write: {error.strerror}") from error
 
 
+_STRING_OR_NUMBERS = re.compile(r'"(?:[^"\\]|\\.)*"|\[[\s\d.,eE+-]+\]')
+
+
 def compact_numbers(text: str) -> str:
-    """Put arrays of plain numbers on one line, so that a calibration file stays readable."""
-    return re.sub(
-        r"\[[\s\d.,eE+-]+\]", lambda m: "[" + ", ".join(m[0][1:-1].replace(",", " ").split()) + "]", text
-    )
+    """Put arrays of plain numbers on one line, so that a calibration file stays readable; strings stay."""
+
+    def compact(found: re.Match[str]) -> str:
+        part = found[0]
+        return part if part[0] == '"' else "[" + ", ".join(part[1:-1].replace(",", " ").split()) + "]"
+
+    return _STRING_OR_NUMBERS.sub(compact, text)
 
 
 def schema(kind: type[Struct]) -> bytes:

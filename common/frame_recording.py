@@ -4,6 +4,7 @@ The slave's recorder writes it, the replay camera and the offline solver read it
 """
 
 import csv
+import re
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import Literal
 
 from msgspec import Struct
 
-from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration import CameraCalibration, RigCalibration, check, load
 from common.errors import CalibrationError, RecordingError
 
 MANIFEST = "recording.json"
 FRAMES = "frames.csv"
+_INTEGER = re.compile(r"-?[0-9]{1,19}")
 COLUMNS = ("camera", "seq", "t_ns", "illumination", "file")
 
 
@@ -98,31 +100,46 @@ def open_recording(folder: Path) -> FrameRecording:
     """
     try:
         manifest = load(folder / MANIFEST, Manifest)
+        _check(manifest, str(folder / MANIFEST))
     except CalibrationError as error:
         raise RecordingError(str(error)) from error
     path = folder / FRAMES
     try:
         with path.open(newline="") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != COLUMNS:
+            reader = csv.reader(file)
+            if tuple(next(reader, ())) != COLUMNS:
                 raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")
-            rows = tuple(_row(path, number, line) for number, line in enumerate(reader, 2))
+            rows = tuple(_row(path, reader.line_num, line) for line in reader if line)
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise RecordingError(f"{path}: not a table of text: {error}") from error
     unknown = {row.camera for row in rows} - manifest.cameras.keys()
     if unknown:
         raise RecordingError(f"{path}: camera {min(unknown)!r} is not in {MANIFEST}")
     return FrameRecording(folder, manifest, rows)
 
 
-def _row(path: Path, number: int, line: dict[str, str]) -> FrameRow:
-    try:
-        return FrameRow(
-            camera=line["camera"],
-            seq=int(line["seq"]),
-            t_ns=int(line["t_ns"]),
-            illumination=Illumination(line["illumination"]),
-            file=line["file"],
-        )
-    except (ValueError, TypeError) as error:
-        raise RecordingError(f"{path}: line {number}: {error}") from error
+def _check(manifest: Manifest, where: str) -> None:
+    """What `load` cannot know: the files inside the manifest, and that they fit together."""
+    for name, camera in manifest.cameras.items():
+        check(camera, f"{where}: cameras.{name}")
+    for rig in (manifest.rig, *manifest.rigs):
+        if rig is None:
+            continue
+        check(rig, f"{where}: rig {rig.name!r}")
+        if missing := set(rig.cameras) - manifest.cameras.keys():
+            raise CalibrationError(f"{where}: cameras: {min(missing)!r} of rig {rig.name!r} is missing")
+
+
+def _row(path: Path, number: int, line: list[str]) -> FrameRow:
+    where = f"{path}: line {number}"
+    if len(line) != len(COLUMNS) or not all(line):
+        raise RecordingError(f"{where}: expected the {len(COLUMNS)} columns {','.join(COLUMNS)}, got {line}")
+    camera, seq, t_ns, illumination, file = line
+    for column, text in (("seq", seq), ("t_ns", t_ns)):
+        if not _INTEGER.fullmatch(text):
+            raise RecordingError(f"{where}: {column}: {text!r} is not an integer")
+    if illumination not in set(Illumination):
+        raise RecordingError(f"{where}: illumination: {illumination!r} is none of {', '.join(Illumination)}")
+    return FrameRow(camera, int(seq), int(t_ns), Illumination(illumination), file)

@@ -20,7 +20,8 @@ MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
 
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+$")]
+# The look-ahead: in Python `$` also matches before a final line feed, and names become keys and file names.
+Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 TimeNs = Annotated[int, Meta(ge=-(2**63), le=2**63 - 1)]
 Finite = Annotated[float, Meta(ge=-1e18, le=1e18)]
@@ -121,6 +122,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "tracked", np.bool_, (j,))
         _freeze(self, "cov_m2", np.float64, (j, 3, 3))
         _freeze(self, "source", np.uint8, (j,))
+        if self.source.max() > max(Source):
+            raise ValueError(f"source: {self.source.max()} is no Source code")
         _freeze(self, "angles_rad", np.float64, (FINGER_COUNT, 4))
         _freeze(self, "markers_m", np.float64, (m, 3))
         _freeze(self, "markers_raw_m", np.float64, (m, 3))
@@ -197,6 +200,8 @@ def _from_bytes(kind: type, raw: object) -> object:
     dtype = _WIRE_DTYPE[kind]
     if len(raw) % dtype.itemsize:
         raise ValueError("array is cut")
+    if kind is Bool and raw.translate(None, b"\0\1"):
+        raise ValueError("truth value is neither 0 nor 1")
     return np.frombuffer(raw, dtype)
 
 
