@@ -200,7 +200,7 @@ def _from_bytes(kind: type, raw: object) -> object:
     dtype = _WIRE_DTYPE[kind]
     if len(raw) % dtype.itemsize:
         raise ValueError("array is cut")
-    if kind is Bool and raw.translate(None, b"\0\1"):
+    if dtype.kind == "b" and raw.translate(None, b"\0\1"):
         raise ValueError("truth value is neither 0 nor 1")
     return np.frombuffer(raw, dtype)
 
