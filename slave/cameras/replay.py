@@ -1,0 +1,97 @@
+"""Play a recording of raw frames as a camera: in its own time, or as fast as possible."""
+
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.clock import Clock
+from common.errors import CameraError, RecordingError
+from common.frame_recording import FrameRow, open_recording
+from slave.cameras.source import Frame
+
+STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
+
+
+class ReplayCamera:
+    """A `FrameSource` that reads PNG files.
+
+    Holds the list of frames and the next index. Paced, the first frame comes at once and each further one when
+    as much time has passed as in the recording; its `t_ns` is on the slave's clock then. Unpaced, `t_ns` is
+    the recording's.
+    """
+
+    def __init__(self, folder: Path, camera: str, paced: bool, clock: Clock) -> None:
+        """Open the recording; images are read one by one.
+
+        Raises:
+            CameraError: The recording is broken, or has no frame of `camera`. The text names the file.
+        """
+        try:
+            recording = open_recording(folder)
+            self._rows = recording.frames_of(camera)
+        except RecordingError as error:
+            raise CameraError(str(error)) from error
+        if not self._rows:
+            raise CameraError(f"{folder}: frames.csv has no frame of camera {camera!r}")
+        calibration = recording.manifest.cameras[camera]
+        self._size = (calibration.height_px, calibration.width_px)
+        self._folder = folder
+        self._paced = paced
+        self._clock = clock
+        self._next = 0
+        self._shift_ns: int | None = None
+
+    def read(self) -> Frame | None:
+        """Next frame in the order of time, or None after the last.
+
+        Raises:
+            CameraError: A PNG is missing, broken or of another size than the camera file says.
+        """
+        if self._next >= len(self._rows):
+            return None
+        row = self._rows[self._next]
+        self._next += 1
+        image = self._load(row)
+        if not self._paced:
+            return Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination)
+        if self._shift_ns is None:
+            self._shift_ns = self._clock.now_ns() - row.t_ns
+        t_ns = row.t_ns + self._shift_ns
+        self._wait_until(t_ns)
+        return Frame(row.seq, t_ns, self._clock.now_ns(), image, row.illumination)
+
+    def close(self) -> None:
+        """End the stream."""
+        self._next = len(self._rows)
+
+    def _load(self, row: FrameRow) -> Image:
+        return read_png(self._folder / row.file, self._size)
+
+    def _wait_until(self, t_ns: int) -> None:
+        while (left_s := (t_ns - self._clock.now_ns()) * 1e-9) > 0.0:
+            time.sleep(min(left_s, STEP_S))
+
+
+def read_png(path: Path, size: tuple[int, int]) -> Image:
+    """Read one frame as (H, W, 3) BGR uint8.
+
+    Args:
+        path: PNG file.
+        size: Height and width the camera file says.
+
+    Raises:
+        CameraError: Missing, not an image, or of another size; the text names the file.
+    """
+    try:
+        raw = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError as error:
+        raise CameraError(f"{path}: cannot read: {error.strerror}") from error
+    image = cv2.imdecode(raw, cv2.IMREAD_COLOR) if raw.size else None
+    if image is None:
+        raise CameraError(f"{path}: not an image, or cut; record again or remove its line from frames.csv")
+    if image.shape[:2] != size:
+        raise CameraError(f"{path}: {image.shape[1]}x{image.shape[0]} px, the camera file says {size[1]}x{size[0]}")
+    return np.asarray(image, dtype=np.uint8)

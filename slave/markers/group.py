@@ -1,0 +1,127 @@
+"""Choose among all blobs those that are markers: the ones that belong together, as markers of one hand do.
+
+Used when the past does not answer: at the start, when a marker comes back, or when something in the marker's
+colour (a green mug, a blue pen) competes with it. Three facts tell markers from clutter, none of which knows the
+hand: markers are close together for their size, skin touches them, and those of the past have a place.
+
+Two blobs are linked when their distance is at most `REACH` times the geometric mean of their sizes, more where skin
+touches both; the linked set with the best sum of evidence is the hand. Measured on rendered hands: neighbouring
+tips are 2-4 sizes apart, the little finger and the thumb 12, back and middle finger 7, clutter 10 and more.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from slave.markers.blobs import Blob
+
+REACH = 8.5
+SKIN_REACH = 0.8
+RING = 4  # px around the box in which skin is sought
+SPECK = 12.0  # px^2; smaller blobs are rarely markers
+CLICKED = 10.0
+TRACKED = 1.0
+STRANGE_SIZE = 2.5
+STRANGE_FILL = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A blob that may be marker `marker`, and what speaks for it.
+
+    Attributes:
+        marker: Row of the marker.
+        blob: The blob.
+        skin: Share of its surroundings that is skin, 0..1.
+        bonus: What click or track add to its score.
+    """
+
+    marker: int
+    blob: Blob
+    skin: float
+    bonus: float
+
+    @property
+    def size(self) -> float:
+        """Side of a square of the same area [px]."""
+        return math.sqrt(self.blob.area)
+
+    @property
+    def score(self) -> float:
+        """Sum of evidence; 1 for being there at all."""
+        there = min(1.0, self.blob.area / SPECK) ** 2
+        return there + min(1.0, 3.0 * self.skin) + self.bonus
+
+
+def skin_share(image: Image, blob: Blob) -> float:
+    """Share of the pixels around the blob's box that have the hue and saturation of skin, 0..1."""
+    top, left = max(blob.top - RING, 0), max(blob.left - RING, 0)
+    window = image[top : blob.bottom + RING, left : blob.right + RING]
+    hsv = cv2.cvtColor(window, cv2.COLOR_BGR2HSV)
+    # Skin of every tone lies between red and orange, less saturated than paint (K7: it collides with red, orange
+    # and yellow markers, which is why those are not used).
+    skin = cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)) | cv2.inRange(hsv, (174, 60, 70), (179, 190, 255))
+    around = window.shape[0] * window.shape[1] - blob.area
+    return min(1.0, cv2.countNonZero(skin) / max(around, 1.0))
+
+
+def linked(a: Candidate, b: Candidate) -> bool:
+    """Whether two blobs are near enough to sit on one hand."""
+    reach = REACH * (1.0 + SKIN_REACH * min(1.0, 4.0 * min(a.skin, b.skin)))
+    return math.hypot(a.blob.u - b.blob.u, a.blob.v - b.blob.v) <= reach * math.sqrt(a.size * b.size)
+
+
+def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
+    """The markers among the candidates: marker row -> candidate. A marker without a plausible blob is absent."""
+    best: dict[int, Candidate] = {}
+    best_score = -1.0
+    for members in _components(candidates):
+        chosen: dict[int, Candidate] = {}
+        for candidate in members:
+            rival = chosen.get(candidate.marker)
+            if rival is None or _fit(candidate, members) > _fit(rival, members):
+                chosen[candidate.marker] = candidate
+        score = sum(c.score for c in chosen.values())
+        if score > best_score:
+            best, best_score = chosen, score
+    return {m: c for m, c in best.items() if not _strange(c, [o for o in best.values() if o is not c])}
+
+
+def _components(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
+    """Groups of candidates that are linked directly or through others, in a fixed order."""
+    rest = list(candidates)
+    groups: list[list[Candidate]] = []
+    while rest:
+        group = [rest.pop(0)]
+        for member in group:  # grows while it is walked
+            near = [c for c in rest if linked(member, c)]
+            group.extend(near)
+            rest = [c for c in rest if c not in near]
+        groups.append(group)
+    return groups
+
+
+def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
+    others = [c for c in members if c.marker != candidate.marker]
+    if not others:
+        return candidate.score + 1e-4 * candidate.blob.area
+    typical = float(np.median([c.size for c in others]))
+    u, v = float(np.median([c.blob.u for c in others])), float(np.median([c.blob.v for c in others]))
+    away = math.hypot(candidate.blob.u - u, candidate.blob.v - v) / (REACH * typical)
+    return candidate.score - 0.5 * abs(math.log(candidate.size / typical)) - 0.3 * away
+
+
+def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
+    """Whether a blob sits like clutter beside a hand: no skin, and a size or shape unlike the others."""
+    if len(others) < 2 or candidate.bonus >= CLICKED or candidate.skin > 0.08:
+        return False
+    if float(np.median([c.skin for c in others])) < 0.15:
+        return False
+    blob = candidate.blob
+    fill = blob.area / ((blob.right - blob.left) * (blob.bottom - blob.top))
+    typical = float(np.median([c.blob.area for c in others]))
+    return blob.area > STRANGE_SIZE * typical or (blob.area > SPECK and fill < STRANGE_FILL)

@@ -1,0 +1,116 @@
+"""Detect a whole recording offline: deterministic, without clock or network, into one file per camera."""
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.calibration import CameraCalibration, load
+from common.errors import CalibrationError, RecordingError
+from common.frame_recording import FrameRecording, open_recording
+from slave.cameras.replay import read_png
+from slave.markers.detector import MarkerDetector
+
+EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can carry: the same bytes on every run
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedDetections:
+    """Content of detections_<camera>.npz: T frames, M markers, NaN = not seen.
+
+    Attributes:
+        t_ns: (T,) middle of the exposure of row 0 [ns].
+        seq: (T,) frame counters.
+        uv: (T, M, 2) centroids [px], distorted image.
+        area_px2: (T, M) visible areas [px^2].
+        quality: (T, M) 0..1.
+    """
+
+    t_ns: Int
+    seq: Int
+    uv: Float
+    area_px2: Float
+    quality: Float
+
+
+def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
+    """The camera of a recording: geometry and timing from the recording, colours from `calibration` if given.
+
+    Raises:
+        RecordingError: The recording has no such camera.
+        CalibrationError: DIR/cameras/NAME.json is broken, or there are no marker colours anywhere.
+    """
+    recording.frames_of(camera)  # refuses an unknown name
+    own = recording.manifest.cameras[camera]
+    if calibration is not None:
+        path = calibration / "cameras" / f"{camera}.json"
+        markers = load(path, CameraCalibration).markers
+        if markers is None:
+            raise CalibrationError(f"{path}: markers: missing; make them with `phalanx-slave colours`")
+    else:
+        markers = own.markers
+        if markers is None:
+            raise CalibrationError(
+                f"{recording.folder}/recording.json: cameras.{camera}.markers: missing; give --calibration DIR with "
+                f"DIR/cameras/{camera}.json (make it with `phalanx-slave colours`)"
+            )
+    return CameraCalibration(**{f: getattr(own, f) for f in own.__struct_fields__ if f != "markers"}, markers=markers)
+
+
+def detect_recording(
+    folder: Path,
+    camera: str,
+    calibration: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RecordedDetections:
+    """Detect the markers in every frame of one camera.
+
+    Args:
+        folder: Recording.
+        camera: Camera name.
+        calibration: calib_json tree whose cameras/<camera>.json holds the marker colours.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        RecordingError: The recording is broken or has no such camera or no frame of it.
+        CalibrationError: No marker colours.
+        CameraError: A frame cannot be read.
+    """
+    recording = open_recording(folder)
+    rows = recording.frames_of(camera)
+    if not rows:
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    model = camera_of(recording, camera, calibration)
+    names = recording.manifest.marker_rig().markers
+    detector = MarkerDetector(model, names, recording.manifest.clicks.get(camera))
+    shape = (len(rows), len(names))
+    uv, area, quality = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    for i, row in enumerate(rows):
+        if i > 0 and not recording.manifest.continuous:
+            detector = detector.fresh()
+        image = read_png(folder / row.file, (model.height_px, model.width_px))
+        found = detector.push(image, row.t_ns)
+        uv[i], area[i], quality[i] = found.uv, found.area, found.quality
+        progress(i + 1, len(rows))
+    t_ns = np.array([row.t_ns for row in rows], np.int64)
+    return RecordedDetections(t_ns, np.array([row.seq for row in rows], np.int64), uv, area, quality)
+
+
+def save_detections(path: Path, found: RecordedDetections) -> None:
+    """Write detections_<camera>.npz; equal content gives equal bytes.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    try:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
+            for name in found.__slots__:
+                content = BytesIO()
+                np.lib.format.write_array(content, getattr(found, name), allow_pickle=False)
+                archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), content.getvalue())
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
