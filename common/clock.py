@@ -168,6 +168,11 @@ class OffsetEstimator:
         self.refused = 0
 
     @property
+    def ready(self) -> bool:
+        """Whether there are enough echoes for a usable estimate."""
+        return len(self._echoes) >= BEST_AT_LEAST
+
+    @property
     def settled(self) -> bool:
         """Whether there are enough echoes, and none that contradict: no need to hurry."""
         return len(self._echoes) >= 2 * BEST_AT_LEAST and not self._suspects

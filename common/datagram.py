@@ -1,0 +1,185 @@
+"""Sealed datagrams: bytes in, what they mean out. No socket here, and no clock.
+
+    offset size field
+    0      4    magic "PHLX"
+    4      1    wire version
+    5      1    kind
+    6      2    length of the whole datagram
+    8      4    rig tag: which rig key, without telling it
+    12     8    key id: which key under the rig key (a process or a session)
+    20     8    counter of that key, from 1
+    28     n    body, encrypted
+    28+n   16   tag of ChaCha20-Poly1305 (RFC 8439), over header and body
+
+All integers big-endian. The nonce is the counter (and 4 zero bytes): a key belongs to one sender
+in one direction and counts up, so no nonce is used twice. Refusing must be cheap, hence the
+order: length, magic, version, rig, kind, then the key's table, then the cipher.
+"""
+
+import struct
+from enum import IntEnum, StrEnum
+from typing import NamedTuple
+
+from cryptography.exceptions import InvalidTag
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+
+from common.messages import WIRE_VERSION
+
+MAGIC = b"PHLX"
+HEADER = struct.Struct("!4sBBHIQQ")
+TAG_BYTES = 16
+OVERHEAD = HEADER.size + TAG_BYTES
+MAX_DATAGRAM = 4096  # 48 markers take 1.8 kB
+KEY_BYTES = 32
+WINDOW = 1024
+
+
+class Kind(IntEnum):
+    """What a datagram carries; docs/wire.md has the fields of each."""
+
+    BEACON = 1
+    HELLO = 2
+    WELCOME = 3
+    START = 4
+    STARTED = 5
+    ECHO_ASK = 6
+    ECHO_ANSWER = 7
+    DATA = 8
+
+
+class Refusal(StrEnum):
+    """Why a datagram was not taken. Each is counted under this name."""
+
+    FOREIGN = "foreign"  # not ours, or of another rig
+    VERSION = "version"  # ours, of another wire version
+    CUT = "cut"  # shorter than it says
+    JUNK = "junk"  # longer than it says
+    OVERSIZED = "oversized"  # longer than any of ours
+    UNEXPECTED = "unexpected"  # unknown kind, or one that this side does not take
+    STALE = "stale"  # sealed for a session that is over, or never was
+    FORGED = "forged"  # the seal does not fit
+    DUPLICATE = "duplicate"  # this counter was taken already
+    REPLAYED = "replayed"  # so old that it can only be a replay; a handshake of an earlier life
+    UNDECODABLE = "undecodable"  # sealed rightly, but not a message of its kind
+    IMPOSTOR = "impostor"  # speaks for a camera that it is not
+    UNKNOWN = "unknown_camera"  # a slave that this rig does not have
+    RIVAL = "rival"  # a beacon of another master while ours is well
+
+
+class Header(NamedTuple):
+    """The first 28 bytes, not yet proven: only `Opener.open` tells whether they are true."""
+
+    kind: Kind
+    key_id: int
+    counter: int
+
+
+class Opened(NamedTuple):
+    """A datagram that is what it says. `reordered`: a later one came before it."""
+
+    body: bytes
+    reordered: bool
+
+
+_KINDS = {int(kind): kind for kind in Kind}
+
+
+def parse(datagram: bytes, rig_tag: int) -> Header | Refusal:
+    """Return the header of `datagram`, or why it needs no further look."""
+    size = len(datagram)
+    if size > MAX_DATAGRAM:
+        return Refusal.OVERSIZED
+    if datagram[:4] != MAGIC:
+        return Refusal.CUT if 0 < size < 4 and MAGIC.startswith(datagram) else Refusal.FOREIGN
+    if size < OVERHEAD:
+        return Refusal.CUT
+    _, version, kind, length, rig, key_id, counter = HEADER.unpack_from(datagram)
+    if version != WIRE_VERSION:
+        return Refusal.VERSION
+    if rig != rig_tag:
+        return Refusal.FOREIGN
+    if size != length:
+        return Refusal.CUT if size < length else Refusal.JUNK
+    if kind not in _KINDS:
+        return Refusal.UNEXPECTED
+    return Header(_KINDS[kind], key_id, counter)
+
+
+class Sealer:
+    """Seals what one sender says under one key. Holds the counter; not for use by two threads."""
+
+    def __init__(self, key: bytes, rig_tag: int, key_id: int) -> None:
+        """Begin counting at 1: a `Sealer` is made once for a key, and never again for the same."""
+        self._cipher = ChaCha20Poly1305(key)
+        self._rig_tag = rig_tag
+        self._key_id = key_id
+        self._counter = 0
+
+    def seal(self, kind: Kind, body: bytes) -> bytes:
+        """Return the datagram.
+
+        Raises:
+            ValueError: The body does not fit into a datagram.
+        """
+        size = OVERHEAD + len(body)
+        if size > MAX_DATAGRAM:
+            raise ValueError(f"datagram of {size} bytes, at most {MAX_DATAGRAM}")
+        self._counter += 1
+        header = HEADER.pack(MAGIC, WIRE_VERSION, kind, size, self._rig_tag, self._key_id, self._counter)
+        return header + self._cipher.encrypt(_nonce(self._counter), body, header)
+
+
+class ReplayWindow:
+    """Which counters were taken. Holds the highest and one bit for each of the 1024 before it."""
+
+    def __init__(self) -> None:
+        """Begin with nothing taken."""
+        self._highest = 0
+        self._taken = 1  # bit i: counter `highest - i`; 0 is never used and counts as taken
+
+    def take(self, counter: int) -> Refusal | bool:
+        """Take `counter` once: whether a later one came before it, or why it is refused."""
+        ahead = counter - self._highest
+        if ahead > 0:
+            self._taken = ((self._taken << ahead) | 1) & _MASK if ahead < WINDOW else 1
+            self._highest = counter
+            return False
+        if -ahead >= WINDOW:
+            return Refusal.REPLAYED
+        bit = 1 << -ahead
+        if self._taken & bit:
+            return Refusal.DUPLICATE
+        self._taken |= bit
+        return True
+
+
+class Opener:
+    """Opens what one sender sealed under one key, each datagram once. Holds the replay window."""
+
+    def __init__(self, key: bytes) -> None:
+        """Open datagrams sealed with `key`."""
+        self._cipher = ChaCha20Poly1305(key)
+        self._window = ReplayWindow()
+
+    def open(self, header: Header, datagram: bytes) -> Opened | Refusal:
+        """Return the body of a datagram whose header `parse` returned, or why it is refused."""
+        body = unseal(self._cipher, header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        taken = self._window.take(header.counter)
+        return taken if isinstance(taken, Refusal) else Opened(body, taken)
+
+
+def unseal(cipher: ChaCha20Poly1305, header: Header, datagram: bytes) -> bytes | None:
+    """Return the body if the seal fits, else None. Whether it is a replay is not asked."""
+    try:
+        return cipher.decrypt(_nonce(header.counter), datagram[HEADER.size :], datagram[: HEADER.size])
+    except InvalidTag:
+        return None
+
+
+_MASK = (1 << WINDOW) - 1
+
+
+def _nonce(counter: int) -> bytes:
+    return counter.to_bytes(12, "big")

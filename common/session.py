@@ -1,0 +1,173 @@
+"""The handshake of master and slave: its keys and its messages. docs/wire.md draws it.
+
+From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
+- the rig tag, by which a datagram of another rig is told at once,
+- one key for every process that says beacon, hello or welcome, named by its random process id, so
+  that two processes never seal under one key with the same nonce,
+- for every session two keys, one per direction, and the session's id, from random numbers of both
+  sides: what was captured in one session opens in no other, whoever restarted.
+"""
+
+from collections.abc import Mapping
+from typing import Annotated, NamedTuple
+
+import msgspec
+from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
+from cryptography.hazmat.primitives.hashes import SHA256
+from cryptography.hazmat.primitives.kdf.hkdf import HKDF
+from msgspec import Meta, Struct
+
+from common.datagram import KEY_BYTES, Header, Kind, Sealer, unseal
+from common.messages import Count, Name, TimeNs
+
+NONCE_BYTES = 16
+MAX_CAMERAS = 32
+Nonce = Annotated[bytes, Meta(min_length=NONCE_BYTES, max_length=NONCE_BYTES)]
+
+
+class Handshake(Struct, frozen=True, forbid_unknown_fields=True):
+    """Base of what travels in a datagram besides data; unknown fields are refused."""
+
+
+class Beacon(Handshake, frozen=True):
+    """The master says that it is there. Broadcast for ever; its source address is where hello goes.
+
+    Attributes:
+        master_nonce: Drawn when the master started: another one is another life of it.
+        zenoh_endpoint: Where the master's bus listens; empty if it has none.
+        sessions: Camera -> id of its session, for those that are acknowledged.
+    """
+
+    master_nonce: Nonce
+    zenoh_endpoint: Annotated[str, Meta(max_length=256)]
+    sessions: Annotated[dict[Name, Count], Meta(max_length=MAX_CAMERAS)]
+
+
+class Hello(Handshake, frozen=True):
+    """A slave answers a beacon.
+
+    Attributes:
+        name: Camera.
+        process: Random id of the slave's process, the `session` of its messages.
+        slave_nonce: Drawn for this one attempt to get a session.
+        master_nonce: That of the beacon: a hello to an earlier master is a replay.
+    """
+
+    name: Name
+    process: Count
+    slave_nonce: Nonce
+    master_nonce: Nonce
+
+
+class Welcome(Handshake, frozen=True):
+    """The master's share of the session's keys, for the hello with this `slave_nonce`."""
+
+    master_nonce: Nonce
+    slave_nonce: Nonce
+    session_nonce: Nonce
+
+
+class Start(Handshake, frozen=True):
+    """Begin at `start_t_ns` [ns] on the clock of the slave that receives this; a past time: now."""
+
+    start_t_ns: TimeNs
+
+
+class Started(Handshake, frozen=True):
+    """The start was understood. Data acknowledges it as well."""
+
+    start_t_ns: TimeNs
+
+
+class EchoAsk(Handshake, frozen=True):
+    """First time stamp of an echo: `t1_ns` on the master's clock."""
+
+    t1_ns: TimeNs
+
+
+class EchoAnswer(Handshake, frozen=True):
+    """`t1_ns` as it came; `t2_ns` received, `t3_ns` answered, on the slave's clock."""
+
+    t1_ns: TimeNs
+    t2_ns: TimeNs
+    t3_ns: TimeNs
+
+
+_BODIES: Mapping[Kind, type[Handshake]] = {
+    Kind.BEACON: Beacon,
+    Kind.HELLO: Hello,
+    Kind.WELCOME: Welcome,
+    Kind.START: Start,
+    Kind.STARTED: Started,
+    Kind.ECHO_ASK: EchoAsk,
+    Kind.ECHO_ANSWER: EchoAnswer,
+}
+_DECODERS = {kind: msgspec.msgpack.Decoder(body) for kind, body in _BODIES.items()}
+_KINDS: Mapping[type[Handshake], Kind] = {body: kind for kind, body in _BODIES.items()}
+_ENCODER = msgspec.msgpack.Encoder()
+
+
+def seal(sealer: Sealer, message: Handshake) -> bytes:
+    """Return the datagram that carries `message`."""
+    return sealer.seal(_KINDS[type(message)], _ENCODER.encode(message))
+
+
+def read(kind: Kind, body: bytes) -> Handshake | None:
+    """Return the message of `kind` in `body`, or None if it is none."""
+    try:
+        return _DECODERS[kind].decode(body)
+    except (msgspec.MsgspecError, RecursionError, KeyError):
+        return None
+
+
+class SessionKeys(NamedTuple):
+    """The keys of one session: 32 bytes for each direction, and the id that datagrams name."""
+
+    key_id: int
+    to_master: bytes
+    to_slave: bytes
+
+
+class RigKeys:
+    """Everything that follows from the rig key. Holds the key."""
+
+    def __init__(self, key: bytes) -> None:
+        """Derive from the rig key.
+
+        Raises:
+            ValueError: It is not 32 bytes.
+        """
+        if len(key) != KEY_BYTES:
+            raise ValueError(f"rig key of {len(key)} bytes, must be {KEY_BYTES}")
+        self._key = key
+        self.rig_tag = int.from_bytes(self._derive(4, b"", b"phalanx rig tag"), "big")
+
+    def sealer(self, process: int) -> Sealer:
+        """Return the sealer for the handshakes of `process`, to be made once in its life."""
+        return Sealer(self._process_key(process), self.rig_tag, process)
+
+    def open(self, header: Header, datagram: bytes) -> bytes | None:
+        """Return the body of a handshake datagram if its seal fits, else None."""
+        return unseal(ChaCha20Poly1305(self._process_key(header.key_id)), header, datagram)
+
+    def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
+        """Return the keys of the session that `hello` and the master's `session_nonce` make."""
+        nonces = hello.master_nonce + session_nonce + hello.slave_nonce
+        block = self._derive(8 + 2 * KEY_BYTES, nonces, b"phalanx session " + hello.name.encode())
+        key_id = int.from_bytes(block[:8], "big") >> 1  # 63 bits, as ids in messages have
+        return SessionKeys(key_id, block[8 : 8 + KEY_BYTES], block[8 + KEY_BYTES :])
+
+    def session_sealer(self, key: bytes, key_id: int) -> Sealer:
+        """Return the sealer of one direction of a session, to be made once."""
+        return Sealer(key, self.rig_tag, key_id)
+
+    def _process_key(self, process: int) -> bytes:
+        return self._derive(KEY_BYTES, process.to_bytes(8, "big"), b"phalanx handshake")
+
+    def _derive(self, length: int, salt: bytes, info: bytes) -> bytes:
+        return HKDF(algorithm=SHA256(), length=length, salt=salt, info=info).derive(self._key)
+
+
+def new_process_id(random: bytes) -> int:
+    """Return a 63 bit id from 8 random bytes."""
+    return int.from_bytes(random[:8], "big") >> 1

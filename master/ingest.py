@@ -1,0 +1,161 @@
+"""Where datagrams become detections on the master's clock: decoded, checked, counted.
+
+A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
+pipeline takes detections from a queue that drops the oldest, so a slow pipeline sees what is new.
+"""
+
+import os
+import threading
+from collections import deque
+
+from common.clock import Clock, ClockEstimate
+from common.messages import MarkerDetections
+from common.udp import UdpSocket
+from master.link import MasterLink, Random
+from master.sequence import CameraCounts
+
+QUEUE = 64
+
+
+class Ingest:
+    """All slaves of one rig, heard on one UDP port.
+
+    Holds the socket, its thread, the queue, and the link's state behind a lock.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        key: bytes,
+        clock: Clock,
+        beacon: tuple[str, int],
+        bind: tuple[str, int],
+        zenoh_endpoint: str,
+        start_timeout_s: float = 5.0,
+        random: Random = os.urandom,
+    ) -> None:
+        """Begin to call the slaves.
+
+        Args:
+            cameras: Names that may take part; any other slave is refused.
+            key: Rig key (32 bytes).
+            clock: The clock that every time is moved to.
+            beacon: Where beacons go: a broadcast address and the slaves' beacon port.
+            bind: Own address and port (0: any).
+            zenoh_endpoint: Where this master's bus listens, told to the slaves; may be empty.
+            start_timeout_s: How long the first slave waits for the others.
+            random: Source of nonces.
+
+        Raises:
+            BusError: The address cannot be bound.
+            ValueError: Key of wrong length, no camera or too many.
+        """
+        self._clock = clock
+        timeout_ns = round(start_timeout_s * 1e9)
+        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random)
+        self._cameras = cameras
+        self._socket = UdpSocket(bind, broadcast=True)
+        self._lock = threading.Lock()
+        self._queue: deque[MarkerDetections] = deque(maxlen=QUEUE)
+        self._changed = threading.Condition()
+        self._overflowed = 0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
+        self._thread.start()
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Own address and port."""
+        return self._socket.address
+
+    @property
+    def started(self) -> bool:
+        """Whether the start was given."""
+        with self._lock:
+            return self._link.started
+
+    @property
+    def connected(self) -> frozenset[str]:
+        """The cameras heard within the last second."""
+        with self._lock:
+            return self._link.connected()
+
+    @property
+    def lost(self) -> int:
+        """Frames of all cameras that were skipped and never came."""
+        return sum(self.counts_of(camera).lost for camera in self._cameras)
+
+    @property
+    def refused(self) -> dict[str, int]:
+        """Reason (docs/wire.md) -> datagrams refused for it."""
+        with self._lock:
+            return {str(reason): n for reason, n in self._link.refused.items()}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Event -> how often, as `Health.counts` wants it: <camera>.<event>, refused.<reason>, queue.*"""
+        counts = {
+            "queue.dropped": self._overflowed,
+            "would_block": self._socket.would_block,
+            "send_failed": self._socket.failed,
+            "unsynchronised": self._link.unsynchronised,
+        }
+        for camera in self._cameras:
+            of = self.counts_of(camera)
+            counts[f"{camera}.received"] = of.received
+            counts[f"{camera}.lost"] = of.lost
+            counts[f"{camera}.late"] = of.late
+            counts[f"{camera}.duplicate"] = of.duplicate
+            counts[f"{camera}.reordered"] = of.reordered
+        return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
+
+    def counts_of(self, camera: str) -> CameraCounts:
+        """Return what became of the frames of `camera`.
+
+        Raises:
+            KeyError: The rig has no such camera.
+        """
+        with self._lock:
+            return self._link.counts_of(camera)
+
+    def clock_of(self, camera: str) -> ClockEstimate | None:
+        """Return how the clock of `camera` runs against this one; None while unknown.
+
+        Raises:
+            KeyError: The rig has no such camera.
+        """
+        with self._lock:
+            return self._link.clock_of(camera)
+
+    def get(self, timeout_s: float) -> MarkerDetections | None:
+        """Return the oldest waiting detections, times on the master's clock; None after `timeout_s`."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
+            return self._queue.popleft() if self._queue else None
+
+    def close(self) -> None:
+        """End the thread and give the port back. Safe to call twice."""
+        self._closing.set()
+        self._thread.join()
+        with self._changed:
+            self._changed.notify_all()
+        self._socket.close()
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            arrived = self._socket.receive()
+            t_ns = self._clock.now_ns()
+            with self._lock:
+                detections = None if arrived is None else self._link.receive(*arrived, t_ns)
+                outbox = self._link.due()
+            for datagram, address in outbox:
+                self._socket.send(datagram, address)
+            if detections is not None:
+                self._put(detections)
+
+    def _put(self, detections: MarkerDetections) -> None:
+        with self._changed:
+            if len(self._queue) == self._queue.maxlen:
+                self._overflowed += 1
+            self._queue.append(detections)
+            self._changed.notify()

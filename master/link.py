@@ -1,0 +1,308 @@
+"""The master's side of the datagram link: sessions of all slaves, as a push machine without a socket.
+
+Rules that must stay in step with `slave.link` and docs/wire.md:
+- A hello makes a *pending* session; it replaces the live one only when its slave has sealed
+  something with the new keys. So a replayed or late hello never ends a live session.
+- The clock is asked in pending and live sessions alike: the answer is what confirms a session.
+- The start is sent when every camera is in a session whose clock is known, or a timeout after the
+  first one; then to each camera that joins, again and again until acknowledged.
+- Everything held is bounded: two sessions and 64 old nonces per camera of the rig.
+"""
+
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from common.clock import Clock, ClockEstimate, OffsetEstimator
+from common.datagram import Header, Kind, Opened, Opener, Refusal, Sealer, parse
+from common.errors import MessageError
+from common.messages import MarkerDetections, decode
+from common.session import (
+    MAX_CAMERAS,
+    NONCE_BYTES,
+    Beacon,
+    EchoAnswer,
+    EchoAsk,
+    Hello,
+    RigKeys,
+    Start,
+    Started,
+    Welcome,
+    new_process_id,
+    read,
+    seal,
+)
+from master.sequence import CameraCounts, Sequence
+
+Address = tuple[str, int]
+Random = Callable[[int], bytes]
+
+BEACON_NS = 200_000_000
+ECHO_FAST_NS = 10_000_000  # until the clock is settled
+ECHO_EARLY_NS = 100_000_000
+ECHO_NS = 200_000_000
+EARLY_NS = 5_000_000_000
+PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
+SILENT_NS = 1_000_000_000
+START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
+START_AGAIN_NS = 50_000_000
+OLD_NONCES = 64
+
+
+@dataclass(slots=True)
+class _Session:
+    """One session of one slave, pending or live."""
+
+    camera: str
+    hello: Hello
+    session_nonce: bytes
+    key_id: int
+    address: Address
+    sealer: Sealer
+    opener: Opener
+    since_ns: int
+    heard_ns: int
+    next_echo_ns: int
+    next_start_ns: int
+    started: bool = False
+    clock: OffsetEstimator = field(default_factory=OffsetEstimator)
+
+
+@dataclass(slots=True)
+class _Camera:
+    """What is kept of one camera of the rig."""
+
+    live: _Session | None = None
+    pending: _Session | None = None
+    old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
+    sequence: Sequence = field(default_factory=Sequence)
+
+
+class MasterLink:
+    """Takes datagrams, gives detections on the master's clock, and says what to send.
+
+    Holds the sessions of the rig's cameras, the moment of the start, the counters of refusals.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        key: bytes,
+        clock: Clock,
+        beacon_to: Address,
+        zenoh_endpoint: str,
+        start_timeout_ns: int,
+        random: Random,
+    ) -> None:
+        """Begin a new life of the master, with a nonce from `random`.
+
+        Raises:
+            ValueError: Key of wrong length, no camera, or more than 32.
+        """
+        if not 1 <= len(set(cameras)) <= MAX_CAMERAS:
+            raise ValueError(f"{len(set(cameras))} cameras, expected 1 to {MAX_CAMERAS}")
+        self._keys = RigKeys(key)
+        self._clock = clock
+        self._random = random
+        self._beacon_to = beacon_to
+        self._zenoh_endpoint = zenoh_endpoint
+        self._start_timeout_ns = start_timeout_ns
+        self._nonce = random(NONCE_BYTES)
+        self._sealer = self._keys.sealer(new_process_id(random(8)))
+        self._cameras = {name: _Camera() for name in cameras}
+        self._sessions: dict[int, _Session] = {}
+        self._first_ns: int | None = None
+        self._start_ns: int | None = None
+        self._next_beacon_ns = clock.now_ns()
+        self._outbox: list[tuple[bytes, Address]] = []
+        self.refused: Counter[Refusal] = Counter()
+        self.unsynchronised = 0
+
+    def receive(self, datagram: bytes, address: Address, t_ns: int) -> MarkerDetections | None:
+        """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
+        header = parse(datagram, self._keys.rig_tag)
+        if isinstance(header, Refusal):
+            result = header
+        elif header.kind is Kind.HELLO:
+            result = self._hear_hello(header, datagram, address, t_ns)
+        elif header.kind in (Kind.ECHO_ANSWER, Kind.STARTED, Kind.DATA):
+            result = self._hear_slave(header, datagram, t_ns)
+        else:
+            result = Refusal.UNEXPECTED
+        if isinstance(result, Refusal):
+            self.refused[result] += 1
+            return None
+        return result
+
+    def due(self) -> list[tuple[bytes, Address]]:
+        """Return the datagrams to send now, each with its destination."""
+        t_ns = self._clock.now_ns()
+        if t_ns >= self._next_beacon_ns:
+            self._next_beacon_ns = max(self._next_beacon_ns + BEACON_NS, t_ns)
+            self._outbox.append((seal(self._sealer, self._beacon()), self._beacon_to))
+        for camera in self._cameras.values():
+            pending = camera.pending
+            if pending is not None and t_ns - pending.since_ns > PENDING_NS:
+                # Its nonce stays usable: the slave may be there, only unheard.
+                del self._sessions[pending.key_id]
+                camera.pending = pending = None
+            for session in (camera.live, pending):
+                if session is not None:
+                    self._ask_clock(session)
+        self._open_barrier(t_ns)
+        for camera in self._cameras.values():
+            self._send_start(camera, t_ns)
+        outbox, self._outbox = self._outbox, []
+        return outbox
+
+    @property
+    def started(self) -> bool:
+        """Whether the start has been given."""
+        return self._start_ns is not None
+
+    def connected(self) -> frozenset[str]:
+        """Return the cameras heard in a live session within the last second."""
+        t_ns = self._clock.now_ns()
+        live = ((name, camera.live) for name, camera in self._cameras.items())
+        return frozenset(name for name, link in live if link is not None and t_ns - link.heard_ns < SILENT_NS)
+
+    def clock_of(self, camera: str) -> ClockEstimate | None:
+        """Return how the clock of `camera` runs, or None before its first echo."""
+        live = self._cameras[camera].live
+        return None if live is None else live.clock.estimate()
+
+    def counts_of(self, camera: str) -> CameraCounts:
+        """Return what was counted of `camera` since this master began."""
+        return self._cameras[camera].sequence.counts
+
+    def _beacon(self) -> Beacon:
+        live = {name: camera.live for name, camera in self._cameras.items()}
+        known = {name: session.key_id for name, session in live.items() if session is not None}
+        return Beacon(self._nonce, self._zenoh_endpoint, known)
+
+    def _hear_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        body = self._keys.open(header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        hello = read(Kind.HELLO, body)
+        if not isinstance(hello, Hello):
+            return Refusal.UNDECODABLE
+        if hello.master_nonce != self._nonce:
+            return Refusal.REPLAYED
+        camera = self._cameras.get(hello.name)
+        if camera is None:
+            return Refusal.UNKNOWN
+        for session in (camera.live, camera.pending):
+            if session is not None and session.hello.slave_nonce == hello.slave_nonce:
+                self._welcome(session)  # ours was lost; always to the address of the first hello
+                return None
+        if hello.slave_nonce in camera.old_nonces:
+            return Refusal.REPLAYED
+        if camera.pending is not None:  # a newer attempt of the slave, which has given that one up
+            camera.old_nonces.append(camera.pending.hello.slave_nonce)
+            del self._sessions[camera.pending.key_id]
+        camera.pending = self._new_session(hello, address, t_ns)
+        self._sessions[camera.pending.key_id] = camera.pending
+        self._welcome(camera.pending)
+        return None
+
+    def _new_session(self, hello: Hello, address: Address, t_ns: int) -> _Session:
+        session_nonce = self._random(NONCE_BYTES)
+        keys = self._keys.session(hello, session_nonce)
+        sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
+        return _Session(
+            hello.name, hello, session_nonce, keys.key_id, address, sealer, Opener(keys.to_master),
+            since_ns=t_ns, heard_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
+        )  # fmt: skip
+
+    def _welcome(self, session: _Session) -> None:
+        welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce)
+        self._outbox.append((seal(self._sealer, welcome), session.address))
+
+    def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> MarkerDetections | Refusal | None:
+        session = self._sessions.get(header.key_id)
+        if session is None:
+            return Refusal.STALE
+        camera = self._cameras[session.camera]
+        opened = session.opener.open(header, datagram)
+        if isinstance(opened, Refusal):
+            if opened is Refusal.DUPLICATE:
+                camera.sequence.duplicate()
+            return opened
+        session.heard_ns = t_ns
+        if camera.pending is session:
+            self._confirm(camera, session, t_ns)
+        if opened.reordered:
+            camera.sequence.reordered()
+        if header.kind is Kind.DATA:
+            return self._take_data(session, camera.sequence, opened)
+        message = read(header.kind, opened.body)
+        if isinstance(message, EchoAnswer):
+            session.clock.push(message.t1_ns, message.t2_ns, message.t3_ns, t_ns)
+        elif isinstance(message, Started):
+            session.started = True
+        else:
+            return Refusal.UNDECODABLE
+        return None
+
+    def _confirm(self, camera: _Camera, session: _Session, t_ns: int) -> None:
+        if camera.live is not None:
+            del self._sessions[camera.live.key_id]
+        camera.live, camera.pending = session, None
+        camera.old_nonces.append(session.hello.slave_nonce)
+        if self._first_ns is None:
+            self._first_ns = t_ns
+
+    def _take_data(
+        self, session: _Session, sequence: Sequence, opened: Opened
+    ) -> MarkerDetections | Refusal | None:
+        try:
+            message = decode(opened.body)
+        except MessageError:
+            return Refusal.UNDECODABLE
+        if not isinstance(message, MarkerDetections):
+            return Refusal.UNDECODABLE
+        if message.camera != session.camera:
+            return Refusal.IMPOSTOR
+        session.started = True
+        if not sequence.take(message.session, message.seq):
+            return None
+        clock = session.clock.estimate()
+        if clock is None:  # data before the start, of a slave that did not wait for it
+            self.unsynchronised += 1
+            return None
+        t_ns, ready_t_ns = clock.to_local(message.t_ns), clock.to_local(message.ready_t_ns)
+        return msgspec.structs.replace(message, t_ns=t_ns, ready_t_ns=ready_t_ns)
+
+    def _ask_clock(self, session: _Session) -> None:
+        t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
+        if t_ns < session.next_echo_ns:
+            return
+        if t_ns - session.heard_ns > SILENT_NS:
+            period = ECHO_NS
+        elif not session.clock.settled:
+            period = ECHO_FAST_NS
+        else:
+            period = ECHO_EARLY_NS if t_ns - session.since_ns < EARLY_NS else ECHO_NS
+        session.next_echo_ns = t_ns + period
+        self._outbox.append((seal(session.sealer, EchoAsk(t_ns)), session.address))
+
+    def _open_barrier(self, t_ns: int) -> None:
+        if self._start_ns is not None or self._first_ns is None:
+            return
+        ready = all(camera.live is not None and camera.live.clock.ready for camera in self._cameras.values())
+        if ready or t_ns - self._first_ns > self._start_timeout_ns:
+            self._start_ns = t_ns + START_LEAD_NS
+
+    def _send_start(self, camera: _Camera, t_ns: int) -> None:
+        session = camera.live
+        if self._start_ns is None or session is None or session.started or t_ns < session.next_start_ns:
+            return
+        clock = session.clock.estimate()
+        if clock is None or not session.clock.ready:
+            return
+        session.next_start_ns = t_ns + START_AGAIN_NS
+        start = Start(clock.to_remote(self._start_ns))
+        self._outbox.append((seal(session.sealer, start), session.address))

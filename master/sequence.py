@@ -1,0 +1,69 @@
+"""Counts what becomes of one camera's frames on the way: received, lost, late, duplicate, reordered.
+
+A frame is *lost* when its number was skipped and never came; *late* when it came after a newer
+one, and is dropped then, because the newer one was used already. So received + lost + late is the
+number of frames between the first and the last. A restarted slave is a new sequence.
+"""
+
+from dataclasses import dataclass, replace
+
+REMEMBERED = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class CameraCounts:
+    """Counters of one camera since the master began.
+
+    Attributes:
+        received: Frames taken.
+        lost: Frame numbers skipped and not come so far.
+        late: Frames that came after a newer one, dropped.
+        duplicate: Datagrams that came twice, dropped.
+        reordered: Datagrams of any kind that came after a later one of their session.
+    """
+
+    received: int = 0
+    lost: int = 0
+    late: int = 0
+    duplicate: int = 0
+    reordered: int = 0
+
+
+class Sequence:
+    """Push machine over frame numbers. Holds the last one, and the newest skipped ones (<= 1024)."""
+
+    def __init__(self) -> None:
+        """Begin with nothing received."""
+        self.counts = CameraCounts()
+        self._session: int | None = None
+        self._last = -1
+        self._missing: dict[int, None] = {}
+
+    def take(self, session: int, seq: int) -> bool:
+        """Count frame `seq` of the slave process `session`; whether it is to be used."""
+        counts = self.counts
+        if session != self._session:
+            self._session = session
+            self._missing.clear()
+        elif seq <= self._last:
+            found = seq in self._missing
+            self._missing.pop(seq, None)
+            self.counts = replace(counts, late=counts.late + 1, lost=counts.lost - found)
+            return False
+        else:
+            skipped = range(self._last + 1, seq)
+            counts = replace(counts, lost=counts.lost + len(skipped))
+            self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
+            while len(self._missing) > REMEMBERED:
+                del self._missing[next(iter(self._missing))]
+        self._last = seq
+        self.counts = replace(counts, received=counts.received + 1)
+        return True
+
+    def duplicate(self) -> None:
+        """Count a datagram that came twice."""
+        self.counts = replace(self.counts, duplicate=self.counts.duplicate + 1)
+
+    def reordered(self) -> None:
+        """Count a datagram that came after a later one."""
+        self.counts = replace(self.counts, reordered=self.counts.reordered + 1)

@@ -1,0 +1,237 @@
+"""The slave's side of the datagram link: from the first beacon to data, as a push machine.
+
+Rules that must stay in step with `master.link` and docs/wire.md:
+- While the master of the session is heard, beacons of any other life are ignored: an old one
+  replayed cannot end a live session, and two masters do not tear a slave apart.
+- An offer (one slave nonce) lasts until a welcome that carries it; the session changes only then.
+- A session that the master's beacons do not list for a second is lost to it: say hello again.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from common.clock import Clock
+from common.datagram import Header, Kind, Opener, Refusal, Sealer, parse
+from common.messages import Message, encode
+from common.session import (
+    NONCE_BYTES,
+    Beacon,
+    EchoAnswer,
+    EchoAsk,
+    Hello,
+    RigKeys,
+    Start,
+    Started,
+    Welcome,
+    new_process_id,
+    read,
+    seal,
+)
+
+Address = tuple[str, int]
+Random = Callable[[int], bytes]
+
+WELL_NS = 500_000_000  # a master heard this recently is well, and rivals are ignored
+VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
+UNLISTED_NS = 1_000_000_000
+HELLO_AGAIN_NS = 50_000_000
+OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
+
+
+@dataclass(slots=True)
+class _Offer:
+    """An attempt to get a session: the nonce, and the beacon that it answers."""
+
+    slave_nonce: bytes
+    beacon: Beacon
+    beacon_counter: int
+    address: Address
+    heard_ns: int
+    next_ns: int
+
+
+@dataclass(slots=True)
+class _Session:
+    """The session that is."""
+
+    master_nonce: bytes
+    slave_nonce: bytes
+    beacon_counter: int  # of the newest beacon: an older one may not list this session
+    key_id: int
+    address: Address
+    zenoh_endpoint: str | None
+    sealer: Sealer
+    opener: Opener
+    since_ns: int
+    heard_ns: int
+    start_t_ns: int | None = None
+
+
+class SlaveLink:
+    """Takes beacons and datagrams, seals what is to be sent, and says what to send by itself.
+
+    Holds the session, the offer under way, and the counters.
+    """
+
+    def __init__(self, name: str, key: bytes, clock: Clock, random: Random) -> None:
+        """Begin a new life of the slave `name`, with an id from `random`.
+
+        Raises:
+            ValueError: Key of wrong length.
+        """
+        self._name = name
+        self._keys = RigKeys(key)
+        self._clock = clock
+        self._random = random
+        self.process = new_process_id(random(8))
+        self._sealer = self._keys.sealer(self.process)
+        self._session: _Session | None = None
+        self._offer: _Offer | None = None
+        self._outbox: list[tuple[bytes, Address]] = []
+        self.refused: Counter[Refusal] = Counter()
+
+    @property
+    def started(self) -> bool:
+        """Whether the master has said start and is still there."""
+        session = self._session
+        if session is None or session.start_t_ns is None:
+            return False
+        return self._clock.now_ns() - session.heard_ns < VANISHED_NS
+
+    @property
+    def start_t_ns(self) -> int | None:
+        """When to begin [ns], on this slave's clock; None before the start of this session."""
+        return None if self._session is None else self._session.start_t_ns
+
+    @property
+    def zenoh_endpoint(self) -> str | None:
+        """Where the bus of the session's master listens; None without session or bus."""
+        return None if self._session is None else self._session.zenoh_endpoint
+
+    def hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
+        """Take a datagram from the beacon's port."""
+        self._count(self._hear_beacon(datagram, address, t_ns))
+
+    def receive(self, datagram: bytes, address: Address, t_ns: int) -> None:
+        """Take a datagram from the port of this slave that arrived at `t_ns`."""
+        header = parse(datagram, self._keys.rig_tag)
+        if isinstance(header, Refusal):
+            self._count(header)
+        elif header.kind is Kind.WELCOME:
+            self._count(self._hear_welcome(header, datagram, address, t_ns))
+        elif header.kind in (Kind.START, Kind.ECHO_ASK):
+            self._count(self._hear_master(header, datagram, t_ns))
+        else:
+            self._count(Refusal.UNEXPECTED)
+
+    def seal(self, message: Message) -> tuple[bytes, Address] | None:
+        """Return `message` as a datagram and its destination, or None while not started.
+
+        Raises:
+            ValueError: The message does not fit into a datagram.
+        """
+        session = self._session
+        if session is None or not self.started:
+            return None
+        return session.sealer.seal(Kind.DATA, encode(message)), session.address
+
+    def due(self) -> list[tuple[bytes, Address]]:
+        """Return the datagrams to send now, each with its destination."""
+        t_ns = self._clock.now_ns()
+        offer = self._offer
+        if offer is not None and t_ns - offer.heard_ns < OFFER_NS and t_ns >= offer.next_ns:
+            self._say_hello(offer, t_ns)
+        outbox, self._outbox = self._outbox, []
+        return outbox
+
+    def _count(self, refusal: Refusal | None) -> None:
+        if refusal is not None:
+            self.refused[refusal] += 1
+
+    def _hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        header = parse(datagram, self._keys.rig_tag)
+        if isinstance(header, Refusal):
+            return header
+        if header.kind is not Kind.BEACON:
+            return Refusal.UNEXPECTED
+        body = self._keys.open(header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        beacon = read(Kind.BEACON, body)
+        if not isinstance(beacon, Beacon):
+            return Refusal.UNDECODABLE
+        session = self._session
+        if session is not None:
+            if beacon.master_nonce == session.master_nonce:
+                if header.counter <= session.beacon_counter:
+                    return Refusal.REPLAYED
+                session.beacon_counter = header.counter
+                listed = beacon.sessions.get(self._name) == session.key_id
+                if listed or t_ns - session.since_ns < UNLISTED_NS:
+                    return None
+            elif t_ns - session.heard_ns < WELL_NS:
+                return Refusal.RIVAL
+        self._answer(beacon, header.counter, address, t_ns)
+        return None
+
+    def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
+        nonce = self._random(NONCE_BYTES) if self._offer is None else self._offer.slave_nonce
+        self._offer = _Offer(nonce, beacon, counter, address, heard_ns=t_ns, next_ns=t_ns)
+        self._say_hello(self._offer, t_ns)
+
+    def _say_hello(self, offer: _Offer, t_ns: int) -> None:
+        offer.next_ns = t_ns + HELLO_AGAIN_NS
+        self._outbox.append((seal(self._sealer, self._hello(offer)), offer.address))
+
+    def _hello(self, offer: _Offer) -> Hello:
+        return Hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
+
+    def _hear_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
+        body = self._keys.open(header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        welcome = read(Kind.WELCOME, body)
+        if not isinstance(welcome, Welcome):
+            return Refusal.UNDECODABLE
+        offer = self._offer
+        if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
+            return Refusal.DUPLICATE
+        if offer is None or welcome.slave_nonce != offer.slave_nonce:
+            return Refusal.REPLAYED
+        if welcome.master_nonce != offer.beacon.master_nonce:
+            return Refusal.STALE  # a beacon of another life came meanwhile, and hello went there
+        keys = self._keys.session(self._hello(offer), welcome.session_nonce)
+        self._session = _Session(
+            welcome.master_nonce,
+            welcome.slave_nonce,
+            offer.beacon_counter,
+            keys.key_id,
+            address,
+            offer.beacon.zenoh_endpoint or None,
+            self._keys.session_sealer(keys.to_master, keys.key_id),
+            Opener(keys.to_slave),
+            since_ns=t_ns,
+            heard_ns=t_ns,
+        )
+        self._offer = None
+        return None
+
+    def _hear_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
+        session = self._session
+        if session is None or header.key_id != session.key_id:
+            return Refusal.STALE
+        opened = session.opener.open(header, datagram)
+        if isinstance(opened, Refusal):
+            return opened
+        message = read(header.kind, opened.body)
+        session.heard_ns = t_ns
+        if isinstance(message, EchoAsk):
+            answer = EchoAnswer(message.t1_ns, t_ns, self._clock.now_ns())
+            self._outbox.append((seal(session.sealer, answer), session.address))
+        elif isinstance(message, Start):
+            session.start_t_ns = message.start_t_ns
+            self._outbox.append((seal(session.sealer, Started(message.start_t_ns)), session.address))
+        else:
+            return Refusal.UNDECODABLE
+        return None
