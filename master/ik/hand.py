@@ -30,8 +30,8 @@ class Priors:
 
     abduction: float = np.radians(7.0)
     natural_flexion: float = np.radians(14.0)
-    neighbour_flexion: float = np.radians(22.0)
-    neighbour_pip: float = np.radians(25.0)
+    neighbour_flexion: float = np.radians(30.0)
+    neighbour_pip: float = np.radians(35.0)
     pip: float = np.radians(60.0)
     thumb: float = np.radians(20.0)
     thumb_mean: tuple[float, float, float, float] = (
@@ -41,7 +41,13 @@ class Priors:
         float(np.radians(15.0)),
     )
     hidden: float = np.radians(15.0)
-    curled: tuple[float, float] = (float(np.radians(58.0)), float(np.radians(80.0)))
+    curled: tuple[float, float] = (float(np.radians(65.0)), float(np.radians(88.0)))
+    thumb_curled: tuple[float, float, float, float] = (
+        float(np.radians(20.0)),
+        float(np.radians(30.0)),
+        float(np.radians(25.0)),
+        float(np.radians(30.0)),
+    )
     facing: float = np.radians(30.0)
     model_m: float = 1.0e-3
     walk_rad_s: float = 8.0
@@ -86,7 +92,9 @@ class HandSolver:
         self.priors = priors or Priors()
         mounts = [model.mount(name) for name in markers]
         self._finger = np.array([-1 if m.finger is None else m.finger for m in mounts])
-        self._level = np.array([0 if m.finger is None else int(np.argmax(CHAINS[m.finger] == m.joint)) for m in mounts])
+        self._level = np.array(
+            [0 if m.finger is None else int(np.argmax(CHAINS[m.finger] == m.joint)) for m in mounts]
+        )
         self.free, self._angles_of = _parameters(model)
         self._low, self._high = _bounds(model, self.free)
         self._prior, self._prior_mean = _prior_rows(model, self.free, self.priors)
@@ -103,7 +111,7 @@ class HandSolver:
         cov_m2: Float,
         last: HandSolution | None = None,
         dt_s: float = 0.0,
-        hidden_rad: Float | None = None,
+        hidden: tuple[Float, Float] | None = None,
         facing: Float | None = None,
     ) -> HandSolution | None:
         """Fit the hand to its markers.
@@ -113,7 +121,8 @@ class HandSolver:
             cov_m2: Their covariance (M, 3, 3) [m^2].
             last: Solution of the last frame, as seed and prior; None: solve afresh.
             dt_s: Time since then [s].
-            hidden_rad: (5, 4) where fingers without a marker are believed to be; None: curled away.
+            hidden: Where fingers without a marker are believed to be, angles (5, 4) [rad], and the
+                standard deviation (5,) [rad] of that belief; None: curled out of sight.
             facing: (3,) unit vector, rig frame, from the hand to the cameras where a marker on the back
                 of the hand is seen: that marker faces them. None: nothing known.
 
@@ -125,7 +134,7 @@ class HandSolver:
         if last is None and not _determined(points_m[seen], facing):
             return None
         whiten = self._whitening(cov_m2, seen)
-        rows, means = self._state_prior(seen, last, dt_s, hidden_rad)
+        rows, means = self._state_prior(seen, last, dt_s, hidden)
         problem = _Problem(self, points_m, seen, whiten, (rows, means), last, dt_s, facing)
         best: tuple[float, Float, Float, Float, int] | None = None
         for T, x in self._seeds(points_m, seen, last, facing):
@@ -186,26 +195,28 @@ class HandSolver:
         return np.linalg.inv(np.linalg.cholesky(cov))
 
     def _state_prior(
-        self, seen: Bool, last: HandSolution | None, dt_s: float, hidden_rad: Float | None
+        self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None
     ) -> tuple[Float, Float]:
-        """Rows and means of the priors that depend on this frame: unseen fingers and the last frame."""
+        """Rows and means of all angle priors: the constant ones, unseen fingers, and the last frame."""
         n = len(self.free)
-        rows, means = [self._prior], [self._prior_mean]
+        weight = np.zeros(n)
+        mean = np.zeros(n)
         seen_fingers = set(self._finger[seen].tolist())
-        flat = None if hidden_rad is None else hidden_rad.reshape(20)
         for column, angle in enumerate(self.free):
             finger, kind = divmod(int(angle), 4)
-            if finger in seen_fingers or (flat is None and (finger == 0 or kind not in (1, 2))):
+            if finger in seen_fingers:
                 continue
-            mean = flat[angle] if flat is not None else self.priors.curled[kind - 1]
-            row = np.zeros((1, n))
-            row[0, column] = 1 / self.priors.hidden
-            rows.append(row)
-            means.append(np.array([mean / self.priors.hidden]))
+            if hidden is not None:
+                mean[column], weight[column] = hidden[0][finger, kind], 1 / hidden[1][finger]
+            elif finger == 0:
+                mean[column], weight[column] = self.priors.thumb_curled[kind], 1 / self.priors.hidden
+            elif kind in (1, 2):
+                mean[column], weight[column] = self.priors.curled[kind - 1], 1 / self.priors.hidden
+        rows, means = [self._prior, np.diag(weight)], [self._prior_mean, weight * mean]
         if last is not None:
-            weight = 1 / (self.priors.walk_rad_s * max(dt_s, 1e-3))
-            rows.append(np.eye(n) * weight)
-            means.append(last.angles_rad.reshape(20)[self.free] * weight)
+            walk = 1 / (self.priors.walk_rad_s * max(dt_s, 1e-3))
+            rows.append(np.eye(n) * walk)
+            means.append(last.angles_rad.reshape(20)[self.free] * walk)
         return np.vstack(rows), np.concatenate(means)
 
     def _seeds(
@@ -313,7 +324,9 @@ class _Problem:
         if self._last is None:
             return np.concatenate([r_markers, r_prior]), np.vstack([J_markers, J_prior])
         turned = T[:3, :3] @ self._last[:3, :3].T
-        vector = 0.5 * np.array([turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]])
+        vector = 0.5 * np.array(
+            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+        )
         r_palm = self._palm_weight * np.concatenate([vector, T[:3, 3] - self._last[:3, 3]])
         J_palm = np.hstack([np.diag(self._palm_weight), np.zeros((6, len(x)))])
         return np.concatenate([r_markers, r_prior, r_palm]), np.vstack([J_markers, J_prior, J_palm])

@@ -11,10 +11,11 @@ import numpy as np
 
 from common.arrays import Float
 from common.camera_model import CameraModel
-from common.geometry import invert
 from common.hand_model import HandJoints, HandModel
 
 _RINGS, _SPOKES = 8, 16
+_PAINTED_M = 0.016  # the last 16 mm of a finger are painted; seen from the side that is 2 r x 16 mm
+_WHOLE_SHARE = 0.6  # seen from its end a whole cap still shows this share of that
 
 
 class CapModel:
@@ -40,44 +41,57 @@ class CapModel:
             areas.append(a)
             self._joint.append(mount.joint)
             self._marker.append(index)
+        self._radius = np.array([model.radius_m[joint] for joint in self._joint])
         self._points, self._normals, self._areas = np.array(points), np.array(normals), np.array(areas)
 
-    def bias_px(self, joints: HandJoints, cameras: tuple[CameraModel, ...], count: int) -> Float:
-        """Seen centroid minus cap centroid, (C, M, 2) [px]; zero for markers without a cap.
+    def doubt_px(self, area_px2: Float, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
+        """Extra centroid noise (C, M) [px] of caps that show less than they must: partly hidden.
+
+        What is missing lies to one side, so the centroid moves by up to a radius. Two cameras see different
+        remains of a hidden cap; without this, a sliver would pass for a point known to a tenth of a pixel.
 
         Args:
-            joints: Hand pose, rig frame.
+            area_px2: Seen areas (C, M) [px^2].
+            points_m: Where the caps were found (M, 3) [m], rig frame.
             cameras: The rig's cameras.
-            count: Number of markers M.
         """
-        bias = np.zeros((len(cameras), count, 2))
+        doubt = np.zeros(area_px2.shape)
+        if not self._joint:
+            return doubt
+        for c, camera in enumerate(cameras):
+            distance = np.linalg.norm(points_m[self._marker] - camera.centre, axis=1)
+            scale = _project_scale(camera) / distance
+            share = area_px2[c, self._marker] / (2.0 * self._radius * _PAINTED_M * scale**2)
+            doubt[c, self._marker] = np.maximum(_WHOLE_SHARE - share, 0.0) * self._radius * scale
+        return np.nan_to_num(doubt)
+
+    def bias_px(self, joints: HandJoints, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
+        """Seen centroid minus cap centroid, (C, M, 2) [px]; zero for markers without a cap or not found.
+
+        Args:
+            joints: Hand pose, rig frame; only the orientation of the finger ends is used, so that a wrong pose
+                cannot move a cap by more than its radius.
+            points_m: Where the caps were found (M, 3) [m], rig frame.
+            cameras: The rig's cameras.
+        """
+        bias = np.zeros((len(cameras), len(points_m), 2))
         if not self._joint:
             return bias
         R = joints.rotation[self._joint]
-        centre = joints.position_m[self._joint]
-        middle = centre + np.einsum("kij,kj->ki", R, self._offset[self._marker])
+        middle = points_m[self._marker]
         for c, camera in enumerate(cameras):
-            sight = centre - camera.centre
+            sight = middle - camera.centre
             sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
             local = np.einsum("kij,ki->kj", R, sight)
             facing = np.maximum(-np.einsum("knj,kj->kn", self._normals, local), 0.0) * self._areas
             seen = np.einsum("kn,knj->kj", facing, self._points) / facing.sum(axis=1, keepdims=True)
-            bias[c, self._marker] = camera.project(centre + np.einsum("kij,kj->ki", R, seen)) - camera.project(middle)
+            shift = np.einsum("kij,kj->ki", R, seen - self._offset[self._marker])
+            bias[c, self._marker] = camera.project(middle + shift) - camera.project(middle)
         return np.nan_to_num(bias)
 
-    def area_px2(self, joints: HandJoints, camera: CameraModel, count: int) -> Float:
-        """Silhouette areas (M,) [px^2] of whole, unhidden caps; NaN for markers without a cap."""
-        area = np.full(count, np.nan)
-        if not self._joint:
-            return area
-        R, centre = joints.rotation[self._joint], joints.position_m[self._joint]
-        sight = centre - camera.centre
-        distance = np.linalg.norm(sight, axis=1)
-        local = np.einsum("kij,ki->kj", R, sight / distance[:, None])
-        facing = np.maximum(-np.einsum("knj,kj->kn", self._normals, local), 0.0) * self._areas
-        depth = (centre @ invert(camera.T_rig_camera)[:3, :3].T + invert(camera.T_rig_camera)[:3, 3])[:, 2]
-        area[self._marker] = facing.sum(axis=1) * camera.matrix[0, 0] * camera.matrix[1, 1] / depth**2
-        return area
+
+def _project_scale(camera: CameraModel) -> float:
+    return float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
 
 
 def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:

@@ -1,6 +1,7 @@
 """All cameras brought to one instant: which frames belong together, and where each marker was then.
 
-An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent. It is
+An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
+delivered a dozen frames since its last). It is
 *complete* when every other camera has delivered a frame at or after it, so that tracks can be interpolated; it
 is emitted then, or when the message time has passed its deadline, with whatever there is. Message time is the
 newest capture time seen: no clock is read here, so a replay pairs exactly as the live run did.
@@ -22,7 +23,7 @@ from common.camera_model import CameraModel
 from common.messages import MarkerDetections
 
 HISTORY = 8
-SILENT_DEADLINES = 8
+SILENT_FRAMES = 12
 # What a hand can do that a polynomial does not know, at half a metre from a 500 px lens.
 _SPEED_PX_S = 500.0
 _ACCELERATION_PX_S2 = 1.0e4
@@ -85,8 +86,10 @@ class Pairing:
         period_ns = int(1e9 / min(frame_rate_hz[name] for name in self._names))
         self._deadline_ns = int(1.25 * period_ns)
         self._gap_ns = int(2.5 * period_ns)
+        self._patience = SILENT_FRAMES * len(cameras)
         self._policy, self._continuous = policy, continuous
         self._seen: tuple[deque[_Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
+        self._waiting = [0] * len(self._names)  # frames of other cameras since this one's last
         self._pending: deque[int] = deque()
         self._origin_ns: int | None = None
         self._newest_ns = -(2**63)
@@ -105,6 +108,8 @@ class Pairing:
         half = 0.5 * (camera.height_px - 1) * camera.row_time_ns
         centre_ns = message.t_ns + round(half)
         rows = np.where(np.isnan(message.uv[:, 1]), 0.5 * (camera.height_px - 1), message.uv[:, 1])
+        if self._seen[index] and centre_ns <= self._seen[index][-1].centre_ns:
+            return []  # a restarted slave's first clock estimate may step back: wait until time goes on
         self._seen[index].append(
             _Sighting(
                 centre_ns=centre_ns,
@@ -116,6 +121,7 @@ class Pairing:
             )
         )
         self._newest_ns = max(self._newest_ns, centre_ns)
+        self._waiting = [0 if c == index else count + 1 for c, count in enumerate(self._waiting)]
         if index == self._leader() and centre_ns > self._emitted_ns:
             self._pending.append(centre_ns)
         return self._emit(flush=False)
@@ -125,11 +131,8 @@ class Pairing:
         return self._emit(flush=True)
 
     def _leader(self) -> int:
-        silent = SILENT_DEADLINES * self._deadline_ns
-        for index, seen in enumerate(self._seen):
-            if seen and self._newest_ns - seen[-1].centre_ns <= silent:
-                return index
-        return 0
+        speaking = (c for c, seen in enumerate(self._seen) if seen and self._waiting[c] < self._patience)
+        return next(speaking, 0)
 
     def _emit(self, *, flush: bool) -> list[Instant]:
         out: list[Instant] = []
@@ -144,17 +147,17 @@ class Pairing:
         return out
 
     def _complete(self, t_ns: int) -> bool:
-        silent = SILENT_DEADLINES * self._deadline_ns
-        for seen in self._seen:
+        for camera, seen in enumerate(self._seen):
+            if self._waiting[camera] >= self._patience:
+                continue
             if not seen:
                 return False
             newest = seen[-1].centre_ns
             if newest >= t_ns:
+                # At the very start one sighting after the instant is not yet a track.
                 if newest == t_ns or not self._continuous or len(seen) > 1:
                     continue
                 return False
-            if t_ns - newest > silent:
-                continue
             if self._policy == "interpolate" or t_ns - newest > self._deadline_ns:
                 return False
         return True

@@ -1,0 +1,79 @@
+"""The live loop: messages in, poses out to every sink; and the figures of a run."""
+
+import threading
+from collections import deque
+from collections.abc import Sequence
+from typing import Protocol
+
+import msgspec
+import numpy as np
+
+from common.clock import Clock
+from common.messages import Health, MarkerDetections
+from master.outputs.sink import Sink
+from master.stereo.pipeline import MarkerPipeline
+
+_KEPT = 200_000  # latencies kept for the quantiles: about an hour at 60 Hz
+
+
+class Source(Protocol):
+    """Where detections come from: the network, or a test."""
+
+    def get(self, timeout_s: float) -> MarkerDetections | None:
+        """The next message, or None when none came in time."""
+        ...
+
+
+class RunFigures:
+    """What a run achieved; written by the loop, read by health reports and the summary."""
+
+    def __init__(self) -> None:
+        self.poses = 0
+        self.latency_ms: deque[float] = deque(maxlen=_KEPT)
+        self._first_ns = self._last_ns = 0
+
+    def add(self, t_ns: int, latency_ns: int) -> None:
+        """Count one published pose."""
+        if self.poses == 0:
+            self._first_ns = t_ns
+        self._last_ns = t_ns
+        self.poses += 1
+        self.latency_ms.append(latency_ns * 1e-6)
+
+    def summary(self) -> dict[str, float]:
+        """poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms."""
+        span_s = (self._last_ns - self._first_ns) * 1e-9
+        out = {"poses": float(self.poses)}
+        if self.poses > 1 and span_s > 0:
+            out["poses_per_s"] = round((self.poses - 1) / span_s, 2)
+        if self.latency_ms:
+            p50, p99 = np.percentile(np.array(self.latency_ms), [50, 99])
+            out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
+        return out
+
+
+def run(
+    source: Source,
+    pipeline: MarkerPipeline,
+    sinks: Sequence[Sink],
+    clock: Clock,
+    figures: RunFigures,
+    stop: threading.Event,
+) -> None:
+    """Solve and publish until `stop` is set."""
+    while not stop.is_set():
+        message = source.get(timeout_s=0.1)
+        if message is None:
+            continue
+        for solved in pipeline.push(message):
+            now = clock.now_ns()
+            pose = msgspec.structs.replace(solved.pose, latency_ns=now - solved.ready_t_ns)
+            for sink in sinks:
+                sink.write(pose)
+            figures.add(now, pose.latency_ns)
+
+
+def health(session: int, clock: Clock, figures: RunFigures, counts: dict[str, int]) -> Health:
+    """The master's report."""
+    gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
+    return Health("master", session, clock.now_ns(), {"poses": figures.poses} | counts, gauges)

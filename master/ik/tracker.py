@@ -1,0 +1,184 @@
+"""One hand over time: what to believe about fingers that nobody sees, and what to say about each joint.
+
+A finger whose marker is seen is solved from it. When the marker goes, the finger moves on a little the way it
+was moving and is *held* there while the doubt grows; a finger that was never seen is believed to be curled out
+of sight, because a stretched one would show. It is never put back to an open flat hand. When a marker returns,
+the last pose is only a wide prior, so the finger is solved from what is seen at once.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float
+from common.geometry import matrix_to_quaternion
+from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
+from common.messages import HandPose, Source
+from master.ik.fingers import FingerRefiner
+from master.ik.hand import HandSolution, HandSolver, Priors
+
+_COAST_S = 0.12  # a lost finger's motion fades with this time constant
+_DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
+_FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
+_BAD_FIT_M = 8e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedHand:
+    """A solution with its bits: valid (26,), tracked (26,), source (26,)."""
+
+    solution: HandSolution | None
+    valid: Bool
+    tracked: Bool
+    source: Code
+
+
+class HandTracker:
+    """Push machine. Holds the last solution, each finger's angular speed, and since when it is lost."""
+
+    def __init__(
+        self,
+        model: HandModel,
+        markers: tuple[str, ...],
+        *,
+        continuous: bool = True,
+        priors: Priors | None = None,
+    ) -> None:
+        """Track one hand.
+
+        Args:
+            model: The hand.
+            markers: Marker names in the order of the points.
+            continuous: False: every push is an unrelated pose, nothing is remembered.
+            priors: Widths of the priors; None: the defaults.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self.model, self.markers = model, markers
+        self._solver = HandSolver(model, markers, priors)
+        self._refine = FingerRefiner(model, markers)
+        self._continuous = continuous
+        mounts = [model.mount(name) for name in markers]
+        self._finger = np.array([-1 if m.finger is None else m.finger for m in mounts])
+        self._on_palm = np.array([m.joint is None for m in mounts])
+        self.last: HandSolution | None = None
+        self._last_ns = 0
+        self._seen_ns: int | None = None
+        self._speed = np.zeros((5, 4))
+        self._lost_ns: list[int | None] = [None] * 5
+        self._anchor = np.zeros((5, 4))
+        self._anchor_speed = np.zeros((5, 4))
+
+    def push(self, t_ns: int, points_m: Float, cov_m2: Float, towards_cameras: Float) -> TrackedHand:
+        """Solve one instant.
+
+        Args:
+            t_ns: The instant.
+            points_m: Cap centroids (M, 3) [m], rig frame; NaN: not seen.
+            cov_m2: (M, 3, 3) [m^2].
+            towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
+        """
+        seen = np.isfinite(points_m).all(axis=1)
+        last = self.last if self._continuous else None
+        dt_s = (t_ns - self._last_ns) * 1e-9
+        if last is not None and not 0.0 < dt_s <= _FORGET_S:
+            last = None
+        facing = towards_cameras if (seen & self._on_palm).any() else None
+        hidden = self._belief(t_ns, seen) if last is not None else None
+        solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing)
+        if solution is not None and last is not None and _worst(solution) > _BAD_FIT_M:
+            # The last pose may have led into the wrong valley: look once without it.
+            fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
+            if fresh is not None and _worst(fresh) < 0.5 * _worst(solution):
+                solution = fresh
+        if solution is not None:
+            solution = self._refine(solution, points_m, cov_m2)
+        if solution is not None and last is not None:
+            self._speed = 0.5 * self._speed + 0.5 * (solution.angles_rad - last.angles_rad) / dt_s
+        if seen.any():
+            self._seen_ns = t_ns
+        bits = self._bits(t_ns, solution, seen, last is not None)
+        if solution is not None:
+            self.last, self._last_ns = solution, t_ns
+        return bits
+
+    def peek(self, points_m: Float, cov_m2: Float, towards_cameras: Float) -> HandSolution | None:
+        """Solve one instant afresh and remember nothing; arguments as `push`."""
+        seen = np.isfinite(points_m).all(axis=1)
+        facing = towards_cameras if (seen & self._on_palm).any() else None
+        return self._solver.solve(points_m, cov_m2, None, 0.0, None, facing)
+
+    def _belief(self, t_ns: int, seen: Bool) -> tuple[Float, Float]:
+        """Where lost fingers are believed to be (5, 4) [rad], and how uncertain that is (5,) [rad]."""
+        assert self.last is not None
+        fingers = set(self._finger[seen].tolist())
+        angles = self.last.angles_rad.copy()
+        doubt = np.full(5, _DOUBT_RAD)
+        low, high = self.model.limits_rad[..., 0], self.model.limits_rad[..., 1]
+        for f in range(5):
+            if f in fingers:
+                self._lost_ns[f] = None
+                continue
+            since = self._lost_ns[f]
+            if since is None:
+                since = self._lost_ns[f] = self._last_ns
+                self._anchor[f], self._anchor_speed[f] = self.last.angles_rad[f], self._speed[f]
+            gone_s = (t_ns - since) * 1e-9
+            coast = self._anchor_speed[f] * _COAST_S * (1.0 - np.exp(-gone_s / _COAST_S))
+            angles[f] = np.clip(self._anchor[f] + coast, low[f], high[f])
+            doubt[f] = min(_DOUBT_RAD + _DOUBT_RAD_S * gone_s, _DOUBT_MAX_RAD)
+        return angles, doubt
+
+    def _bits(self, t_ns: int, solution: HandSolution | None, seen: Bool, held: bool) -> TrackedHand:
+        valid = np.zeros(26, dtype=bool)
+        tracked = np.zeros(26, dtype=bool)
+        source = np.zeros(26, dtype=np.uint8)
+        recent = self._seen_ns is not None and (t_ns - self._seen_ns) * 1e-9 <= _FORGET_S
+        if solution is None:
+            return TrackedHand(None, valid, tracked, source)
+        valid[:] = recent
+        unseen = Source.HELD if held else Source.SOLVED
+        source[:] = unseen
+        if seen.sum() >= 3 or (seen & self._on_palm).any():
+            palm = [0, 1, *METACARPALS]
+            tracked[palm] = True
+            source[palm] = Source.SOLVED
+        for f in self._finger[seen & (self._finger >= 0)]:
+            tracked[CHAINS[f]] = True
+            source[CHAINS[f]] = Source.SOLVED
+            source[TIPS[f]] = Source.MEASURED
+        return TrackedHand(solution, valid, tracked & valid, source)
+
+
+def pose_of(
+    hand: TrackedHand, model: HandModel, t_ns: int, markers_m: Float, markers_raw_m: Float
+) -> HandPose:
+    """The message for one tracked hand; all NaN and not valid where nothing has been solved yet."""
+    solution = hand.solution
+    if solution is None:
+        nan = np.full(26, np.nan)
+        position, cov = np.full((26, 3), np.nan), np.full((26, 3, 3), np.nan)
+        orientation, angles = np.repeat(nan[:, None], 4, axis=1), np.full((5, 4), np.nan)
+    else:
+        position, cov, angles = solution.joints.position_m, solution.cov_m2, solution.angles_rad
+        orientation = matrix_to_quaternion(solution.joints.rotation)
+    return HandPose(
+        hand=model.profile.name,
+        t_ns=t_ns,
+        position_m=position,
+        orientation_wxyz=orientation,
+        radius_m=model.radius_m,
+        valid=hand.valid,
+        tracked=hand.tracked,
+        cov_m2=cov,
+        source=hand.source,
+        angles_rad=angles,
+        markers_m=markers_m,
+        markers_raw_m=markers_raw_m,
+    )
+
+
+def _worst(solution: HandSolution) -> float:
+    residual = solution.residual_m[np.isfinite(solution.residual_m)]
+    return float(residual.max()) if len(residual) else 0.0

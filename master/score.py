@@ -1,0 +1,151 @@
+"""Errors against exact truth, in millimetres and degrees, as defined in the formats of the project.
+
+A finger counts as *visible* where its marker is at least half seen by two cameras. Scores come twice: over
+visible fingers (the palm's joints with them), and over all.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import RecordingError
+from common.hand_model import FINGER_JOINTS
+from master.outputs.poses import Poses
+
+_MATCH_NS = 1_000_000
+_FINGER_OF_JOINT = np.full(26, -1)
+for _f, _joints in enumerate(FINGER_JOINTS):
+    _FINGER_OF_JOINT[list(_joints)] = _f
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Exact values at N moments.
+
+    Attributes:
+        t_ns: (N,) the moments, on the clock of the poses.
+        joints_m: (N, 25, 3) WebXR joints [m], rig frame; NaN where the scene has no hand.
+        pip_rad: (N, 4) PIP of index ... little.
+        markers_m: (N, M, 3) cap centroids.
+        visible: (N, C, M) visible share of each marker in each camera.
+    """
+
+    t_ns: Int
+    joints_m: Float
+    pip_rad: Float
+    markers_m: Float
+    visible: Float
+
+
+def load_truth(folder: Path, shown: Bool) -> Truth | None:
+    """Truth of a rendered recording; None where the folder holds none.
+
+    Args:
+        folder: The recording.
+        shown: (M,) markers found most often; a sweep of the depth shows a single flat one.
+
+    Raises:
+        RecordingError: truth.npz is broken or lacks an array.
+    """
+    path = folder / "truth.npz"
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            data = {name: np.asarray(file[name]) for name in file.files}
+        return _sweep(data, shown) if "depth" in data else _hand(data)
+    except (OSError, KeyError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
+    """Mean errors over the frames that have a truth.
+
+    Args:
+        poses: Solved poses.
+        truth: Exact values.
+        fingers: For each marker the finger it sits on, or -1.
+
+    Returns:
+        marker_mm (median over markers seen at least half by two cameras), marker_raw_mm (the same before the
+        filter), marker_count, joint_mm, joint_mm_visible, pip_deg, pip_deg_visible, frames_without_pose.
+        A score with nothing to average is left out.
+    """
+    rows, columns = _match(poses.t_ns, truth.t_ns)
+    clear = (truth.visible[columns] >= 0.5).sum(axis=1) >= 2
+    out: dict[str, float] = {}
+    for name, found in (("marker_mm", poses.markers_m[rows]), ("marker_raw_mm", poses.markers_raw_m[rows])):
+        error = np.linalg.norm(found - truth.markers_m[columns], axis=2)[clear]
+        _put(out, name, 1e3 * error[np.isfinite(error)], np.median)
+    wanted = np.isfinite(truth.markers_m[columns]).all(axis=2) & clear
+    out["markers_missed"] = float((wanted & ~np.isfinite(poses.markers_raw_m[rows]).all(axis=2)).sum())
+    solved = np.isfinite(poses.position_m[rows]).all(axis=(1, 2))
+    if not np.isfinite(truth.joints_m[columns]).any():
+        return out
+    joint = 1e3 * np.linalg.norm(poses.position_m[rows][:, 1:] - truth.joints_m[columns], axis=2)
+    pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
+    finger_clear = _fingers_clear(clear, fingers)
+    joint_clear = np.where(_FINGER_OF_JOINT[1:] < 0, True, finger_clear[:, _FINGER_OF_JOINT[1:]])
+    _put(out, "joint_mm", joint[solved], np.mean)
+    _put(out, "joint_mm_visible", joint[solved][joint_clear[solved]], np.mean)
+    _put(out, "pip_deg", pip[solved], np.mean)
+    _put(out, "pip_deg_visible", pip[solved][finger_clear[:, 1:][solved]], np.mean)
+    out["frames_without_pose"] = float((~solved).sum())
+    return out
+
+
+def _put(out: dict[str, float], name: str, values: Float, reduce: object) -> None:
+    if values.size:
+        out[name] = round(float(np.median(values) if reduce is np.median else np.mean(values)), 4)
+
+
+def _fingers_clear(clear: Bool, fingers: tuple[int, ...]) -> Bool:
+    """(N, 5) whether a marker of each finger is clearly seen."""
+    out = np.zeros((len(clear), 5), dtype=bool)
+    for marker, finger in enumerate(fingers):
+        if finger >= 0:
+            out[:, finger] |= clear[:, marker]
+    return out
+
+
+def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
+    """Rows of the poses and of the truth that belong together.
+
+    A recording has one truth per frame of the reference camera, hence per pose, or one for all its frames;
+    any other truth is matched by time.
+    """
+    rows = np.arange(len(t_ns))
+    if len(truth_ns) == 1:
+        return rows, np.zeros_like(rows)
+    if len(truth_ns) == len(t_ns):
+        return rows, rows
+    nearest = np.clip(np.searchsorted(truth_ns, t_ns), 1, len(truth_ns) - 1)
+    nearest = nearest - (np.abs(truth_ns[nearest - 1] - t_ns) <= np.abs(truth_ns[nearest] - t_ns))
+    rows = np.flatnonzero(np.abs(truth_ns[nearest] - t_ns) <= _MATCH_NS)
+    return rows, nearest[rows]
+
+
+def _hand(data: dict[str, Float]) -> Truth:
+    angles = data["angles"]
+    return Truth(
+        t_ns=np.round(1e9 * (1.0 + data["t_ref"])).astype(np.int64),
+        joints_m=data["joints"],
+        pip_rad=angles[:, [7, 11, 15, 19]],
+        markers_m=data["paint_centroid"],
+        visible=data["frac"],
+    )
+
+
+def _sweep(data: dict[str, Float], shown: Bool) -> Truth:
+    """One flat marker moved along the axis in steps of a second; there is no hand."""
+    n = len(data["depth"])
+    centre = np.where(shown[None, :, None], data["center"][:, None], np.nan)
+    return Truth(
+        t_ns=1_000_000_000 * (1 + np.arange(n)),
+        joints_m=np.full((n, 25, 3), np.nan),
+        pip_rad=np.full((n, 4), np.nan),
+        markers_m=centre,
+        visible=np.where(shown, data["frac"][:, :, None], 0.0),
+    )

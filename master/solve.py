@@ -1,0 +1,127 @@
+"""The same line offline: detections of every camera and a recording's calibration -> poses, scores, summary.
+
+No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
+same bytes. Only the stage times of the summary are measured.
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import RecordingError
+from common.frame_recording import FrameRecording
+from common.messages import HandPose, MarkerDetections
+from master.outputs.files import PosesFile
+from master.outputs.poses import Poses
+from master.rig import RigSetup, build_pipeline
+from master.score import load_truth, score
+from master.stages import StageTimes
+
+
+def solve(
+    recording: FrameRecording,
+    setup: RigSetup,
+    detections: Path,
+    out: Path,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, object]:
+    """Solve a marker recording and write poses.npz and summary.json into `out`.
+
+    Args:
+        recording: The raw frames' manifest; gives `continuous`, clicks and, where there is one, the truth.
+        setup: Rig, cameras and hand.
+        detections: Folder with detections_<camera>.npz of every camera of the rig.
+        out: Existing folder for the results.
+        progress: Told how many of how many messages are done.
+
+    Returns:
+        The summary.
+
+    Raises:
+        RecordingError: A detections file is missing or broken, or the results cannot be written.
+        CalibrationError: The depth model does not fit the rig.
+    """
+    stages = StageTimes()
+    pipeline = build_pipeline(setup, stages, continuous=recording.manifest.continuous)
+    messages = _messages(setup, detections)
+    poses: list[HandPose] = []
+    sink = PosesFile(out / "poses.npz", setup.hand.profile.name, len(setup.rig.markers))
+    for number, message in enumerate(messages, 1):
+        poses += [solved.pose for solved in pipeline.push(message)]
+        progress(number, len(messages))
+    poses += [solved.pose for solved in pipeline.flush()]
+    for pose in poses:
+        sink.write(pose)
+    sink.close()
+    summary = summarise(recording, setup, poses) | {
+        "counts": dict(sorted(pipeline.counts.items())),
+        "stage_us": stages.mean_us(),
+    }
+    write_json(out / "summary.json", summary)
+    return summary
+
+
+def summarise(recording: FrameRecording, setup: RigSetup, poses: list[HandPose]) -> dict[str, object]:
+    """Counts, and scores where the recording carries its truth."""
+    seen = sum(bool(pose.valid.any()) for pose in poses)
+    summary: dict[str, object] = {"poses": len(poses), "poses_valid": seen}
+    if not poses:
+        return summary
+    found = np.isfinite([pose.markers_raw_m for pose in poses]).all(axis=2).sum(axis=0)
+    truth = load_truth(recording.folder, found == found.max())
+    return summary if truth is None else summary | score(Poses.of(poses), truth, fingers_of(setup))
+
+
+def fingers_of(setup: RigSetup) -> tuple[int, ...]:
+    """For each marker of the rig the finger it sits on, or -1."""
+    mounts = [setup.hand.mount(name) for name in setup.rig.markers]
+    return tuple(-1 if mount.finger is None else mount.finger for mount in mounts)
+
+
+def write_json(path: Path, value: dict[str, object]) -> None:
+    """Write a summary.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    try:
+        path.write_text(json.dumps(value, indent=1) + "\n")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
+    """All cameras' detections in the order of their capture times; ties in the rig's order of cameras."""
+    count = len(setup.rig.markers)
+    messages = [message for camera in setup.rig.cameras for message in _of_camera(folder, camera, count)]
+    order = {camera: index for index, camera in enumerate(setup.rig.cameras)}
+    return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
+
+
+def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
+    path = folder / f"detections_{camera}.npz"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            t_ns: Int = np.asarray(file["t_ns"], dtype=np.int64)
+            seq: Int = np.asarray(file["seq"], dtype=np.int64)
+            uv: Float = np.asarray(file["uv"], dtype=np.float64)
+            area: Float = np.asarray(file["area_px2"], dtype=np.float64)
+            quality: Float = np.asarray(file["quality"], dtype=np.float64)
+    except (OSError, KeyError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}: run `phalanx-slave detect` for camera {camera!r} first") from error
+    if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
+        raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
+    for row in range(len(t_ns)):
+        yield MarkerDetections(
+            camera=camera,
+            session=0,
+            seq=int(seq[row]),
+            t_ns=int(t_ns[row]),
+            ready_t_ns=int(t_ns[row]),
+            uv=uv[row],
+            area=area[row],
+            quality=quality[row],
+        )

@@ -1,0 +1,149 @@
+"""The marker rig's straight line: detections -> one instant -> 3D caps -> 1 € filter -> hand.
+
+`MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
+and get the same poses. It is built from calibration by `master.rig`.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.camera_model import CameraModel
+from common.hand_model import HandModel
+from common.messages import HandPose, MarkerDetections
+from master.filters import OneEuro
+from master.ik.hand import HandSolution
+from master.ik.tracker import HandTracker, pose_of
+from master.stereo.caps import CapModel
+from master.stereo.depth import DepthLaw, position_at_depth
+from master.stereo.pairing import Instant, Pairing
+from master.stereo.triangulate import Triangulator
+
+Stage = Callable[[str], AbstractContextManager[None]]
+_MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedPose:
+    """A pose, and when the last frame that contributed to it was handed to its slave [ns]."""
+
+    pose: HandPose
+    ready_t_ns: int
+
+
+class MarkerPipeline:
+    """Push machine. Holds pairing, filter and tracker, each with its own state."""
+
+    def __init__(
+        self,
+        cameras: dict[str, CameraModel],
+        model: HandModel,
+        markers: tuple[str, ...],
+        *,
+        pairing: Pairing,
+        law: DepthLaw | None = None,
+        smooth: OneEuro | None = None,
+        tracker: HandTracker,
+        stage: Stage = lambda name: nullcontext(),
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            cameras: In the rig's order.
+            model: The hand.
+            markers: Names in the order of every marker array.
+            pairing: Brings cameras to one instant.
+            law: Depth from disparity of the first two cameras; None: triangulate all cameras.
+            smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
+            tracker: Solves the hand.
+            stage: Opens a timer by stage name.
+        """
+        self.model, self.markers = model, markers
+        self.counts: Counter[str] = Counter()
+        self._cameras = tuple(cameras.values())
+        self._pairing, self._law, self._smooth, self._tracker = pairing, law, smooth, tracker
+        self._triangulator = Triangulator.of(self._cameras)
+        self._caps = CapModel(model, markers)
+        self._stage = stage
+        centres = np.array([camera.centre for camera in self._cameras])
+        axes = np.array([camera.T_rig_camera[:3, 2] for camera in self._cameras])
+        self._eye = centres.mean(axis=0)
+        self._ahead = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
+
+    def push(self, message: MarkerDetections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        with self._stage("pairing"):
+            instants = self._pairing.push(message)
+        return [self._solve(instant) for instant in instants]
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for a camera."""
+        return [self._solve(instant) for instant in self._pairing.flush()]
+
+    def _solve(self, instant: Instant) -> SolvedPose:
+        last = self._tracker.last if self._smooth is not None else None
+        with self._stage("triangulate"):
+            raw, cov = self._locate(instant, last)
+        if last is None:
+            # The caps' tilt is not known yet: a first solution without correction tells it.
+            with self._stage("hand"):
+                first = self._tracker.peek(raw, cov, self._towards(raw))
+            if first is not None:
+                with self._stage("triangulate"):
+                    raw, cov = self._locate(instant, first)
+        with self._stage("filter"):
+            markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
+        with self._stage("hand"):
+            hand = self._tracker.push(instant.t_ns, markers, cov, self._towards(markers))
+            pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
+        self.counts["poses"] += 1
+        self.counts["instants_with_missing_camera"] += int(instant.missing.any())
+        return SolvedPose(pose, instant.ready_t_ns)
+
+    def _locate(self, instant: Instant, hand: HandSolution | None) -> tuple[Float, Float]:
+        """Cap centroids (M, 3) [m] and covariances (M, 3, 3) at the instant, given the hand known so far."""
+        uv, sigma = instant.uv, instant.sigma_px
+        points, cov, residual = self._triangulate(uv, sigma)
+        sigma = np.hypot(sigma, self._caps.doubt_px(instant.area, points, self._cameras))
+        if hand is not None:
+            uv = uv - self._caps.bias_px(hand.joints, points, self._cameras)
+        points, cov, residual = self._triangulate(uv, sigma)
+        limit = np.maximum(_MISFIT_PX, _MISFIT_SIGMAS * np.nan_to_num(sigma).max(axis=0))
+        misfit = residual > limit
+        if misfit.any():
+            # Rays that pass each other: one camera saw something else of that colour.
+            self.counts["epipolar_misfits"] += int(misfit.sum())
+            points[misfit], cov[misfit] = np.nan, np.nan
+        return points, cov
+
+    def _triangulate(self, uv: Float, sigma_px: Float) -> tuple[Float, Float, Float]:
+        """Points (M, 3) [m], covariances (M, 3, 3) and reprojection residuals (M,) [px] by the rig's depth model."""
+        if self._law is None:
+            found = self._triangulator.triangulate(uv, sigma_px)
+            return found.points.copy(), found.covariance.copy(), found.residual_px
+        points, cov = self._by_law(self._law, uv, sigma_px)
+        return points, cov, np.zeros(len(points))
+
+    def _by_law(self, law: DepthLaw, uv: Float, sigma_px: Float) -> tuple[Float, Float]:
+        camera = self._cameras[0]
+        depth = law.depth(uv[0, :, 0] - uv[1, :, 0])
+        points = position_at_depth(camera, uv[0], depth)
+        along = law.metres_per_pixel(depth) * np.hypot(sigma_px[0], sigma_px[1])
+        across = depth / camera.matrix[0, 0] * sigma_px[0]
+        sight = points - camera.centre
+        sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+        outer = sight[:, :, None] * sight[:, None, :]
+        cov = across[:, None, None] ** 2 * (np.eye(3) - outer) + along[:, None, None] ** 2 * outer
+        return points, cov
+
+    def _towards(self, points: Float) -> Float:
+        """Unit vector (3,) from what is seen of the hand to the cameras."""
+        seen = points[np.isfinite(points).all(axis=1)]
+        if not len(seen):
+            return -self._ahead
+        back = self._eye - seen.mean(axis=0)
+        return back / np.linalg.norm(back)
