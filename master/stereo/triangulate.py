@@ -25,7 +25,7 @@ from common.geometry import invert
 
 _MIN_RELATIVE_DETERMINANT = 1e-14
 """Of a 3x3 normal matrix, against the cube of its trace; the rounding of parallel rays stays below."""
-_MINOR = np.array(
+_MINOR: Int = np.array(
     [
         [4, 5, 3, 7, 8, 6, 1, 2, 0],
         [8, 6, 7, 2, 0, 1, 5, 3, 4],
@@ -173,10 +173,9 @@ def _judge(points: Float, covariance: Float, z: Float, error: Float, weight: Flo
 def _inverse(matrix: Float) -> Float:
     """Inverses (M, 3, 3) of symmetric matrices by cofactors; NaN where singular, never an exception."""
     flat = matrix.reshape(-1, 9)
-    cofactor: Float = flat.take(_MINOR[0], 1) * flat.take(_MINOR[1], 1) - flat.take(_MINOR[2], 1) * flat.take(
-        _MINOR[3], 1
-    )
-    determinant: Float = (flat[:, :3] * cofactor[:, :3]).sum(axis=1)
+    a, b, c, d = _MINOR
+    cofactor = flat[:, a] * flat[:, b] - flat[:, c] * flat[:, d]
+    determinant = (flat[:, :3] * cofactor[:, :3]).sum(axis=1)
     trace = flat[:, 0] + flat[:, 4] + flat[:, 8]
     regular = determinant > _MIN_RELATIVE_DETERMINANT * trace * trace * trace
     return (cofactor / np.where(regular, determinant, np.nan)[:, None]).reshape(-1, 3, 3)

@@ -1,0 +1,275 @@
+"""Finger angles from one point on the finger, in closed form: seed and oracle of FABRIK (I8).
+
+A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the MCP's frame the
+point lies at w(PIP), which neither flexion nor abduction can stretch:
+
+    |target - MCP| = |w(PIP)|        monotone but for a few degrees round the straight finger -> PIP
+    R_y(a) rest R_x(-f) w = target   y gives the flexion, x and z the abduction: two atan2
+
+This holds for bones out of plane too. The 1-D inversion is a table per monotone branch over
+s = sqrt(|w|_max^2 - |w|^2): PIP and w are smooth in s, also at the straight finger, where they are not in |w|.
+The thumb is the same chain (CMC, MCP, IP); its IP follows its MCP by the ratio of their highest angles, so that
+one ratio reaches every distance the two can reach. Where that ratio cannot hit the target but another pair can
+(only a thumb, or a hand whose DIP is free), damped least squares finds it from there, bounded by the limits.
+
+Targets that no legal pose hits get the bounded least-squares pose (stretched or bent towards the target) and
+`reached` False. Tables are built once per hand; solving is plain Python on single numbers.
+"""
+
+from dataclasses import dataclass
+from math import acos, atan2, cos, hypot, isfinite, pi, sin
+from typing import NamedTuple
+
+from common.arrays import Float
+from common.hand_model import HandModel
+from master.ik.bounded import Four, bounded_least_squares
+from master.ik.chain import THUMB, Chain, finger_chain, finger_root
+from master.ik.joints import Hinge, Matrix, Rotor, Vector, dot, rotate, rotate_back, swing_and_flex
+from master.ik.reach_table import Branch, ReachCurve, flexed
+
+REACHED_M = 1e-6
+_SLACK_RAD = 2e-6
+"""A limit passed by less is the table's rounding: the angle is clamped, which moves the point < 0.2 um."""
+_POLE = 0.0025
+"""Within asin(sqrt(.)) of the abduction's pole the table's error grows more than 20-fold: done with care."""
+_EDGE = 1e-12
+"""Relative slack of a squared distance at the end of a branch."""
+_SPREAD_OF_SEEDS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
+"""PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
+_NAN = float("nan")
+
+
+class FingerSolution(NamedTuple):
+    """Angles of one finger [rad] (thumb: CMC abduction, CMC flexion, MCP, IP) and how well they fit.
+
+    Attributes:
+        residual_m: Distance of the point to the target; in the closed form the bound of the table's error.
+        reached: Whether legal angles hit the target within 1 um.
+    """
+
+    abduction_rad: float
+    flexion_rad: float
+    pip_rad: float
+    dip_rad: float
+    residual_m: float
+    reached: bool
+
+
+NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingerSolver:
+    """One finger of one hand, prepared; build once with `of`.
+
+    Attributes:
+        chain: The finger's links and limits, root frame (the palm's axes, origin at the root joint).
+        root: MCP (thumb: CMC) in the palm frame [m].
+        ratio: DIP per PIP that makes the closed form exact.
+        branches: Distance -> PIP.
+        bound_m: Largest error of the closed form, from that of the branches' tables.
+        limits: Low and high of the four angles.
+        before: Turn in front of the abduction (thumb), else None.
+        rest: Turn between abduction and flexion (identity for the thumb).
+        ahead: Sign of z, in the abduction's frame, where the finger points at rest.
+    """
+
+    chain: Chain
+    root: Vector
+    ratio: float
+    branches: tuple[Branch, ...]
+    bound_m: float
+    limits: tuple[tuple[float, float], ...]
+    before: Matrix | None
+    rest: Matrix
+    sign: float
+    ahead: float
+
+    @classmethod
+    def of(
+        cls, model: HandModel, finger: int, offset_m: Float, free_ratio: float | None = None
+    ) -> "FingerSolver":
+        """Prepare one finger.
+
+        Args:
+            model: The hand.
+            finger: 0 thumb ... 4 little.
+            offset_m: The observed point (3,) in the tip joint's frame [m]; zero: the tip joint.
+            free_ratio: DIP (thumb: IP) per PIP (MCP) to prefer where the model leaves it free; None: the
+                ratio of their highest angles.
+        """
+        chain = finger_chain(model, finger, offset_m)
+        root = chain.links[0].joint
+        if not isinstance(root, Rotor):
+            raise TypeError("a finger's first joint is a rotor")
+        (_, pip_high), (_, dip_high) = chain.spans[2:]
+        if chain.coupling is not None:
+            ratio = chain.coupling.ratio
+        elif free_ratio is not None:
+            ratio = free_ratio
+        else:
+            ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
+        curve = ReachCurve.of(chain, ratio)
+        branches = curve.branches()
+        thumb = finger == THUMB
+        straight = rotate(root.rest, chain.links[0].bone)
+        return cls(
+            chain=chain,
+            root=finger_root(model, finger),
+            ratio=ratio,
+            branches=branches,
+            bound_m=_POLE**-0.5 * curve.error(branches),
+            limits=chain.spans,
+            before=chain.links[0].turn if thumb else None,
+            rest=root.rest,
+            sign=root.sign,
+            ahead=1.0 if straight[2] > 0.0 else -1.0,
+        )
+
+    def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
+        """Angles that bring the point to `target`.
+
+        Args:
+            target: (x, y, z) of the point in the palm frame [m]. NaN: not seen.
+            near: Angles of a moment ago; where several legal poses hit the target (straight finger, pole of
+                the abduction) the nearest is taken, else the more bent one.
+
+        Returns:
+            Angles inside the limits; NaN where the target is not finite.
+        """
+        root = self.root
+        x, y, z = target[0] - root[0], target[1] - root[1], target[2] - root[2]
+        if self.before is not None:
+            x, y, z = rotate_back(self.before, (x, y, z))
+        if near is None:
+            quick = self._quick(x, y, z)
+            if quick is not None:
+                return quick
+        if not isfinite(x + y + z):
+            return NOT_SEEN
+        return self._thorough((x, y, z), near)
+
+    def forward(self, angles: Four) -> Vector:
+        """The point [m] in the palm frame at given angles [rad]."""
+        a, f, pip, dip = angles
+        x, y, z = self.chain.forward(((a, f), (pip,), (dip,)))[0][-1]
+        return x + self.root[0], y + self.root[1], z + self.root[2]
+
+    def _quick(self, x: float, y: float, z: float) -> FingerSolution | None:
+        """The usual case, without a loop or a call: most bent branch, legal at once. Else None."""
+        branch = self.branches[0]
+        distance2 = x * x + y * y + z * z
+        if not branch.near2 <= distance2 < branch.far2 or x * x + z * z < _POLE * distance2:
+            return None
+        u = (branch.far2 - distance2) ** 0.5 * branch.per_cell
+        i = int(u)
+        if i >= len(branch.rows):
+            return None
+        u -= i
+        pip, d_pip, wx, dx, wy, dy, wz, dz = branch.rows[i]
+        pip += u * d_pip
+        wx += u * dx
+        wy += u * dy
+        wz += u * dz
+        (ax, ay, az), (yx, yy, yz), (zx, zy, zz) = self.rest
+        even, odd = yy * wy + yz * wz, yy * wz - yz * wy
+        ratio = (y - yx * wx) / hypot(even, odd)
+        if not -1.0 < ratio < 1.0:
+            return None
+        f = atan2(odd, even)
+        f = f + acos(ratio) if z * self.ahead > 0.0 else f - acos(ratio)
+        if f < -pi:
+            f += 2.0 * pi
+        c, s = cos(f), sin(f)
+        py, pz = wy * c + wz * s, wz * c - wy * s
+        vx, vz = ax * wx + ay * py + az * pz, zx * wx + zy * py + zz * pz
+        a = self.sign * atan2(x * vz - z * vx, x * vx + z * vz)
+        (a_low, a_high), (f_low, f_high), _, (dip_low, dip_high) = self.limits
+        if not (a_low <= a <= a_high and f_low <= f <= f_high):
+            if not (
+                a_low - _SLACK_RAD < a < a_high + _SLACK_RAD and f_low - _SLACK_RAD < f < f_high + _SLACK_RAD
+            ):
+                return None
+            a, f = min(max(a, a_low), a_high), min(max(f, f_low), f_high)
+        dip = self.ratio * pip
+        dip = dip_low if dip < dip_low else dip_high if dip > dip_high else dip
+        return FingerSolution(a, f, pip, dip, self.bound_m, True)
+
+    def _thorough(self, target: Vector, near: Four | None) -> FingerSolution:
+        """Every branch and both flexions; where none is legal or exact enough, bounded least squares."""
+        seeds: list[tuple[float, float, Four]] = []
+        distance2 = dot(target, target)
+        for rank, branch in enumerate(self.branches):
+            pip, w = branch.at(distance2)
+            off = max(distance2 - branch.far2, branch.near2 - distance2)
+            for angles, miss in self._swings(pip, self.ratio * pip, w, target):
+                legal = miss <= _SLACK_RAD and off <= _EDGE * branch.far2
+                close = rank if near is None else sum(abs(p - q) for p, q in zip(angles, near, strict=True))
+                seeds.append((0.0 if legal else 1.0 + miss + 1e2 * max(off, 0.0) ** 0.5, close, angles))
+        seeds.sort()
+        goal = target if self.before is None else rotate(self.before, target)
+        if seeds[0][0] == 0.0:
+            solution = self._improve(seeds[0][2], goal)
+            if solution.reached:
+                return solution
+        return self._fallback([angles for _, _, angles in seeds[:2]], target, goal, near)
+
+    def _improve(self, seed: Four, goal: Vector) -> FingerSolution:
+        angles, left = bounded_least_squares(self.chain, seed, goal, 0.05 * REACHED_M)
+        return FingerSolution(*angles, left, left < REACHED_M)
+
+    def _swings(self, pip: float, dip: float, w: Vector, target: Vector) -> list[tuple[Four, float]]:
+        """Both legalised poses of one PIP, and by how much each had to be cut [rad]."""
+        found: list[tuple[Four, float]] = []
+        for a, f in swing_and_flex(w, target, self.rest, self.sign):
+            ((ca, cf), (cp,), (cd,)) = self.chain.clamp(((a, f), (pip,), (dip,)))
+            found.append(((ca, cf, cp, cd), max(abs(ca - a), abs(cf - f))))
+        return found
+
+    def _fallback(self, seeds: list[Four], target: Vector, goal: Vector, near: Four | None) -> FingerSolution:
+        """No closed-form pose is legal: improve the nearest ones inside the limits."""
+        seeds = [self._in_plane(seeds[0][0], target), *seeds]
+        free = self.chain.coupling is None
+        if free:
+            if near is not None:
+                seeds.append(near)
+            seeds += [seed for share in _SPREAD_OF_SEEDS for seed in self._free_pair(*share, target)]
+        else:
+            # a coupled finger that misses in closed form is out of reach: the best start is enough
+            x, y, z = goal
+            start = [self.chain.forward(((a, f), (p,), (d,)))[0][-1] for a, f, p, d in seeds]
+            left = [hypot(x - tip[0], y - tip[1], z - tip[2]) for tip in start]
+            seeds = [seeds[left.index(min(left))]]
+        best: FingerSolution | None = None
+        for seed in seeds:
+            solution = self._improve(seed, goal)
+            if best is None or solution.residual_m < best.residual_m - 1e-9:
+                best = solution
+            if best.reached:
+                break
+        return best or NOT_SEEN
+
+    def _in_plane(self, abduction: float, target: Vector) -> Four:
+        """The abduction is given (cut at its limit): the point of the finger's plane nearest to the target."""
+        c, s = cos(self.sign * abduction), sin(self.sign * abduction)
+        x, y, z = rotate_back(
+            self.rest, (c * target[0] - s * target[2], target[1], s * target[0] + c * target[2])
+        )
+        branch = self.branches[0]
+        _, w = branch.at(y * y + z * z)
+        pip, w = branch.at(y * y + z * z + w[0] * w[0])
+        (f,) = Hinge(*self.limits[1]).fit(w, (x, y, z), (0.0,))
+        return abduction, f, pip, self.ratio * pip
+
+    def _free_pair(self, pip_share: float, dip_share: float, target: Vector) -> list[Four]:
+        (p_low, p_high), (d_low, d_high) = self.limits[2:]
+        pip, dip = p_low + pip_share * (p_high - p_low), d_low + dip_share * (d_high - d_low)
+        _, middle, last = self.chain.links
+        x, y, z = flexed(dip, last.bone)
+        inner = rotate(last.turn, (x, y, z))
+        bone = middle.bone
+        x, y, z = flexed(pip, (bone[0] + inner[0], bone[1] + inner[1], bone[2] + inner[2]))
+        x, y, z = rotate(middle.turn, (x, y, z))
+        first = self.chain.links[0].bone
+        w = (first[0] + x, first[1] + y, first[2] + z)
+        return [angles for angles, _ in self._swings(pip, dip, w, target)]
