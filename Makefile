@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench clean
+.PHONY: help install demo test check bench schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -36,6 +36,9 @@ check: $(STAMP) ## lint, format and strict types
 
 bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
 	@$(BIN)/python -m bench $(BENCH_ARGS)
+
+schema: $(STAMP) ## write docs/schema/*.json afresh from the types
+	@$(BIN)/python -m tests.test_schemas
 
 clean: ## remove .venv, out/ and caches
 	rm -rf .venv out .pytest_cache .ruff_cache .hypothesis

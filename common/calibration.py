@@ -29,6 +29,7 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
+Json = Annotated[object, Meta(extra_json_schema={"description": "any JSON value"})]
 Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=48)]
 
 
@@ -130,7 +131,7 @@ class RigCalibration(_File, frozen=True):
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
     led: tuple[Vector3, ...] | None = None
-    imu: dict[str, object] | None = None
+    imu: dict[str, Json] | None = None
 
     def camera_pose(self, camera: str) -> Float:
         """`T_rig_camera` (4, 4) [m] of one camera."""
@@ -215,7 +216,7 @@ def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
     """
     try:
         value = msgspec.json.decode(raw, type=kind)
-    except (msgspec.MsgspecError, RecursionError) as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise CalibrationError(f"{where}: {error}") from error
     check(value, where)
     return value
