@@ -32,7 +32,7 @@ from common.messages import Health, MarkerDetections, Source
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
-from master.outputs.truth import Truth, mean_known
+from master.outputs.truth import Truth, distance_m, mean_known
 
 IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
 _PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its centre
@@ -217,9 +217,9 @@ class RerunScene:
     def _log_plots(self, poses: Poses) -> None:
         t = poses.t_ns
         if poses.latency_ns.any():  # all zero: an offline run, which has none
-            self._scalars("plots/latency_ms", t, poses.latency_ns * 1e-6)
+            self._scalars("plots/latency_ms", t, poses.latency_ns.astype(np.float64) * 1e-6)
         self._scalars("plots/rate_hz", t, self._rate_hz(t))
-        step: Float = np.sqrt(((poses.markers_raw_m - poses.markers_m) ** 2).sum(axis=-1)) * 1e3
+        step = distance_m(poses.markers_raw_m, poses.markers_m) * 1e3
         for m in range(poses.marker_count):
             name = self._rig.markers[m] if m < len(self._rig.markers) else f"marker-{m}"
             self._scalars(rr.new_entity_path(["plots", "jitter_mm", name]), t, step[:, m])

@@ -33,12 +33,17 @@ class Truth:
 
     def joint_error_m(self, poses: Poses) -> Float:
         """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""
-        error = np.linalg.norm(poses.position_m - self.joints_m, axis=-1)
+        error = distance_m(poses.position_m, self.joints_m)
         return np.where(poses.valid, error, np.nan)[:, 1:]
 
     def marker_error_m(self, poses: Poses) -> Float:
         """Distance (T, M) [m] of the unfiltered caps; NaN where not seen."""
-        return np.linalg.norm(poses.markers_raw_m - self.markers_m, axis=-1)
+        return distance_m(poses.markers_raw_m, self.markers_m)
+
+
+def distance_m(a: Float, b: Float) -> Float:
+    """Distances (...) of points (..., 3), same unit; NaN where either is."""
+    return np.asarray(np.linalg.norm(a - b, axis=-1), np.float64)
 
 
 def mean_known(values: Float) -> Float:
