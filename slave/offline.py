@@ -6,13 +6,15 @@ from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from common.arrays import Float, Int
-from common.calibration import CameraCalibration, load
+from common.calibration import CameraCalibration, load, save
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording, open_recording
 from slave.cameras.replay import read_png
+from slave.markers.colours import ColourRow, calibrate
 from slave.markers.detector import MarkerDetector
 
 EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can carry: the same bytes on every run
@@ -58,7 +60,7 @@ def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) 
                 f"{recording.folder}/recording.json: cameras.{camera}.markers: missing; give --calibration DIR with "
                 f"DIR/cameras/{camera}.json (make it with `phalanx-slave colours`)"
             )
-    return CameraCalibration(**{f: getattr(own, f) for f in own.__struct_fields__ if f != "markers"}, markers=markers)
+    return msgspec.structs.replace(own, markers=markers)
 
 
 def detect_recording(
@@ -98,6 +100,38 @@ def detect_recording(
         progress(i + 1, len(rows))
     t_ns = np.array([row.t_ns for row in rows], np.int64)
     return RecordedDetections(t_ns, np.array([row.seq for row in rows], np.int64), uv, area, quality)
+
+
+def calibrate_colours(folder: Path, camera: str, output: Path) -> list[ColourRow]:
+    """Make the colour ranges of one camera from the clicks of a recording and write its camera file.
+
+    Args:
+        folder: Recording whose `clicks` name one pixel per marker in the camera's first frame.
+        camera: Camera name.
+        output: Camera file to write: the recording's, with `markers` filled.
+
+    Raises:
+        RecordingError: The recording is broken or has no clicks for the camera.
+        FitError: A click is not on a paint, or two paints look the same.
+        CameraError, CalibrationError: The frame cannot be read, the file cannot be written.
+    """
+    recording = open_recording(folder)
+    rows = recording.frames_of(camera)
+    clicks = recording.manifest.clicks.get(camera, {})
+    names = recording.manifest.marker_rig().markers
+    missing = [name for name in names if name not in clicks]
+    if missing or not rows:
+        raise RecordingError(
+            f"{folder}/recording.json: clicks.{camera}: nothing for {', '.join(missing)}; give one pixel [u, v] on "
+            f"each marker in the first frame"
+            if missing
+            else f"{folder}/frames.csv: no frame of camera {camera!r}"
+        )
+    own = recording.manifest.cameras[camera]
+    image = read_png(folder / rows[0].file, (own.height_px, own.width_px))
+    table = calibrate(image, {name: clicks[name] for name in names})
+    save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
+    return table
 
 
 def save_detections(path: Path, found: RecordedDetections) -> None:

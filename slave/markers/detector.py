@@ -19,7 +19,7 @@ from common.calibration import CameraCalibration
 from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured, measure
 from slave.markers.classify import ColourTable, table_of
-from slave.markers.group import CLICKED, TRACKED, Candidate, choose, linked, skin_share
+from slave.markers.group import CLICKED, TRACKED, Candidate, choose, linked, on_fringe, skin_share
 from slave.markers.roi import Track, advance
 
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
@@ -126,11 +126,12 @@ class MarkerDetector:
                 certain = False
         if certain and _connected(tracked):
             return tracked
-        candidates = [
-            Candidate(m, blob, skin_share(image, blob), self._bonus(m, blob, tracked.get(m)))
-            for m, options in enumerate(blobs)
-            for blob in options
-        ]
+        candidates: list[Candidate] = []
+        for m, options in enumerate(blobs):
+            others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
+            for blob in options:
+                bonus = self._bonus(m, blob, tracked.get(m))
+                candidates.append(Candidate(m, blob, skin_share(image, blob), on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
         return {m: c.blob for m, c in choose(candidates).items()}
@@ -147,7 +148,7 @@ class MarkerDetector:
 
 def _connected(chosen: Mapping[int, Blob]) -> bool:
     """Whether every chosen blob is linked to another one; skin is taken as given, since the past vouches."""
-    nodes = [Candidate(m, blob, 1.0, 0.0) for m, blob in chosen.items()]
+    nodes = [Candidate(m, blob, 1.0, False, 0.0) for m, blob in chosen.items()]
     return len(nodes) < 2 or all(any(linked(a, b) for b in nodes if b is not a) for a in nodes)
 
 

@@ -10,19 +10,21 @@ tips are 2-4 sizes apart, the little finger and the thumb 12, back and middle fi
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from common.arrays import Image
-from slave.markers.blobs import Blob
+from slave.markers.blobs import SCALE, Blob
 
 REACH = 8.5
 SKIN_REACH = 0.8
 RING = 4  # px around the box in which skin is sought
-SPECK = 12.0  # px^2; smaller blobs are rarely markers
+SPECK = 24.0  # px^2; smaller blobs are rarely markers
+FRINGE = 0.3  # what a fringe counts
+FRINGE_RATIO = 4.0
 CLICKED = 10.0
 TRACKED = 1.0
 STRANGE_SIZE = 2.5
@@ -37,12 +39,14 @@ class Candidate:
         marker: Row of the marker.
         blob: The blob.
         skin: Share of its surroundings that is skin, 0..1.
+        fringe: It touches a much larger blob of another colour: perhaps only the rim of that one.
         bonus: What click or track add to its score.
     """
 
     marker: int
     blob: Blob
     skin: float
+    fringe: bool
     bonus: float
 
     @property
@@ -53,8 +57,8 @@ class Candidate:
     @property
     def score(self) -> float:
         """Sum of evidence; 1 for being there at all."""
-        there = min(1.0, self.blob.area / SPECK) ** 2
-        return there + min(1.0, 3.0 * self.skin) + self.bonus
+        there = min(1.0, self.blob.area / SPECK) * (FRINGE if self.fringe else 1.0)
+        return there * (1.0 + min(1.0, 3.0 * self.skin)) + self.bonus
 
 
 def skin_share(image: Image, blob: Blob) -> float:
@@ -67,6 +71,18 @@ def skin_share(image: Image, blob: Blob) -> float:
     skin = cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)) | cv2.inRange(hsv, (174, 60, 70), (179, 190, 255))
     around = window.shape[0] * window.shape[1] - blob.area
     return min(1.0, cv2.countNonZero(skin) / max(around, 1.0))
+
+
+def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
+    """Whether `blob` touches one of the blobs of other colours that is much larger than itself."""
+    return any(
+        other.area > FRINGE_RATIO * blob.area
+        and blob.left <= other.right + SCALE
+        and other.left <= blob.right + SCALE
+        and blob.top <= other.bottom + SCALE
+        and other.top <= blob.bottom + SCALE
+        for other in others
+    )
 
 
 def linked(a: Candidate, b: Candidate) -> bool:

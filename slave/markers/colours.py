@@ -1,0 +1,184 @@
+"""Make the HSV range of every marker from one click on each, and report what collides (K6, K8).
+
+A tight range around the clicked paint fails under the next lamp ("a broader range at calibration worked better"), so
+each range is as broad as its neighbours allow: in hue half-way to the next marker or to the skin, at most
+`HUE_MARGIN`; in saturation down to `SATURATION_SHARE` of the paint's, where a rim pixel is about half paint, but
+above what the background shows in that hue; in value down to the shadow side of a cap and up to a highlight.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Bool, Image
+from common.calibration import HsvRange
+from common.errors import FitError
+from slave.markers.classify import HUES, in_range
+
+HUE_GROW = 10  # how far the hue of one paint wanders between its lit and its shadow side
+HUE_MARGIN = 14
+HUE_APART = 8
+SATURATION_SHARE = 0.45
+SATURATION_LEAST = 50
+VALUE_SHARE = 0.3
+VALUE_LEAST = 25
+PALE = 60  # saturation below which nothing is a paint that can be told from a grey desk
+AROUND = 25  # px around the markers in which skin is sampled
+RIM = 4  # px around a marker that are partly paint
+SMALLEST = 6  # px of paint
+BACKGROUND_TAIL = 99.9  # percentile of the background's saturation that a range stays above
+
+
+@dataclass(frozen=True, slots=True)
+class ColourRow:
+    """What the range of one marker catches.
+
+    Attributes:
+        name: Marker.
+        range: Its HSV range.
+        pixels: Paint pixels grown from the click.
+        own: Share of them inside the range.
+        others: Other markers -> share of their paint inside the range; only those above zero.
+        skin: Share of the skin pixels inside the range.
+        background: Share of the background pixels inside the range.
+    """
+
+    name: str
+    range: HsvRange
+    pixels: int
+    own: float
+    others: dict[str, float]
+    skin: float
+    background: float
+
+
+def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[ColourRow]:
+    """Ranges and collisions of the clicked markers, in the order of `clicks`.
+
+    Args:
+        image: (H, W, 3) BGR.
+        clicks: Marker -> (u, v) [px], a pixel on its paint.
+
+    Raises:
+        FitError: A click is outside the image or not on a paint, or two paints have the same hue.
+    """
+    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
+    hue = {name: circular_median(hsv[..., 0][mask]) for name, mask in paint.items()}
+    _refuse_twins(hue)
+    skin, background = _surroundings(hsv, paint)
+    skin_hue = circular_median(hsv[..., 0][skin]) if skin.any() else None
+    ranges = {
+        name: _range(hsv, hsv[mask], hue[name], _limits(name, hue, skin_hue), background)
+        for name, mask in paint.items()
+    }
+    return [
+        ColourRow(
+            name=name,
+            range=colour,
+            pixels=int(paint[name].sum()),
+            own=_share(hsv[paint[name]], colour),
+            others={o: s for o in paint if o != name and (s := _share(hsv[paint[o]], colour)) > 0.0},
+            skin=_share(hsv[skin], colour),
+            background=_share(hsv[background], colour),
+        )
+        for name, colour in ranges.items()
+    ]
+
+
+def report(rows: list[ColourRow]) -> str:
+    """The collision report as a table for people."""
+    lines = [f"{'marker':<10}{'H':>9}{'S':>9}{'V':>9}{'paint px':>10}{'caught':>8}{'skin':>8}{'backgr.':>9}  other markers"]
+    for row in rows:
+        low, high = row.range.hsv_low, row.range.hsv_high
+        spans = "".join(f"{f'{a}-{b}':>9}" for a, b in zip(low, high, strict=True))
+        others = ", ".join(f"{name} {share:.1%}" for name, share in row.others.items()) or "-"
+        lines.append(
+            f"{row.name:<10}{spans}{row.pixels:>10}{row.own:>8.1%}{row.skin:>8.2%}{row.background:>9.3%}  {others}"
+        )
+    bad = [r.name for r in rows if r.others or r.skin > 0.001 or r.background > 0.001]
+    lines.append(f"collisions: {', '.join(bad)}: other paint, or remove what is in the picture" if bad else "no collisions")
+    return "\n".join(lines)
+
+
+def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
+    """The paint around a click: connected pixels of its hue, (H, W).
+
+    Raises:
+        FitError: The click is outside the image, on something pale, or on a spot too small.
+    """
+    u, v = round(click[0]), round(click[1])
+    height, width = hsv.shape[:2]
+    if not (0 <= u < width and 0 <= v < height):
+        raise FitError(f"clicks.{name}: ({u}, {v}) is outside the {width}x{height} image")
+    seed = hsv[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].reshape(-1, 3)
+    hue, saturation, value = circular_median(seed[:, 0]), np.median(seed[:, 1]), np.median(seed[:, 2])
+    if saturation < PALE:
+        raise FitError(f"clicks.{name}: ({u}, {v}) is not on a paint: saturation {saturation:.0f} of 255")
+    near = hue_distance(hsv[..., 0], hue) <= HUE_GROW
+    near &= (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+    _, labels = cv2.connectedComponents(near.astype(np.uint8), connectivity=4)
+    label = labels[v, u]
+    mask = labels == label
+    if label == 0 or int(mask.sum()) < SMALLEST:
+        raise FitError(f"clicks.{name}: ({u}, {v}) is on a spot of fewer than {SMALLEST} pixels of one colour")
+    return mask
+
+
+def circular_median(hues: Image) -> float:
+    """Median of hues 0-179 on the circle: taken around their mean direction."""
+    angle = hues.astype(np.float64) * (2.0 * np.pi / HUES)
+    mean = np.arctan2(np.sin(angle).mean(), np.cos(angle).mean())
+    offset = (angle - mean + np.pi) % (2.0 * np.pi) - np.pi
+    return float((mean + np.median(offset)) * HUES / (2.0 * np.pi) % HUES)
+
+
+def hue_distance(hues: Image, hue: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+    """Distance on the hue circle of 180."""
+    d = np.abs(hues.astype(np.float64) - hue)
+    return np.minimum(d, HUES - d)
+
+
+def _refuse_twins(hue: Mapping[str, float]) -> None:
+    names = sorted(hue, key=lambda name: hue[name])
+    for a, b in zip(names, names[1:] + names[:1], strict=True):
+        apart = (hue[b] - hue[a]) % HUES
+        if a != b and min(apart, HUES - apart) < HUE_APART:
+            raise FitError(f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one")
+
+
+def _surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
+    """Skin near the markers, and everything that is neither paint nor its rim."""
+    union = np.any(list(paint.values()), axis=0).astype(np.uint8)
+    rim = cv2.dilate(union, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) != 0
+    near = cv2.dilate(union, np.ones((2 * AROUND + 1, 2 * AROUND + 1), np.uint8)) != 0
+    skin_like = (hue_distance(hsv[..., 0], 12.0) <= 12.0) & (hsv[..., 1] >= PALE) & (hsv[..., 1] <= 190)
+    return near & ~rim & skin_like, ~rim
+
+
+def _limits(name: str, hue: Mapping[str, float], skin_hue: float | None) -> tuple[int, int]:
+    """How far below and above its hue the range of a marker may go."""
+    obstacles = [h for other, h in hue.items() if other != name] + ([] if skin_hue is None else [skin_hue])
+    below = min((((hue[name] - h) % HUES) / 2.0 for h in obstacles), default=HUES)
+    above = min((((h - hue[name]) % HUES) / 2.0 for h in obstacles), default=HUES)
+    # One hue between two ranges belongs to neither: ranges that touch would both claim it after rounding.
+    return int(min(HUE_MARGIN, below - 0.5)), int(min(HUE_MARGIN, above - 0.5))
+
+
+def _range(hsv: Image, paint: Image, hue: float, limits: tuple[int, int], background: Bool) -> HsvRange:
+    middle = round(hue)
+    low, high = (middle - limits[0]) % HUES, (middle + limits[1]) % HUES
+    saturation = max(SATURATION_LEAST, SATURATION_SHARE * float(np.median(paint[:, 1])))
+    value = max(VALUE_LEAST, VALUE_SHARE * float(np.median(paint[:, 2])))
+    same_hue = in_range(hsv[background], HsvRange(hsv_low=(low, 0, 0), hsv_high=(high, 255, 255)))
+    seen = hsv[background][same_hue][:, 1]
+    if seen.size > 1000:  # a desk of that tint, not an object
+        floor = float(np.percentile(seen, BACKGROUND_TAIL)) + 5.0
+        saturation = max(saturation, min(floor, 0.7 * float(np.median(paint[:, 1]))))
+    return HsvRange(hsv_low=(low, round(saturation), round(value)), hsv_high=(high, 255, 255))
+
+
+def _share(pixels: Image, colour: HsvRange) -> float:
+    return float(in_range(pixels, colour).mean()) if len(pixels) else 0.0
