@@ -1,0 +1,306 @@
+import threading
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from msgspec.structs import replace
+
+from common.arrays import Image
+from common.bus import LoopbackBus
+from common.calibration import CameraCalibration, Intrinsics, RigCalibration
+from common.errors import PhalanxError, RecordingError
+from common.geometry import matrix_to_quaternion, rigid
+from common.hand_model import JOINTS, TIPS, HandModel
+from common.hand_profiles import generated_profile
+from common.messages import HandPose, Health, MarkerDetections, Source
+from master.outputs.bus import BusSink
+from master.outputs.poses import Poses
+from master.outputs.rerun import run_viewer, write_rrd
+from master.outputs.rerun_process import ViewerProcess, viewer_arguments
+from master.outputs.rerun_scene import RerunScene
+from master.outputs.truth import Truth
+
+MODEL = HandModel.of(generated_profile("test-hand", "right"))
+EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+BESIDE = ((1.0, 0.0, 0.0, 0.075), *EYE[1:])
+RIG = RigCalibration(
+    version=1,
+    name="desk",
+    kind="markers",
+    cameras=("left", "right"),
+    hand="test-hand",
+    T_rig_camera={"left": EYE, "right": BESIDE},
+)
+CAMERAS = {
+    name: CameraCalibration(
+        version=1,
+        name=name,
+        width_px=640,
+        height_px=480,
+        frame_rate_hz=60.0,
+        exposure_us=5000,
+        analogue_gain=1.0,
+        colour_gains=(1.0, 1.0),
+        row_time_us=20.0,
+        intrinsics=Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=319.5, cy_px=239.5),
+    )
+    for name in RIG.cameras
+}
+STEP_NS = 16_666_667
+
+
+def moving_hand(rows: int) -> list[HandPose]:
+    """A hand that closes: middle finger's marker lost in row 3, whole little finger invalid in row 4."""
+    T = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.04, 0.1, 0.42]))
+    poses = []
+    for i in range(rows):
+        angles = np.full((5, 4), 0.05) + 0.1 * i * np.array([0.0, 1.0, 1.0, 0.6])
+        joints = MODEL.forward(T, np.clip(angles, MODEL.limits_rad[..., 0], MODEL.limits_rad[..., 1]))
+        source = np.full(26, Source.SOLVED, np.uint8)
+        source[TIPS] = Source.MEASURED
+        valid = np.ones(26, np.bool_)
+        markers = MODEL.marker_points(joints, RIG.markers).copy()
+        if i == 3:
+            source[11:16], markers[2] = Source.HELD, np.nan
+        if i == 4:
+            valid[21:26] = False
+        poses.append(
+            HandPose(
+                hand="test-hand",
+                t_ns=10**15 + i * STEP_NS,
+                position_m=joints.position_m,
+                orientation_wxyz=matrix_to_quaternion(joints.rotation),
+                radius_m=MODEL.radius_m,
+                valid=valid,
+                tracked=valid & (source == Source.MEASURED),
+                cov_m2=np.tile(np.diag([1e-6, 1e-6, 9e-6]), (26, 1, 1)),
+                source=source,
+                angles_rad=angles,
+                markers_m=markers,
+                markers_raw_m=markers + 0.001,
+                latency_ns=8_000_000,
+            )
+        )
+    return poses
+
+
+def truth_of(poses: Poses, off_m: float) -> Truth:
+    return Truth(poses.position_m + np.array([off_m, 0.0, 0.0]), poses.markers_raw_m)
+
+
+def rows_of(path: Path) -> dict[str, int]:
+    """Rows of every entity that changes with time, read back by the SDK's own reader."""
+    rows: dict[str, int] = {}
+    for chunk in rr.chunk.RrdReader(path).stream():
+        if not chunk.is_static:
+            rows[chunk.entity_path] = rows.get(chunk.entity_path, 0) + chunk.num_rows
+    return rows
+
+
+def column(path: Path, entity: str, component: str) -> tuple[list[int], list[list[object]]]:
+    """Times [ns] and values, row by row, of one component."""
+    times: list[int] = []
+    values: list[list[object]] = []
+    for chunk in rr.chunk.RrdReader(path).stream():
+        if chunk.entity_path == entity and not chunk.is_static:
+            table = chunk.to_record_batch()
+            name = next(key for key in table.schema.names if key.endswith(component))
+            times += table.column("capture").cast("int64").to_pylist()
+            values += table.column(name).to_pylist()
+    return times, values
+
+
+def test_a_run_written_as_rrd_is_all_there(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    poses = Poses.of(moving_hand(6))
+    seen = [
+        MarkerDetections("left", 1, i, int(t), 0, np.full((6, 2), 100.0 + i), np.ones(6), np.ones(6))
+        for i, t in enumerate(poses.t_ns)
+    ]
+    frames = [("right", int(t), np.full((48, 64, 3), 90, np.uint8)) for t in poses.t_ns]
+    write_rrd(path, poses, RIG, CAMERAS, MODEL, {"left": seen}, truth_of(poses, 0.004), frames)
+    rows = rows_of(path)
+    for entity in ("skeleton", "joints", "at_limit", "uncertainty"):
+        assert rows[f"/world/hand/test-hand/{entity}"] == 6
+    for entity in ("markers/raw", "markers/filtered", "rays/left", "rays/right", "truth/skeleton"):
+        assert rows[f"/world/{entity}"] == 6
+    assert rows["/world/cameras/left/detections"] == 6
+    assert rows["/world/cameras/right"] == 1  # 83 ms of images: one at 10 Hz
+    assert rows["/plots/latency_ms"] == 6
+    assert rows["/plots/jitter_mm/middle"] == 5  # lost in one row
+    assert rows["/plots/jitter_mm/index"] == 6
+    assert rows["/plots/error_mm/joints"] == 6
+    assert len(rr.chunk.RrdReader(path).blueprints()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
+
+
+def test_rows_hold_what_the_poses_say_at_their_exact_times(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    poses = Poses.of(moving_hand(6))
+    write_rrd(path, poses, RIG, CAMERAS, MODEL, None, truth_of(poses, 0.004))
+    times, joints = column(path, "/world/hand/test-hand/joints", "positions")
+    assert times == poses.t_ns.tolist()
+    assert [len(row) for row in joints] == [26, 26, 26, 26, 21, 26]  # an invalid joint is not shown
+    np.testing.assert_allclose(np.array(joints[0]), poses.position_m[0], atol=1e-6)
+    _, strips = column(path, "/world/hand/test-hand/skeleton", "strips")
+    # Row 4: the little finger and the palm's outline lack invalid joints.
+    assert [len(row) for row in strips] == [6, 6, 6, 6, 4, 6]
+    _, colours = column(path, "/world/hand/test-hand/skeleton", "colors")
+    assert colours[3][2] != colours[2][2]  # the middle finger is held in row 3
+    assert colours[3][1] == colours[2][1]
+    _, markers = column(path, "/world/markers/raw", "positions")
+    assert [len(row) for row in markers] == [6, 6, 6, 5, 6, 6]
+    _, error = column(path, "/plots/error_mm/joints", "scalars")
+    np.testing.assert_allclose(np.array(error).ravel(), 4.0, rtol=1e-6)
+    _, jitter = column(path, "/plots/jitter_mm/index", "scalars")
+    np.testing.assert_allclose(np.array(jitter).ravel(), np.sqrt(3.0), rtol=1e-6)
+    _, rate = column(path, "/plots/rate_hz", "scalars")
+    np.testing.assert_allclose(np.array(rate).ravel(), 60.0, rtol=1e-6)
+    _, size = column(path, "/world/hand/test-hand/uncertainty", "half_sizes")
+    np.testing.assert_allclose(np.sort(np.array(size[0])[0]), [0.002, 0.002, 0.006], rtol=1e-5)  # 2 sigma
+
+
+def test_a_joint_at_its_limit_is_marked_and_one_inside_is_not(tmp_path: Path) -> None:
+    pose = moving_hand(1)[0]
+    angles = np.full((5, 4), 0.3)
+    angles[:, 0] = 0.05
+    angles[1, 2] = MODEL.limits_rad[1, 2, 1]
+    bent = replace(pose, angles_rad=angles)
+    write_rrd(tmp_path / "run.rrd", Poses.of([bent]), RIG, CAMERAS, MODEL)
+    _, at = column(tmp_path / "run.rrd", "/world/hand/test-hand/at_limit", "positions")
+    assert len(at[0]) == 1
+    pip = JOINTS.index("index-finger-phalanx-intermediate")
+    np.testing.assert_allclose(np.array(at[0][0]), pose.position_m[pip], atol=1e-6)
+
+
+def test_an_offline_run_has_no_latency_plot_and_an_empty_run_is_a_valid_file(tmp_path: Path) -> None:
+    pose = moving_hand(1)[0]
+    offline = replace(pose, latency_ns=0)
+    poses = Poses.of([offline])
+    write_rrd(tmp_path / "one.rrd", poses, RIG, CAMERAS, MODEL)
+    assert "/plots/latency_ms" not in rows_of(tmp_path / "one.rrd")
+    write_rrd(tmp_path / "none.rrd", poses.rows(0, 0), RIG, CAMERAS, MODEL)
+    # Only the recording's own properties and no pose.
+    assert not [entity for entity in rows_of(tmp_path / "none.rrd") if entity.startswith("/world")]
+
+
+def test_images_are_limited_to_ten_a_second_for_each_camera() -> None:
+    scene = RerunScene(rr.RecordingStream("test"), RIG, CAMERAS, MODEL)
+    image = np.zeros((8, 8), np.uint8)
+    taken = [scene.log_image("left", image, t * 1_000_000) for t in range(0, 1000, 16)]
+    assert sum(taken) == 9  # every 7th of 63 frames, 112 ms apart
+    assert scene.log_image("right", b"\xff\xd8jpeg", 1_000_000)
+    assert scene.log_image("left", image, 5)  # a replay that starts over is shown again
+
+
+class Viewing:
+    """A viewer in mode save on a thread; leaving the block stops it and raises what it raised."""
+
+    def __init__(
+        self, bus: LoopbackBus, path: Path, cameras: Mapping[str, CameraCalibration] = CAMERAS
+    ) -> None:
+        self.stop = threading.Event()
+        self.ready = threading.Event()
+        self.shown = -1
+        self._args = (bus, path, cameras)
+        self._thread = threading.Thread(target=self._run)
+
+    def _run(self) -> None:
+        bus, path, cameras = self._args
+        self.shown = run_viewer(
+            bus,
+            RIG,
+            cameras,
+            MODEL,
+            mode="save",
+            path=path,
+            stop=self.stop,
+            on_ready=lambda text: self.ready.set(),
+        )
+
+    def __enter__(self) -> "Viewing":
+        self._thread.start()
+        assert self.ready.wait(20.0)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop.set()
+        self._thread.join(20.0)
+        assert not self._thread.is_alive()
+
+
+def test_the_viewer_records_what_the_sink_publishes_and_ends_on_stop(tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    bus = LoopbackBus()
+    sink = BusSink(bus)
+    with Viewing(bus, path) as viewing:
+        for pose in moving_hand(20):
+            sink.write(pose)
+        bus.publish("health", "left", Health("left", 1, 5, {"frames": 20}, {"rate_hz": 60.0}))
+        assert not path.exists()  # not before it is complete
+    sink.close()
+    assert viewing.shown == 20
+    rows = rows_of(path)
+    assert rows["/world/hand/test-hand/skeleton"] == 20
+    assert rows["/plots/health/left/frames"] == 1
+    times, value = column(path, "/plots/health/left/rate_hz", "scalars")
+    # The slave's own clock said 5 ns; the report stands at the newest pose of the timeline.
+    assert times[0] >= 10**15
+    assert value == [[60.0]]
+    bus.close()
+
+
+def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
+    bus = LoopbackBus()
+    pose = moving_hand(1)[0]
+    other = replace(pose, hand="other", markers_m=np.zeros((2, 3)), markers_raw_m=np.zeros((2, 3)))
+    with Viewing(bus, tmp_path / "live.rrd"):
+        bus.publish("hand", pose.hand, pose)
+        bus.publish("hand", other.hand, other)
+    rows = rows_of(tmp_path / "live.rrd")
+    assert rows["/world/hand/test-hand/joints"] == 1
+    assert rows["/world/hand/other/joints"] == 1
+    bus.close()
+
+
+def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+    path = tmp_path / "nowhere" / "run.rrd"
+    with pytest.raises(RecordingError, match=r"run\.rrd: cannot write"):
+        write_rrd(path, Poses.of(moving_hand(1)), RIG, CAMERAS, MODEL)
+    bus = LoopbackBus()
+    with pytest.raises(RecordingError, match=r"run\.rrd"):
+        run_viewer(bus, RIG, CAMERAS, MODEL, mode="save", path=path, stop=threading.Event())
+    with pytest.raises(ValueError, match="mode 'save'"):
+        run_viewer(bus, RIG, CAMERAS, MODEL, mode="save", path=None, stop=threading.Event())
+    bus.close()
+
+
+def test_an_error_midway_leaves_the_older_file_as_it_was(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    path.write_bytes(b"older")
+
+    def images() -> Iterator[tuple[str, int, Image]]:
+        yield ("left", 0, np.zeros((8, 8), np.uint8))
+        raise RecordingError("frame 1 is broken")
+
+    with pytest.raises(RecordingError, match="frame 1 is broken"):
+        write_rrd(path, Poses.of(moving_hand(2)), RIG, CAMERAS, MODEL, images=images())
+    assert path.read_bytes() == b"older"
+    assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
+
+
+@pytest.mark.parametrize("web_port", [None, 9090])
+def test_every_viewer_is_bound_to_this_machine_with_a_memory_limit(web_port: int | None) -> None:
+    arguments = viewer_arguments(1234, web_port)
+    assert arguments[arguments.index("--bind") + 1] == "127.0.0.1"
+    assert "--server-memory-limit" in arguments
+    assert ("--memory-limit" in arguments) == (web_port is None)
+
+
+def test_a_viewer_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(PhalanxError, match=r"viewer ended at once.*--web or --save"), ViewerProcess(None):
+        pass
