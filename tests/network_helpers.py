@@ -1,10 +1,13 @@
 """What the network tests share: free addresses, patience, and messages to send."""
 
+import random
 import socket
 import time
 from collections.abc import Callable
 
-from common.messages import Health
+import numpy as np
+
+from common.messages import Health, MarkerDetections
 
 
 def free_endpoint() -> str:
@@ -34,3 +37,24 @@ def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
 def health(source: str, frames: int = 0) -> Health:
     """Return a small message."""
     return Health(source, 1, 2, {"frames": frames}, {"rate_hz": 60.0})
+
+
+class ManualClock:
+    """A clock that stands still until it is told."""
+
+    def __init__(self, t_ns: int = 0) -> None:
+        self.t_ns = t_ns
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+def detections(camera: str, session: int, seq: int, t_ns: int = 0) -> MarkerDetections:
+    """Return a frame with six markers."""
+    uv = np.arange(12.0).reshape(6, 2)
+    return MarkerDetections(camera, session, seq, t_ns, t_ns + 1000, uv, np.full(6, 50.0), np.ones(6))
+
+
+def seeded(seed: int) -> Callable[[int], bytes]:
+    """Return a source of random bytes that repeats."""
+    return random.Random(seed).randbytes
