@@ -4,6 +4,7 @@ A rig is a JSON file, not a class: cameras, markers, depth model and hand are da
 names where they are not SI. The JSON schema of each file is exported to docs/ from these types.
 """
 
+import inspect
 import os
 import re
 import tempfile
@@ -304,5 +305,9 @@ def compact_numbers(text: str) -> str:
 
 
 def schema(kind: type[Struct]) -> bytes:
-    """JSON schema of one file type, formatted."""
-    return msgspec.json.format(msgspec.json.encode(msgspec.json.schema(kind)), indent=1)
+    """JSON schema of one file type, formatted; the same bytes on every Python version."""
+    content = msgspec.json.schema(kind)
+    for part in content["$defs"].values():
+        # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.
+        part["description"] = inspect.cleandoc(part["description"])
+    return msgspec.json.format(msgspec.json.encode(content), indent=1)

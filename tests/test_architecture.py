@@ -28,6 +28,7 @@ FORBIDDEN: dict[str, frozenset[str]] = {
 ONLY_IN: dict[str, tuple[str, ...]] = {
     "zenoh": ("common/zenoh_bus.py",),
     "rerun": ("master/outputs/rerun*.py",),
+    "rerun_cli": ("master/outputs/rerun*.py",),
     "serial": ("slave/imu/*.py",),
     "smbus2": ("slave/imu/*.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
@@ -152,33 +153,32 @@ def globals_written(path: str, text: str) -> set[str]:
 
 
 def import_time_work(path: str, text: str) -> set[str]:
-    """Statements of a module that do something when it is imported: loops, bare calls, devices."""
+    """What a module does when it is imported: bare calls, endless loops, open resources, devices.
+
+    A loop that fills a table of constants is no work in this sense.
+    """
     found: set[str] = set()
-    for node in ast.parse(text).body:
-        if isinstance(node, ast.If) and "__name__" in ast.unparse(node.test):
-            continue
-        if isinstance(node, (ast.For, ast.While, ast.With)):
-            found.add(f"line {node.lineno}: {type(node).__name__}")
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
-            found.add(f"line {node.lineno}: {ast.unparse(node)}")
-        for call in _calls_now(node):
-            if ast.unparse(call.func).split(".")[-1] in DEVICES:
-                found.add(f"line {call.lineno}: {ast.unparse(call)}")
+    for node in _executed(ast.parse(text)):
+        bare_call = isinstance(node, ast.Expr) and isinstance(node.value, ast.Call)
+        device = isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in DEVICES
+        if bare_call or device or isinstance(node, (ast.While, ast.With, ast.Await)):
+            found.add(f"line {getattr(node, 'lineno', 0)}: {ast.unparse(node).splitlines()[0]}")
     return found
 
 
-def _calls_now(node: ast.AST) -> Iterator[ast.Call]:
-    """Calls made when `node` is executed: bodies of functions and lambdas wait."""
-    if isinstance(node, ast.Call):
-        yield node
-    waits: set[ast.AST] = set()
+def _executed(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that run on import: the bodies of functions and lambdas wait, and so does the command line."""
+    waits: list[ast.stmt | ast.expr] = []
     if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-        waits = set(node.body)
+        waits = [*node.body]
     elif isinstance(node, ast.Lambda):
-        waits = {node.body}
+        waits = [node.body]
+    elif isinstance(node, ast.If) and "__name__" in ast.unparse(node.test):
+        waits = [*node.body]
     for child in ast.iter_child_nodes(node):
         if child not in waits:
-            yield from _calls_now(child)
+            yield child
+            yield from _executed(child)
 
 
 Guard = Callable[[str, str], set[str]]
@@ -228,7 +228,9 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (import_time_work, "slave/app.py", "class A:\n    s = socket.socket()", "class A:\n    n = max(1, 2)"),
     (import_time_work, "slave/app.py", "def f(s=open('x')): ...", "f = lambda: open('x')"),
     (import_time_work, "slave/app.py", "main()", "if __name__ == '__main__':\n    main()"),
-    (import_time_work, "slave/app.py", "for i in x:\n    f(i)", "y = [f(i) for i in x]"),
+    (import_time_work, "slave/app.py", "for i in x:\n    f(i)", "for i in x:\n    y[i] = f(i)"),
+    (import_time_work, "slave/app.py", "while x:\n    y = x.pop()", "y = [f(i) for i in x]"),
+    (import_time_work, "slave/app.py", "if X:\n    with lock:\n        y = 1", "if X:\n    y = 1"),
 ]
 GUARDS: list[Guard] = list(dict.fromkeys(guard for guard, *_ in PLANTED))
 
