@@ -1,0 +1,86 @@
+"""What lies behind the hand, and what the sensor adds: the desk as one camera sees it, and tiles of noise.
+
+Both are made once and only copied afterwards: cameras do not move.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Image
+from common.camera_model import CameraModel
+from common.geometry import transform
+from common.sim.light import DESK_LINEAR_RGB, to_srgb
+
+TEXEL_M = 0.001
+SIDE = 1536
+NOISE_SIGMA = 1.7  # in sRGB levels: gamma turns shot noise into a nearly constant amplitude
+NOISE_MARGIN = 96
+LENS_SIGMA_PX = 0.62
+
+
+def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
+    """Image (H, W, 3) BGR of a worn dark grey desk at rig depth `depth_m` [m], fixed in the rig frame."""
+    height, width = optics.height_px, optics.width_px
+    v, u = np.mgrid[0:height, 0:width].astype(np.float64)
+    rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2))
+    along = (depth_m - optics.centre[2]) / np.where(rays[:, 2] > 0.05, rays[:, 2], 0.05)
+    points = transform(np.eye(4), optics.centre + along[:, None] * rays)
+    texel = (points[:, :2] / TEXEL_M + SIDE / 2).reshape(height, width, 2).astype(np.float32)
+    wear = cv2.remap(
+        _wear(seed), texel[..., 0], texel[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+    )
+    radius2 = ((u - width / 2) ** 2 + (v - height / 2) ** 2) / (width / 2) ** 2
+    lamp = 1.05 - 0.10 * radius2 - 0.06 * (v / height - 0.5)
+    linear = np.array(DESK_LINEAR_RGB)[::-1] * (wear * lamp[..., None])
+    image = np.round(255.0 * to_srgb(linear)).astype(np.uint8)
+    return np.asarray(cv2.GaussianBlur(image, (3, 3), LENS_SIGMA_PX), dtype=np.uint8)
+
+
+def _wear(seed: int) -> Float:
+    """Relative brightness (SIDE, SIDE, 3) about 1: blotches, grain and brushed streaks."""
+    rng = np.random.default_rng([seed, 1])
+    wear = np.ones((SIDE, SIDE, 3))
+    for cell, depth in ((256, 0.07), (64, 0.06), (16, 0.05), (4, 0.07), (1, 0.10)):
+        n = SIDE // cell
+        coarse = rng.normal(0.0, 1.0, (n, n))
+        wear += depth * cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)[..., None]
+        tint = rng.normal(0.0, 0.12, (n, n, 3))
+        wear += depth * cv2.resize(tint, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+    streaks = cv2.blur(rng.normal(0.0, 1.0, (SIDE, SIDE)), (61, 1))
+    wear += 0.25 * streaks[..., None]
+    return np.clip(wear, 0.5, 1.6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseTiles:
+    """Sensor noise, drawn once: what to add and what to subtract (2 x H + margin, W + margin, 3)."""
+
+    plus: tuple[Image, ...]
+    minus: tuple[Image, ...]
+
+    @classmethod
+    def make(cls, height: int, width: int, seed: int, tiles: int = 2) -> "NoiseTiles":
+        """Draw the pool."""
+        rng = np.random.default_rng([seed, 2])
+        plus: list[Image] = []
+        minus: list[Image] = []
+        for _ in range(tiles):
+            white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3)).astype(np.float32)
+            mixed = cv2.GaussianBlur(white, (3, 3), 0.45)  # a colour filter array mixes neighbours
+            noise = mixed * (NOISE_SIGMA * np.array([1.25, 0.85, 1.1], dtype=np.float32) / mixed.std())
+            level = np.round(noise).astype(np.int16)
+            plus.append(np.clip(level, 0, 255).astype(np.uint8))
+            minus.append(np.clip(-level, 0, 255).astype(np.uint8))
+        return cls(tuple(plus), tuple(minus))
+
+    def add_to(self, image: Image, key: int) -> None:
+        """Add noise in place; the same key adds the same noise."""
+        height, width = image.shape[:2]
+        mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
+        mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
+        tile = mixed % len(self.plus)
+        y, x = (mixed >> 4) % NOISE_MARGIN, (mixed >> 14) % NOISE_MARGIN
+        cv2.add(image, self.plus[tile][y : y + height, x : x + width], dst=image)
+        cv2.subtract(image, self.minus[tile][y : y + height, x : x + width], dst=image)

@@ -1,0 +1,276 @@
+"""Seeded hand motions: where the hand is and how its fingers bend, as a pure function of time.
+
+A motion is a sum. A resting posture with slow natural drift is always there; on top of it acts come and go, each
+faded in and out by a smooth window (C2), so that the whole is smooth for every t, and closed over its period.
+Finger targets are given as whole postures in degrees; DIP angles follow the hand's coupling only nearly, as real
+ones do, so that a solver's prior is never exactly true.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
+from common.hand_model import HandModel
+
+PERIOD_S = 60.0
+PEAK_SPEED_M_S = 1.0
+PALM_SWING_DEG = 20.0
+DRIFT_M = 0.006
+DRIFT_DEG = 2.0
+
+# Postures in degrees: rows thumb, index, middle, ring, little; columns abduction, flexion (MCP), PIP.
+# The thumb's columns are CMC abduction, CMC flexion, MCP and its IP follows the MCP.
+REST = ((8, 2, 6), (3, 10, 16), (0, 10, 17), (-4, 11, 18), (-9, 12, 19))
+POSES = {
+    "open_palm": ((22, -6, 0), (9, 4, 5), (0, 4, 5), (-7, 4, 5), (-13, 4, 5)),
+    "counting_two": ((2, 34, 38), (9, 5, 6), (-0, 5, 6), (-3, 70, 92), (-5, 72, 90)),
+    "pointing": ((4, 32, 34), (2, 5, 7), (0, 68, 92), (-2, 70, 94), (-4, 72, 92)),
+    "small_grasp": ((6, 30, 30), (2, 58, 82), (0, 60, 86), (-3, 62, 86), (-5, 62, 82)),
+    "large_grasp": ((30, 16, 14), (8, 28, 40), (0, 28, 44), (-6, 30, 44), (-11, 32, 42)),
+    "pinch": ((14, 28, 20), (2, 44, 46), (0, 20, 26), (-5, 16, 22), (-10, 14, 20)),
+}
+FIST = ((4, 32, 34), (1, 66, 88), (0, 68, 92), (-2, 68, 92), (-4, 68, 88))
+WAVE_CREST = ((12, 8, 12), (5, 34, 30), (0, 34, 30), (-5, 34, 30), (-10, 34, 30))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandState:
+    """One instant: palm pose `T_rig_palm` (4, 4) [m] and `angles_rad` (5, 4) [rad]."""
+
+    T_rig_palm: Float
+    angles_rad: Float
+
+
+class HandMotion(Protocol):
+    """A motion: pure, smooth, the same in every process."""
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        ...
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0, after the period from the beginning."""
+        ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """What one act adds to the rest: posture change (5, 3) [deg], shift (3,) [m], turn (3,) [rad], rig axes."""
+
+    posture: Float
+    shift: Float
+    turn: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Act:
+    """One act on the time line; `change` takes the seconds since its start, and is faded at both ends."""
+
+    name: str
+    start_s: float
+    stop_s: float
+    fade_s: float
+    change: Callable[[float], Change]
+
+
+def smooth_step(x: float) -> float:
+    """0 below 0, 1 above 1, between them 6x^5 - 15x^4 + 10x^3: first and second derivative vanish at the ends."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * x * (x * (6.0 * x - 15.0) + 10.0)
+
+
+def window(t_s: float, start_s: float, stop_s: float, fade_s: float) -> float:
+    """1 inside an act, 0 outside, smooth over `fade_s` [s] at both ends."""
+    return smooth_step((t_s - start_s) / fade_s) * smooth_step((stop_s - t_s) / fade_s)
+
+
+class ScriptedMotion:
+    """The motion of the standard scene: all acts in each half of its period.
+
+    The state it holds is its script, fixed by the constructor.
+    """
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        """Write the script.
+
+        Args:
+            model: Whose limits and coupling hold.
+            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
+            seed: Same seed, same motion.
+        """
+        rng = np.random.default_rng(seed)
+        self._model = model
+        self._centre = np.asarray(centre_m, dtype=np.float64)
+        self._rest = np.array(REST, dtype=np.float64)
+        self._drift = _Drift(rng)
+        self.acts = _half(rng, 0.0, 0) + _half(rng, PERIOD_S / 2, 1)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % PERIOD_S
+        wobble, shift, turn = self._drift.at(t)
+        posture = self._rest.copy()
+        for act in self.acts:
+            if act.start_s < t < act.stop_s:
+                weight = window(t, act.start_s, act.stop_s, act.fade_s)
+                change = act.change(t - act.start_s)
+                posture += weight * change.posture
+                shift = shift + weight * change.shift
+                turn = turn + weight * change.turn
+        angles = angles_of(self._model, posture, wobble)
+        return HandState(base_pose(self._model, self._centre, shift, turn), angles)
+
+
+def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
+    """Angles (5, 4) [rad] inside the limits, of a posture (5, 3) [deg] and `wobble` (5, 4) about -1..1.
+
+    The wobble moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the DIP coupling by up to 12 %.
+    """
+    angles = np.empty((5, 4))
+    angles[:, :3] = posture_deg
+    angles[:, 0] += wobble[:, 0]
+    angles[:, 1:3] += 3.0 * wobble[:, 1:3]
+    coupling = 2.0 / 3.0 if model.dip_per_pip is None else model.dip_per_pip
+    ratio = np.array([0.9, coupling, coupling, coupling, coupling])
+    angles[:, 3] = ratio * angles[:, 2] * (1.0 + 0.12 * wobble[:, 3])
+    angles = np.radians(angles)
+    low, high = model.limits_rad[..., 0], model.limits_rad[..., 1]
+    return np.clip(angles, low, high)
+
+
+def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float) -> Float:
+    """`T_rig_palm` (4, 4) of the hand seen from behind its back, fingers up in the image.
+
+    The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `turn_rad` (3,) turns the
+    palm about the rig's axes through that middle. Fingers point a little towards the cameras.
+    """
+    flat = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+    tilt = axis_rotation(0, np.radians(12.0))
+    rotation = rotation_vector_to_matrix(turn_rad) @ tilt @ flat
+    middle = np.array([0.0, 0.0, 0.5 * float(model.rest_position_m[:, 2].max())])
+    return rigid(rotation, centre_m + shift_m - rotation @ middle)
+
+
+class _Drift:
+    """Slow natural wandering: random Fourier sums, closed over the period."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        n = 20 + 6
+        self._cycles = rng.integers(5, 30, (n, 4)).astype(np.float64)
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, (n, 4))
+        self._weight = rng.uniform(0.5, 1.0, (n, 4))
+        self._weight /= self._weight.sum(axis=1, keepdims=True)
+
+    def at(self, t_s: float) -> tuple[Float, Float, Float]:
+        """Wobble (5, 4) in -1..1, shift (3,) [m], turn (3,) [rad]."""
+        waves = np.sin(2.0 * np.pi * self._cycles * t_s / PERIOD_S + self._phase)
+        value = (self._weight * waves).sum(axis=1)
+        return value[:20].reshape(5, 4), DRIFT_M * value[20:23], np.radians(DRIFT_DEG) * value[23:]
+
+
+def _still(posture: Float) -> Change:
+    return Change(posture, np.zeros(3), np.zeros(3))
+
+
+def _offset(posture: tuple[tuple[float, ...], ...]) -> Float:
+    return np.array(posture, dtype=np.float64) - np.array(REST, dtype=np.float64)
+
+
+def _hold(posture: Float) -> Callable[[float], Change]:
+    return lambda _s: _still(posture)
+
+
+def _open_close(rate_hz: float, depth: float) -> Callable[[float], Change]:
+    fist = depth * _offset(FIST)
+
+    def change(s: float) -> Change:
+        return _still(fist * 0.5 * (1.0 - np.cos(2.0 * np.pi * rate_hz * s)))
+
+    return change
+
+
+def _one_by_one(order: tuple[int, ...], each_s: float, depth: float) -> Callable[[float], Change]:
+    fist = depth * _offset(FIST)
+
+    def change(s: float) -> Change:
+        posture = np.zeros((5, 3))
+        for place, finger in enumerate(order):
+            start = place * each_s
+            bend = window(s, start, start + 1.25 * each_s, 0.6 * each_s)
+            posture[finger] = bend * fist[finger]
+        return _still(posture)
+
+    return change
+
+
+def _wave(rate_hz: float, roll_rad: float) -> Callable[[float], Change]:
+    crest = _offset(WAVE_CREST)
+
+    def change(s: float) -> Change:
+        phase = 2.0 * np.pi * (rate_hz * s - 0.13 * np.arange(5))
+        posture = crest * (0.5 - 0.5 * np.cos(phase))[:, None]
+        return Change(posture, np.zeros(3), np.array([0.0, 0.0, roll_rad * np.sin(2.0 * np.pi * 0.5 * s)]))
+
+    return change
+
+
+def _travel(direction: Float, rate_hz: float) -> Callable[[float], Change]:
+    # Sideways sine: its peak speed is amplitude times angular rate. The fade adds none where it is over.
+    along = direction / np.linalg.norm(direction)
+    amplitude = 0.98 * PEAK_SPEED_M_S / (2.0 * np.pi * rate_hz)
+
+    def change(s: float) -> Change:
+        shift = amplitude * np.sin(2.0 * np.pi * rate_hz * s) * along
+        return Change(np.zeros((5, 3)), shift, np.zeros(3))
+
+    return change
+
+
+def _turns(axes: tuple[int, ...], each_s: float) -> Callable[[float], Change]:
+    swing = np.radians(PALM_SWING_DEG)
+
+    def change(s: float) -> Change:
+        turn = np.zeros(3)
+        for place, axis in enumerate(axes):
+            start = place * each_s
+            if start <= s <= start + each_s:
+                inside = window(s, start, start + each_s, 0.2 * each_s)
+                turn[axis] = swing * inside * np.sin(2.0 * np.pi * (s - start) / each_s)
+        return Change(np.zeros((5, 3)), np.zeros(3), turn)
+
+    return change
+
+
+def _half(rng: np.random.Generator, start_s: float, half: int) -> tuple[Act, ...]:
+    """All acts once, within 30 s from `start_s`; the halves differ in tempo, order and direction."""
+    acts: list[Act] = []
+    t = start_s + 0.6
+
+    def add(
+        name: str, seconds: float, fade_s: float, change: Callable[[float], Change], pause_s: float = 0.1
+    ) -> None:
+        nonlocal t
+        acts.append(Act(name, t, t + seconds, fade_s, change))
+        t += seconds + pause_s
+
+    rate = (0.5, 0.625)[half]
+    add("open_close", 2.0 / rate, 0.3, _open_close(rate, 0.92 - 0.12 * half))
+    order = ((1, 2, 3, 4, 0), (4, 3, 2, 1, 0))[half]
+    add("one_by_one", 4.0, 0.3, _one_by_one(order, 0.72, float(rng.uniform(0.75, 0.9))))
+    for name, posture in POSES.items():
+        add(f"pose_{name}", 1.35, 0.42, _hold(_offset(posture)), 0.0)
+    add("wave", 3.0, 0.5, _wave((0.7, 0.9)[half], np.radians(12.0)))
+    direction = (np.array([1.0, 0.1, 0.0]), np.array([0.8, 0.25, 0.55]))[half]
+    add("travel", 3.0, 0.5, _travel(direction, (1.35, 1.8)[half]))
+    add("turns", 4.5, 0.2, _turns(((2, 0, 1), (1, 0, 2))[half], 1.5))
+    return tuple(acts)

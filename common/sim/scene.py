@@ -1,0 +1,190 @@
+"""A scene: hand, motion, occluders and cameras, as exact truth for every instant.
+
+Every process that builds the scene from the same files and seed sees the same world: nothing in it remembers.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import CameraCalibration, HandProfile, RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.hand_model import HandJoints, HandModel
+from common.sim.motion import HandMotion, ScriptedMotion
+
+STANDARD_SEED = 7
+HAND_DEPTH_M = 0.47
+DESK_DEPTH_M = 0.78
+LATE_NS = 5_000_000
+APART_PPM = 50.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SceneTruth:
+    """Everything true of one instant.
+
+    Attributes:
+        t_s: The instant [s], scene time.
+        T_rig_palm: (4, 4) palm frame -> rig frame [m].
+        angles_rad: (5, 4).
+        joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
+        markers_m: (M, 3) centroids of the painted surfaces [m], rig frame.
+    """
+
+    t_s: float
+    T_rig_palm: Float
+    angles_rad: Float
+    joints: HandJoints
+    markers_m: Float
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A dark card that passes between the cameras and the hand, once a period, at steady speed.
+
+    Attributes:
+        middle_s: When its middle is before the reference point [s].
+        width_m: Its width along the way: width over speed is the time a resting marker is hidden.
+        top_m, bottom_m: Its edges along the rig's y [m].
+        depth_m: Its distance from the cameras.
+        speed_m_s: Along the rig's x; negative from right to left.
+    """
+
+    middle_s: float
+    width_m: float
+    top_m: float
+    bottom_m: float
+    depth_m: float
+    speed_m_s: float
+
+    def corners(self, t_s: float, x0_m: float) -> Float | None:
+        """Corners (4, 3) [m], rig frame, or None while it is far outside every view."""
+        x = x0_m + self.speed_m_s * (t_s - self.middle_s)
+        if abs(x - x0_m) > 0.6:
+            return None
+        left, right = x - self.width_m / 2, x + self.width_m / 2
+        lean = 0.012  # the far edge is a little deeper: a card is never held quite straight
+        z = self.depth_m
+        return np.array(
+            [
+                [left, self.top_m, z],
+                [right, self.top_m, z + lean],
+                [right, self.bottom_m, z + lean],
+                [left, self.bottom_m, z],
+            ]
+        )
+
+
+STANDARD_CARDS = (
+    Card(middle_s=28.9, width_m=0.055, top_m=-0.40, bottom_m=0.012, depth_m=0.32, speed_m_s=0.24),
+    Card(middle_s=58.4, width_m=0.095, top_m=-0.40, bottom_m=0.075, depth_m=0.32, speed_m_s=-0.24),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTiming:
+    """How a camera's frames lie in time: start after the others [ns], rate of its clock [ppm]."""
+
+    start_offset_ns: int
+    clock_ppm: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """Hand, motion, occluders and the cameras that look at them.
+
+    Attributes:
+        rig: Which cameras, where, which markers.
+        cameras: Camera name -> its file.
+        model: The hand.
+        motion: How it moves.
+        cards: Occluders.
+        seed: Of textures and noise.
+        centre_m: Middle of the volume (3,), rig frame [m].
+    """
+
+    rig: RigCalibration
+    cameras: Mapping[str, CameraCalibration]
+    model: HandModel
+    motion: HandMotion
+    centre_m: Float
+    cards: tuple[Card, ...] = ()
+    seed: int = STANDARD_SEED
+    optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
+
+    def __post_init__(self) -> None:
+        for name in self.rig.cameras:
+            if name not in self.cameras:
+                raise CalibrationError(f"rig {self.rig.name!r}: cameras: no camera file for {name!r}")
+        optics = {
+            name: CameraModel.of(self.cameras[name], self.rig.camera_pose(name)) for name in self.rig.cameras
+        }
+        object.__setattr__(self, "optics", optics)
+
+    @classmethod
+    def standard(
+        cls,
+        rig: RigCalibration,
+        cameras: Mapping[str, CameraCalibration],
+        hand: HandProfile,
+        seed: int = STANDARD_SEED,
+    ) -> "Scene":
+        """The standard scene of demo and benchmarks: every motion in each half of 60 s, two occlusion gaps.
+
+        Raises:
+            CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger.
+        """
+        model = HandModel.of(hand)
+        centre = view_centre(rig)
+        return cls(rig, cameras, model, ScriptedMotion(model, centre, seed), centre, STANDARD_CARDS, seed)
+
+    @classmethod
+    def of_motion(
+        cls,
+        rig: RigCalibration,
+        cameras: Mapping[str, CameraCalibration],
+        hand: HandProfile,
+        motion: HandMotion,
+        seed: int = STANDARD_SEED,
+    ) -> "Scene":
+        """A scene without occluders around any motion, such as one that follows a recording."""
+        return cls(rig, cameras, HandModel.of(hand), motion, view_centre(rig), (), seed)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the scene repeats."""
+        return self.motion.period_s
+
+    def truth(self, t_s: float) -> SceneTruth:
+        """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
+        state = self.motion.at(t_s)
+        joints = self.model.forward(state.T_rig_palm, state.angles_rad)
+        markers = self.model.marker_points(joints, self.rig.markers)
+        return SceneTruth(t_s, state.T_rig_palm, state.angles_rad, joints, markers)
+
+    def joints(self, times_s: tuple[float, ...]) -> HandJoints:
+        """Joints at several instants at once, stacked along the first axis."""
+        states = [self.motion.at(t) for t in times_s]
+        return self.model.forward(
+            np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
+        )
+
+    def occluders(self, t_s: float) -> tuple[Float, ...]:
+        """Corners (4, 3) [m] of every card that is near the view, rig frame."""
+        t = max(t_s, 0.0) % self.period_s
+        corners = (card.corners(t, float(self.centre_m[0])) for card in self.cards)
+        return tuple(quad for quad in corners if quad is not None)
+
+    def timing(self, camera: str) -> CameraTiming:
+        """How the standard scene runs its cameras: each 5 ms after the one before, clocks 50 ppm apart."""
+        place = self.rig.cameras.index(camera)
+        return CameraTiming(place * LATE_NS, place * APART_PPM)
+
+
+def view_centre(rig: RigCalibration) -> Float:
+    """Middle of the volume (3,) [m], rig frame: between the cameras, at the hand's working distance."""
+    centres = np.stack([rig.camera_pose(name)[:3, 3] for name in rig.cameras])
+    return centres.mean(axis=0) + np.array([0.0, 0.01, HAND_DEPTH_M])

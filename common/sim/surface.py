@@ -1,0 +1,201 @@
+"""The skin and paint of a simulated hand, as few points as a fast renderer can live with.
+
+The hand is spheres joined to tapered capsules (phalanges) and hulls (palm, thumb web, sleeve). All places that
+move are *key points* of one array, so that a camera can bring each to the moment at which its own row is exposed.
+
+A painted cap is the rounded end of a finger: half a sphere of radius R and a cylinder of length 0.7 R behind it,
+its axis along the tip joint's -z. The area of a sphere between parallel planes equals that of the cylinder around
+it (Archimedes), so the centroid of the painted surface is the middle of its length, 0.15 R ahead of the sphere's
+centre: the cap is placed so that this is exactly the profile's marker offset. The back marker is a box painted on
+top and sides, placed by its area centroid likewise.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import CalibrationError
+from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
+
+CYLINDER_SHARE = 0.7
+BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
+SKIN_UNDER_PAINT = 0.97
+
+# Sphere indices: 4 f + k is joint k of finger f; then the rest of palm, web and sleeve.
+WRIST_SPHERES = (20, 21)
+METACARPAL_SPHERES = (22, 23, 24, 25)
+WEB_SPHERE = 26
+SLEEVE_SPHERES = (27, 28)
+SPHERE_COUNT = 29
+PALM_HULL = (0, 4, 8, 12, 16, *WRIST_SPHERES, *METACARPAL_SPHERES)
+WEB_HULL = (0, 1, WEB_SPHERE)
+CAPSULES = np.array([[4 * f + k, 4 * f + k + 1] for f in range(5) for k in range(3)])
+ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cap:
+    """A painted finger end: marker index, finger, radius [m]; key points of sphere centre and base centre."""
+
+    marker: int
+    finger: int
+    radius_m: float
+    centre: int
+    base: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """A painted box: marker index and its eight key points, top four (in ring order) first."""
+
+    marker: int
+    corners: slice
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandSurface:
+    """Which points a hand has, and how they move with its joints.
+
+    Attributes:
+        model: The hand.
+        radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
+        caps, boxes: The painted markers.
+        owner: (K,) per key point, the marker whose moment it shares, or -1 for its own.
+    """
+
+    model: HandModel
+    markers: tuple[str, ...]
+    radius_m: Float
+    caps: tuple[Cap, ...]
+    boxes: tuple[Box, ...]
+    owner: Int
+
+    @classmethod
+    def of(cls, model: HandModel, markers: tuple[str, ...]) -> "HandSurface":
+        """Lay out the key points.
+
+        Raises:
+            CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
+        """
+        radius = np.zeros(SPHERE_COUNT)
+        radius[:20] = model.radius_m[CHAINS].ravel()
+        radius[0] *= 0.85
+        wrist = model.radius_m[1]
+        radius[list(WRIST_SPHERES)] = 0.76 * wrist
+        radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
+        radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
+        radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 1.9 * wrist
+        owner = [-1] * SPHERE_COUNT
+        caps: list[Cap] = []
+        boxes: list[Box] = []
+        for m, name in enumerate(markers):
+            mount = model.mount(name)
+            finger = mount.finger
+            if mount.joint is None:
+                boxes.append(Box(m, slice(len(owner), len(owner) + 8)))
+                owner += [m] * 8
+            elif finger is not None and mount.joint == CHAINS[finger, 3]:
+                caps.append(Cap(m, finger, float(model.radius_m[mount.joint]), len(owner), len(owner) + 1))
+                radius[4 * finger + 3] *= SKIN_UNDER_PAINT
+                owner += [m, m]
+            else:
+                raise CalibrationError(
+                    f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
+                )
+        return cls(model, markers, radius, tuple(caps), tuple(boxes), np.array(owner))
+
+    def key_points(self, joints: HandJoints) -> Float:
+        """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
+        lead = joints.position_m.shape[:-2]
+        points = np.empty((*lead, len(self.owner), 3))
+        points[..., :20, :] = joints.position_m[..., CHAINS.ravel(), :]
+        wrist = 0.45 * self.model.radius_m[1]
+        T = joints.T_rig_palm
+        z = T[..., :3, 2]
+        for sphere, x in zip(WRIST_SPHERES, (wrist, -wrist), strict=True):
+            points[..., sphere, :] = _apply(T, np.array([x, -0.003, -0.012]))
+        points[..., METACARPAL_SPHERES, :] = joints.position_m[..., METACARPALS, :]
+        knuckle, base = joints.position_m[..., 7, :], joints.position_m[..., 6, :]
+        points[..., WEB_SPHERE, :] = base + 0.62 * (knuckle - base) - 0.004 * T[..., :3, 1]
+        cuff = T[..., :3, 3] - 0.018 * z
+        arm = -0.55 * z + 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
+        points[..., SLEEVE_SPHERES[0], :] = cuff
+        points[..., SLEEVE_SPHERES[1], :] = cuff + 0.26 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
+        centroid = self.model.marker_points(joints, self.markers)
+        for cap in self.caps:
+            ahead = -joints.rotation[..., CHAINS[cap.finger, 3], :, 2]
+            points[..., cap.centre, :] = (
+                centroid[..., cap.marker, :] - cap_centroid_ahead(cap.radius_m) * ahead
+            )
+            points[..., cap.base, :] = points[..., cap.centre, :] - CYLINDER_SHARE * cap.radius_m * ahead
+            points[..., 4 * cap.finger + 3, :] = points[..., cap.centre, :]  # the skin ends under the paint
+        for box in self.boxes:
+            corners = box_corners()
+            turned = np.einsum("...ij,kj->...ki", T[..., :3, :3], corners)
+            points[..., box.corners, :] = centroid[..., box.marker, None, :] + turned
+        return points
+
+
+def cap_centroid_ahead(radius_m: float) -> float:
+    """Distance [m] of the painted surface's centroid ahead of the sphere's centre: the middle of [-0.7 R, R]."""
+    return 0.5 * (1.0 - CYLINDER_SHARE) * radius_m
+
+
+def box_corners() -> Float:
+    """Corners (8, 3) [m] around the area centroid of top and sides; palm axes, top ring first."""
+    x, y, z = BOX_M
+    top, sides = x * z, 2.0 * (x + z) * y
+    above = sides * 0.5 * y / (top + sides)  # the top lies this far above the centroid
+    ring = np.array([[1, 0, 1], [1, 0, -1], [-1, 0, -1], [-1, 0, 1]]) * np.array([x, 0.0, z]) / 2.0
+    return np.vstack([ring + np.array([0.0, above, 0.0]), ring + np.array([0.0, above - y, 0.0])])
+
+
+def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> Float:
+    """Points (C, 2 n, 3) whose projections' convex hull is exactly the outline of a cap each; camera frame.
+
+    Args:
+        centre: Sphere centres (C, 3) [m]; base: centres of the rims (C, 3) [m].
+        radius_m: (C,) radius of both.
+        circle: `unit_circle` (n, 2).
+
+    The sphere's part is its contact circle with the cone of rays. Behind the sphere's equator the cylinder hides
+    it: those points are moved onto the rim.
+    """
+    axis = unit(centre - base)
+    d2 = (centre * centre).sum(axis=-1)
+    shrink = 1.0 - radius_m**2 / d2
+    towards = centre / np.sqrt(d2)[:, None]
+    contact = (centre * shrink[:, None])[:, None] + rim(towards, radius_m * np.sqrt(shrink), circle)
+    edge = base[:, None] + rim(axis, radius_m, circle)
+    ahead = ((contact - centre[:, None]) * axis[:, None]).sum(axis=-1, keepdims=True) >= 0.0
+    return np.concatenate([np.where(ahead, contact, edge), edge], axis=1)
+
+
+def rim(normal: Float, radius_m: Float, circle: Float) -> Float:
+    """Circles (..., n, 3) [m] about the origin, across unit normals (..., 3)."""
+    x, y, z = normal[..., 0], normal[..., 1], normal[..., 2]
+    # A frame around the normal without a branch (Duff et al., 2017).
+    sign = np.where(z >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    frame = np.empty((*x.shape, 2, 3))
+    frame[..., 0, 0], frame[..., 0, 1], frame[..., 0, 2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+    frame[..., 1, 0], frame[..., 1, 1], frame[..., 1, 2] = b, sign + y * y * a, -y
+    return radius_m[..., None, None] * (circle @ frame)
+
+
+def unit(vector: Float) -> Float:
+    """Vectors (..., 3) at length one."""
+    return vector / np.sqrt((vector * vector).sum(axis=-1, keepdims=True))
+
+
+def unit_circle(n: int) -> Float:
+    """Regular polygon (n, 2) with the area of the unit circle."""
+    angle = 2.0 * np.pi * np.arange(n) / n
+    scale = np.sqrt((2.0 * np.pi / n) / np.sin(2.0 * np.pi / n))
+    return scale * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def _apply(T: Float, point: Float) -> Float:
+    return T[..., :3, :3] @ point + T[..., :3, 3]

@@ -1,0 +1,231 @@
+"""The scene in front of one camera at one frame: every part where it is when its own row is exposed.
+
+Rolling shutter: the middle of the exposure of row v is `t + v row_time`, so a part's place and its row are found
+together, by two rounds of projecting and moving (the hand moves far less than a row per row time). Between three
+exact instants the key points follow a parabola.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.geometry import invert, transform
+from common.sim import raster
+from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
+from common.sim.raster import Shape
+from common.sim.scene import Scene
+from common.sim.surface import (
+    CAPSULES,
+    PALM_HULL,
+    SLEEVE_SPHERES,
+    SPHERE_COUNT,
+    HandSurface,
+    cap_outline,
+    rim,
+    unit,
+    unit_circle,
+)
+
+HALF_SPAN_ROWS = 130.0
+NEAREST_M = 0.05
+FURTHEST_PX = 4000.0
+LAYERS = len(LAYER_COSINES)
+LAYER_SINES = np.sqrt(1.0 - LAYER_COSINES**2)
+PHALANGES = len(CAPSULES)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Snapshot:
+    """One frame's geometry, every part at the moment of its row. C caps in the order of `HandSurface.caps`.
+
+    Attributes:
+        points: (K, 3) key points [m], camera frame.
+        uv: (K, 2) [px] of the points; speed_uv: (K, 2) [px/s].
+        t_s: (K,) the moments [s], scene time.
+        discs_uv: (B, LAYERS, 2) [px], discs_px: (B, LAYERS): shading of the spheres, then of the caps' two ends each.
+        outlines: (PHALANGES + C, LAYERS, N, 2) [px] phalanges, then the shading of the caps.
+        cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
+        rim_uv: (C, n, 2) [px] the cap's edge towards the finger.
+        from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
+        shine_uv: (C, 2) [px] where the paint mirrors the lamp.
+        cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
+    """
+
+    points: Float
+    uv: Float
+    speed_uv: Float
+    t_s: Float
+    discs_uv: Float
+    discs_px: Float
+    outlines: Float
+    cap_uv: Float
+    rim_uv: Float
+    from_behind: Bool
+    shine_uv: Float
+    cuff_uv: Float
+
+
+class View:
+    """Projects one scene into one camera. It holds what never changes; every call is pure."""
+
+    def __init__(self, scene: Scene, camera: str) -> None:
+        """Prepare.
+
+        Raises:
+            CalibrationError: The scene has no such camera, or a marker cannot be painted.
+        """
+        if camera not in scene.optics:
+            raise CalibrationError(f"camera {camera!r}: the scene has only {', '.join(scene.optics)}")
+        self.scene = scene
+        self.optics: CameraModel = scene.optics[camera]
+        self.surface = HandSurface.of(scene.model, scene.rig.markers)
+        self.row_s = self.optics.row_time_ns * 1e-9
+        self.exposure_s = scene.cameras[camera].exposure_us * 1e-6
+        self.T_camera_rig = invert(self.optics.T_rig_camera)
+        self.to_light = self.T_camera_rig[:3, :3] @ TO_LIGHT_RIG
+        self.focal_px = float(np.sqrt(self.optics.matrix[0, 0] * self.optics.matrix[1, 1]))
+        self.circle = unit_circle(16)
+        caps = self.surface.caps
+        self.cap_radius = np.array([cap.radius_m for cap in caps])
+        self.cap_centre = np.array([cap.centre for cap in caps], dtype=np.intp)
+        self.cap_base = np.array([cap.base for cap in caps], dtype=np.intp)
+        ends = np.stack([self.cap_centre, self.cap_base], axis=1).ravel()
+        self._bodies = np.concatenate([np.arange(SPHERE_COUNT), ends])
+        self._radius = np.concatenate([self.surface.radius_m, np.repeat(self.cap_radius, 2)])
+        first = SPHERE_COUNT + 2 * np.arange(len(caps))
+        self._from = np.concatenate([CAPSULES[:, 0], first])
+        self._to = np.concatenate([CAPSULES[:, 1], first + 1])
+        self._fine_circle = unit_circle(24)
+        count = len(self.surface.owner)
+        # Row k averages the rows of the points that share the moment of point k.
+        same = self.surface.owner[:, None] == self.surface.owner[None, :]
+        same[:SPHERE_COUNT] = np.eye(count, dtype=np.bool_)[:SPHERE_COUNT]
+        self._together = same / same.sum(axis=1, keepdims=True)
+
+    def project(self, points: Float) -> Float:
+        """Pixels (..., 2) of points (..., 3) [m] in the camera frame; what is too near or far out is held there."""
+        uv = self.optics.distort(points[..., :2] / np.maximum(points[..., 2:], NEAREST_M))
+        return np.minimum(np.maximum(uv, -FURTHEST_PX), FURTHEST_PX)
+
+    def snapshot(self, t_s: float) -> Snapshot:
+        """Geometry of the frame whose row 0 is exposed around `t_s` [s]."""
+        points, uv, speed_uv, when = self._moments(t_s)
+        body = points[self._bodies]
+        lit = body[:, None] + (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
+        size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
+        discs_px = size[:, None] * LAYER_SINES
+        centre, base = points[self.cap_centre], points[self.cap_base]
+        edge = base[:, None] + rim(unit(centre - base), 1.01 * self.cap_radius, self._fine_circle)
+        half = unit(self.to_light - unit(centre))
+        parts = (
+            lit,
+            cap_outline(centre, base, self.cap_radius, self._fine_circle),
+            edge,
+            centre + self.cap_radius[:, None] * half,
+            self._cuff(points),
+        )
+        discs_uv, cap_uv, rim_uv, shine_uv, cuff_uv = self._project_all(parts)
+        a, b = self._from, self._to
+        return Snapshot(
+            points=points,
+            uv=uv,
+            speed_uv=speed_uv,
+            t_s=when,
+            discs_uv=discs_uv,
+            discs_px=discs_px,
+            outlines=raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b]),
+            cap_uv=cap_uv,
+            rim_uv=rim_uv,
+            from_behind=((centre - base) * base).sum(axis=1) > 0.0,
+            shine_uv=shine_uv,
+            cuff_uv=cuff_uv,
+        )
+
+    def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
+        """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
+        if not snapshot.from_behind[cap]:
+            return None
+        joint = 4 * self.surface.caps[cap].finger + 2
+        disc = snapshot.discs_uv[joint, 0] + snapshot.discs_px[joint, 0] * self.circle
+        return Shape(
+            raster.hull(np.vstack([snapshot.rim_uv[cap], disc])), snapshot.speed_uv[self.cap_base[cap]]
+        )
+
+    def phalanx_depth(self, snapshot: Snapshot, uv: Float) -> Float:
+        """Depth (..., PHALANGES) [m] of every phalanx where it passes nearest to the pixels `uv` (..., 2)."""
+        a, b = CAPSULES[:, 0], CAPSULES[:, 1]
+        start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
+        share = ((uv[..., None, :] - start) * along).sum(axis=-1) / np.maximum(
+            (along * along).sum(axis=-1), 1e-9
+        )
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        return snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share
+
+    def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
+        """Whether the plane of the palm passes between the camera and points (..., 3) [m], camera frame."""
+        normal, offset = _palm_plane(snapshot)
+        # The plane meets the ray at (offset / (normal . p)) p: before p if that factor is between 0 and 1.
+        along = points @ normal
+        return np.asarray((along * offset > 0.0) & (np.abs(along) > abs(offset)))
+
+    def shows_back(self, snapshot: Snapshot) -> bool:
+        """Whether the back of the hand is turned to the camera."""
+        _, offset = _palm_plane(snapshot)
+        return offset * self.scene.model.side_sign > 0.0
+
+    def cards(self, snapshot: Snapshot) -> tuple[Shape, ...]:
+        """Outlines of the cards near the view, at the moment of the hand's middle row."""
+        when = float(snapshot.t_s[: len(PALM_HULL)].mean())
+        shapes: list[Shape] = []
+        for now, later in zip(self.scene.occluders(when), self.scene.occluders(when + 1e-3), strict=False):
+            uv, ahead = (self.project(transform(self.T_camera_rig, quad)) for quad in (now, later))
+            shapes.append(Shape(uv, (ahead - uv).mean(axis=0) * 1e3))
+        return tuple(shapes)
+
+    def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float]:
+        """Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,)."""
+        middle = transform(self.T_camera_rig, self.scene.motion.at(t_s).T_rig_palm[:3, 3])
+        row = min(max(float(self.project(middle)[1]), 0.0), self.optics.height_px - 1.0)
+        t_middle = t_s + row * self.row_s
+        h = max(HALF_SPAN_ROWS * self.row_s, 0.5 * self.exposure_s, 1e-4)
+        joints = self.scene.joints((t_middle - h, t_middle, t_middle + h))
+        before, now, after = transform(self.T_camera_rig, self.surface.key_points(joints))
+        slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
+        when = np.full(len(now), t_middle)
+        points = now
+        for _ in range(2):
+            when = t_s + (self._together @ self.project(points)[:, 1]) * self.row_s
+            ahead = (when - t_middle)[:, None]
+            points = now + ahead * slope + 0.5 * ahead * ahead * bend
+        speed = slope + (when - t_middle)[:, None] * bend
+        z = np.maximum(points[:, 2:], NEAREST_M)
+        speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
+        return points, self.project(points), speed_uv, when
+
+    def _cuff(self, points: Float) -> Float:
+        """Front edges (LAYERS, n, 3) of the sleeve's shading, the first the sleeve's own edge."""
+        start, end = points[SLEEVE_SPHERES[0]], points[SLEEVE_SPHERES[1]]
+        axis = unit(start - end)
+        radius = float(self.surface.radius_m[SLEEVE_SPHERES[0]])
+        across = self.to_light - (self.to_light @ axis) * axis
+        centre = start + radius * LAYER_COSINES[:, None] * across
+        return centre[:, None] + rim(np.broadcast_to(axis, (LAYERS, 3)), radius * LAYER_SINES, self.circle)
+
+    def _project_all(self, parts: tuple[Float, ...]) -> list[Float]:
+        """Project arrays of points (..., 3) in one call."""
+        uv = self.project(np.concatenate([part.reshape(-1, 3) for part in parts]))
+        ends = np.cumsum([part.size // 3 for part in parts])[:-1]
+        return [
+            flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)
+        ]
+
+
+def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
+    """Normal (3,) and offset of the plane through wrist, index and little knuckle, camera frame."""
+    wrist, index, little = snapshot.points[20], snapshot.points[4], snapshot.points[16]
+    (ax, ay, az), (bx, by, bz) = index - wrist, little - wrist
+    normal = np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return normal, float(normal @ wrist)

@@ -1,0 +1,107 @@
+"""A camera that looks at the simulated scene, in real time: the first-class stand-in for hardware.
+
+Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, says
+`epoch + start offset + k periods`. It is handed over when a real sensor would have read out its last row. The
+picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame rate loses
+frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from common.clock import Clock
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+from slave.cameras.source import Frame
+
+STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
+
+
+@runtime_checkable
+class _Skewed(Protocol):
+    """A clock that can be told apart from true time."""
+
+    def to_true(self, t_ns: int) -> int: ...
+
+    def from_true(self, t_ns: int) -> int: ...
+
+
+class SyntheticCamera:
+    """A `FrameSource` that renders. Holds the number of the next frame and how many were skipped."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera_name: str,
+        epoch_ns: int,
+        clock: Clock,
+        start_offset_ns: int,
+        true_clock: Clock,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        """Prepare the renderer. The camera may join at any time: `seq` counts from the epoch.
+
+        Args:
+            scene: What it looks at.
+            camera_name: A camera of the scene's rig.
+            epoch_ns: Scene time 0, on the true clock [ns].
+            clock: The slave's clock; stamps are on it, and its rate is that of the camera.
+            start_offset_ns: How much later than the epoch frame 0 is taken [ns].
+            true_clock: The clock of the scene.
+            sleep: Waits so many seconds.
+
+        Raises:
+            CalibrationError: The scene has no such camera, or a marker without paint.
+        """
+        self._renderer = Renderer(scene, camera_name)
+        camera = scene.cameras[camera_name]
+        self._clock, self._true, self._sleep = clock, true_clock, sleep
+        self._epoch_ns = epoch_ns
+        self._first_ns = self._own(epoch_ns + start_offset_ns)
+        self._rate_hz = camera.frame_rate_hz
+        self._readout_ns = round(camera.exposure_us * 500.0 + camera.height_px * camera.row_time_us * 1e3)
+        self._next = 0
+        self._started = False
+        self._closed = False
+        self.skipped = 0
+
+    def read(self) -> Frame | None:
+        """Draw the next frame, wait until it is due, hand it over; None once closed."""
+        if self._closed:
+            return None
+        seq = self._due_next()
+        t_ns = self._exposed_ns(seq)
+        image = self._renderer.render((self._true_ns(t_ns) - self._epoch_ns) * 1e-9)
+        self._next = seq + 1
+        due = self._true_ns(t_ns + self._readout_ns)
+        while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
+            self._sleep(min(left_s, STEP_S))
+        return Frame(seq, t_ns, self._clock.now_ns(), image)
+
+    def close(self) -> None:
+        """End the stream."""
+        self._closed = True
+
+    def _due_next(self) -> int:
+        """Number of the next frame: the one after the last, or the first that is not yet read out."""
+        late_ns = self._clock.now_ns() - self._readout_ns - self._exposed_ns(self._next)
+        period_ns = 1e9 / self._rate_hz
+        if late_ns <= (0.5 * period_ns if self._started else 0.0):
+            self._started = True
+            return self._next
+        seq = self._next + int(late_ns // period_ns) + 1
+        if self._started:
+            self.skipped += seq - self._next
+        self._started = True
+        return seq
+
+    def _exposed_ns(self, seq: int) -> int:
+        """Middle of the exposure of row 0 of frame `seq`, own clock [ns]."""
+        return self._first_ns + round(seq * 1e9 / self._rate_hz)
+
+    def _own(self, t_ns: int) -> int:
+        return self._clock.from_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+
+    def _true_ns(self, t_ns: int) -> int:
+        return self._clock.to_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
