@@ -41,6 +41,7 @@ DISTRIBUTION = {
     "zenoh": "eclipse-zenoh",
     "serial": "pyserial",
     "rerun": "rerun-sdk",
+    "rerun_cli": "rerun-sdk",
 }
 SYSTEM = frozenset({"picamera2", "libcamera"})
 # Files of common that the slave never loads may use what only the PC has.

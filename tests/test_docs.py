@@ -1,0 +1,38 @@
+"""The documents agree with the code where a machine can tell."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from common.hand_model import FINGERS, JOINTS
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "calib_json").rglob("*.md")})
+
+
+def broken_links(page: Path, text: str) -> list[str]:
+    """Relative links of `text` that lead nowhere."""
+    links = [link.split("#")[0] for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
+    return [link for link in links if link and not (page.parent / link).exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_leads_somewhere(page: Path) -> None:
+    assert broken_links(page, page.read_text()) == []
+
+
+def test_the_link_check_sees_a_broken_link() -> None:
+    assert broken_links(ROOT / "README.md", "[x](docs/none.md#y) [z](https://example.org)") == [
+        "docs/none.md"
+    ]
+
+
+def test_the_joint_table_is_the_joint_order() -> None:
+    cells = re.findall(r"\| (\d+) \| ([a-z-]+) ", (ROOT / "docs" / "frames.md").read_text())
+    assert tuple(name for _, name in sorted(cells, key=lambda cell: int(cell[0]))) == JOINTS
+    assert [int(number) for number, _ in cells] == list(range(len(JOINTS)))
+
+
+def test_the_finger_order_is_written_as_it_is() -> None:
+    assert f"rows {', '.join(FINGERS)}" in (ROOT / "docs" / "frames.md").read_text()
