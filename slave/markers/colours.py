@@ -90,7 +90,8 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
 
 def report(rows: list[ColourRow]) -> str:
     """The collision report as a table for people."""
-    lines = [f"{'marker':<10}{'H':>9}{'S':>9}{'V':>9}{'paint px':>10}{'caught':>8}{'skin':>8}{'backgr.':>9}  other markers"]
+    head = f"{'marker':<10}{'H':>9}{'S':>9}{'V':>9}{'paint px':>10}{'caught':>8}{'skin':>8}{'backgr.':>9}"
+    lines = [f"{head}  other markers"]
     for row in rows:
         low, high = row.range.hsv_low, row.range.hsv_high
         spans = "".join(f"{f'{a}-{b}':>9}" for a, b in zip(low, high, strict=True))
@@ -99,7 +100,8 @@ def report(rows: list[ColourRow]) -> str:
             f"{row.name:<10}{spans}{row.pixels:>10}{row.own:>8.1%}{row.skin:>8.2%}{row.background:>9.3%}  {others}"
         )
     bad = [r.name for r in rows if r.others or r.skin > 0.001 or r.background > 0.001]
-    lines.append(f"collisions: {', '.join(bad)}: other paint, or remove what is in the picture" if bad else "no collisions")
+    advice = "take another paint, or remove what has this colour from the picture"
+    lines.append(f"collisions: {', '.join(bad)}: {advice}" if bad else "no collisions")
     return "\n".join(lines)
 
 

@@ -1,0 +1,66 @@
+"""The slave's loop: frame in, one sealed datagram out; where camera, detector and uplink meet."""
+
+import threading
+import time
+from typing import Protocol
+
+from common.messages import MarkerDetections, Message
+from slave.cameras.source import FrameSource
+from slave.markers.detector import MarkerDetector
+from slave.tally import Tally
+
+
+class Sender(Protocol):
+    """Where detections go; an `Uplink`."""
+
+    @property
+    def session(self) -> int:
+        """Random id of this process."""
+        ...
+
+    def send(self, message: Message) -> None:
+        """Send or count as unsent; never waits."""
+        ...
+
+
+class Barrier(Protocol):
+    """What the master's start is waited for with; an `Uplink`."""
+
+    def wait_for_start(self, timeout_s: float) -> bool:
+        """Whether the start has come within the time."""
+        ...
+
+
+POLL_S = 0.2
+
+
+def wait_for_start(barrier: Barrier, stop: threading.Event) -> bool:
+    """Wait for the master as long as it takes; False if told to stop before."""
+    while not stop.is_set():
+        if barrier.wait_for_start(POLL_S):
+            return True
+    return False
+
+
+def run(
+    source: FrameSource,
+    detector: MarkerDetector,
+    sender: Sender,
+    camera: str,
+    tally: Tally,
+    stop: threading.Event,
+) -> None:
+    """Detect and send until the source ends or `stop` is set. A frame without any marker is sent as well.
+
+    Raises:
+        CameraError: The camera is gone.
+    """
+    while not stop.is_set() and (frame := source.read()) is not None:
+        began_ns = time.perf_counter_ns()
+        found = detector.push(frame.image, frame.t_ns)
+        detect_ns = time.perf_counter_ns() - began_ns
+        message = MarkerDetections(
+            camera, sender.session, frame.seq, frame.t_ns, frame.ready_t_ns, found.uv, found.area, found.quality
+        )
+        sender.send(message)
+        tally.frame(frame.seq, detect_ns, found.uv)

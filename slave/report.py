@@ -1,0 +1,146 @@
+"""Tell the master how the slave is: `Health` once a second and on command, on a thread of its own.
+
+The camera loop never waits for the bus: this thread opens it when the uplink has learned where the master's
+bus is, opens it anew when another master takes over, and lives on without it when there is none.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+from common.bus import Bus
+from common.clock import Clock
+from common.errors import BusError
+from common.messages import Command, Health
+
+PERIOD_S = 1.0
+LOG_EVERY = 10  # reports
+_LOG = logging.getLogger(__name__)
+
+
+class Link(Protocol):
+    """What the reporter asks the uplink."""
+
+    @property
+    def session(self) -> int:
+        """Random id of this process."""
+        ...
+
+    @property
+    def zenoh_endpoint(self) -> str | None:
+        """Where the master's bus listens, if known."""
+        ...
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Event -> how often."""
+        ...
+
+
+class Numbers(Protocol):
+    """Where the counts and gauges of the loop come from; a `Tally`."""
+
+    def counts(self) -> Mapping[str, int]:
+        """Event -> how often."""
+        ...
+
+    def gauges(self) -> Mapping[str, float]:
+        """Quantity with unit -> value."""
+        ...
+
+
+class Reporter:
+    """Publishes `Health` and answers "report" and "stop".
+
+    Holds the bus while a master is there, and the gauges of the last period.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        link: Link,
+        numbers: Numbers,
+        clock: Clock,
+        connect: Callable[[str], Bus],
+        stop: Callable[[], None],
+        period_s: float = PERIOD_S,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            name: Name of this slave on the bus.
+            link: Uplink, which learns the endpoint.
+            numbers: Counts of the loop.
+            clock: Clock of the reports' times.
+            connect: Opens a bus to an endpoint.
+            stop: Called on the command "stop".
+            period_s: Time between reports [s].
+        """
+        self._name = name
+        self._link = link
+        self._numbers = numbers
+        self._clock = clock
+        self._connect = connect
+        self._stop = stop
+        self._period_s = period_s
+        self._gauges: dict[str, float] = {}
+        self._bus: Bus | None = None
+        self._endpoint: str | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name=f"{name} health", daemon=True)
+        self._thread.start()
+
+    def health(self) -> Health:
+        """The report of this moment, with the gauges of the last period."""
+        counts = {**self._numbers.counts(), **self._link.counts}
+        return Health(self._name, self._link.session, self._clock.now_ns(), counts, dict(self._gauges))
+
+    def answer(self, command: Command) -> Health:
+        """Obey a command: "report" says how it is, "stop" ends the slave after the answer.
+
+        Raises:
+            ValueError: Another verb; the asker reads which ones there are.
+        """
+        if command.verb not in ("report", "stop"):
+            raise ValueError(f"{self._name}: no command {command.verb!r}; there are report, stop")
+        health = self.health()
+        if command.verb == "stop":
+            self._stop()
+        return health
+
+    def close(self) -> None:
+        """End the thread and leave the bus. Safe to call twice."""
+        self._closing.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        count = 0
+        while not self._closing.wait(self._period_s):
+            self._gauges = dict(self._numbers.gauges())
+            try:
+                self._follow(self._link.zenoh_endpoint)
+                if self._bus is not None:
+                    self._bus.publish("health", self._name, self.health())
+            except BusError as error:
+                self._leave()
+                if count % LOG_EVERY == 0:
+                    _LOG.warning("no bus: %s", error)
+            if count % LOG_EVERY == 0 and self._numbers.counts().get("frames", 0):
+                _LOG.info("%s", "  ".join(f"{k} {v:.0f}" for k, v in self._gauges.items()))
+            count += 1
+        self._leave()
+
+    def _follow(self, endpoint: str | None) -> None:
+        if endpoint is None or endpoint == self._endpoint:
+            return
+        self._leave()
+        bus = self._connect(endpoint)
+        bus.announce(self._name)
+        bus.serve(self._name, self.answer)
+        self._bus, self._endpoint = bus, endpoint
+
+    def _leave(self) -> None:
+        if self._bus is not None:
+            self._bus.close()
+        self._bus, self._endpoint = None, None

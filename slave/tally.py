@@ -1,0 +1,66 @@
+"""Count what the slave's loop does, for `Health`: frames, drops, markers seen, detection time."""
+
+import threading
+import time
+
+import numpy as np
+
+from common.arrays import Float
+
+SMOOTHING = 0.05  # weight of the newest frame in the running means
+
+
+class Tally:
+    """Counters of the loop, written by the loop and read by the health thread.
+
+    Holds the counts since the start, running means, and what the last rate was reckoned from.
+    """
+
+    def __init__(self, names: tuple[str, ...]) -> None:
+        """Count for the markers `names`."""
+        self._lock = threading.Lock()
+        self._frames = 0
+        self._dropped = 0
+        self._empty = 0
+        self._seen = np.zeros(len(names), np.int64)
+        self._names = names
+        self._last_seq: int | None = None
+        self._detect_us = 0.0
+        self._worst_us = 0.0
+        self._rate_from = (time.monotonic_ns(), 0)
+
+    def frame(self, seq: int, detect_ns: int, uv: Float) -> None:
+        """Count one frame.
+
+        Args:
+            seq: Camera's frame counter.
+            detect_ns: Time the detection took [ns].
+            uv: (M, 2) centroids [px], NaN row = not seen.
+        """
+        seen = np.isfinite(uv[:, 0])
+        took_us = detect_ns * 1e-3
+        with self._lock:
+            if self._last_seq is not None and seq > self._last_seq + 1:
+                self._dropped += seq - self._last_seq - 1
+            self._last_seq = seq
+            self._frames += 1
+            self._empty += not seen.any()
+            self._seen += seen
+            self._detect_us += (took_us - self._detect_us) * (SMOOTHING if self._frames > 1 else 1.0)
+            self._worst_us = max(self._worst_us, took_us)
+
+    def counts(self) -> dict[str, int]:
+        """Event -> how often since the start: frames, dropped, empty, seen.<marker>."""
+        with self._lock:
+            counts = {"frames": self._frames, "dropped": self._dropped, "empty": self._empty}
+            return counts | {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
+
+    def gauges(self) -> dict[str, float]:
+        """rate_hz since the last call, running mean and worst (since the last call) of the detection time [us]."""
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            since_ns, frames = self._rate_from
+            rate_hz = (self._frames - frames) * 1e9 / max(now_ns - since_ns, 1)
+            self._rate_from = (now_ns, self._frames)
+            worst_us, self._worst_us = self._worst_us, 0.0
+            return {"rate_hz": rate_hz, "detect_us": self._detect_us, "detect_worst_us": worst_us}
