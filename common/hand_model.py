@@ -12,6 +12,7 @@ stacked products and no loop over fingers.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -39,7 +40,13 @@ PALM, WRIST = 0, 1
 MIDDLE_METACARPAL, MIDDLE_PROXIMAL = 11, 12
 METACARPALS = (6, 11, 16, 21)
 CHAINS = np.array([[2, 3, 4, 5], [7, 8, 9, 10], [12, 13, 14, 15], [17, 18, 19, 20], [22, 23, 24, 25]])
-FINGER_JOINTS = ((2, 3, 4, 5), (6, 7, 8, 9, 10), (11, 12, 13, 14, 15), (16, 17, 18, 19, 20), (21, 22, 23, 24, 25))
+FINGER_JOINTS = (
+    (2, 3, 4, 5),
+    (6, 7, 8, 9, 10),
+    (11, 12, 13, 14, 15),
+    (16, 17, 18, 19, 20),
+    (21, 22, 23, 24, 25),
+)
 PALM_FRAME = "palm_frame"
 TIPS = CHAINS[:, 3]
 
@@ -71,7 +78,9 @@ class Mount:
     @property
     def finger(self) -> int | None:
         """Finger (0 thumb ... 4 little) whose chain carries the marker, or None."""
-        rows = np.flatnonzero((CHAINS == self.joint).any(axis=1)) if self.joint is not None else ()
+        if self.joint is None:
+            return None
+        rows = np.flatnonzero((CHAINS == self.joint).any(axis=1))
         return int(rows[0]) if len(rows) else None
 
 
@@ -117,7 +126,7 @@ class HandModel:
         bone = np.empty((5, 3, 3))
         turn = np.empty((5, 3, 3, 3))
         for f, chain in enumerate(CHAINS):
-            for k, (a, b) in enumerate(zip(chain[:-1], chain[1:], strict=True)):
+            for k, (a, b) in enumerate(pairwise(chain)):
                 bone[f, k] = rotation[a].T @ (position[b] - position[a])
                 turn[f, k] = rotation[a].T @ rotation[b]
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
@@ -191,7 +200,9 @@ class HandModel:
         """
         if name not in self.mounts:
             known = ", ".join(self.mounts)
-            raise CalibrationError(f"hand {self.profile.name!r}: no marker {name!r} under 'markers'; it has {known}")
+            raise CalibrationError(
+                f"hand {self.profile.name!r}: no marker {name!r} under 'markers'; it has {known}"
+            )
         return self.mounts[name]
 
     def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
@@ -220,7 +231,10 @@ def preset_couplings(preset: Literal["K", "D"]) -> Couplings:
 
 
 def _degrees(
-    abduction: tuple[float, float], flexion: tuple[float, float], pip: tuple[float, float], dip: tuple[float, float]
+    abduction: tuple[float, float],
+    flexion: tuple[float, float],
+    pip: tuple[float, float],
+    dip: tuple[float, float],
 ) -> FingerLimits:
     def span(value: tuple[float, float]) -> tuple[float, float]:
         return float(np.radians(value[0])), float(np.radians(value[1]))
@@ -264,7 +278,14 @@ def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:
 
 
 # Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
-_RADIUS_SHARE = {"wrist": 0.5, "metacarpal": 0.3, "proximal": 0.2, "intermediate": 0.175, "distal": 0.16, "tip": 0.145}
+_RADIUS_SHARE = {
+    "wrist": 0.5,
+    "metacarpal": 0.3,
+    "proximal": 0.2,
+    "intermediate": 0.175,
+    "distal": 0.16,
+    "tip": 0.145,
+}
 
 
 def _radii(profile: HandProfile, where: str) -> Float:
@@ -272,7 +293,9 @@ def _radii(profile: HandProfile, where: str) -> Float:
     unknown = (profile.radius_m or {}).keys() - set(JOINTS)
     if unknown:
         raise CalibrationError(f"{where}: radius_m: unknown joint {min(unknown)!r}")
-    a, b = (np.array(joints[f"middle-finger-phalanx-{part}"].position_m) for part in ("proximal", "intermediate"))
+    a, b = (
+        np.array(joints[f"middle-finger-phalanx-{part}"].position_m) for part in ("proximal", "intermediate")
+    )
     length = float(np.linalg.norm(b - a))
     default = [length * _RADIUS_SHARE["metacarpal"]]
     default += [length * _RADIUS_SHARE[name.rsplit("-", 1)[-1]] for name in WEBXR_JOINTS]
@@ -283,7 +306,10 @@ def _radii(profile: HandProfile, where: str) -> Float:
 def _limits(limits: Limits, where: str) -> Float:
     table = np.array(
         [
-            [getattr(getattr(limits, finger), f"{angle}_rad") for angle in ("abduction", "flexion", "pip", "dip")]
+            [
+                getattr(getattr(limits, finger), f"{angle}_rad")
+                for angle in ("abduction", "flexion", "pip", "dip")
+            ]
             for finger in FINGERS
         ]
     )

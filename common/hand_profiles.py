@@ -50,7 +50,9 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
         raise ValueError(f"side {side!r}: left or right")
     if not 0.1 <= hand_length_m <= 0.25:
         raise ValueError(f"hand length {hand_length_m} m: expected 0.1 to 0.25 m")
-    joints: dict[str, tuple[Float, Float]] = {"wrist": (np.zeros(3), _frame(np.array([0, 0, 1.0]), np.array([0, 1.0, 0])))}
+    joints: dict[str, tuple[Float, Float]] = {
+        "wrist": (np.zeros(3), _frame(np.array([0, 0, 1.0]), np.array([0, 1.0, 0])))
+    }
     joints |= _thumb() | _fingers()
     mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
 
@@ -107,7 +109,9 @@ def _fingers() -> dict[str, tuple[Float, Float]]:
         base, knuckle = np.array(_METACARPAL_BASE[finger]), np.array(mcp)
         joints[f"{finger}-finger-metacarpal"] = (base, _frame(knuckle - base, np.array([0.0, 1.0, 0.0])))
         ends = knuckle + np.cumsum([0.0, *bones])[:, None] * heading
-        for part, end in zip(("phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"), ends, strict=True):
+        for part, end in zip(
+            ("phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"), ends, strict=True
+        ):
             joints[f"{finger}-finger-{part}"] = (end, frame)
     return joints
 

@@ -9,10 +9,10 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from master.filters import OneEuro
 from master.ik.tracker import HandTracker
+from master.stages import StageTimes
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, Stage
-from master.stages import StageTimes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +60,9 @@ def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) 
         CalibrationError: A file is missing, broken or contradicts another.
     """
     rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
-    cameras = {name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in rig.cameras}
+    cameras = {
+        name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in rig.cameras
+    }
     return RigSetup.of(rig, cameras, load_hand(calibration, rig.hand, hand_file))
 
 
@@ -72,7 +74,9 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
     """
     if hand_file is None:
         if calibration is None:
-            raise CalibrationError(f"hand {name!r}: give --hand FILE, or --calibration DIR with hands/{name}.json")
+            raise CalibrationError(
+                f"hand {name!r}: give --hand FILE, or --calibration DIR with hands/{name}.json"
+            )
         hand_file = calibration / "hands" / f"{name}.json"
         if not hand_file.exists():
             raise CalibrationError(f"{hand_file}: no such hand profile: give --hand FILE")

@@ -7,6 +7,7 @@ same bytes. Only the stage times of the summary are measured.
 import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 
@@ -93,6 +94,21 @@ def write_json(path: Path, value: dict[str, object]) -> None:
         raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
 
 
+def read_json(path: Path) -> dict[str, object]:
+    """Read a summary.
+
+    Raises:
+        RecordingError: Missing, or not a JSON object.
+    """
+    try:
+        value = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: cannot read the summary: {error}") from error
+    if not isinstance(value, dict):
+        raise RecordingError(f"{path}: not a JSON object")
+    return cast(dict[str, object], value)
+
+
 def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
     """All cameras' detections in the order of their capture times; ties in the rig's order of cameras."""
     count = len(setup.rig.markers)
@@ -111,7 +127,9 @@ def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetectio
             area: Float = np.asarray(file["area_px2"], dtype=np.float64)
             quality: Float = np.asarray(file["quality"], dtype=np.float64)
     except (OSError, KeyError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}: run `phalanx-slave detect` for camera {camera!r} first") from error
+        raise RecordingError(
+            f"{path}: {error}: run `phalanx-slave detect` for camera {camera!r} first"
+        ) from error
     if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
     for row in range(len(t_ns)):

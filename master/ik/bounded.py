@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from math import sqrt
 
 from master.ik.chain import Chain
-from master.ik.joints import Vector, cross, dot
+from master.ik.vectors import Vector, cross, dot
 
 Four = tuple[float, float, float, float]
 _MAX_STEPS = 60

@@ -12,20 +12,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, HandModel
-from master.ik.joints import (
-    IDENTITY,
-    Angles,
-    Hinge,
-    Joint,
-    Matrix,
-    Rotor,
-    Vector,
-    as_matrix,
-    as_vector,
-    length,
-    product,
-    rotate,
-)
+from master.ik.joints import Angles, Hinge, Joint, Rotor
+from master.ik.vectors import IDENTITY, Matrix, Vector, as_matrix, as_vector, length, product, rotate
 
 THUMB = 0
 
@@ -150,3 +138,39 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
 def finger_root(model: HandModel, finger: int) -> Vector:
     """The MCP (thumb: CMC) in the palm frame [m]."""
     return as_vector(model.rest_position_m[CHAINS[finger, 0]])
+
+
+def nearest_reach(chain: Chain) -> float:
+    """Least |end - root| [m] inside the limits: pattern search over the joints behind the first, several starts."""
+    spans = chain.spans
+    first = 2 if isinstance(chain.links[0].joint, Rotor) else 1
+
+    def distance(flat: list[float]) -> float:
+        pose: list[Angles] = []
+        rest = iter(flat)
+        for link in chain.links:
+            count = 2 if isinstance(link.joint, Rotor) else 1
+            pose.append(tuple(next(rest) for _ in range(count)))
+        return length(chain.forward(chain.clamp(tuple(pose)))[0][-1])
+
+    least = float("inf")
+    for share in (1.0, 0.5, 0.0):
+        flat = [
+            min(max(0.0, low), high) if i < first else low + share * (high - low)
+            for i, (low, high) in enumerate(spans)
+        ]
+        here, step = distance(flat), 0.25
+        while step > 1e-4:
+            before = here
+            for i in range(first, len(flat)):
+                low, high = spans[i]
+                for move in (step, -step):
+                    trial = flat.copy()
+                    trial[i] = min(max(flat[i] + move * (high - low), low), high)
+                    found = distance(trial)
+                    if found < here:
+                        flat, here = trial, found
+            if here >= before - 1e-12:
+                step *= 0.5
+        least = min(least, here)
+    return least

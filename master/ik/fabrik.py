@@ -19,28 +19,30 @@ residual; nothing is claimed that is not so, and no finite target raises or give
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
-from math import dist, isfinite, sqrt
+from math import dist, isfinite
 from typing import NamedTuple
 
-from master.ik.chain import Chain
+from master.ik.chain import Chain, nearest_reach
 from master.ik.finger import FingerSolver
-from master.ik.joints import (
+from master.ik.joints import Angles, Hinge, Rotor
+from master.ik.vectors import (
     IDENTITY,
-    Angles,
-    Hinge,
     Matrix,
-    Rotor,
     Vector,
-    cross,
-    dot,
+    between,
     length,
+    minus,
     product,
     rotate,
     rotate_back,
+    transposed,
+    turned,
 )
 
 _NAN = float("nan")
-_RESTART_SHARES = (0.5, 0.2, 0.8)
+_RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
+"""How a restart shares out its bend between the front and the back of the chain."""
+_RESTART_HALVINGS = 14
 _STALL = 0.995
 _STALL_ITERATIONS = 6
 _SHORTEST_M = 1e-9
@@ -100,6 +102,7 @@ class Fabrik:
         nearest_m: Least distance of the end to the root that the limits allow (found by search).
         tolerance_m: Residual that counts as reached.
         max_iterations: Per attempt.
+        restarts: Attempts after a stall, at most 3; 0: FABRIK as published, with limits.
     """
 
     chain: Chain
@@ -107,9 +110,12 @@ class Fabrik:
     nearest_m: float
     tolerance_m: float
     max_iterations: int
+    restarts: int
 
     @classmethod
-    def of(cls, chain: Chain, tolerance_m: float = 1e-5, max_iterations: int = 100) -> "Fabrik":
+    def of(
+        cls, chain: Chain, tolerance_m: float = 1e-5, max_iterations: int = 100, restarts: int = 3
+    ) -> "Fabrik":
         """Prepare a chain.
 
         Raises:
@@ -119,7 +125,7 @@ class Fabrik:
             raise ValueError(
                 f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
             )
-        return cls(chain, sum(chain.lengths), _nearest(chain), tolerance_m, max_iterations)
+        return cls(chain, sum(chain.lengths), nearest_reach(chain), tolerance_m, max_iterations, restarts)
 
     def solve(
         self,
@@ -139,7 +145,7 @@ class Fabrik:
         Returns:
             The best legal pose found; NaN poses for a target that is not finite.
         """
-        goal = rotate_back(frame, _minus(target, root))
+        goal = rotate_back(frame, minus(target, root))
         reach = self._reach(goal)
         links = self.chain.links
         if reach is Reach.NOT_SEEN:
@@ -176,21 +182,36 @@ class Fabrik:
         return Reach.TOO_NEAR if distance < self.nearest_m - self.tolerance_m else Reach.WITHIN
 
     def _starts(self, seed: Pose, goal: Vector) -> Iterator[Pose]:
-        """The seed, then bent poses whose end points to the target: never on one line with it."""
+        """The seed, then bent poses as long as the target is far, turned to it: never on one line with it."""
         yield seed
-        for share in _RESTART_SHARES:
-            bent: list[Angles] = []
-            for link in self.chain.links:
-                joint = link.joint
-                if isinstance(joint, Hinge):
-                    bent.append((joint.low_rad + share * (joint.high_rad - joint.low_rad),))
-                else:
-                    bent.append(joint.clamp((0.0, 0.0)))
-            pose = self.chain.clamp(tuple(bent))
-            first = self.chain.links[0]
+        distance = length(goal)
+        first = self.chain.links[0]
+        for front, back in _RESTART_BENDS[: self.restarts]:
+            low, high = 0.0, 1.0
+            for _ in range(_RESTART_HALVINGS):
+                share = 0.5 * (low + high)
+                pose = self._bent(share, front, back)
+                end = self.chain.forward(pose)[0][-1]
+                low, high = (share, high) if length(end) > distance else (low, share)
+            pose = self._bent(0.5 * (low + high), front, back)
             end = self.chain.forward(pose)[0][-1]
             arm = rotate_back(first.joint.rotation(pose[0]), rotate_back(first.turn, end))
             yield first.joint.fit(arm, rotate_back(first.turn, goal), pose[0]), *pose[1:]
+
+    def _bent(self, share: float, front: float, back: float) -> Pose:
+        """Every hinge bent by its share of the longer way from rest; weight from `front` to `back`."""
+        links = self.chain.links
+        bent: list[Angles] = []
+        for k, link in enumerate(links):
+            joint = link.joint
+            if isinstance(joint, Hinge):
+                (rest,) = joint.clamp((0.0,))
+                end = joint.high_rad if joint.high_rad - rest >= rest - joint.low_rad else joint.low_rad
+                weight = front + (back - front) * k / max(len(links) - 1, 1)
+                bent.append((rest + min(share * weight, 1.0) * (end - rest),))
+            else:
+                bent.append(joint.clamp((0.0, 0.0)))
+        return self.chain.clamp(tuple(bent))
 
     def _attempt(self, start: Pose, goal: Vector) -> _Attempt:
         """FABRIK from one start until it arrives, stalls or tires; the best pose on the way."""
@@ -224,10 +245,10 @@ class Fabrik:
         last = len(links) - 1
         places = list(positions)
         places[last + 1] = goal
-        behind = _turned(orientations[last], links[last].bone, _minus(goal, positions[last]))
-        places[last] = _minus(goal, rotate(behind, links[last].bone))
+        behind = turned(orientations[last], links[last].bone, minus(goal, positions[last]))
+        places[last] = minus(goal, rotate(behind, links[last].bone))
         for k in range(last - 1, -1, -1):
-            wanted = _minus(places[k + 1], positions[k])
+            wanted = minus(places[k + 1], positions[k])
             next_link, bone = links[k + 1], links[k].bone
             joint = next_link.joint
             if isinstance(joint, Hinge) and joint.frame == "local":
@@ -235,13 +256,13 @@ class Fabrik:
                 mirrored = Hinge(-joint.high_rad, -joint.low_rad, joint.axis)
                 seen = rotate_back(next_link.turn, bone)
                 (angle,) = mirrored.fit(seen, rotate_back(behind, wanted), (-angles[k + 1][0],))
-                undo = product(mirrored.rotation((angle,)), _transposed(next_link.turn))
+                undo = product(mirrored.rotation((angle,)), transposed(next_link.turn))
                 here = product(behind, undo)
             else:
-                here = _turned(orientations[k], bone, wanted)
+                here = turned(orientations[k], bone, wanted)
                 if joint.frame == "local":
                     here = self._agree(here, behind, k + 1, angles[k + 1])
-            places[k] = _minus(places[k + 1], rotate(here, bone))
+            places[k] = minus(places[k + 1], rotate(here, bone))
             behind = here
         return places
 
@@ -252,7 +273,7 @@ class Fabrik:
         actual = rotate(behind, link.bone)
         angles = link.joint.fit(link.bone, rotate_back(frame, actual), now)
         allowed = rotate(frame, rotate(link.joint.rotation(angles), link.bone))
-        return product(_between(allowed, actual), here)
+        return product(between(allowed, actual), here)
 
     def _forward(
         self, places: list[Vector], now: list[Angles]
@@ -266,7 +287,7 @@ class Fabrik:
             if coupling is not None and k == coupling.follower:
                 fitted = link.joint.clamp((coupling.ratio * angles[coupling.leader][0],))
             else:
-                wanted = rotate_back(frame, _minus(places[k + 1], position))
+                wanted = rotate_back(frame, minus(places[k + 1], position))
                 fitted = link.joint.fit(link.bone, wanted, now[k])
             orientation = product(frame, link.joint.rotation(fitted))
             x, y, z = rotate(orientation, link.bone)
@@ -318,80 +339,4 @@ def _not_seen(chain: Chain) -> ChainResult:
         reached=False,
         reach=Reach.NOT_SEEN,
         degenerate=False,
-    )
-
-
-def _nearest(chain: Chain) -> float:
-    """Least |end - root| inside the limits: pattern search over the joints behind the first, several starts."""
-    spans = chain.spans
-    first = 2 if isinstance(chain.links[0].joint, Rotor) else 1
-
-    def distance(flat: list[float]) -> float:
-        pose: list[Angles] = []
-        rest = iter(flat)
-        for link in chain.links:
-            count = 2 if isinstance(link.joint, Rotor) else 1
-            pose.append(tuple(next(rest) for _ in range(count)))
-        return length(chain.forward(chain.clamp(tuple(pose)))[0][-1])
-
-    least = float("inf")
-    for share in (1.0, 0.5, 0.0):
-        flat = [
-            min(max(0.0, low), high) if i < first else low + share * (high - low)
-            for i, (low, high) in enumerate(spans)
-        ]
-        here, step = distance(flat), 0.25
-        while step > 1e-4:
-            before = here
-            for i in range(first, len(flat)):
-                low, high = spans[i]
-                for move in (step, -step):
-                    trial = flat.copy()
-                    trial[i] = min(max(flat[i] + move * (high - low), low), high)
-                    found = distance(trial)
-                    if found < here:
-                        flat, here = trial, found
-            if here >= before - 1e-12:
-                step *= 0.5
-        least = min(least, here)
-    return least
-
-
-def _minus(a: Vector, b: Vector) -> Vector:
-    return a[0] - b[0], a[1] - b[1], a[2] - b[2]
-
-
-def _transposed(m: Matrix) -> Matrix:
-    a, b, c = m
-    return (a[0], b[0], c[0]), (a[1], b[1], c[1]), (a[2], b[2], c[2])
-
-
-def _turned(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
-    """The orientation turned the shortest way so that its bone points as wanted."""
-    return product(_between(rotate(orientation, bone), wanted), orientation)
-
-
-def _between(a: Vector, b: Vector) -> Matrix:
-    """Shortest rotation from direction a to direction b; identity where either has none."""
-    scale = length(a) * length(b)
-    if not scale > _SHORTEST_M * _SHORTEST_M:
-        return IDENTITY
-    x, y, z = (component / scale for component in cross(a, b))
-    c = dot(a, b) / scale
-    if c < -1.0 + 1e-12:
-        # half a turn about any axis across a
-        least = min(range(3), key=lambda i: abs(a[i]))
-        x, y, z = cross(a, (float(least == 0), float(least == 1), float(least == 2)))
-        n = sqrt(x * x + y * y + z * z)
-        x, y, z = x / n, y / n, z / n
-        return (
-            (2 * x * x - 1, 2 * x * y, 2 * x * z),
-            (2 * x * y, 2 * y * y - 1, 2 * y * z),
-            (2 * x * z, 2 * y * z, 2 * z * z - 1),
-        )
-    k = 1.0 / (1.0 + c)
-    return (
-        (c + k * x * x, k * x * y - z, k * x * z + y),
-        (k * x * y + z, c + k * y * y, k * y * z - x),
-        (k * x * z - y, k * y * z + x, c + k * z * z),
     )

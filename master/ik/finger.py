@@ -17,21 +17,23 @@ Targets that no legal pose hits get the bounded least-squares pose (stretched or
 """
 
 from dataclasses import dataclass
-from math import acos, atan2, cos, hypot, isfinite, pi, sin
+from math import atan2, cos, dist, isfinite, sin, sqrt
 from typing import NamedTuple
 
 from common.arrays import Float
 from common.hand_model import HandModel
 from master.ik.bounded import Four, bounded_least_squares
 from master.ik.chain import THUMB, Chain, finger_chain, finger_root
-from master.ik.joints import Hinge, Matrix, Rotor, Vector, dot, rotate, rotate_back, swing_and_flex
+from master.ik.joints import Hinge, Rotor, swing_and_flex
 from master.ik.reach_table import Branch, ReachCurve, flexed
+from master.ik.vectors import Matrix, Vector, dot, rotate, rotate_back
 
 REACHED_M = 1e-6
-_SLACK_RAD = 2e-6
+_SLACK_RAD = 1e-6
 """A limit passed by less is the table's rounding: the angle is clamped, which moves the point < 0.2 um."""
-_POLE = 0.0025
-"""Within asin(sqrt(.)) of the abduction's pole the table's error grows more than 20-fold: done with care."""
+_POLE = 0.004
+"""Squared sine of the angle to the abduction's pole below which the tables alone are not exact enough: there
+their error grows more than 16-fold."""
 _EDGE = 1e-12
 """Relative slack of a squared distance at the end of a branch."""
 _SPREAD_OF_SEEDS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
@@ -118,7 +120,7 @@ class FingerSolver:
             root=finger_root(model, finger),
             ratio=ratio,
             branches=branches,
-            bound_m=_POLE**-0.5 * curve.error(branches),
+            bound_m=_POLE**-0.5 * curve.error(branches) + _SLACK_RAD * sum(chain.lengths),
             limits=chain.spans,
             before=chain.links[0].turn if thumb else None,
             rest=root.rest,
@@ -161,7 +163,7 @@ class FingerSolver:
         distance2 = x * x + y * y + z * z
         if not branch.near2 <= distance2 < branch.far2 or x * x + z * z < _POLE * distance2:
             return None
-        u = (branch.far2 - distance2) ** 0.5 * branch.per_cell
+        u = sqrt(branch.far2 - distance2) * branch.per_cell
         i = int(u)
         if i >= len(branch.rows):
             return None
@@ -172,15 +174,16 @@ class FingerSolver:
         wy += u * dy
         wz += u * dz
         (ax, ay, az), (yx, yy, yz), (zx, zy, zz) = self.rest
+        # as `swing_and_flex`, with one of the two flexions and fewer calls
         even, odd = yy * wy + yz * wz, yy * wz - yz * wy
-        ratio = (y - yx * wx) / hypot(even, odd)
-        if not -1.0 < ratio < 1.0:
+        amplitude2 = even * even + odd * odd
+        level = y - yx * wx
+        side2 = amplitude2 - level * level
+        if side2 <= 0.0:
             return None
-        f = atan2(odd, even)
-        f = f + acos(ratio) if z * self.ahead > 0.0 else f - acos(ratio)
-        if f < -pi:
-            f += 2.0 * pi
-        c, s = cos(f), sin(f)
+        side = sqrt(side2) if z * self.ahead > 0.0 else -sqrt(side2)
+        c, s = (even * level - odd * side) / amplitude2, (odd * level + even * side) / amplitude2
+        f = atan2(s, c)
         py, pz = wy * c + wz * s, wz * c - wy * s
         vx, vz = ax * wx + ay * py + az * pz, zx * wx + zy * py + zz * pz
         a = self.sign * atan2(x * vz - z * vx, x * vx + z * vz)
@@ -200,7 +203,7 @@ class FingerSolver:
         seeds: list[tuple[float, float, Four]] = []
         distance2 = dot(target, target)
         for rank, branch in enumerate(self.branches):
-            pip, w = branch.at(distance2)
+            pip, w = self._exact(branch, distance2)
             off = max(distance2 - branch.far2, branch.near2 - distance2)
             for angles, miss in self._swings(pip, self.ratio * pip, w, target):
                 legal = miss <= _SLACK_RAD and off <= _EDGE * branch.far2
@@ -208,11 +211,35 @@ class FingerSolver:
                 seeds.append((0.0 if legal else 1.0 + miss + 1e2 * max(off, 0.0) ** 0.5, close, angles))
         seeds.sort()
         goal = target if self.before is None else rotate(self.before, target)
-        if seeds[0][0] == 0.0:
-            solution = self._improve(seeds[0][2], goal)
-            if solution.reached:
-                return solution
+        for penalty, _, angles in seeds:
+            if penalty == 0.0:
+                # bones out of plane cannot point exactly at the pole: legal angles may still miss
+                left = self._miss(angles, goal)
+                if left < REACHED_M:
+                    return FingerSolution(*angles, left, True)
         return self._fallback([angles for _, _, angles in seeds[:2]], target, goal, near)
+
+    def _exact(self, branch: Branch, distance2: float) -> tuple[float, Vector]:
+        """PIP and w without the table's error: two Newton steps with the table's slope."""
+        pip, w = branch.at(distance2)
+        low, high = self.limits[2]
+        for _ in range(2):
+            dw = branch.slope(distance2)
+            slope = 2.0 * dot(w, dw)
+            w = self._point(pip, self.ratio * pip)
+            off = min(max(distance2, branch.near2), branch.far2) - dot(w, w)
+            if abs(slope) > 1e-6 * branch.far2:
+                pip = min(max(pip + off / slope, low), high)
+        return pip, self._point(pip, self.ratio * pip)
+
+    def _point(self, pip: float, dip: float) -> Vector:
+        """w: the point in the root joint's frame [m]; the DIP is cut at its limits."""
+        first, middle, last = self.chain.links
+        low, high = self.limits[3]
+        x, y, z = rotate(last.turn, flexed(min(max(dip, low), high), last.bone))
+        bone = middle.bone
+        x, y, z = rotate(middle.turn, flexed(pip, (bone[0] + x, bone[1] + y, bone[2] + z)))
+        return first.bone[0] + x, first.bone[1] + y, first.bone[2] + z
 
     def _improve(self, seed: Four, goal: Vector) -> FingerSolution:
         angles, left = bounded_least_squares(self.chain, seed, goal, 0.05 * REACHED_M)
@@ -236,10 +263,7 @@ class FingerSolver:
             seeds += [seed for share in _SPREAD_OF_SEEDS for seed in self._free_pair(*share, target)]
         else:
             # a coupled finger that misses in closed form is out of reach: the best start is enough
-            x, y, z = goal
-            start = [self.chain.forward(((a, f), (p,), (d,)))[0][-1] for a, f, p, d in seeds]
-            left = [hypot(x - tip[0], y - tip[1], z - tip[2]) for tip in start]
-            seeds = [seeds[left.index(min(left))]]
+            seeds = [min(seeds, key=lambda seed: self._miss(seed, goal))]
         best: FingerSolution | None = None
         for seed in seeds:
             solution = self._improve(seed, goal)
@@ -248,6 +272,10 @@ class FingerSolver:
             if best.reached:
                 break
         return best or NOT_SEEN
+
+    def _miss(self, angles: Four, goal: Vector) -> float:
+        a, f, pip, dip = angles
+        return dist(self.chain.forward(((a, f), (pip,), (dip,)))[0][-1], goal)
 
     def _in_plane(self, abduction: float, target: Vector) -> Four:
         """The abduction is given (cut at its limit): the point of the finger's plane nearest to the target."""
@@ -264,12 +292,5 @@ class FingerSolver:
     def _free_pair(self, pip_share: float, dip_share: float, target: Vector) -> list[Four]:
         (p_low, p_high), (d_low, d_high) = self.limits[2:]
         pip, dip = p_low + pip_share * (p_high - p_low), d_low + dip_share * (d_high - d_low)
-        _, middle, last = self.chain.links
-        x, y, z = flexed(dip, last.bone)
-        inner = rotate(last.turn, (x, y, z))
-        bone = middle.bone
-        x, y, z = flexed(pip, (bone[0] + inner[0], bone[1] + inner[1], bone[2] + inner[2]))
-        x, y, z = rotate(middle.turn, (x, y, z))
-        first = self.chain.links[0].bone
-        w = (first[0] + x, first[1] + y, first[2] + z)
+        w = self._point(pip, dip)
         return [angles for angles, _ in self._swings(pip, dip, w, target)]

@@ -13,24 +13,27 @@ angles; a direction that is legal comes back unchanged.
 The rotor has four half-angles. `box`: every flexion with every abduction. `ellipse`: the four quadrants of a cone,
 (a / A)^2 + (f / F)^2 <= 1 with the A and F of the quadrant (FABRIK's elliptic cone; Aristidou & Lasenby 2011).
 Both may lose abduction with flexion: spread fingers cannot stay spread in a fist.
-
-Vectors and matrices are tuples of floats: the chain solver calls these functions thousands of times on single
-vectors, where an array costs ten times the arithmetic.
 """
 
 from dataclasses import dataclass
 from math import acos, atan2, cos, hypot, inf, pi, sin, sqrt
 from typing import Literal
 
-import numpy as np
+from master.ik.vectors import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    cross,
+    dot,
+    length,
+    product,
+    rotate,
+    rotate_back,
+    rotation_about,
+)
 
-from common.arrays import Float
-
-Vector = tuple[float, float, float]
-Matrix = tuple[Vector, Vector, Vector]
 Angles = tuple[float, ...]
 
-IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 _TINY = 1e-15
 
 
@@ -230,74 +233,3 @@ def _check_span(what: str, low: float, high: float) -> None:
 def _turn(angle: float) -> float:
     """An angle in [0, 2 pi)."""
     return angle % (2.0 * pi)
-
-
-def dot(a: Vector, b: Vector) -> float:
-    """Scalar product."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def cross(a: Vector, b: Vector) -> Vector:
-    """Vector product."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def length(a: Vector) -> float:
-    """Euclidean norm."""
-    return sqrt(a[0] * a[0] + a[1] * a[1] + a[2] * a[2])
-
-
-def rotate(m: Matrix, v: Vector) -> Vector:
-    """m v."""
-    x, y, z = v
-    a, b, c = m
-    return (
-        a[0] * x + a[1] * y + a[2] * z,
-        b[0] * x + b[1] * y + b[2] * z,
-        c[0] * x + c[1] * y + c[2] * z,
-    )
-
-
-def rotate_back(m: Matrix, v: Vector) -> Vector:
-    """m^T v."""
-    x, y, z = v
-    a, b, c = m
-    return (
-        a[0] * x + b[0] * y + c[0] * z,
-        a[1] * x + b[1] * y + c[1] * z,
-        a[2] * x + b[2] * y + c[2] * z,
-    )
-
-
-def product(m: Matrix, n: Matrix) -> Matrix:
-    """m n."""
-    (a, b, c), (d, e, f), (g, h, i) = n
-
-    def row(r: Vector) -> Vector:
-        x, y, z = r
-        return x * a + y * d + z * g, x * b + y * e + z * h, x * c + y * f + z * i
-
-    return row(m[0]), row(m[1]), row(m[2])
-
-
-def rotation_about(axis: Vector, angle: float) -> Matrix:
-    """Rotation by `angle` [rad] about a unit vector (Rodrigues)."""
-    x, y, z = axis
-    c, s = cos(angle), sin(angle)
-    k = 1.0 - c
-    return (
-        (c + k * x * x, k * x * y - s * z, k * x * z + s * y),
-        (k * x * y + s * z, c + k * y * y, k * y * z - s * x),
-        (k * x * z - s * y, k * y * z + s * x, c + k * z * z),
-    )
-
-
-def as_matrix(array: Float) -> Matrix:
-    """A rotation (3, 3) as tuples."""
-    return as_vector(array[0]), as_vector(array[1]), as_vector(array[2])
-
-
-def as_vector(array: Float) -> Vector:
-    """A vector (3,) as a tuple."""
-    x, y, z = np.asarray(array, dtype=np.float64).tolist()
-    return x, y, z

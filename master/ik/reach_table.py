@@ -14,7 +14,8 @@ import numpy as np
 
 from common.arrays import Float
 from master.ik.chain import Chain
-from master.ik.joints import Hinge, Vector
+from master.ik.joints import Hinge
+from master.ik.vectors import Vector
 
 _CELLS = 4096
 _GRID = 2001
@@ -44,6 +45,12 @@ class Branch:
         u = min(u - i, 1.0)
         pip, d_pip, x, dx, y, dy, z, dz = self.rows[i]
         return pip + u * d_pip, (x + u * dx, y + u * dy, z + u * dz)
+
+    def slope(self, distance2: float) -> Vector:
+        """dw/dPIP [m/rad] at a squared distance [m^2]; zero on a branch without extent."""
+        u = sqrt(self.far2 - distance2) * self.per_cell if distance2 < self.far2 else 0.0
+        _, d_pip, _, dx, _, dy, _, dz = self.rows[min(int(u), _CELLS - 1)]
+        return (dx / d_pip, dy / d_pip, dz / d_pip) if d_pip != 0.0 else (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

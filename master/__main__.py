@@ -1,0 +1,187 @@
+"""Command line of the master: `phalanx-master run | solve | view | report`."""
+
+import logging
+import os
+import signal
+import sys
+import threading
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from common.calibration import HandProfile, load
+from common.errors import PhalanxError
+from common.frame_recording import open_recording
+from common.keys import rig_key
+from common.sim.scene import Scene
+from common.zenoh_bus import ZenohBus
+from master.live import LiveSettings, run_live
+from master.rig import RigSetup, load_hand, load_setup
+from master.solve import read_json, solve, write_json
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+Rig = Annotated[str, typer.Option(help="Rig: a file of CALIBRATION/rigs, without .json.")]
+Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and hands/.")]
+Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
+KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
+BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
+
+_HERE = Path("calib_json")
+_BUS = "tcp/127.0.0.1:47802"
+
+
+@app.callback()
+def phalanx_master() -> None:
+    """Turn the detections of several cameras into one hand of 26 joints.
+
+    Examples:
+
+      phalanx-master run --rig desk                     track live, slaves on this machine
+
+      phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
+
+      phalanx-master view --rig desk                    watch a running master
+
+      phalanx-master solve RECORDING --detections DIR --out DIR     the same line, offline
+    """
+
+
+@app.command()
+def run(
+    rig: Rig = "desk",
+    calibration: Calibration = _HERE,
+    hand: Hand = None,
+    beacon: Annotated[
+        str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")
+    ] = "127.255.255.255:47800",
+    bind: Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")] = "127.0.0.1:47801",
+    bus: BusEnd = _BUS,
+    key_file: KeyFile = None,
+    start_timeout_s: Annotated[
+        float, typer.Option(help="How long the first camera waits for the others.")
+    ] = 5.0,
+    poses: Annotated[Path | None, typer.Option(help="Write every pose to this .npz.")] = None,
+    summary: Annotated[Path | None, typer.Option(help="Write the figures of the run to this .json.")] = None,
+) -> None:
+    """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file."""
+    setup = load_setup(calibration, rig, hand)
+    settings = LiveSettings(
+        _address(beacon, "--beacon"), _address(bind, "--bind"), bus, start_timeout_s, poses, summary
+    )
+    run_live(setup, rig_key(os.environ, key_file), settings, _stop_on_signals(), _say)
+
+
+@app.command(name="solve")
+def solve_command(
+    recording: Annotated[Path, typer.Argument(help="Folder of a raw-frame recording.")],
+    detections: Annotated[Path, typer.Option(help="Folder with detections_<camera>.npz.")],
+    out: Annotated[Path, typer.Option(help="Folder for poses.npz and summary.json.")],
+    calibration: Annotated[
+        Path | None, typer.Option(help="Folder whose hands/ holds the rig's hand.")
+    ] = None,
+    hand: Hand = None,
+) -> None:
+    """Solve recorded detections offline and deterministically: no clock, no network."""
+    opened = open_recording(recording)
+    rig = opened.manifest.marker_rig()
+    setup = RigSetup.of(rig, opened.manifest.cameras, load_hand(calibration, rig.hand, hand))
+    out.mkdir(parents=True, exist_ok=True)
+    solve(opened, setup, detections, out, lambda done, total: _progress("solving", done, total))
+    _say(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")
+
+
+@app.command()
+def view(
+    rig: Rig = "desk",
+    calibration: Calibration = _HERE,
+    hand: Hand = None,
+    bus: BusEnd = _BUS,
+    web: Annotated[
+        bool, typer.Option(help="Serve the viewer to a browser on 127.0.0.1 instead of a window.")
+    ] = False,
+    save: Annotated[Path | None, typer.Option(help="Write an .rrd instead of showing anything.")] = None,
+) -> None:
+    """Show a running master in Rerun. A process of its own: it only listens, and may come and go."""
+    from master.outputs.rerun import run_viewer
+
+    setup = load_setup(calibration, rig, hand)
+    connection = ZenohBus(None, bus)
+    try:
+        mode = "save" if save is not None else "web" if web else "spawn"
+        run_viewer(
+            connection,
+            setup.rig,
+            setup.cameras,
+            setup.hand,
+            mode=mode,
+            path=save,
+            stop=_stop_on_signals(),
+            on_ready=_say,
+        )
+    finally:
+        connection.close()
+
+
+@app.command()
+def report(
+    poses: Annotated[Path, typer.Option(help="poses.npz of the run.")],
+    scene_epoch_ns: Annotated[int, typer.Option(help="Scene time 0 on this machine's monotonic clock [ns].")],
+    out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
+    scene: Annotated[str, typer.Option(help="Scene: standard.")] = "standard",
+    seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
+    rig: Rig = "desk",
+    calibration: Calibration = _HERE,
+    summary: Annotated[Path | None, typer.Option(help="summary.json of the run, to be completed.")] = None,
+) -> None:
+    """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file."""
+    from master.report import report_scene
+
+    if scene != "standard":
+        raise PhalanxError(f"--scene {scene!r}: known scenes: standard")
+    setup = load_setup(calibration, rig)
+    profile = load(calibration / "hands" / f"{setup.rig.hand}.json", HandProfile)
+    played = Scene.standard(setup.rig, setup.cameras, profile, seed)
+    figures = {} if summary is None else read_json(summary)
+    out.mkdir(parents=True, exist_ok=True)
+    write_json(
+        out / "summary.json", report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)
+    )
+
+
+def main() -> None:
+    """Entry point `phalanx-master`."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        app()
+    except PhalanxError as error:
+        print(f"phalanx-master: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def _stop_on_signals() -> threading.Event:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
+
+
+def _address(text: str, option: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise PhalanxError(f"{option} {text!r}: expected ADDRESS:PORT, for example 127.0.0.1:47801")
+    return host, int(port)
+
+
+def _say(line: str) -> None:
+    print(f"master: {line}", flush=True)
+
+
+def _progress(what: str, done: int, total: int) -> None:
+    if sys.stderr.isatty():
+        print(f"\r{what}: {100 * done // max(total, 1)} %   ", end="", file=sys.stderr, flush=True)
+
+
+if __name__ == "__main__":
+    main()
