@@ -42,14 +42,14 @@ def _wear(seed: int) -> Float:
     """Relative brightness (SIDE, SIDE, 3) about 1: blotches, grain and brushed streaks."""
     rng = np.random.default_rng([seed, 1])
     wear = np.ones((SIDE, SIDE, 3))
-    for cell, depth in ((256, 0.07), (64, 0.06), (16, 0.05), (4, 0.07), (1, 0.10)):
+    for cell, depth in ((256, 0.06), (64, 0.045), (16, 0.04), (4, 0.05), (1, 0.07)):
         n = SIDE // cell
         coarse = rng.normal(0.0, 1.0, (n, n))
         wear += depth * cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)[..., None]
         tint = rng.normal(0.0, 0.12, (n, n, 3))
         wear += depth * cv2.resize(tint, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
     streaks = cv2.blur(rng.normal(0.0, 1.0, (SIDE, SIDE)), (61, 1))
-    wear += 0.25 * streaks[..., None]
+    wear += 0.18 * streaks[..., None]
     return np.clip(wear, 0.5, 1.6)
 
 

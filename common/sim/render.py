@@ -20,7 +20,7 @@ from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 
 BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
-SHINE_SHARE = 0.2  # radius of the glossy spot, share of the cap's
+SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
 ROUND_LAYER = 2
 BEND_COSINE = 0.6  # a finger bent more than this is drawn in two parts, each at its own depth
@@ -70,11 +70,11 @@ class Renderer:
         self._noise = NoiseTiles.make(optics.height_px, optics.width_px, scene.seed * 64 + place)
         self._tables = light.SrgbTables.make()
         self._paint = [light.paint(name) for name in scene.rig.markers]
-        self._paint_shades = [light.shades(paint, gloss=0.06) for paint in self._paint]
+        self._paint_shades = [light.shades(paint, gloss=0.02) for paint in self._paint]
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
-        self._shine = [light.bgr_bytes(np.array(paint) + 0.14) for paint in self._paint]
+        self._shine = [light.bgr_bytes(np.array(paint) + 0.10) for paint in self._paint]
 
     def render(self, t_s: float) -> Image:
         """Image (H, W, 3) BGR of the frame whose row 0 is at mid-exposure at scene time `t_s` [s]."""

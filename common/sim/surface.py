@@ -20,7 +20,9 @@ from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
 
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
-SKIN_UNDER_PAINT = 0.97
+# The skin below the paint is a little smaller and shorter, so that it does not shine out around it.
+SKIN_UNDER_PAINT = 0.93
+SKIN_BACK_SHARE = 0.3
 
 # Sphere indices: 4 f + k is joint k of finger f; then the rest of palm, web and sleeve.
 WRIST_SPHERES = (20, 21)
@@ -129,7 +131,8 @@ class HandSurface:
                 centroid[..., cap.marker, :] - cap_centroid_ahead(cap.radius_m) * ahead
             )
             points[..., cap.base, :] = points[..., cap.centre, :] - CYLINDER_SHARE * cap.radius_m * ahead
-            points[..., 4 * cap.finger + 3, :] = points[..., cap.centre, :]  # the skin ends under the paint
+            back = SKIN_BACK_SHARE * cap.radius_m * ahead
+            points[..., 4 * cap.finger + 3, :] = points[..., cap.centre, :] - back
         for box in self.boxes:
             corners = box_corners()
             turned = np.einsum("...ij,kj->...ki", T[..., :3, :3], corners)
