@@ -116,7 +116,7 @@ def read(kind: Kind, body: bytes) -> Handshake | None:
     """Return the message of `kind` in `body`, or None if it is none."""
     try:
         return _DECODERS[kind].decode(body)
-    except (msgspec.MsgspecError, RecursionError, KeyError):
+    except (msgspec.MsgspecError, ValueError, RecursionError, KeyError):
         return None
 
 

@@ -91,7 +91,8 @@ def test_junk_is_none_and_never_an_exception(kind: Kind, body: bytes) -> None:
     assert result is None or isinstance(result, Handshake)
 
 
-def test_deep_nesting_is_none() -> None:
+def test_broken_utf8_and_deep_nesting_are_none() -> None:
+    assert read(Kind.START, b"\x81\xa4t\x85pe\x01") is None
     assert read(Kind.BEACON, b"\x91" * 4000) is None
 
 
