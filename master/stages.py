@@ -1,6 +1,6 @@
 """Where the time goes: mean duration of each named stage, measured from outside the pure code."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 from common.clock import now_ns
@@ -14,7 +14,7 @@ class StageTimes:
         self._count: dict[str, int] = {}
 
     @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
+    def __call__(self, name: str) -> Generator[None]:
         """Measure one passage through stage `name`."""
         start = now_ns()
         try:

@@ -130,7 +130,7 @@ class HandSolver:
             The solution, or None where there is no last frame and too few markers: three that are not in
             one line, or two where `facing` is known.
         """
-        seen = np.isfinite(points_m).all(axis=1) & np.isfinite(cov_m2).all(axis=(1, 2))
+        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.sum(axis=(1, 2))))
         if last is None and not _determined(points_m[seen], facing):
             return None
         whiten = self._whitening(cov_m2, seen)
@@ -192,7 +192,7 @@ class HandSolver:
 
     def _whitening(self, cov_m2: Float, seen: Bool) -> Float:
         cov = np.where(seen[:, None, None], cov_m2, np.eye(3)) + self.priors.model_m**2 * np.eye(3)
-        return np.linalg.inv(np.linalg.cholesky(cov))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
 
     def _state_prior(
         self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None
@@ -235,7 +235,7 @@ class HandSolver:
             if facing is not None:
                 # A point above the wrist stands for "the back of the hand faces the cameras".
                 observed = np.vstack([observed, points[seen].mean(axis=0) + 0.05 * facing])
-                expected = np.vstack([expected, model[seen].mean(axis=0) + [0.0, 0.05, 0.0]])
+                expected = np.vstack([expected, model[seen].mean(axis=0) + np.array([0.0, 0.05, 0.0])])
                 w = np.append(weight, 0.3)
             seeds.append((fit_rigid(observed, expected, w), x))
         return seeds

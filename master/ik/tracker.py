@@ -79,7 +79,7 @@ class HandTracker:
             cov_m2: (M, 3, 3) [m^2].
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
         """
-        seen = np.isfinite(points_m).all(axis=1)
+        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1)))
         last = self.last if self._continuous else None
         dt_s = (t_ns - self._last_ns) * 1e-9
         if last is not None and not 0.0 < dt_s <= _FORGET_S:
@@ -105,7 +105,7 @@ class HandTracker:
 
     def peek(self, points_m: Float, cov_m2: Float, towards_cameras: Float) -> HandSolution | None:
         """Solve one instant afresh and remember nothing; arguments as `push`."""
-        seen = np.isfinite(points_m).all(axis=1)
+        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1)))
         facing = towards_cameras if (seen & self._on_palm).any() else None
         return self._solver.solve(points_m, cov_m2, None, 0.0, None, facing)
 

@@ -109,7 +109,9 @@ def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:
     circle = np.stack([np.cos(phi), np.sin(phi), np.zeros(_SPOKES)], axis=1)
     # Rings of equal height have equal area, on a sphere as on a cylinder (Archimedes).
     height = (np.arange(_RINGS) + 0.5) / _RINGS
-    points, normals, areas = [], [], []
+    points: list[Float] = []
+    normals: list[Float] = []
+    areas: list[Float] = []
     for h in height:
         normal = circle * np.sqrt(1 - h * h) - [0.0, 0.0, h]
         points.append(radius_m * normal)
