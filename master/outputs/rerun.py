@@ -133,19 +133,28 @@ def _pump(
     shown, flush_ns, going = 0, now_ns(), True
     while going:
         going = go_on()
+        received = _waiting(reports)  # before the poses: a report never overtakes a pose sent before it
         for poses in _by_hand(_drain(hands)):
             scene.log_poses(poses)
             shown += len(poses)
-        while (health := reports.get(0.0)) is not None:
-            if isinstance(health, Health):
-                # A health report has the clock of its sender; the timeline has the master's.
-                at_ns = scene.last_t_ns
-                scene.log_health(health, health.t_ns if at_ns is None else at_ns)
+        for health in received:
+            # A health report has the clock of its sender; the timeline has the master's.
+            at_ns = scene.last_t_ns
+            scene.log_health(health, health.t_ns if at_ns is None else at_ns)
         if now_ns() - flush_ns > _FLUSH_PERIOD_NS:
             # The SDK queues without bound towards a viewer that hangs; one second's data is the bound here.
             _flush(recording)
             flush_ns = now_ns()
     return shown
+
+
+def _waiting(reports: Subscription) -> list[Health]:
+    """The health reports that have arrived."""
+    received: list[Health] = []
+    while (message := reports.get(0.0)) is not None:
+        if isinstance(message, Health):
+            received.append(message)
+    return received
 
 
 def _drain(hands: Subscription) -> list[HandPose]:

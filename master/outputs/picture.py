@@ -1,0 +1,258 @@
+"""One picture of a run (1600 x 900): the hand as solved, the rig around it, and how good the run was.
+
+The rig frame is that of a camera that looks along +z at the back of the hand, y down; the hand is shown
+as that camera sees it, turned a little to the side, so it stands upright. All axes of the hand and of
+the rig have one scale.
+"""
+
+import tempfile
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from common.arrays import Float
+from common.calibration import RigCalibration
+from common.errors import RecordingError
+from common.geometry import axis_rotation
+from common.hand_model import FINGER_JOINTS, TIPS, WRIST, HandModel
+from common.messages import Source
+from master.outputs.hand_render import View, render_hand
+from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
+from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
+from master.outputs.poses import Poses
+from master.outputs.truth import Truth
+
+WIDTH_PX, HEIGHT_PX = 1600, 900
+_DPI = 100
+_HAND_BOX = (0.19, 0.0, 0.43, 0.87)  # left, bottom, width, height of the figure
+_FILL = 0.90  # share of the box that the hand may take
+_SKIN = np.array([1.0, 0.79, 0.67])
+_YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
+_RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
+_STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
+# Key figures of the summary, in the order of importance: key, what it says, format.
+_FIGURES = (
+    ("poses_per_s", "poses / s", "{:.1f}"),
+    ("latency_p50_ms", "ms latency p50", "{:.1f}"),
+    ("latency_p99_ms", "ms latency p99", "{:.1f}"),
+    ("lost", "lost", "{:.0f}"),
+    ("marker_mm", "mm marker error", "{:.1f}"),
+    ("joint_mm", "mm joint error", "{:.1f}"),
+    ("joint_mm_visible", "mm joints, visible", "{:.1f}"),
+    ("pip_deg_visible", "deg PIP, visible", "{:.1f}"),
+)
+
+
+def draw_summary(
+    path: Path,
+    poses: Poses,
+    rig: RigCalibration,
+    model: HandModel,
+    summary: Mapping[str, float],
+    truth: Truth | None = None,
+    row: int | None = None,
+) -> None:
+    """Write the picture as PNG.
+
+    Args:
+        path: The file; replaced only by a complete one.
+        poses: The run; without a valid pose the picture says so.
+        rig: Camera places.
+        model: The hand; its name, side and limits are shown.
+        summary: Key figures by the names of the summary JSON; others are left out.
+        truth: Row by row with `poses`; drawn as a ghost, and as error over time.
+        row: The pose to show; None: an open hand with as many tracked joints as there are.
+
+    Raises:
+        RecordingError: The file cannot be written; nothing half written is left.
+    """
+    figure = Figure(figsize=(WIDTH_PX / _DPI, HEIGHT_PX / _DPI), dpi=_DPI, facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    _header(figure, rig, model, summary)
+    row = best_row(poses) if row is None else row
+    if row is None:
+        figure.text(0.3, 0.45, "no valid pose in this run", color=INK, size=20, ha="center")
+    else:
+        _hand(figure, poses, row, model, truth)
+        _rig(figure, poses, row, rig)
+        draw_panels(figure, poses, row, model, truth)
+    _save(figure, path)
+
+
+def best_row(poses: Poses) -> int | None:
+    """The row to show: all joints valid if possible, most of them tracked, fingers spread; None: none valid."""
+    whole = poses.valid.sum(axis=1)
+    if not whole.any():
+        return None
+    tips = poses.position_m[:, TIPS]
+    reach = np.linalg.norm(tips - poses.position_m[:, WRIST, None], axis=-1).sum(axis=1)
+    spread = np.linalg.norm(np.diff(tips, axis=1), axis=-1).sum(axis=1)
+    score = whole * 100.0 + poses.tracked.sum(axis=1) * 10.0 + np.nan_to_num(reach + spread)
+    return int(np.argmax(score))
+
+
+def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapping[str, float]) -> None:
+    figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
+    what = f"rig {rig.name} · {len(rig.cameras)} cameras · hand {model.profile.name} ({model.profile.side})"
+    figure.text(0.019, 0.897, what, color=INK, alpha=0.75, size=12, va="center")
+    shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary]
+    for i, (label, value) in enumerate(reversed(shown)):
+        x = 0.945 - i * 0.0845
+        figure.text(x, 0.949, value, color=INK, size=21, weight="bold", ha="center", va="center")
+        figure.text(x, 0.905, label, color=INK, alpha=0.75, size=10, ha="center", va="center")
+
+
+def _hand(figure: Figure, poses: Poses, row: int, model: HandModel, truth: Truth | None) -> None:
+    at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
+    view = fit_view(
+        at, axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)
+    )  # the thumb towards the eye
+    axes = figure.add_axes(_HAND_BOX)
+    axes.set_axis_off()
+    axes.set_xlim(0, view.width_px)
+    axes.set_ylim(view.height_px, 0)
+    brightness, covered = render_hand(view, at, poses.radius_m[row])
+    rgba = np.concatenate([brightness[..., None] * _SKIN, 0.8 * covered[..., None]], axis=-1)
+    axes.imshow(
+        np.clip(rgba, 0.0, 1.0), extent=(0, view.width_px, view.height_px, 0), interpolation="bilinear"
+    )
+    if truth is not None:
+        _bones(axes, view.project(truth.joints_m[row]), [TRUTH_RGB] * 26, width=1.3, dashes=(3, 2))
+    colours = [_source_rgb(code) for code in poses.source[row].tolist()]
+    pixels = view.project(at)
+    _bones(axes, pixels, colours, width=3.4)
+    for joint in np.flatnonzero(poses.valid[row]).tolist():
+        face = unit(colours[joint]) if poses.tracked[row, joint] else PAPER
+        axes.plot(
+            pixels[joint, 0],
+            pixels[joint, 1],
+            "o",
+            ms=8,
+            mfc=face,
+            mec=unit(colours[joint]),
+            mew=2.0,
+            zorder=6,
+        )
+    caps = view.project(poses.markers_m[row])
+    for m in range(poses.marker_count):
+        ring = unit(series_rgb(m))
+        axes.plot(caps[m, 0], caps[m, 1], "o", mfc="none", mec=ring, mew=2.4, ms=19, zorder=7)
+    _scale_bar(axes, view)
+    _legend(figure, poses, truth)
+
+
+def fit_view(at: Float, rotation: Float) -> View:
+    """The view in which the joints (26, 3) [m] fill the hand's box."""
+    width, height = round(_HAND_BOX[2] * WIDTH_PX), round(_HAND_BOX[3] * HEIGHT_PX)
+    turned = at @ rotation.T
+    low, high = np.nanmin(turned, axis=0), np.nanmax(turned, axis=0)
+    margin_m = 0.02  # of flesh around the joints
+    span = high - low + 2 * margin_m
+    scale = _FILL * min(width / span[0], height / span[1])
+    return View(rotation, (low + high) / 2 @ rotation, float(scale), width, height)
+
+
+def _bones(
+    axes: Axes, pixels: Float, colours: list[Rgb], width: float, dashes: tuple[float, float] | None = None
+) -> None:
+    """Every bone in the colour of its far joint."""
+    for strip in _STRIPS:
+        for a, b in pairwise(strip):
+            line = Line2D(pixels[[a, b], 0], pixels[[a, b], 1], lw=width, color=unit(colours[b]), zorder=5)
+            line.set_solid_capstyle("round")
+            if dashes is not None:
+                line.set_dashes(dashes)
+            axes.add_line(line)
+
+
+def _scale_bar(axes: Axes, view: View) -> None:
+    length = 0.05 * view.scale_px_m
+    x, y = view.width_px - 40 - length, view.height_px - 34
+    axes.plot([x, x + length], [y, y], color=INK, lw=2.5)
+    axes.text(x + length / 2, y - 9, "5 cm", color=INK, size=11, ha="center", va="bottom")
+
+
+def _legend(figure: Figure, poses: Poses, truth: Truth | None) -> None:
+    used = [source for source in Source if (poses.source[poses.valid] == source).any()]
+    entries = [
+        Line2D([], [], color=unit(SOURCE_RGB[s]), marker="o", mfc=PAPER, mew=2, lw=3, label=SOURCE_MEANING[s])
+        for s in used
+    ]
+    entries.append(Line2D([], [], color=INK, marker="o", ls="", label="filled: tracked now"))
+    entries.append(
+        Line2D([], [], color=INK, marker="o", ms=13, mfc="none", mew=2, ls="", label="marker, filtered")
+    )
+    if truth is not None:
+        entries.append(Line2D([], [], color=unit(TRUTH_RGB), ls="--", lw=1.3, label="truth"))
+    legend = figure.legend(
+        handles=entries,
+        loc="upper left",
+        bbox_to_anchor=(0.010, 0.85),
+        frameon=False,
+        fontsize=11,
+        labelspacing=0.8,
+    )
+    for text in legend.get_texts():
+        text.set_color(INK)
+
+
+def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
+    """Small view of the whole rig from the side: cameras, rays to the caps, hand."""
+    axes = figure.add_axes((0.012, 0.02, 0.215, 0.33))
+    style(axes, "Rig, seen from the side")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.set_aspect("equal", adjustable="datalim")
+    rotation = axis_rotation(0, _RIG_PITCH) @ axis_rotation(1, _RIG_YAW)
+    at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan) @ rotation.T
+    for strip in _STRIPS:
+        axes.plot(at[list(strip), 0], at[list(strip), 1], color=unit((237, 184, 153)), lw=1.8)
+    caps = poses.markers_m[row] @ rotation.T
+    middle = np.mean([rig.camera_pose(name)[:3, 3] for name in rig.cameras], axis=0) @ rotation.T
+    for name in rig.cameras:
+        pose = rig.camera_pose(name)
+        centre = pose[:3, 3] @ rotation.T
+        for cap in caps:
+            axes.plot([centre[0], cap[0]], [centre[1], cap[1]], color=unit(RAY_RGB), lw=0.6, alpha=0.55)
+        _frustum(axes, pose, rotation)
+        away = (centre - middle)[:2] * [1.0, -1.0]
+        away = 17.0 * away / max(float(np.linalg.norm(away)), 1e-6)
+        axes.annotate(name, (float(centre[0]), float(centre[1])), (float(away[0]), float(away[1])),
+                      textcoords="offset points", color=INK, size=10, ha="center", va="center")  # fmt: skip
+    axes.invert_yaxis()
+    axes.margins(0.12)
+
+
+def _frustum(axes: Axes, pose: Float, rotation: Float) -> None:
+    d, w, h = 0.05, 0.03, 0.0225
+    corners = np.array([[-w, -h, d], [w, -h, d], [w, h, d], [-w, h, d], [-w, -h, d]])
+    image = (corners @ pose[:3, :3].T + pose[:3, 3]) @ rotation.T
+    centre = pose[:3, 3] @ rotation.T
+    axes.plot(image[:, 0], image[:, 1], color=INK, lw=1.2)
+    for corner in image[:4]:
+        axes.plot([centre[0], corner[0]], [centre[1], corner[1]], color=INK, lw=1.2)
+
+
+def _source_rgb(code: int) -> Rgb:
+    return SOURCE_RGB[Source(code)] if code in set(Source) else SOURCE_RGB[Source.NONE]
+
+
+def _save(figure: Figure, path: Path) -> None:
+    temporary = None
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
+            temporary = Path(file.name)
+            # No creation date or version inside: the same run gives the same picture.
+            figure.savefig(file, format="png", dpi=_DPI, facecolor=PAPER, metadata={"Software": None})
+        temporary.chmod(0o644)
+        temporary.replace(path)
+    except OSError as error:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+        raise RecordingError(f"{path}: cannot write: {error.strerror or error}") from error
