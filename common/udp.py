@@ -8,7 +8,7 @@ from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
 
 Address = tuple[str, int]
-READ_TIMEOUT_S = 0.01  # how long `receive` waits: the grid of everything that is repeated
+READ_TIMEOUT_S = 0.01  # the grid of everything that a reading thread repeats in between
 _RECEIVE_BUFFER = 1 << 20
 
 
@@ -19,7 +19,9 @@ class UdpSocket:
     route, no such interface): both are lost like any other datagram.
     """
 
-    def __init__(self, bind: Address, shared: bool = False, broadcast: bool = False) -> None:
+    def __init__(
+        self, bind: Address, shared: bool = False, broadcast: bool = False, timeout_s: float = READ_TIMEOUT_S
+    ) -> None:
         """Bind; `shared` lets several processes hear the same broadcasts.
 
         Raises:
@@ -32,7 +34,7 @@ class UdpSocket:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
         # The kernel's own receive timeout: `settimeout` would make `send` wait as well.
-        timeout = struct.pack("ll", 0, round(READ_TIMEOUT_S * 1e6))
+        timeout = struct.pack("ll", 0, round(timeout_s * 1e6))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, timeout)
         try:
             self._socket.bind(bind)
@@ -44,7 +46,7 @@ class UdpSocket:
         self.failed = 0
 
     def receive(self) -> tuple[bytes, Address] | None:
-        """Return the next datagram and where it came from, or None after 10 ms or an error.
+        """Return the next datagram and where it came from, or None after the timeout or an error.
 
         One that is too long comes cut to one byte more than allowed, so that it is seen to be.
         """

@@ -7,8 +7,10 @@ pipeline takes detections from a queue that drops the oldest, so a slow pipeline
 import os
 import threading
 from collections import deque
+from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock, ClockEstimate
+from common.errors import BusError
 from common.messages import MarkerDetections
 from common.udp import UdpSocket
 from master.link import MasterLink, Random
@@ -47,9 +49,10 @@ class Ingest:
             random: Source of nonces.
 
         Raises:
-            BusError: The address cannot be bound.
+            BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
             ValueError: Key of wrong length, no camera or too many.
         """
+        _check_address(beacon[0])
         self._clock = clock
         timeout_ns = round(start_timeout_s * 1e9)
         self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random)
@@ -159,3 +162,13 @@ class Ingest:
                 self._overflowed += 1
             self._queue.append(detections)
             self._changed.notify()
+
+
+def _check_address(host: str) -> None:
+    """Refuse a host name: looking it up would stop the thread that reads, at every beacon."""
+    try:
+        IPv4Address(host)
+    except AddressValueError as error:
+        raise BusError(
+            f"beacon address {host!r}: must be an IPv4 address, for example 192.168.1.255"
+        ) from error

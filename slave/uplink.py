@@ -19,6 +19,7 @@ from slave.link import Random, SlaveLink
 
 ANYWHERE = "0.0.0.0"
 LOOPBACK_BROADCAST = "127.255.255.255"
+BEACON_TIMEOUT_S = 0.1
 _LOG = logging.getLogger(__name__)
 
 
@@ -54,7 +55,7 @@ class Uplink:
         self._clock = clock
         self._link = SlaveLink(name, key, clock, random)
         beacon_host, data_host = _hosts(bind)
-        self._beacons = UdpSocket((beacon_host, beacon_port), shared=True)
+        self._beacons = UdpSocket((beacon_host, beacon_port), shared=True, timeout_s=BEACON_TIMEOUT_S)
         self._data = UdpSocket((data_host, 0))
         self._lock = threading.Lock()
         self._sent = 0

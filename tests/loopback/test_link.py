@@ -1,0 +1,187 @@
+"""The link over real UDP: through a bad network, and through deaths of either side."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from common.clock import Clock, SkewedClock, SystemClock
+from common.messages import MarkerDetections
+from master.ingest import Ingest
+from slave.uplink import Uplink
+from tests.loopback.relay import Impairment, Relay
+from tests.network_helpers import detections, free_udp_port, until
+
+KEY = bytes(range(32))
+BROADCAST = "127.255.255.255"
+CLOCK_NS = 20_000_000  # clocks are 5 s apart; microseconds are asserted in simulated time (test_clock)
+BAD = Impairment(loss=0.2, delay_s=0.002, jitter_s=0.004, reorder=0.05, duplicate=0.05)
+
+
+class Rig:
+    """Two slaves with clocks of their own, and a master, all on loopback."""
+
+    def __init__(self, stack: ExitStack) -> None:
+        self.stack = stack
+        self.port = free_udp_port()
+        self.beacon = (BROADCAST, self.port)
+        self.clocks: dict[str, Clock] = {
+            "left": SystemClock(),
+            "right": SkewedClock(5_000_000_000, 50.0),
+        }
+        self.seq = {"left": 0, "right": 0}
+
+    def through(self, impairment: Impairment, seed: int) -> Relay:
+        relay = Relay(self.port, impairment, seed)
+        self.stack.callback(relay.close)
+        self.beacon = relay.beacon
+        return relay
+
+    def master(self) -> Ingest:
+        ingest = Ingest(
+            ("left", "right"), KEY, SystemClock(), self.beacon, ("127.0.0.1", 0), "tcp/127.0.0.1:1"
+        )
+        self.stack.callback(ingest.close)
+        return ingest
+
+    def slave(self, name: str) -> Uplink:
+        uplink = Uplink(name, KEY, self.clocks[name], self.port, "127.0.0.1")
+        self.stack.callback(uplink.close)
+        self.seq[name] = 0
+        return uplink
+
+    def send(self, name: str, uplink: Uplink) -> int:
+        """Send one frame taken now; return now on the master's clock."""
+        clock = self.clocks[name]
+        t_ns = clock.now_ns()
+        uplink.send(detections(name, uplink.session, self.seq[name], t_ns))
+        self.seq[name] += 1
+        return clock.to_true(t_ns) if isinstance(clock, SkewedClock) else t_ns
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    with ExitStack() as stack:
+        yield Rig(stack)
+
+
+def drain(ingest: Ingest, wait_s: float = 0.2) -> list[MarkerDetections]:
+    messages: list[MarkerDetections] = []
+    while (message := ingest.get(wait_s)) is not None:
+        messages.append(message)
+    return messages
+
+
+def stream(
+    rig: Rig, slaves: dict[str, Uplink], ingest: Ingest, seconds: float
+) -> tuple[dict[str, int], list[int]]:
+    """Send 100 frames/s from both; return how many came from each, and the errors of their times."""
+    sent: dict[tuple[str, int, int], int] = {}
+    received: list[MarkerDetections] = []
+    for _ in range(round(seconds * 100)):
+        for name, uplink in slaves.items():
+            seq = rig.seq[name]
+            sent[(name, uplink.session, seq)] = rig.send(name, uplink)
+        time.sleep(0.01)
+        received += drain(ingest, 0.0)
+    received += drain(ingest)
+    errors = [message.t_ns - sent[(message.camera, message.session, message.seq)] for message in received]
+    return {name: sum(message.camera == name for message in received) for name in slaves}, errors
+
+
+def all_started(slaves: dict[str, Uplink]) -> Callable[[], bool]:
+    return lambda: all(uplink.started for uplink in slaves.values())
+
+
+def test_a_clean_network_loses_nothing(rig: Rig) -> None:
+    slaves = {name: rig.slave(name) for name in ("left", "right")}
+    assert not slaves["left"].wait_for_start(0.05)  # no master yet
+    ingest = rig.master()
+    assert all(uplink.wait_for_start(5) for uplink in slaves.values())
+    assert ingest.connected == {"left", "right"}
+    assert slaves["left"].zenoh_endpoint == "tcp/127.0.0.1:1"
+    got, errors = stream(rig, slaves, ingest, 1.0)
+    assert got == {"left": 100, "right": 100}
+    assert max(map(abs, errors)) < CLOCK_NS
+    assert ingest.lost == 0
+    assert not ingest.refused
+    assert slaves["left"].counts["sent"] == 100
+
+
+def test_twenty_percent_loss_jitter_duplicates_and_reordering(rig: Rig) -> None:
+    relay = rig.through(BAD, seed=3)
+    slaves = {name: rig.slave(name) for name in ("left", "right")}
+    ingest = rig.master()
+    assert all(uplink.wait_for_start(10) for uplink in slaves.values())
+    got, errors = stream(rig, slaves, ingest, 3.0)
+    assert relay.lost > 100
+    assert (
+        sum(got.values())
+        == sum(ingest.counts_of(name).received for name in got) - ingest.counts["queue.dropped"]
+    )
+    for name, uplink in slaves.items():
+        counts = ingest.counts_of(name)
+        assert 120 < got[name] < 280  # 80 % of 300 arrive, some of them late
+        assert counts.late > 0
+        assert counts.duplicate > 0
+        assert counts.reordered >= counts.late
+        assert counts.lost > 20
+        # All that was sent between the first and the last that came is accounted for.
+        assert abs(counts.received + counts.lost + counts.late - uplink.counts["sent"]) < 20
+    estimate = ingest.clock_of("right")
+    assert estimate is not None
+    assert max(map(abs, errors)) < CLOCK_NS
+    assert set(ingest.refused) <= {"duplicate", "replayed", "stale"}
+
+
+@pytest.mark.parametrize("impairment", [Impairment(), BAD], ids=["clean", "bad"])
+def test_either_side_may_die_and_the_others_go_on(rig: Rig, impairment: Impairment) -> None:
+    rig.through(impairment, seed=5)
+    slaves = {name: rig.slave(name) for name in ("left", "right")}
+    ingest = rig.master()
+    assert until(all_started(slaves), 10)
+
+    session = slaves["right"].session
+    slaves["left"].close()
+    slaves["left"] = rig.slave("left")
+    assert slaves["left"].wait_for_start(5)
+    assert slaves["right"].session == session
+    assert slaves["right"].started
+    got, _ = stream(rig, slaves, ingest, 0.5)
+    assert min(got.values()) > 15
+
+    ingest.close()
+    ingest = rig.master()
+    assert until(lambda: ingest.started, 10)
+    assert until(all_started(slaves), 10)
+    got, _ = stream(rig, slaves, ingest, 0.5)
+    assert min(got.values()) > 15
+    assert {uplink.session for uplink in slaves.values()} >= {session}
+
+
+def test_a_pulled_cable_is_noticed_on_both_ends_and_its_return_too(rig: Rig) -> None:
+    relay = rig.through(Impairment(), seed=1)
+    slaves = {name: rig.slave(name) for name in ("left", "right")}
+    ingest = rig.master()
+    assert until(all_started(slaves), 5)
+    relay.cable_out = True
+    assert until(lambda: not ingest.connected, 5)
+    assert until(lambda: not any(uplink.started for uplink in slaves.values()), 5)
+    relay.cable_out = False
+    assert until(all_started(slaves), 5)
+    got, _ = stream(rig, slaves, ingest, 0.3)
+    assert min(got.values()) == 30
+
+
+def test_a_late_slave_joins_at_once(rig: Rig) -> None:
+    left = rig.slave("left")
+    ingest = Ingest(
+        ("left", "right"), KEY, SystemClock(), rig.beacon, ("127.0.0.1", 0), "", start_timeout_s=0.2
+    )  # fmt: skip
+    rig.stack.callback(ingest.close)
+    assert left.wait_for_start(5)
+    assert left.zenoh_endpoint is None
+    right = rig.slave("right")
+    assert right.wait_for_start(5)
+    assert until(lambda: ingest.connected == {"left", "right"})

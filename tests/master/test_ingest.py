@@ -1,0 +1,90 @@
+"""Ingest at its own port: rubbish from anybody is counted, a slow reader gets what is new."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from common.clock import SystemClock
+from common.datagram import MAX_DATAGRAM
+from common.errors import BusError
+from master.ingest import QUEUE, Ingest
+from tests.network_helpers import detections, free_udp_port, until
+
+KEY = bytes(range(32))
+
+
+def new_ingest(bind: tuple[str, int] = ("127.0.0.1", 0)) -> Ingest:
+    return Ingest(("left", "right"), KEY, SystemClock(), ("127.255.255.255", free_udp_port()), bind, "")
+
+
+@pytest.fixture
+def ingest() -> Iterator[Ingest]:
+    ingest = new_ingest()
+    yield ingest
+    ingest.close()
+
+
+def test_rubbish_is_counted_by_reason(ingest: Ingest) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for datagram in (
+            b"GET / HTTP/1.0",
+            b"",
+            b"PHLX",
+            b"PHLX" + bytes(60),
+            bytes(MAX_DATAGRAM + 1),
+            bytes(60000),
+        ):
+            stranger.sendto(datagram, ingest.address)
+    expected = {"foreign": 2, "cut": 1, "version": 1, "oversized": 2}
+    assert until(lambda: ingest.refused == expected)
+    assert ingest.counts["refused.oversized"] == 2
+    assert ingest.counts["left.received"] == 0
+    assert not ingest.connected
+    assert not ingest.started
+    assert ingest.get(0.0) is None
+
+
+def test_a_slow_reader_gets_the_newest_and_a_count(ingest: Ingest) -> None:
+    for seq in range(QUEUE + 5):
+        ingest._put(detections("left", 1, seq))
+    first = ingest.get(0.0)
+    assert first is not None
+    assert first.seq == 5
+    assert ingest.counts["queue.dropped"] == 5
+
+
+def test_close_wakes_a_reader_and_frees_the_port() -> None:
+    ingest = new_ingest()
+    with pytest.raises(BusError, match="cannot bind UDP"):
+        new_ingest(ingest.address)
+    ingest.close()
+    ingest.close()
+    assert ingest.get(30.0) is None
+    again = new_ingest(ingest.address)
+    again.close()
+
+
+def test_an_unknown_camera_is_the_callers_error(ingest: Ingest) -> None:
+    with pytest.raises(KeyError, match="third"):
+        ingest.clock_of("third")
+    assert ingest.clock_of("left") is None
+
+
+def test_a_beacon_that_cannot_be_sent_is_counted_and_survived() -> None:
+    ingest = Ingest(("left",), KEY, SystemClock(), ("127.0.0.1", 0), ("127.0.0.1", 0), "")
+    try:
+        assert until(lambda: ingest.counts["send_failed"] >= 2)
+    finally:
+        ingest.close()
+
+
+@pytest.mark.parametrize("host", ["pi.local", "256.0.0.1", ""])
+def test_a_beacon_address_that_is_none_is_refused_at_start(host: str) -> None:
+    with pytest.raises(BusError, match="must be an IPv4 address"):
+        Ingest(("left",), KEY, SystemClock(), (host, 1), ("127.0.0.1", 0), "")
+
+
+def test_a_wrong_key_is_refused_at_start() -> None:
+    with pytest.raises(ValueError, match="rig key of 3 bytes"):
+        Ingest(("left",), b"abc", SystemClock(), ("127.255.255.255", 1), ("127.0.0.1", 0), "")
