@@ -56,7 +56,7 @@ def report_scene(
     ghost = Ghost.of_webxr(truth.joints_m, truth.markers_m)
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
-    draw_summary(out / "hand.png", poses, setup.hand, figures, ghost)
+    draw_summary(out / "hand.png", poses, setup.rig, setup.hand, figures, ghost)
     images = _images(poses, scene, epoch_ns, tell)
     write_rrd(out / "run.rrd", poses, setup.rig, setup.cameras, setup.hand, truth=ghost, images=images)
     return full

@@ -1,0 +1,138 @@
+"""Command line `phalanx`: starts and orchestrates the processes of a rig; imports none of them."""
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from deploy.demo import DemoError, DemoSettings, run_demo, stop_on_signals
+from deploy.replay import ReplayError, ReplaySettings, run_replay
+
+_EXAMPLES = """examples:
+  phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
+  phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
+  phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
+"""
+_LABELS = {
+    "poses_per_s": ("poses", "/s"),
+    "latency_p50_ms": ("latency, median", "ms"),
+    "latency_p99_ms": ("latency, 99 %", "ms"),
+    "lost": ("frames lost on the way", ""),
+    "frames_without_pose": ("frames without a pose", ""),
+    "marker_mm": ("marker error, median", "mm"),
+    "joint_mm_visible": ("joint error, visible fingers", "mm"),
+    "joint_mm": ("joint error, all fingers", "mm"),
+    "pip_deg_visible": ("PIP error, visible fingers", "deg"),
+    "pip_deg": ("PIP error, all fingers", "deg"),
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage."""
+    options = _parser().parse_args(arguments)
+    try:
+        return _demo(options) if options.command == "demo" else _replay(options)
+    except (DemoError, ReplayError) as error:
+        print(f"phalanx: {error}", file=sys.stderr)
+        return 1
+
+
+def _demo(options: argparse.Namespace) -> int:
+    settings = DemoSettings(
+        options.seconds, options.headless, options.out, options.calibration, options.rig, options.seed
+    )
+    summary = run_demo(settings, stop_on_signals(), _say)
+    _finish(summary, options.json)
+    print(
+        f"\npicture {settings.out / 'hand.png'}\nRerun   {settings.out / 'run.rrd'}   (open with: rerun FILE)"
+    )
+    return 0
+
+
+def _replay(options: argparse.Namespace) -> int:
+    settings = ReplaySettings(options.recording, options.out, options.calibration, options.hand)
+    _finish(run_replay(settings, _say), None)
+    print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")
+    return 0
+
+
+def _finish(summary: dict[str, object], file: Path | None) -> None:
+    if file is not None:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(summary, indent=1) + "\n")
+    print()
+    for key, (label, unit) in _LABELS.items():
+        if key in summary:
+            print(f"  {label:30s} {summary[key]:>9} {unit}")
+
+
+def _say(line: str) -> None:
+    if line.startswith("\r"):
+        end = "" if sys.stdout.isatty() else "\n"
+        print(line if sys.stdout.isatty() else line[1:], end=end, flush=True)
+    else:
+        print(line, flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="phalanx",
+        description="Hand tracking from cameras that anyone can buy.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    demo = commands.add_parser(
+        "demo",
+        help="everything on this machine, without hardware",
+        description="Starts a slave with a synthetic camera for each camera of the rig, the master and the viewer.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    demo.add_argument("--headless", action="store_true", help="no viewer; write hand.png and run.rrd")
+    demo.add_argument(
+        "--seconds", type=_positive, default=30.0, metavar="N", help="length (default: %(default)s)"
+    )
+    demo.add_argument("--json", type=Path, metavar="FILE", help="write the summary to FILE as well")
+    demo.add_argument(
+        "--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: %(default)s"
+    )
+    demo.add_argument(
+        "--calibration", type=Path, default=_calibration(), metavar="DIR", help="default: %(default)s"
+    )
+    demo.add_argument("--rig", default="desk", help="default: %(default)s")
+    demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
+    replay = commands.add_parser(
+        "replay",
+        help="a recording of raw frames, offline",
+        description="Detects the markers in every camera's frames, solves the hand, scores it where there is a truth.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    replay.add_argument("recording", type=Path, metavar="RECORDING", help="folder with recording.json")
+    replay.add_argument("--out", type=Path, required=True, metavar="DIR")
+    replay.add_argument(
+        "--calibration", type=Path, metavar="DIR", help="calib_json tree: marker colours, hands"
+    )
+    replay.add_argument(
+        "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"
+    )
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < 1e6:
+        raise argparse.ArgumentTypeError("seconds must be positive")
+    return value
+
+
+def _calibration() -> Path:
+    """The calib_json of the working directory, else the one beside the source."""
+    here = Path("calib_json")
+    return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

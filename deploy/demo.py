@@ -1,0 +1,214 @@
+"""The demo: every slave of a rig with a synthetic camera, the master and the viewer, as processes on this machine.
+
+Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The cameras' clocks
+have different zeros and rates, and each camera runs 5 ms after the one before.
+"""
+
+import json
+import os
+import re
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+from deploy.process import Process
+
+_READY_S = 30.0
+_LEAD_NS = 4_000_000_000  # processes need about two seconds to be ready; the scene begins then
+_LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
+
+
+class DemoError(Exception):
+    """The demo cannot run; the text says why and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoSettings:
+    """What the user chose.
+
+    Attributes:
+        seconds: Length of the tracked run.
+        headless: No viewer; a picture and an .rrd are written instead.
+        out: Folder for logs and results.
+        calibration: calib_json tree.
+        rig: Rig to simulate.
+        seed: Seed of the scene.
+    """
+
+    seconds: float
+    headless: bool
+    out: Path
+    calibration: Path
+    rig: str
+    seed: int
+
+
+@dataclass(slots=True)
+class _State:
+    """What the processes said so far."""
+
+    tracking: threading.Event = field(default_factory=threading.Event)
+    rate: float = 0.0
+    viewer: str | None = None
+
+
+def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str], None]) -> dict[str, object]:
+    """Run the demo and return its summary.
+
+    Args:
+        settings: What the user chose.
+        stop: Set by Ctrl-C; the run then ends early, cleanly, and is summed up all the same.
+        say: Told one line of progress at a time.
+
+    Raises:
+        DemoError: A process does not come up, or the results cannot be made.
+    """
+    out = settings.out
+    out.mkdir(parents=True, exist_ok=True)
+    for stale in ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd"):
+        (out / stale).unlink(missing_ok=True)
+    epoch_ns = time.monotonic_ns() + _LEAD_NS
+    state = _State()
+    processes: list[Process] = []
+    try:
+        for name, command, environment in _table(settings, epoch_ns):
+            processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state)))
+        say(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
+        _wait_until_tracking(state, processes, stop, say)
+        _play(settings, state, processes, epoch_ns, stop, say)
+    finally:
+        # The master first: slaves that end under it would look like lost frames.
+        for process in sorted(processes, key=lambda p: p.name not in ("master", "viewer")):
+            process.stop()
+    restarts = {p.name: p.restarts for p in processes if p.restarts}
+    summary = _report(settings, epoch_ns, say)
+    if restarts:
+        summary["restarts"] = restarts
+    return summary
+
+
+def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], dict[str, str]]]:
+    """The process table: name, command line, environment."""
+    key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
+    beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
+    bus = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    place = ["--rig", settings.rig, "--calibration", str(settings.calibration)]
+    rows: list[tuple[str, list[str], dict[str, str]]] = []
+    for index, camera in enumerate(_cameras(settings)):
+        scene = ["--scene", "standard", "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
+        clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
+        start = ["--start-offset-ms", str(_LATE_MS * index)]
+        link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
+        command = ["run", "--name", camera, *place, "--camera", "synthetic", *scene, *clock, *start, *link]
+        rows.append((camera, [sys.executable, "-m", "slave", *command], key))
+    files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
+    address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
+    rows.append(("master", [sys.executable, "-m", "master", "run", *place, *address, *files], key))
+    if not settings.headless:
+        rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus], key))
+    return rows
+
+
+def _cameras(settings: DemoSettings) -> list[str]:
+    path = settings.calibration / "rigs" / f"{settings.rig}.json"
+    try:
+        return cast(list[str], json.loads(path.read_text())["cameras"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DemoError(
+            f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
+        ) from error
+
+
+def _free_port(kind: int) -> int:
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _listener(state: _State) -> Callable[[str, str], None]:
+    def on_line(name: str, line: str) -> None:
+        if name == "master":
+            if line.endswith("tracking"):
+                state.tracking.set()
+            elif match := re.search(r"rate (\d+) poses/s", line):
+                state.rate = float(match[1])
+        elif name == "viewer" and line.startswith("master: "):
+            state.viewer = line.removeprefix("master: ")
+
+    return on_line
+
+
+def _wait_until_tracking(
+    state: _State, processes: list[Process], stop: threading.Event, say: Callable[[str], None]
+) -> None:
+    say("waiting until every camera is there and the first pose is out ...")
+    deadline = time.monotonic() + _READY_S
+    while not state.tracking.wait(0.1):
+        if stop.is_set():
+            return
+        failed = next((p for p in processes if p.ended() is not None), None)
+        if failed is not None or time.monotonic() > deadline:
+            late = failed or processes[-1]
+            what = "ended" if failed else f"no pose after {_READY_S:.0f} s"
+            raise DemoError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
+
+
+def _play(
+    settings: DemoSettings,
+    state: _State,
+    processes: list[Process],
+    epoch_ns: int,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> None:
+    """Let it run for the wanted time; report the rate, and any process that died and was started again."""
+    end = max(time.monotonic(), epoch_ns * 1e-9) + settings.seconds
+    next_line = 0.0
+    while not stop.is_set() and (left := end - time.monotonic()) > 0:
+        stop.wait(min(0.2, left))
+        for process in processes:
+            if process.name == "viewer":
+                continue  # its window may be closed; the run goes on
+            if (code := process.check()) is not None:
+                say(f"{process.name} ended with code {code}: started again")
+        if time.monotonic() >= next_line:
+            next_line = time.monotonic() + 1.0
+            done = min(settings.seconds, max(0.0, settings.seconds - left))
+            viewer = f"  |  {state.viewer}" if state.viewer else ""
+            say(f"\r{done:4.0f} of {settings.seconds:.0f} s   {state.rate:3.0f} poses/s{viewer}")
+
+
+def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -> dict[str, object]:
+    out = settings.out
+    if not (out / "live.json").exists():
+        raise DemoError(f"the master wrote no summary; see {out / 'master.log'}")
+    say("comparing with the exact truth, drawing the hand ...")
+    place = ["--rig", settings.rig, "--calibration", str(settings.calibration), "--seed", str(settings.seed)]
+    files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
+    command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
+    # A second Ctrl-C may end the report; it must not reach it with the first.
+    done = subprocess.run(command, env=dict(os.environ), start_new_session=True, check=False)
+    if done.returncode != 0:
+        raise DemoError("the report failed, see above")
+    return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
+
+
+def stop_on_signals() -> threading.Event:
+    """An event that Ctrl-C or SIGTERM sets; the second one ends this process at once."""
+    stop = threading.Event()
+
+    def on_signal(number: int, _frame: object) -> None:
+        stop.set()
+        signal.signal(number, signal.SIG_DFL)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    return stop

@@ -1,0 +1,107 @@
+"""Child processes that are watched: started, logged, restarted when they crash, stopped cleanly."""
+
+import os
+import signal
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import IO
+
+_TAIL = 12
+_STOP_S = 5.0
+
+
+class Process:
+    """One row of the process table: a command that is kept running until `stop`.
+
+    Holds the child, its last lines, and how often it was restarted. Its output goes to a log file and, line by
+    line, to `on_line`, which runs on a thread of its own.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        log: Path,
+        on_line: Callable[[str, str], None],
+    ) -> None:
+        """Start the command.
+
+        Args:
+            name: For messages.
+            command: Program and arguments.
+            environment: Added to this process's own.
+            log: File that its output is appended to.
+            on_line: Called with name and line.
+
+        Raises:
+            OSError: The program or the log file cannot be opened.
+        """
+        self.name = name
+        self.restarts = 0
+        self.tail: deque[str] = deque(maxlen=_TAIL)
+        self._command, self._environment = list(command), {**os.environ, **environment}
+        self._on_line = on_line
+        self._log: IO[str] = log.open("w", buffering=1)
+        self._stopping = False
+        self._child = self._start()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the running child."""
+        return self._child.pid
+
+    def check(self) -> int | None:
+        """None while it runs; after an unexpected end the exit code, and it has been started again."""
+        code = self._child.poll()
+        if code is None or self._stopping:
+            return None
+        self.restarts += 1
+        self._child = self._start()
+        return code
+
+    def ended(self) -> int | None:
+        """Exit code, or None while it runs; nothing is restarted."""
+        return self._child.poll()
+
+    def stop(self) -> int:
+        """Ask it to end (SIGINT), insist after five seconds (SIGKILL); return the exit code."""
+        self._stopping = True
+        if self._child.poll() is None:
+            self._child.send_signal(signal.SIGINT)
+        try:
+            code = self._child.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            self._child.kill()
+            code = self._child.wait()
+        self._reader.join(1.0)
+        self._log.close()
+        return code
+
+    def _start(self) -> subprocess.Popen[str]:
+        # A session of its own: Ctrl-C reaches the launcher alone, which then stops the children in order.
+        child = subprocess.Popen(
+            self._command,
+            env=self._environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+        assert child.stdout is not None
+        self._reader = threading.Thread(target=self._read, args=(child.stdout,), daemon=True)
+        self._reader.start()
+        return child
+
+    def _read(self, output: IO[str]) -> None:
+        for line in output:
+            text = line.rstrip("\n")
+            self.tail.append(text)
+            if not self._log.closed:
+                self._log.write(f"{time.monotonic():.3f} {text}\n")
+            self._on_line(self.name, text)

@@ -1,0 +1,69 @@
+"""Replay: `phalanx-slave detect` for every camera of a recording, then `phalanx-master solve`."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+
+class ReplayError(Exception):
+    """The recording cannot be replayed; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReplaySettings:
+    """What the user chose.
+
+    Attributes:
+        recording: Folder of raw frames.
+        out: Folder for detections, poses and summary.
+        calibration: calib_json tree for marker colours and hands, or None.
+        hand: Hand profile, or None for the rig's.
+    """
+
+    recording: Path
+    out: Path
+    calibration: Path | None
+    hand: Path | None
+
+
+def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
+    """Detect, solve, and return the summary.
+
+    Raises:
+        ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
+    """
+    settings.out.mkdir(parents=True, exist_ok=True)
+    recording = str(settings.recording)
+    calibration = [] if settings.calibration is None else ["--calibration", str(settings.calibration)]
+    for camera in _cameras(settings.recording):
+        say(f"detecting markers in camera {camera} ...")
+        target = ["-o", str(settings.out / f"detections_{camera}.npz")]
+        _step("slave", "detect", recording, "--camera", camera, *calibration, *target)
+    say("solving ...")
+    hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
+    results = ["--detections", str(settings.out), "--out", str(settings.out)]
+    _step("master", "solve", recording, *calibration, *hand, *results)
+    return cast(dict[str, object], json.loads((settings.out / "summary.json").read_text()))
+
+
+def _step(module: str, *arguments: str) -> None:
+    done = subprocess.run([sys.executable, "-m", module, *arguments], check=False)
+    if done.returncode != 0:
+        raise ReplayError(f"phalanx-{module} {arguments[0]} ended with code {done.returncode}")
+
+
+def _cameras(recording: Path) -> list[str]:
+    path = recording / "recording.json"
+    try:
+        manifest = json.loads(path.read_text())
+        rigs = [*manifest.get("rigs", []), *([manifest["rig"]] if "rig" in manifest else [])]
+        marker_rigs = [rig for rig in rigs if rig["kind"] == "markers"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ReplayError(f"{path}: not a recording of raw frames ({error})") from error
+    if not marker_rigs:
+        raise ReplayError(f"{path}: no rig of kind 'markers'; wrist recordings are not solved yet")
+    return cast(list[str], marker_rigs[0]["cameras"])
