@@ -67,10 +67,10 @@ class NoiseTiles:
         plus: list[Image] = []
         minus: list[Image] = []
         for _ in range(tiles):
-            white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3)).astype(np.float32)
-            mixed = cv2.GaussianBlur(white, (3, 3), 0.45)  # a colour filter array mixes neighbours
-            noise = mixed * (NOISE_SIGMA * np.array([1.25, 0.85, 1.1], dtype=np.float32) / mixed.std())
-            level = np.round(noise).astype(np.int16)
+            white = rng.normal(0.0, 1.0, (height + NOISE_MARGIN, width + NOISE_MARGIN, 3))
+            # A colour filter array mixes neighbours.
+            mixed: Float = np.asarray(cv2.GaussianBlur(white, (3, 3), 0.45), dtype=np.float64)
+            level = np.rint(mixed * (NOISE_SIGMA * np.array([1.25, 0.85, 1.1]) / float(mixed.std())))
             plus.append(np.clip(level, 0, 255).astype(np.uint8))
             minus.append(np.clip(-level, 0, 255).astype(np.uint8))
         return cls(tuple(plus), tuple(minus))

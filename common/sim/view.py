@@ -144,6 +144,12 @@ class View:
             cuff_uv=cuff_uv,
         )
 
+    def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...]) -> list[Float]:
+        """Hull of some spheres in every layer [px]."""
+        centre, radius = snapshot.discs_uv[list(spheres)], snapshot.discs_px[list(spheres)]
+        points = centre[:, :, None] + radius[:, :, None, None] * self.circle
+        return [raster.hull(points[:, layer].reshape(-1, 2)) for layer in range(LAYERS)]
+
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
         """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
         if not snapshot.from_behind[cap]:

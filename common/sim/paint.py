@@ -1,0 +1,206 @@
+"""Markers: what each covers of the image, its paint in linear light, and the truth that a camera sees of it.
+
+Coverage is measured with everything nearer cut out, and the same coverage blends the paint into the image, so
+image and truth come from one drawing.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Image
+from common.sim import light, raster
+from common.sim.desk import LENS_SIGMA_PX
+from common.sim.raster import Coverage, Shape
+from common.sim.surface import CAPSULES, PALM_HULL, SPHERE_COUNT, unit
+from common.sim.view import LAYERS, PHALANGES, Snapshot, View
+
+BLUR_STEP_PX = 1.2
+MAX_STEPS = 6
+SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
+MARGIN_PX = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerView:
+    """What one camera truly sees of the markers in one frame.
+
+    Attributes:
+        uv: (M, 2) centroid of the visible pixels [px], averaged over the exposure; NaN where none is visible.
+        visible: (M,) visible share of the marker's own outline.
+        area: (M,) visible area [px^2].
+        t_s: (M,) scene time [s] at which the marker's row is at mid-exposure.
+    """
+
+    uv: Float
+    visible: Float
+    area: Float
+    t_s: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Painted:
+    """One marker of one frame: its coverage and its outline."""
+
+    marker: int
+    coverage: Coverage
+    outline: Shape
+    t_s: float
+
+
+class Painter:
+    """Paints the markers of one view. It holds prepared colours; every call is pure."""
+
+    def __init__(self, view: View) -> None:
+        """Prepare colours.
+
+        Raises:
+            CalibrationError: A marker of the rig has no paint.
+        """
+        self._view = view
+        self._size = (view.optics.width_px, view.optics.height_px)
+        self._tables = light.SrgbTables.make()
+        self._paint = [light.paint(name) for name in view.scene.rig.markers]
+        self._shades = [light.shades(paint, gloss=0.02) for paint in self._paint]
+        self._shine = [light.bgr_bytes(np.array(paint) + 0.10) for paint in self._paint]
+
+    def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> list[Painted]:
+        """Every marker with what it covers, everything nearer cut out."""
+        surface, view = self._view.surface, self._view
+        low, high = snapshot.outlines[:, 0].min(axis=1), snapshot.outlines[:, 0].max(axis=1)
+        palm = Shape(view.hulls(snapshot, PALM_HULL)[0], snapshot.speed_uv[list(PALM_HULL)].mean(axis=0))
+        skin = [
+            Shape(snapshot.outlines[k, 0], snapshot.speed_uv[CAPSULES[k]].mean(axis=0))
+            for k in range(PHALANGES)
+        ]
+        caps = [
+            Shape(raster.hull(uv), snapshot.speed_uv[k])
+            for uv, k in zip(snapshot.cap_uv, view.cap_centre, strict=True)
+        ]
+        centre = snapshot.points[view.cap_centre]
+        phalanx = view.phalanx_depth(snapshot, snapshot.uv[view.cap_centre]) < centre[:, 2:]
+        hidden = view.behind_palm(snapshot, centre)
+        painted: list[Painted] = []
+        for c, cap in enumerate(surface.caps):
+            shape = caps[c]
+            touched = raster.overlaps(low[:PHALANGES], high[:PHALANGES], *_reach(shape)) & phalanx[c]
+            touched[3 * cap.finger + 2] = False
+            nearer = [skin[k] for k in np.flatnonzero(touched)]
+            nearer += [caps[n] for n in range(len(caps)) if n != c and centre[n, 2] < centre[c, 2]]
+            nearer += [*([palm] if hidden[c] else []), *cards]
+            cover = raster.cover(
+                shape, view.own_finger(snapshot, c), nearer, self._moments(shape), self._size
+            )
+            painted.append(Painted(cap.marker, cover, shape, float(snapshot.t_s[cap.centre])))
+        for box in surface.boxes:
+            corners = snapshot.points[box.corners]
+            shape = Shape(raster.hull(snapshot.uv[box.corners]), snapshot.speed_uv[box.corners].mean(axis=0))
+            before = (
+                view.phalanx_depth(snapshot, snapshot.uv[box.corners].mean(axis=0)) < corners[:, 2].mean()
+            )
+            touched = raster.overlaps(low[:PHALANGES], high[:PHALANGES], *_reach(shape)) & before
+            nearer = [skin[k] for k in np.flatnonzero(touched)]
+            nearer += [*([] if view.shows_back(snapshot) else [palm]), *cards]
+            cover = raster.cover(shape, None, nearer, self._moments(shape), self._size)
+            painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
+        return sorted(painted, key=lambda item: item.marker)
+
+    def window(self, image: Image, group: list[Painted], snapshot: Snapshot) -> tuple[int, int, Image]:
+        """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""
+        width, height = self._size
+        x0 = max(min(p.coverage.x for p in group) - MARGIN_PX, 0)
+        y0 = max(min(p.coverage.y for p in group) - MARGIN_PX, 0)
+        x1 = min(max(p.coverage.x + p.coverage.alpha.shape[1] for p in group) + MARGIN_PX, width)
+        y1 = min(max(p.coverage.y + p.coverage.alpha.shape[0] for p in group) + MARGIN_PX, height)
+        window = self._tables.decode(image[y0:y1, x0:x1])
+        for item in group:
+            cover = item.coverage
+            h, w = cover.alpha.shape
+            cx0, cy0, cx1, cy1 = (
+                max(cover.x, x0),
+                max(cover.y, y0),
+                min(cover.x + w, x1),
+                min(cover.y + h, y1),
+            )
+            if cx0 >= cx1 or cy0 >= cy1:
+                continue
+            alpha = cover.alpha[cy0 - cover.y : cy1 - cover.y, cx0 - cover.x : cx1 - cover.x, None]
+            look = self._look(item, snapshot, (cx0, cy0, cx1, cy1))
+            part = window[cy0 - y0 : cy1 - y0, cx0 - x0 : cx1 - x0]
+            part += (self._tables.decode(look) - part) * alpha
+        window = cv2.GaussianBlur(window, (3, 3), LENS_SIGMA_PX)
+        left, top = int(x0 > 0), int(y0 > 0)
+        inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
+        return x0 + left, y0 + top, self._tables.encode(np.asarray(inner, dtype=np.float32))
+
+    def _look(self, item: Painted, snapshot: Snapshot, box: tuple[int, int, int, int]) -> Image:
+        """Colours of one marker's surface over a pixel box, as if it filled it."""
+        x0, y0, x1, y1 = box
+        look = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
+        view, corner, shades = self._view, np.array([x0, y0]), self._shades[item.marker]
+        look[:] = shades[0]
+        for c, cap in enumerate(view.surface.caps):
+            if cap.marker == item.marker:
+                bands = raster.fixed(snapshot.outlines[PHALANGES + c] - corner)
+                for layer in range(1, LAYERS):
+                    raster.fill(look, bands[layer], shades[layer])
+                size = SHINE_SHARE * snapshot.discs_px[SPHERE_COUNT + 2 * c, 0]
+                spot = snapshot.shine_uv[c] - corner + size * view.circle
+                raster.fill(look, raster.fixed(spot), self._shine[item.marker])
+        for side in view.surface.boxes:
+            if side.marker == item.marker:
+                uv = snapshot.uv[side.corners] - corner
+                look[:] = light.face_shade(self._paint[item.marker], 0.25)
+                top = snapshot.points[side.corners][:4]
+                normal = unit(_cross(top[1] - top[0], top[3] - top[0]))
+                facing = float(normal @ view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
+                raster.fill(look, raster.fixed(uv[:4]), light.face_shade(self._paint[item.marker], facing))
+        return look
+
+    def _moments(self, shape: Shape) -> Float:
+        """Moments of the exposure [s] at which a marker is drawn: about one per pixel of way."""
+        exposure = self._view.exposure_s
+        n = int(np.clip(np.ceil(np.hypot(*shape.velocity) * exposure / BLUR_STEP_PX), 1, MAX_STEPS))
+        return ((np.arange(n) + 0.5) / n - 0.5) * exposure
+
+    def clusters(self, painted: list[Painted]) -> list[list[Painted]]:
+        """Markers whose windows touch, together; markers outside the image or hidden left out."""
+        groups: list[tuple[Float, Float, list[Painted]]] = []
+        for item in painted:
+            cover = item.coverage
+            low = np.array([cover.x, cover.y], dtype=np.float64) - MARGIN_PX
+            high = low + np.array(cover.alpha.shape[::-1]) + 2.0 * MARGIN_PX
+            if (high <= 0).any() or (low >= np.array(self._size)).any() or not cover.alpha.any():
+                continue
+            members = [item]
+            touching = [group for group in groups if bool(raster.overlaps(low, high, group[0], group[1]))]
+            while touching:
+                for group in touching:
+                    low, high = np.minimum(low, group[0]), np.maximum(high, group[1])
+                    members += group[2]
+                groups = [group for group in groups if not any(group is taken for taken in touching)]
+                touching = [group for group in groups if bool(raster.overlaps(low, high, group[0], group[1]))]
+            groups.append((low, high, members))
+        return [members for _, _, members in groups]
+
+    @staticmethod
+    def truth(painted: list[Painted]) -> MarkerView:
+        """What is visible of all markers, in the order of the rig."""
+        covers = [item.coverage for item in painted]
+        return MarkerView(
+            uv=np.stack([raster.centroid(cover) for cover in covers]),
+            visible=np.array([cover.share for cover in covers]),
+            area=np.array([float(cover.alpha.sum()) for cover in covers]),
+            t_s=np.array([item.t_s for item in painted]),
+        )
+
+
+def _reach(shape: Shape) -> tuple[Float, Float]:
+    """Corners of a box around an outline, with room for motion during the exposure [px]."""
+    return shape.corners.min(axis=0) - 8.0, shape.corners.max(axis=0) + 8.0
+
+
+def _cross(a: Float, b: Float) -> Float:
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
