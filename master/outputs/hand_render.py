@@ -74,9 +74,9 @@ def _spheres(position_m: Float, radius_m: Float) -> Float:
     for left, right in _WEBS:
         a, b = joints[list(FINGER_JOINTS[left][:2])], joints[list(FINGER_JOINTS[right][:2])]
         segments += [tuple((1 - t) * a + t * b) for t in np.linspace(0.0, 1.0, _WEB_STEPS)[1:-1]]
-    # The ball of the thumb spans from the thumb's metacarpal to half way up the index finger's.
+    # The ball of the thumb spans from the lower part of the thumb's metacarpal to that of the index finger's.
     thumb, index = joints[list(FINGER_JOINTS[0][:2])], joints[list(FINGER_JOINTS[1][:2])]
-    root = np.stack([index[0], 0.45 * index[0] + 0.55 * index[1]])
+    thumb, root = (np.stack([bone[0], 0.45 * bone[0] + 0.55 * bone[1]]) for bone in (thumb, index))
     segments += [tuple((1 - t) * thumb + t * root) for t in np.linspace(0.0, 1.0, _WEB_STEPS)[1:-1]]
     segments += [(joints[WRIST], joints[chain[0]]) for chain in FINGER_JOINTS]
     swept = [_sweep(a, b) for a, b in segments if np.isfinite(a + b).all()]

@@ -152,7 +152,7 @@ def fit_view(at: Float, rotation: Float) -> View:
     width, height = round(_HAND_BOX[2] * WIDTH_PX), round(_HAND_BOX[3] * HEIGHT_PX)
     turned = at @ rotation.T
     low, high = np.nanmin(turned, axis=0), np.nanmax(turned, axis=0)
-    margin_m = 0.02  # of flesh around the joints
+    margin_m = 0.027  # of flesh around the joints
     span = high - low + 2 * margin_m
     scale = _FILL * min(width / span[0], height / span[1])
     return View(rotation, (low + high) / 2 @ rotation, float(scale), width, height)
