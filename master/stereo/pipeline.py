@@ -25,6 +25,7 @@ from master.stereo.triangulate import Triangulator
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0
+_HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,14 +92,15 @@ class MarkerPipeline:
         if last is None:
             # The caps' tilt is not known yet: a first solution without correction tells it.
             with self._stage("hand"):
-                first = self._tracker.peek(raw, cov, self._towards(raw))
+                first = self._tracker.peek(*self._with_rays(instant, raw, cov), self._towards(raw))
             if first is not None:
                 with self._stage("triangulate"):
                     raw, cov = self._locate(instant, first)
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
         with self._stage("hand"):
-            hand = self._tracker.push(instant.t_ns, markers, cov, self._towards(markers))
+            aims = self._with_rays(instant, markers, cov)
+            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers))
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
         self.counts["poses"] += 1
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
@@ -118,6 +120,32 @@ class MarkerPipeline:
             # Rays that pass each other: one camera saw something else of that colour.
             self.counts["epipolar_misfits"] += int(misfit.sum())
             points[misfit], cov[misfit] = np.nan, np.nan
+        return points, cov
+
+    def _with_rays(self, instant: Instant, points: Float, cov: Float) -> tuple[Float, Float]:
+        """Points and covariances with those markers added that only one camera sees.
+
+        Such a marker is somewhere on its ray. It is put there at the depth of the other markers, with a
+        covariance as long as a hand along the ray and as thin as a centroid across: the fit takes the two
+        numbers that were measured and no more.
+        """
+        seen = np.isfinite(instant.uv[..., 0])
+        lone = np.flatnonzero((seen.sum(axis=0) == 1) & np.isnan(points[:, 0]))
+        found = points[np.isfinite(points[:, 0])]
+        if not len(lone) or not len(found):
+            return points, cov
+        points, cov = points.copy(), cov.copy()
+        middle = found.mean(axis=0)
+        for marker in lone:
+            c = int(np.argmax(seen[:, marker]))
+            camera = self._cameras[c]
+            direction = camera.ray(instant.uv[c, marker])
+            points[marker] = camera.centre + np.linalg.norm(middle - camera.centre) * direction
+            doubt = self._caps.doubt_px(instant.area, points, self._cameras)[c, marker]
+            away = float(np.linalg.norm(points[marker] - camera.centre))
+            across = np.hypot(instant.sigma_px[c, marker], doubt) * away / camera.matrix[0, 0]
+            along = np.outer(direction, direction)
+            cov[marker] = across**2 * (np.eye(3) - along) + _HAND_DEPTH_M**2 * along
         return points, cov
 
     def _triangulate(self, uv: Float, sigma_px: Float) -> tuple[Float, Float, Float]:
