@@ -143,7 +143,8 @@ class MarkerDetector:
             y = max(blob.top - seed[1], seed[1] - blob.bottom, 0.0)
             if max(x, y) <= CLICK_REACH:
                 return CLICKED + math.sqrt(blob.area)  # the click names it; of its fragments take the largest
-        return TRACKED if blob is tracked else 0.0
+        track = self._tracks[m]
+        return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
 
 
 def _connected(chosen: Mapping[int, Blob]) -> bool:

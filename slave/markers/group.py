@@ -27,7 +27,9 @@ FRINGE = 0.3  # what a fringe counts
 FRINGE_RATIO = 4.0
 CLICKED = 10.0
 TRACKED = 1.0
+SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
 STRANGE_SIZE = 2.5
+STRANGE_SHARE = 0.6
 STRANGE_FILL = 0.3
 
 
@@ -57,7 +59,7 @@ class Candidate:
     @property
     def score(self) -> float:
         """Sum of evidence; 1 for being there at all."""
-        there = min(1.0, self.blob.area / SPECK) * (FRINGE if self.fringe else 1.0)
+        there = min(1.0, self.blob.area / SPECK) ** 2 * (FRINGE if self.fringe else 1.0)
         return there * (1.0 + min(1.0, 3.0 * self.skin)) + self.bonus
 
 
@@ -93,6 +95,16 @@ def linked(a: Candidate, b: Candidate) -> bool:
 
 def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     """The markers among the candidates: marker row -> candidate. A marker without a plausible blob is absent."""
+    rest = list(candidates)
+    while True:
+        best = _best_group(rest)
+        strange = [c for c in best.values() if _strange(c, [o for o in best.values() if o is not c])]
+        if not strange:
+            return best
+        rest = [c for c in rest if c not in strange]  # what it kept out may be the marker
+
+
+def _best_group(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     best: dict[int, Candidate] = {}
     best_score = -1.0
     for members in _components(candidates):
@@ -104,7 +116,7 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
         score = sum(c.score for c in chosen.values())
         if score > best_score:
             best, best_score = chosen, score
-    return {m: c for m, c in best.items() if not _strange(c, [o for o in best.values() if o is not c])}
+    return best
 
 
 def _components(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
@@ -122,7 +134,8 @@ def _components(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
 
 
 def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
-    others = [c for c in members if c.marker != candidate.marker]
+    """How well a candidate suits the rest of its group, to choose among rivals of one marker."""
+    others = [c for c in members if c.marker != candidate.marker and c.blob.area >= SPECK]
     if not others:
         return candidate.score + 1e-4 * candidate.blob.area
     typical = float(np.median([c.size for c in others]))
@@ -132,12 +145,17 @@ def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
 
 
 def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
-    """Whether a blob sits like clutter beside a hand: no skin, and a size or shape unlike the others."""
-    if len(others) < 2 or candidate.bonus >= CLICKED or candidate.skin > 0.08:
+    """Whether a blob lies like clutter beside a hand: no skin touches it, and it is as large as the largest
+    marker, or thin like a pen. A cap seen from its tip has no skin around it either, but it is small and round.
+    """
+    others = [c for c in others if c.blob.area >= SPECK]
+    if not others or candidate.bonus >= TRACKED or candidate.skin >= SKINLESS:
         return False
-    if float(np.median([c.skin for c in others])) < 0.15:
+    if float(np.median([c.skin for c in others])) < 3.0 * SKINLESS:
         return False
     blob = candidate.blob
     fill = blob.area / ((blob.right - blob.left) * (blob.bottom - blob.top))
-    typical = float(np.median([c.blob.area for c in others]))
-    return blob.area > STRANGE_SIZE * typical or (blob.area > SPECK and fill < STRANGE_FILL)
+    largest, typical = max(c.blob.area for c in others), float(np.median([c.blob.area for c in others]))
+    return blob.area > min(STRANGE_SIZE * typical, STRANGE_SHARE * largest) or (
+        blob.area >= SPECK and fill < STRANGE_FILL
+    )
