@@ -1,0 +1,156 @@
+"""Write a rendered sequence as a recording of raw frames with its exact truth, for the offline line and its tests.
+
+The form is that of every recording (recording.json, frames.csv, PNG files); the truth has the keys and conventions
+of rendered recordings: truth.npz, truth_meta.json.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from common.arrays import Float, Image
+from common.errors import RecordingError
+from common.frame_recording import COLUMNS, FRAMES, MANIFEST, Illumination, Manifest
+from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
+from common.sim.light import PAINT_LINEAR_RGB
+from common.sim.paint import MarkerView
+from common.sim.render import Renderer
+from common.sim.scene import Scene, SceneTruth
+
+TRUTH = "truth.npz"
+TRUTH_META = "truth_meta.json"
+FIRST_NS = 10**9  # scene time 0 in frames.csv
+ANGLE_NAMES = (
+    *("thumb_cmc_flex", "thumb_cmc_abd", "thumb_cmc_twist", "thumb_mcp", "thumb_ip"),
+    *(f"{f}_{a}" for f in FINGERS[1:] for a in ("mcp_flex", "mcp_abd", "pip", "dip")),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """Truth of one row: every camera's view and its time of row 0 [s], and the scene at the reference time."""
+
+    views: tuple[MarkerView, ...]
+    t_row0: tuple[float, ...]
+    reference: SceneTruth
+
+
+def record_scene(
+    folder: Path, scene: Scene, seconds: float, start_s: float = 0.0, continuous: bool = True
+) -> int:
+    """Render `seconds` of a scene with every camera of its rig; return the number of frames per camera.
+
+    Cameras run as the scene's timing says, all stamped on one clock. The reference time of a row is the middle
+    of the exposure of the centre row of the rig's first camera.
+
+    Args:
+        folder: Made if missing; must hold no recording yet.
+        scene: What to render.
+        seconds: How long [s]; at least one frame is written.
+        start_s: Scene time of the first frame [s].
+        continuous: False tells readers that every frame is a pose of its own.
+
+    Raises:
+        RecordingError: The folder holds a recording already, or cannot be written.
+        ValueError: The cameras differ in frame rate.
+    """
+    names = scene.rig.cameras
+    rates = {scene.cameras[name].frame_rate_hz for name in names}
+    if len(rates) != 1:
+        raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
+    if (folder / MANIFEST).exists():
+        raise RecordingError(f"{folder}: holds a recording already; give an empty folder")
+    period = 1.0 / rates.pop()
+    count = max(round(seconds / period), 1)
+    renderers = [Renderer(scene, name) for name in names]
+    offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
+    lead = scene.cameras[names[0]]
+    centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
+    rows: list[_Row] = []
+    lines: list[tuple[object, ...]] = []
+    try:
+        for name in names:
+            (folder / name).mkdir(parents=True, exist_ok=True)
+        for k in range(count):
+            times = tuple(start_s + k * period + offset for offset in offsets)
+            views: list[MarkerView] = []
+            for name, renderer, t in zip(names, renderers, times, strict=True):
+                image, view = renderer.observe(t)
+                file = f"{name}/{k:06d}.png"
+                _write_png(folder / file, image)
+                lines.append((name, k, FIRST_NS + round(t * 1e9), Illumination.NONE.value, file))
+                views.append(view)
+            rows.append(_Row(tuple(views), times, scene.truth(times[0] + centre_s)))
+        _write_tables(folder, scene, rows, lines, continuous)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
+    return count
+
+
+def _write_png(path: Path, image: Image) -> None:
+    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
+        raise RecordingError(f"{path}: cannot write")
+
+
+def _write_tables(
+    folder: Path, scene: Scene, rows: list[_Row], lines: list[tuple[object, ...]], continuous: bool
+) -> None:
+    clicks = {
+        name: {
+            marker: (float(uv[0]), float(uv[1]))
+            for marker, uv in zip(scene.rig.markers, view.uv, strict=True)
+            if np.isfinite(uv).all()
+        }
+        for name, view in zip(scene.rig.cameras, rows[0].views, strict=True)
+    }
+    manifest = Manifest(
+        version=1,
+        kind="markers",
+        cameras={name: scene.cameras[name] for name in scene.rig.cameras},
+        rig=scene.rig,
+        clicks=clicks,
+        continuous=continuous,
+        note=f"rendered scene, seed {scene.seed}",
+    )
+    (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1))
+    with (folder / FRAMES).open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        writer.writerows(lines)
+    truths = [row.reference for row in rows]
+    np.savez(
+        folder / TRUTH,
+        uv=np.array([[view.uv for view in row.views] for row in rows]),
+        frac=np.array([[view.visible for view in row.views] for row in rows]),
+        px=np.array([[view.area for view in row.views] for row in rows]),
+        t_cap=np.array([[view.t_s for view in row.views] for row in rows]),
+        t_row0=np.array([row.t_row0 for row in rows]),
+        t_ref=np.array([truth.t_s for truth in truths]),
+        paint_centroid=np.array([truth.markers_m for truth in truths]),
+        joints=np.array([truth.joints.position_m[1:] for truth in truths]),
+        angles=np.array([named_angles(scene.model, truth.angles_rad) for truth in truths]),
+        T_palm=np.array([truth.T_rig_palm for truth in truths]),
+    )
+    meta = {
+        "scene": "stereo",
+        "frames": len(rows),
+        "markers": scene.rig.markers,
+        "joints": WEBXR_JOINTS,
+        "angles": ANGLE_NAMES,
+        "seed": scene.seed,
+        "paint_reflectance_linear_srgb": PAINT_LINEAR_RGB,
+    }
+    (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
+
+
+def named_angles(model: HandModel, angles_rad: Float) -> Float:
+    """Angles (21,) [rad] in the order of ANGLE_NAMES, of angles (5, 4): abduction there is from the palm's +z."""
+    thumb = angles_rad[0]
+    ahead = -model.rest_rotation[CHAINS[1:, 0], :, 2]
+    spread = angles_rad[1:, 0] + model.side_sign * np.arctan2(ahead[:, 0], ahead[:, 2])
+    fingers = np.stack([angles_rad[1:, 1], spread, angles_rad[1:, 2], angles_rad[1:, 3]], axis=1)
+    return np.concatenate([[thumb[1], thumb[0], 0.0, thumb[2], thumb[3]], fingers.ravel()])
