@@ -93,10 +93,16 @@ class MarkerDetector:
         self._seeds = {}
         count = len(self._names)
         uv, area, quality = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
-        for m, blob in chosen.items():
-            track = self._tracks[m]
-            extent = max(track.width, track.height) * 1.3 if track is not None and track.alive(t_ns) else math.inf
-            seen = measure(image, self._table, self._table.bits[m], blob, extent)
+        rows = list(chosen)
+        measured = measure(
+            image,
+            self._table,
+            [self._table.bits[m] for m in rows],
+            [chosen[m] for m in rows],
+            [self._extent(m, t_ns) for m in rows],
+        )
+        for m, seen in zip(rows, measured, strict=True):
+            blob, track = chosen[m], self._tracks[m]
             if seen is None or (seen.thin and seen.foreign > FRINGE):
                 continue
             self._tracks[m] = track = advance(track, seen, blob, t_ns)
@@ -104,6 +110,13 @@ class MarkerDetector:
             area[m] = seen.area
             quality[m] = _quality(seen, track, blob, blobs[m])
         return Detections(uv, area, quality)
+
+    def _extent(self, m: int, t_ns: int) -> float:
+        """Largest side of the whole marker [px] as far as its track knows, else inf."""
+        track = self._tracks[m]
+        if track is None or not track.alive(t_ns):
+            return math.inf
+        return 1.3 * max(track.width, track.height) + 2.0
 
     def _decide(self, image: Image, blobs: list[list[Blob]], t_ns: int) -> dict[int, Blob]:
         """Marker row -> its blob, by prediction alone where that answers for every colour in the image."""
