@@ -29,6 +29,7 @@ LEASE_MS = 1000
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 MAX_MESSAGE_BYTES = 1 << 20
 ASK_AGAIN_S = 0.05
+JOIN_S = 1.0
 LIVELINESS_TIMEOUT_S = 0.5
 FIFO_DEPTH = 64
 
@@ -59,6 +60,7 @@ class ZenohBus:
             ) from error
         self._inboxes: list[Inbox] = []
         self._undeclare: list[Callable[[], None]] = []
+        self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._closed = False
 
@@ -94,8 +96,9 @@ class ZenohBus:
         undeclare.append(_quietly(subscriber))
         # The handler by itself: a thread that waits in `subscriber.recv` would block `undeclare`.
         handler = subscriber.handler
-        _start(f"bus {key}", lambda: inbox.put(handler.recv().payload.to_bytes()))
+        thread = _start(f"bus {key}", lambda: inbox.put(handler.recv().payload.to_bytes()))
         with self._lock:
+            self._threads = [alive for alive in self._threads if alive.is_alive()] + [thread]
             self._inboxes.append(inbox)
         return inbox
 
@@ -112,8 +115,9 @@ class ZenohBus:
             with queries.recv() as query:
                 _answer(query, handler)
 
-        _start(f"bus command {name}", answer_next)
+        thread = _start(f"bus command {name}", answer_next)
         with self._lock:
+            self._threads.append(thread)
             self._undeclare.append(_quietly(queryable))
 
     def ask(self, command: Command, timeout_s: float) -> Health:
@@ -160,7 +164,7 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
-            inboxes, undeclare = list(self._inboxes), list(self._undeclare)
+            inboxes, undeclare, threads = list(self._inboxes), list(self._undeclare), list(self._threads)
         for inbox in inboxes:
             inbox.close()
         for forget in undeclare:
@@ -169,6 +173,10 @@ class ZenohBus:
             self._session.close()
         except zenoh.ZError as error:
             _LOG.warning("bus: closing: %s", error)
+        for thread in threads:
+            # A thread that is still inside zenoh when the interpreter ends aborts the process.
+            if thread is not threading.current_thread():
+                thread.join(JOIN_S)
 
     def _check_open(self) -> None:
         if self._closed:
@@ -213,7 +221,7 @@ def _settings(listen: str | None, connect: str | None) -> dict[str, object]:
     }
 
 
-def _start(name: str, step: Callable[[], None]) -> None:
+def _start(name: str, step: Callable[[], None]) -> threading.Thread:
     """Repeat `step` on a thread until zenoh closes what it reads from."""
 
     def run() -> None:
@@ -223,7 +231,9 @@ def _start(name: str, step: Callable[[], None]) -> None:
         except zenoh.ZError:
             return
 
-    threading.Thread(target=run, name=name, daemon=True).start()
+    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread.start()
+    return thread
 
 
 def _answer(query: zenoh.Query, handler: Handler) -> None:
