@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check bench schema clean
+.PHONY: help install demo test check format bench schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -24,7 +24,7 @@ install: $(STAMP) ## make .venv with everything in it, in the locked versions
 demo: $(STAMP) ## two simulated cameras and the master as live processes on this machine
 	@mkdir -p out/demo
 	@headless=; [ -n "$${DISPLAY-}$${WAYLAND_DISPLAY-}" ] || headless=--headless; \
-	  exec $(BIN)/phalanx demo $$headless --seconds $(DEMO_SECONDS) --json out/demo/summary.json $(DEMO_ARGS)
+	  exec $(BIN)/phalanx demo $$headless --seconds $(DEMO_SECONDS) --out out/demo --json out/demo/summary.json $(DEMO_ARGS)
 
 test: check ## check, then all tests
 	@$(BIN)/python -m pytest -n 2 --dist loadfile $(TEST_ARGS)
@@ -33,6 +33,10 @@ check: $(STAMP) ## lint, format and strict types
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
 	@$(BIN)/python -m pyright --pythonpath $(BIN)/python
+
+format: $(STAMP) ## rewrite the layout of all files, and mend what lint can mend
+	@$(BIN)/ruff check --fix --quiet || true
+	@$(BIN)/ruff format
 
 bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
 	@$(BIN)/python -m bench $(BENCH_ARGS)
