@@ -10,6 +10,7 @@ Samples and commands are read from zenoh's fifo by one thread each, never in a c
 zenoh's own threads.
 """
 
+import atexit
 import json
 import logging
 import threading
@@ -63,6 +64,9 @@ class ZenohBus:
         self._threads: list[threading.Thread] = []
         self._lock = threading.Lock()
         self._closed = False
+        # A thread that is still inside zenoh when the interpreter ends aborts the process, and with
+        # it the report of whatever error ended the program before it could close this.
+        atexit.register(self.close)
 
     @property
     def peers(self) -> int:
@@ -164,6 +168,7 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
+            atexit.unregister(self.close)
             inboxes, undeclare, threads = list(self._inboxes), list(self._undeclare), list(self._threads)
         for inbox in inboxes:
             inbox.close()
@@ -174,7 +179,6 @@ class ZenohBus:
         except zenoh.ZError as error:
             _LOG.warning("bus: closing: %s", error)
         for thread in threads:
-            # A thread that is still inside zenoh when the interpreter ends aborts the process.
             if thread is not threading.current_thread():
                 thread.join(JOIN_S)
 

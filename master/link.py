@@ -39,9 +39,9 @@ from master.sequence import CameraCounts, Sequence
 Address = tuple[str, int]
 Random = Callable[[int], bytes]
 
-BEACON_NS = 200_000_000
+BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # until the clock is settled
-ECHO_EARLY_NS = 100_000_000
+ECHO_EARLY_NS = 50_000_000
 ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten

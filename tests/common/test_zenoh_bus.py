@@ -164,3 +164,23 @@ def test_a_target_that_never_answers_is_a_timeout_that_names_the_living() -> Non
     finally:
         slave.close()
         master.close()
+
+
+LEFT_OPEN = """
+import sys
+from common.zenoh_bus import ZenohBus
+from tests.network_helpers import free_endpoint, health
+bus = ZenohBus(free_endpoint(), None)
+bus.subscribe("health")
+bus.serve("left", lambda command: health("left"))
+sys.exit(int(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("code", [0, 3])
+def test_a_program_that_ends_without_closing_is_not_aborted(code: int) -> None:
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", LEFT_OPEN, str(code)], cwd=root, capture_output=True, timeout=30, check=False
+    )
+    assert (done.returncode, done.stderr) == (code, b"")
