@@ -15,6 +15,7 @@ area, and light adds linearly, so in linear light the share is measurable:
 All windows lie in one stack of tiles, so that a step costs one call, not one per marker. (Fisher 1936.)
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias, cast
@@ -28,17 +29,19 @@ from slave.markers.blobs import Blob
 from slave.markers.classify import ColourTable
 
 Float32: TypeAlias = npt.NDArray[np.float32]
+Index: TypeAlias = npt.NDArray[np.intp]
 
 PAD = 9  # px around the scanned box: 2 for the decimation, 5 for rim and ring, 2 to keep tiles apart
 RIM = cv2.getStructuringElement(cv2.MORPH_RECT, (7, 7))
 RING = cv2.getStructuringElement(cv2.MORPH_RECT, (5, 5))
 SQUARE = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-NOISE = 4e-6  # added to the variances: one grey level of noise, so that a flat colour stays solvable
+# Added to the variances: one grey level of noise, so that a flat colour stays solvable.
+NOISE = 4e-6 * np.eye(3, dtype=np.float32)
 MIN_PIXELS = 4
 SHADING = (9, 9)  # px over which the shading of the paint is followed
 FAINT = 0.02  # weight of the mean level where no core is near
-UNEQUAL = 3.0  # a window this much longer than the shortest one goes into a stack of its own
+UNEQUAL = 3.0
 FRAGMENT_SHARE = 0.04  # of the largest component, below which a fragment is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest component's size
 
@@ -216,7 +219,7 @@ def _joined(
         pixels[i] = sum(rows[k][4] for k in chosen)
     if keep[1:].all():
         return mask, pixels
-    return keep[labels], pixels
+    return keep[cast(Image, labels)], pixels
 
 
 def _touches(row: list[int], blob: Blob, left: int, top: int) -> bool:
@@ -277,22 +280,39 @@ def _shares(tiles: Image, core: Image, ring: Image, rim: Image) -> tuple[Float32
     count = len(core)
     light = cast(Float32, cv2.LUT(tiles, LINEAR))
     colours = light.reshape(count, -1, 3)
-    weights = np.stack([core.reshape(count, -1), ring.reshape(count, -1)], axis=1).astype(np.float32)
-    weights /= np.maximum(weights.sum(axis=2, keepdims=True), 1.0)
-    means = weights @ colours  # (M, 2, 3)
-    second = colours.transpose(0, 2, 1) @ (colours * weights.sum(axis=1)[:, :, None])
-    spread = second.astype(np.float64) - means.astype(np.float64).transpose(0, 2, 1) @ means
-    spread[:, range(3), range(3)] += NOISE
-    step = (means[:, 0] - means[:, 1]).astype(np.float64)
-    w = np.linalg.solve(spread, step[:, :, None])[:, :, 0]
-    distance = np.maximum((w * step).sum(axis=1), 1e-6)
-    w /= distance[:, None]
-    zero = (w * means[:, 1]).sum(axis=1)
-    along = (colours @ w.astype(np.float32)[:, :, None])[:, :, 0] - zero.astype(np.float32)[:, None]
+    w = np.empty((count, 3), np.float32)
+    zero = np.empty(count, np.float32)
+    contrast = np.empty(count)
+    for i in range(count):
+        w[i], zero[i], contrast[i] = _discriminant(
+            colours[i], np.flatnonzero(core[i].reshape(-1)), np.flatnonzero(ring[i].reshape(-1))
+        )
+    along = (colours @ w[:, :, None])[:, :, 0]
+    along -= zero[:, None]
     along = along.reshape(rim.shape)
     weight = core.reshape(rim.shape).astype(np.float32)
-    level = cv2.blur(along * weight, SHADING) + FAINT
-    level /= cv2.blur(weight, SHADING) + FAINT
-    share = np.clip(along / np.maximum(level, 0.3), 0.0, 1.0) * rim
-    np.maximum(share, weight, out=share)
-    return share, np.sqrt(distance)
+    level = cast(Float32, cv2.blur(along * weight, SHADING))
+    level += FAINT
+    level /= cast(Float32, cv2.blur(weight, SHADING)) + np.float32(FAINT)
+    np.maximum(level, 0.3, out=level)
+    along /= level
+    np.clip(along, 0.0, 1.0, out=along)
+    along *= rim
+    np.maximum(along, weight, out=along)
+    return along, contrast
+
+
+def _discriminant(colours: Float32, core: Index, ring: Index) -> tuple[Float, float, float]:
+    """Direction (3,), offset and contrast of the discriminant that is 0 at the ring's mean and 1 at the core's."""
+    if not core.size or not ring.size:
+        return np.zeros(3), 0.0, 0.0
+    inside, outside = colours.take(core, axis=0), colours.take(ring, axis=0)
+    mean_in, mean_out = np.add.reduce(inside) / core.size, np.add.reduce(outside) / ring.size
+    inside -= mean_in
+    outside -= mean_out
+    spread = inside.T @ inside / core.size + outside.T @ outside / ring.size + NOISE
+    step = mean_in - mean_out
+    w = np.asarray(np.linalg.solve(spread, step), dtype=np.float64)
+    distance = max(float(w @ step), 1e-6)
+    w /= distance
+    return w, float(w @ mean_out), math.sqrt(distance)

@@ -8,7 +8,7 @@ per axis; a packed table also carries ranges that are no boxes).
 """
 
 from collections.abc import Mapping, Sequence
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 import cv2
 import numpy as np
@@ -122,7 +122,8 @@ def _build(ranges: Sequence[HsvRange]) -> Codes:
         hsv = cv2.cvtColor(plane, cv2.COLOR_BGR2HSV)
         for m, colour in enumerate(ranges):
             for low, high in _spans(colour):
-                table[red] |= (cv2.inRange(hsv, low, high) & 1).astype(kind) << kind(m)
+                inside = cast(Image, cv2.inRange(hsv, low, high))
+                table[red] |= (inside & 1).astype(kind) << kind(m)
     return table.reshape(-1)
 
 

@@ -8,6 +8,7 @@ above what the background shows in that hue; in value down to the shadow side of
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -64,7 +65,7 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
     Raises:
         FitError: A click is outside the image or not on a paint, or two paints have the same hue.
     """
-    hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
+    hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
     hue = {name: circular_median(hsv[..., 0][mask]) for name, mask in paint.items()}
     _refuse_twins(hue)

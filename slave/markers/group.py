@@ -70,9 +70,10 @@ def skin_share(image: Image, blob: Blob) -> float:
     hsv = cv2.cvtColor(window, cv2.COLOR_BGR2HSV)
     # Skin of every tone lies between red and orange, less saturated than paint (K7: it collides with red, orange
     # and yellow markers, which is why those are not used).
-    skin = cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)) | cv2.inRange(hsv, (174, 60, 70), (179, 190, 255))
+    skin = cv2.countNonZero(cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)))
+    skin += cv2.countNonZero(cv2.inRange(hsv, (174, 60, 70), (179, 190, 255)))
     around = window.shape[0] * window.shape[1] - blob.area
-    return min(1.0, cv2.countNonZero(skin) / max(around, 1.0))
+    return min(1.0, skin / max(around, 1.0))
 
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
