@@ -54,6 +54,19 @@ _NO_TWIST = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Chains:
+    """The four joints of each finger's chain (`CHAINS`): root, two hinges, tip.
+
+    Attributes:
+        position_m: (..., 5, 4, 3) [m], palm frame.
+        rotation: (..., 5, 4, 3, 3), joint frame -> palm frame.
+    """
+
+    position_m: Float
+    rotation: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class HandJoints:
     """Where the joints are.
 
@@ -100,6 +113,7 @@ class HandModel:
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
         turn: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
+        before_abduction, after_abduction: (5, 3, 3) what stands on either side of the abduction in the formulas.
     """
 
     profile: HandProfile
@@ -113,6 +127,8 @@ class HandModel:
     side_sign: float
     bone_m: Float
     turn: Float
+    before_abduction: Float
+    after_abduction: Float
 
     @classmethod
     def of(cls, profile: HandProfile) -> "HandModel":
@@ -132,6 +148,8 @@ class HandModel:
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
         couplings = profile.couplings or Couplings()
+        root = rotation[CHAINS[:, 0]]
+        still = np.broadcast_to(_NO_TWIST, (5, 3, 3))
         return cls(
             profile=profile,
             rest_position_m=position,
@@ -144,37 +162,41 @@ class HandModel:
             side_sign=1.0 if profile.side == "right" else -1.0,
             bone_m=bone,
             turn=turn,
+            before_abduction=np.concatenate([root[:1], still[1:]]),
+            after_abduction=np.concatenate([still[:1], root[1:]]),
         )
 
     def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
         """Joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad]; any matching leading axes."""
         T = np.asarray(T_rig_palm, dtype=np.float64)
-        angles = np.asarray(angles_rad, dtype=np.float64)
-        R_palm, lead = T[..., :3, :3], angles.shape[:-2]
+        chains = self.chains(np.asarray(angles_rad, dtype=np.float64))
+        lead, R_palm = chains.position_m.shape[:-3], T[..., :3, :3]
         position = np.empty((*lead, 26, 3))
         rotation = np.empty((*lead, 26, 3, 3))
         position[...] = self.rest_position_m
         rotation[...] = self.rest_rotation
-        frame = self.root_rotation(angles)
-        point = np.broadcast_to(self.rest_position_m[CHAINS[:, 0]], (*lead, 5, 3))
-        rotation[..., CHAINS[:, 0], :, :] = frame
-        for k in range(3):
-            point = point + np.einsum("...ij,...j->...i", frame, self.bone_m[:, k])
-            frame = frame @ self.turn[:, k]
-            if k < 2:
-                frame = frame @ _flex(angles[..., 2 + k])
-            position[..., CHAINS[:, k + 1], :] = point
-            rotation[..., CHAINS[:, k + 1], :, :] = frame
+        position[..., CHAINS, :] = chains.position_m
+        rotation[..., CHAINS, :, :] = chains.rotation
         position = position @ np.swapaxes(R_palm, -1, -2) + T[..., None, :3, 3]
         return HandJoints(position, R_palm[..., None, :, :] @ rotation, T)
 
-    def root_rotation(self, angles_rad: Float) -> Float:
-        """Rotations (..., 5, 3, 3) of the MCPs (thumb: CMC) in the palm frame."""
+    def chains(self, angles_rad: Float) -> Chains:
+        """The fingers' joints in the palm frame, of angles (..., 5, 4) [rad]."""
+        lead = angles_rad.shape[:-2]
+        position = np.empty((*lead, 5, 4, 3))
+        rotation = np.empty((*lead, 5, 4, 3, 3))
+        bend = _rotate(0, -angles_rad[..., 1:])  # a flexion turns by -a about +x
         swing = _rotate(1, self.side_sign * angles_rad[..., 0])
-        rest = self.rest_rotation[CHAINS[:, 0]]
-        before = np.concatenate([rest[:1], np.broadcast_to(_NO_TWIST, (4, 3, 3))])
-        after = np.concatenate([_NO_TWIST[None], rest[1:]])
-        return before @ swing @ after @ _flex(angles_rad[..., 1])
+        frame = self.before_abduction @ swing @ self.after_abduction @ bend[..., 0, :, :]
+        position[..., 0, :], rotation[..., 0, :, :] = self.rest_position_m[CHAINS[:, 0]], frame
+        for k in range(3):
+            link = (frame @ self.bone_m[:, k, :, None])[..., 0]
+            position[..., k + 1, :] = position[..., k, :] + link
+            frame = frame @ self.turn[:, k]
+            if k < 2:
+                frame = frame @ bend[..., k + 1, :, :]
+            rotation[..., k + 1, :, :] = frame
+        return Chains(position, rotation)
 
     def marker_points(self, joints: HandJoints, names: tuple[str, ...]) -> Float:
         """Cap centroids (..., M, 3) [m] in the rig frame.
@@ -253,10 +275,6 @@ def _rotate(axis: int, angle: Float) -> Float:
     matrix[..., i, i] = matrix[..., j, j] = c
     matrix[..., i, j], matrix[..., j, i] = -s, s
     return matrix
-
-
-def _flex(angle: Float) -> Float:
-    return _rotate(0, -angle)
 
 
 def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:

@@ -15,7 +15,8 @@ from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.fingers import FingerRefiner
-from master.ik.hand import HandSolution, HandSolver, Priors
+from master.ik.hand import HandSolution, HandSolver
+from master.ik.priors import Priors
 
 _COAST_S = 0.12  # a lost finger's motion fades with this time constant
 _DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
