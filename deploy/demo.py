@@ -92,6 +92,7 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     summary = _report(settings, epoch_ns, say)
     if restarts:
         summary["restarts"] = restarts
+        (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     return summary
 
 
