@@ -5,8 +5,9 @@ rim between paint and skin, and such a fringe would split the blob. Only the box
 labelled, so the cost follows the number of coloured pixels, not of markers.
 """
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,6 +16,9 @@ from slave.markers.classify import Codes
 
 SCALE = 2  # the scan looks at every second pixel of every second row
 MAX_CANDIDATES = 6
+FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
+FRAGMENT_GAP = 0.5  # of the largest piece's size
+FRAGMENT_LEAST = 8.0  # px^2
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,26 @@ def find_blobs(codes: Codes, bits: Sequence[int]) -> list[list[Blob]]:
         mask[y - top, x - left] = 1
         found.append(_label(mask, left, top))
     return found
+
+
+def with_fragments(blob: Blob, options: Sequence[Blob], extent: float) -> Blob:
+    """`blob`, its box widened over the pieces that something in front of the marker split from it.
+
+    Args:
+        blob: The marker's largest piece.
+        options: All blobs of its colour.
+        extent: Largest width or height of the whole marker [px], as far as known, else inf.
+    """
+    left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
+    reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
+    for piece in options:
+        if piece is blob or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area) or piece.area > blob.area:
+            continue
+        gap = max(piece.left - right, left - piece.right, piece.top - bottom, top - piece.bottom)
+        box = min(left, piece.left), min(top, piece.top), max(right, piece.right), max(bottom, piece.bottom)
+        if gap <= reach and max(box[2] - box[0], box[3] - box[1]) <= extent:
+            left, top, right, bottom = box
+    return replace(blob, left=left, top=top, right=right, bottom=bottom)
 
 
 def _nonzero(flat: Codes) -> np.ndarray[tuple[int], np.dtype[np.int64]]:

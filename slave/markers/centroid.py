@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image
-from slave.markers.blobs import Blob
+from slave.markers.blobs import FRAGMENT_GAP, FRAGMENT_SHARE, Blob
 from slave.markers.classify import ColourTable
 
 Float32: TypeAlias = npt.NDArray[np.float32]
@@ -42,8 +42,6 @@ MIN_PIXELS = 4
 SHADING = (9, 9)  # px over which the shading of the paint is followed
 FAINT = 0.02  # weight of the mean level where no core is near
 UNEQUAL = 3.0
-FRAGMENT_SHARE = 0.04  # of the largest component, below which a fragment is noise or fringe
-FRAGMENT_GAP = 0.5  # of the largest component's size
 
 
 def _linear_light() -> Float32:
@@ -147,9 +145,9 @@ def _measure_stack(
     codes = table.codes(flat).reshape(count, height, width)
     own = (codes & np.array(bits, codes.dtype)[:, None, None]) != 0
     own[:, 0] = False  # an empty row keeps the tiles' components apart
-    others = ((codes != 0) & ~own).view(np.uint8).reshape(flat.shape[:2])
     mask = own.view(np.uint8).reshape(flat.shape[:2])
     mask, pixels = _joined(mask, stack, blobs, extents)
+    others = (codes.reshape(mask.shape) != 0).view(np.uint8) & (mask ^ 1)
     filled = cast(Image, cv2.morphologyEx(mask, cv2.MORPH_CLOSE, CROSS))
     core = cast(Image, cv2.erode(filled, CROSS))
     shape = (count, height, width)

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from slave.markers.blobs import Blob, find_blobs
+from slave.markers.blobs import Blob, find_blobs, with_fragments
 from slave.markers.centroid import Measured, measure
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.group import CLICKED, TRACKED, Candidate, choose, linked, on_fringe, skin_share
@@ -94,12 +94,12 @@ class MarkerDetector:
         count = len(self._names)
         uv, area, quality = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
         rows = list(chosen)
+        extents = [self._extent(m, t_ns) for m in rows]
+        for m, extent in zip(rows, extents, strict=True):
+            if len(blobs[m]) > 1:
+                chosen[m] = with_fragments(chosen[m], blobs[m], extent)
         measured = measure(
-            image,
-            self._table,
-            [self._table.bits[m] for m in rows],
-            [chosen[m] for m in rows],
-            [self._extent(m, t_ns) for m in rows],
+            image, self._table, [self._table.bits[m] for m in rows], [chosen[m] for m in rows], extents
         )
         for m, seen in zip(rows, measured, strict=True):
             blob, track = chosen[m], self._tracks[m]
@@ -174,7 +174,11 @@ def _quality(seen: Measured, track: Track, blob: Blob, options: list[Blob]) -> f
         quality *= 0.5
     if seen.thin:
         quality *= 0.4
-    rivals = [b for b in options if b is not blob and b.area > 0.3 * blob.area]
+    rivals = [b for b in options if b.area > 0.3 * blob.area and not _within(b, blob)]
     if any(math.hypot(b.u - blob.u, b.v - blob.v) < 3.0 * math.sqrt(blob.area) for b in rivals):
         quality *= 0.5
     return max(0.01, min(1.0, quality))
+
+
+def _within(piece: Blob, blob: Blob) -> bool:
+    return blob.left <= piece.u <= blob.right and blob.top <= piece.v <= blob.bottom

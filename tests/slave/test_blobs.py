@@ -1,0 +1,52 @@
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slave.markers.blobs import MAX_CANDIDATES, find_blobs
+
+
+def test_a_rectangle_gives_its_area_centroid_and_box_in_full_pixels() -> None:
+    codes = np.zeros((60, 80), np.uint8)
+    codes[10:14, 20:26] = 2
+    (first, second) = find_blobs(codes, (1, 2))
+    assert first == []
+    (blob,) = second
+    assert (blob.u, blob.v, blob.area) == (45.0, 23.0, 96.0)
+    assert (blob.left, blob.top, blob.right, blob.bottom) == (40, 20, 52, 28)
+
+
+def test_a_pixel_of_two_colours_belongs_to_both() -> None:
+    codes = np.zeros((60, 80), np.uint8)
+    codes[10:12, 20:22] = 3
+    assert [len(b) for b in find_blobs(codes, (1, 2, 4))] == [1, 1, 0]
+
+
+def test_colours_that_touch_do_not_join_and_a_fringe_does_not_split() -> None:
+    codes = np.zeros((60, 80), np.uint8)
+    codes[10:20, 10:20] = 1
+    codes[15, 12:18] = 2  # a hue fringe across the blob, of another class
+    codes[10:20, 15] = 1
+    blobs = find_blobs(codes, (1, 2))
+    assert blobs[0][0].area == 4.0 * (100 - 5)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([np.uint8, np.uint16, np.uint32]))
+def test_total_area_is_the_number_of_set_pixels(seed: int, kind: type[np.unsignedinteger]) -> None:
+    rng = np.random.default_rng(seed)
+    codes = np.zeros((31, 47), kind)  # not a multiple of the 8-byte words that are skipped
+    for _ in range(3):
+        y, x = rng.integers(0, 28), rng.integers(0, 44)
+        codes[y : y + 3, x : x + 3] = 1
+    (blobs,) = find_blobs(codes, (1,))
+    assert sum(b.area for b in blobs) == 4.0 * np.count_nonzero(codes)
+    assert [b.area for b in blobs] == sorted((b.area for b in blobs), reverse=True)
+
+
+def test_nothing_gives_nothing_and_specks_are_capped_to_the_largest() -> None:
+    assert find_blobs(np.zeros((20, 20), np.uint8), (1, 2)) == [[], []]
+    codes = np.zeros((40, 40), np.uint8)
+    codes[::4, ::4] = 1
+    codes[1, 0] = 1
+    (blobs,) = find_blobs(codes, (1,))
+    assert len(blobs) == MAX_CANDIDATES
+    assert blobs[0].area == 8.0

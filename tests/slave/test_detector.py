@@ -1,0 +1,127 @@
+import math
+
+import numpy as np
+import pytest
+
+from common.arrays import Image
+from slave.markers.detector import Detections, MarkerDetector
+from tests.slave.painted import CENTRES, NAMES, Disc, camera, finger, hand, paint, render
+
+STEP_NS = 16_666_667
+MUG = [Disc(paint(1), 560.0, 120.0, 17.0)]
+DETECTOR = MarkerDetector(camera(), NAMES)
+
+
+def push_all(images: list[Image], seeds: dict[str, tuple[float, float]] | None = None) -> list[Detections]:
+    detector = DETECTOR.fresh(seeds)
+    return [detector.push(image, i * STEP_NS) for i, image in enumerate(images)]
+
+
+def off(found: Detections, u: float, v: float) -> np.ndarray:
+    return np.hypot(*(found.uv - CENTRES - (u, v)).T)
+
+
+def test_six_markers_of_a_hand_are_found_whole_and_certain() -> None:
+    (found,) = push_all([render(hand())])
+    assert (off(found, 300.0, 200.0) < 0.3).all()
+    assert (found.quality > 0.8).all()
+
+
+def test_each_is_measured_as_it_would_be_in_its_own_window() -> None:
+    image = render(hand())
+    tracked = push_all([render(hand(295.0, 200.0)), image])[1]
+    afresh = push_all([image])[0]
+    np.testing.assert_array_equal(tracked.uv, afresh.uv)
+
+
+def test_a_missing_marker_is_nan_in_all_and_the_others_are_what_they_were() -> None:
+    whole = push_all([render(hand())])[0]
+    image = render(hand())
+    image[90:120, 280:303] = render([])[90:120, 280:303]  # the middle finger's tip is gone
+    found = push_all([render(hand()), image])[1]
+    assert np.isnan(found.uv[2]).all()
+    assert math.isnan(found.area[2])
+    assert math.isnan(found.quality[2])
+    rest = [0, 1, 3, 4, 5]
+    np.testing.assert_allclose(found.uv[rest], whole.uv[rest], atol=0.05)
+
+
+def test_a_lost_marker_comes_back_anywhere_on_the_hand_in_the_first_frame_that_shows_it() -> None:
+    without = render([d for d in hand() if d.hsv != paint(2)])
+    moved = [d for d in hand(240.0, 260.0) if d.hsv != paint(2)] + finger(2, 300.0, 170.0)
+    frames = push_all([render(hand())] + [without] * 60 + [render(moved)])
+    assert np.isnan(frames[60].uv[2]).all()
+    assert np.hypot(*(frames[61].uv[2] - (300.0, 170.0))) < 0.3
+
+
+def test_fast_motion_of_35_px_per_frame_is_followed_and_turned() -> None:
+    us = [150.0, 185.0, 220.0, 255.0, 290.0, 325.0, 290.0, 255.0]
+    for u, found in zip(us, push_all([render(hand(u)) for u in us]), strict=True):
+        assert (off(found, u, 200.0) < 0.3).all()
+
+
+def test_a_mug_of_the_same_colour_is_not_the_marker() -> None:
+    for found in push_all([render(hand() + MUG)] * 3):
+        assert (off(found, 300.0, 200.0) < 0.3).all()
+
+
+def test_a_mug_is_not_taken_for_a_hidden_marker() -> None:
+    without = [d for d in hand() if d.hsv != paint(1)]
+    for found in push_all([render(hand() + MUG), *[render(without + MUG)] * 60]):
+        assert not np.hypot(*(found.uv[1] - (560.0, 120.0))) < 30.0
+
+
+def test_a_mug_near_a_fist_is_not_a_marker() -> None:
+    fist = [Disc((12, 100, 200), 300.0, 200.0, 40.0), Disc(paint(5), 300.0, 200.0, 16.0)]
+    (found,) = push_all([render([*fist, Disc(paint(1), 400.0, 180.0, 15.0)])])
+    assert np.isfinite(found.uv[5]).all()
+    assert np.isnan(found.uv[1]).all()
+
+
+def test_clicks_decide_where_two_hands_show_the_same_colours() -> None:
+    image = render(hand(150.0, 330.0) + hand(480.0, 330.0))
+    seeds = {n: (480.0 + x, 330.0 + y) for n, (x, y) in zip(NAMES, CENTRES.tolist(), strict=True)}
+    (found,) = push_all([image], seeds)
+    assert (off(found, 480.0, 330.0) < 0.3).all()
+    seeds = {n: (150.0 + x, 330.0 + y) for n, (x, y) in zip(NAMES, CENTRES.tolist(), strict=True)}
+    (found,) = push_all([image], seeds)
+    assert (off(found, 150.0, 330.0) < 0.3).all()
+
+
+def test_a_single_marker_without_a_hand_is_found_from_30_to_23000_px() -> None:
+    for radius in (4.0, 12.0, 40.0, 85.0):
+        (found,) = push_all([render([Disc(paint(1), 300.0, 240.0, radius)])])
+        assert found.uv[1] == pytest.approx((300.0, 240.0), abs=0.1)
+        assert np.isnan(found.uv[[0, 2, 3, 4, 5]]).all()
+
+
+def test_a_half_hidden_marker_is_reported_with_lower_quality() -> None:
+    image = render(hand())
+    whole = push_all([image, image])[1]
+    hidden = image.copy()
+    hidden[:, :266] = render([])[:, :266]
+    half = push_all([image, hidden])[1]
+    assert 0.0 < half.quality[1] < 0.75 * whole.quality[1]
+    assert half.area[1] < 0.6 * whole.area[1]
+
+
+def test_an_empty_frame_finds_nothing_and_noise_is_nothing() -> None:
+    for noise in (0.0, 4.0):
+        (found,) = push_all([render([], noise=noise)])
+        assert np.isnan(found.uv).all()
+        assert np.isnan(found.area).all()
+        assert np.isnan(found.quality).all()
+
+
+def test_the_same_frames_give_the_same_bytes() -> None:
+    images = [render(hand(200.0 + 9.0 * k), noise=2.0, seed=k) for k in range(4)]
+    for a, b in zip(push_all(images), push_all(images), strict=True):
+        assert a.uv.tobytes() == b.uv.tobytes()
+        assert a.quality.tobytes() == b.quality.tobytes()
+
+
+def test_a_frame_of_another_size_or_kind_is_refused() -> None:
+    with pytest.raises(ValueError, match="camera file says"):
+        DETECTOR.fresh().push(np.zeros((240, 320, 3), np.uint8), 0)
+    with pytest.raises(ValueError, match="camera file says"):
+        DETECTOR.fresh().push(np.zeros((480, 640, 3), np.float32), 0)  # pyright: ignore[reportArgumentType]
