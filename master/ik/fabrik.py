@@ -2,13 +2,16 @@
 
 Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011. One iteration:
 
+    aim        turn the first joint so that the end lies towards the target
     backward   put the end on the target and walk to the root: each bone keeps its length and points as it did,
                as far as the joint between it and the bone behind it allows
     forward    put the root back and walk to the end: each bone points to its place of the backward pass, as far
                as its own joint allows
 
-The forward pass ends legal, so every pose that leaves this file obeys the limits; joints keep full orientations,
-so bones need not be straight or planar. A coupled hinge follows its leader in the forward pass.
+Aiming is ours: hinges hold the bones in one plane, and a backward pass that starts from a plane beside the
+target tilts it the wrong way. The forward pass ends legal, so every pose that leaves this file obeys the limits;
+joints keep full orientations, so bones need not be straight or planar. A coupled hinge follows its leader in the
+forward pass.
 
 FABRIK as published deadlocks on reachable targets: a limit flattens a finger and a straight limited chain cannot
 leave its line (I8). Hence the seed (from the closed form, `master.ik.finger`, it starts on the target), and, when
@@ -185,7 +188,6 @@ class Fabrik:
         """The seed, then bent poses as long as the target is far, turned to it: never on one line with it."""
         yield seed
         distance = length(goal)
-        first = self.chain.links[0]
         for front, back in _RESTART_BENDS[: self.restarts]:
             low, high = 0.0, 1.0
             for _ in range(_RESTART_HALVINGS):
@@ -194,9 +196,13 @@ class Fabrik:
                 end = self.chain.forward(pose)[0][-1]
                 low, high = (share, high) if length(end) > distance else (low, share)
             pose = self._bent(0.5 * (low + high), front, back)
-            end = self.chain.forward(pose)[0][-1]
-            arm = rotate_back(first.joint.rotation(pose[0]), rotate_back(first.turn, end))
-            yield first.joint.fit(arm, rotate_back(first.turn, goal), pose[0]), *pose[1:]
+            yield self._aimed(pose, self.chain.forward(pose)[0][-1], goal)
+
+    def _aimed(self, pose: Pose, end: Vector, goal: Vector) -> Pose:
+        """The pose with its first joint turned so that the end lies towards the goal."""
+        first = self.chain.links[0]
+        arm = rotate_back(first.joint.rotation(pose[0]), rotate_back(first.turn, end))
+        return first.joint.fit(arm, rotate_back(first.turn, goal), pose[0]), *pose[1:]
 
     def _bent(self, share: float, front: float, back: float) -> Pose:
         """Every hinge bent by its share of the longer way from rest; weight from `front` to `back`."""
@@ -222,6 +228,9 @@ class Fabrik:
         for iteration in range(1, self.max_iterations + 1):
             if best.residual <= self.tolerance_m or slow >= _STALL_ITERATIONS:
                 return best
+            # hinges keep the chain in a plane, and only the first joint can turn that to the goal
+            angles = list(self._aimed(tuple(angles), positions[-1], goal))
+            positions, orientations = self.chain.forward(tuple(angles))
             places = self._backward(positions, orientations, angles, goal)
             positions, orientations, angles = self._forward(places, angles)
             residual = dist(positions[-1], goal)

@@ -1,0 +1,259 @@
+"""FABRIK: ten thousand reachable targets, limits, flags; and that it solves what it can without a seed."""
+
+import math
+from functools import cache
+from typing import Literal
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.hand_model import FINGERS, HandModel, preset_couplings, preset_limits
+from common.hand_profiles import generated_profile
+from master.ik.chain import Chain, Coupling, Link, finger_chain, nearest_reach
+from master.ik.fabrik import ChainResult, Fabrik, Reach, solve_chain, solve_finger
+from master.ik.finger import FingerSolver
+from master.ik.joints import Angles, Hinge, Rotor
+from master.ik.vectors import IDENTITY, Vector, length, product, rotate, rotate_back, rotation_about
+
+Preset = Literal["K", "D"]
+
+
+@cache
+def _finger(side: str, preset: Preset, finger: int) -> tuple[Fabrik, FingerSolver]:
+    profile = msgspec.structs.replace(
+        generated_profile("made", side), limits_rad=preset_limits(preset), couplings=preset_couplings(preset)
+    )
+    model = HandModel.of(profile)
+    solver = FingerSolver.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
+    return Fabrik.of(solver.chain), solver
+
+
+def _random_target(solver: FingerSolver, rng: np.random.Generator) -> Vector:
+    """Where the point is at random legal angles; every tenth lies in a corner of the limits."""
+    shares = rng.random(4)
+    if rng.random() < 0.1:
+        shares = np.round(shares)
+    low, high = np.array(solver.limits).T
+    a, f, pip, dip = (low + shares * (high - low)).tolist()
+    if solver.chain.coupling is not None:
+        dip = min(max(solver.ratio * pip, float(low[3])), float(high[3]))
+    return solver.forward((a, f, pip, dip))
+
+
+def _violated(chain: Chain, angles: tuple[Angles, ...]) -> bool:
+    flat = [q for joint in angles for q in joint]
+    outside = any(not low <= q <= high for q, (low, high) in zip(flat, chain.spans, strict=True))
+    c = chain.coupling
+    return outside or (
+        c is not None
+        and abs(flat[-1] - min(max(c.ratio * flat[-2], chain.spans[-1][0]), chain.spans[-1][1])) > 1e-12
+    )
+
+
+def _consistent(chain: Chain, result: ChainResult, root: Vector) -> bool:
+    """Positions and orientations are those of the angles."""
+    positions, orientations = chain.forward(result.angles)
+    moved = np.array(positions) + root
+    return np.allclose(result.positions, moved, atol=1e-12) and np.allclose(result.orientations, orientations)
+
+
+@pytest.mark.parametrize(("side", "preset"), [("right", "K"), ("left", "D")])
+def test_ten_thousand_reachable_targets(side: str, preset: Preset) -> None:
+    rng = np.random.default_rng(20)
+    missed = violated = undefined = flagged = 0
+    for k in range(10_000):
+        fabrik, closed_form = _finger(side, preset, k % 5)
+        target = _random_target(closed_form, rng)
+        result = solve_finger(fabrik, closed_form, target)
+        miss = math.dist(result.positions[-1], target)
+        missed += not miss < 1e-4
+        undefined += not math.isfinite(sum(q for joint in result.angles for q in joint) + miss)
+        violated += _violated(fabrik.chain, result.angles)
+        flagged += not result.reached or result.reach is not Reach.WITHIN
+    assert (missed, violated, undefined, flagged) == (0, 0, 0, 0)
+
+
+def test_without_a_seed_restarts_heal_the_deadlock() -> None:
+    rng = np.random.default_rng(3)
+    plain = missed = 0
+    for k in range(150):
+        fabrik, closed_form = _finger("right", "K", 1 + k % 4)
+        target = _random_target(closed_form, rng)
+        result = fabrik.solve(target, None, closed_form.root)
+        missed += result.residual_m > 1e-4
+        alone = Fabrik(fabrik.chain, fabrik.farthest_m, fabrik.nearest_m, 1e-5, 100, 0)
+        plain += alone.solve(target, None, closed_form.root).residual_m > 1e-3
+        assert not _violated(fabrik.chain, result.angles)
+        assert _consistent(fabrik.chain, result, closed_form.root)
+    assert missed == 0
+    assert plain > 60  # I8: published FABRIK misses most reachable targets from the rest pose
+
+
+WIDE = Hinge(-2.8, 2.8)
+ARM = Chain(
+    (
+        Link(IDENTITY, Rotor((-3.0, 3.0), (-3.0, 3.0)), (0.0, 0.0, -0.3)),
+        Link(IDENTITY, WIDE, (0.0, 0.0, -0.25)),
+        Link(IDENTITY, WIDE, (0.0, 0.0, -0.1)),
+    )
+)
+
+
+@given(
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
+    st.floats(0.3, 1.2),
+    st.floats(0.3, 1.2),
+    st.tuples(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1)),
+)
+def test_iteration_itself_converges_from_a_nearby_pose(
+    swing: tuple[float, float], elbow: float, wrist: float, off: tuple[float, float]
+) -> None:
+    target = ARM.forward((swing, (elbow,), (wrist,)))[0][-1]
+    seed = ((swing[0] + off[0], swing[1] + off[1]), (elbow + off[0],), (wrist + off[1],))
+    result = Fabrik.of(ARM, 1e-4, 200, restarts=0).solve(target, seed)
+    assert math.dist(result.positions[-1], target) < 1e-4 + 1e-12
+    assert result.reached
+    assert result.angles != seed or off == (0.0, 0.0)
+
+
+def test_rotor_in_the_middle_and_world_hinge_obey_their_limits() -> None:
+    ball = Rotor((-0.4, 0.4), (-0.5, 0.9), shape="ellipse")
+    level = Hinge(-0.6, 0.6, (0.0, 1.0, 0.0), frame="world")
+    links = (
+        Link(IDENTITY, Rotor((-1.0, 1.0), (-1.0, 1.0)), (0.0, 0.0, -0.2)),
+        Link(IDENTITY, ball, (0.0, 0.0, -0.2)),
+        Link(IDENTITY, level, (0.0, 0.0, -0.15)),
+    )
+    chain, rng = Chain(links), np.random.default_rng(2)
+    fabrik = Fabrik.of(chain, 1e-4)
+    reached = 0
+    for _ in range(40):
+        legal = chain.clamp(
+            (
+                tuple(rng.uniform(-1, 1, 2).tolist()),
+                tuple(rng.uniform(-0.5, 0.9, 2).tolist()),
+                (float(rng.uniform(-0.6, 0.6)),),
+            )
+        )
+        result = fabrik.solve(chain.forward(legal)[0][-1])
+        reached += result.residual_m < 2e-3
+        legal = chain.clamp(result.angles)
+        assert np.concatenate(legal) == pytest.approx(np.concatenate(result.angles), abs=1e-9)
+        assert _consistent(chain, result, (0.0, 0.0, 0.0))
+        # the world hinge keeps its bone level whatever carries it
+        assert abs(result.positions[3][1] - result.positions[2][1]) < 1e-12
+    assert reached >= 30
+
+
+def test_root_and_frame_only_move_the_answer() -> None:
+    fabrik, closed_form = _finger("right", "K", 1)
+    frame = product(rotation_about((0.0, 1.0, 0.0), 1.0), rotation_about((1.0, 0.0, 0.0), -2.0))
+    root = (0.3, -0.2, 0.9)
+    x, y, z = closed_form.forward((0.1, 0.7, 0.8, closed_form.ratio * 0.8))
+    local = (x - closed_form.root[0], y - closed_form.root[1], z - closed_form.root[2])
+    moved = rotate(frame, local)
+    target = (moved[0] + root[0], moved[1] + root[1], moved[2] + root[2])
+    a, b = fabrik.solve(local), fabrik.solve(target, None, root, frame)
+    assert np.array(b.angles[0]) == pytest.approx(np.array(a.angles[0]), abs=1e-6)
+    back = [rotate_back(frame, (p[0] - root[0], p[1] - root[1], p[2] - root[2])) for p in b.positions]
+    assert np.array(back) == pytest.approx(np.array(a.positions), abs=1e-7)
+    assert b.positions[0] == root
+
+
+def test_too_far_is_stretched_and_flagged() -> None:
+    fabrik, closed_form = _finger("right", "K", 1)
+    assert fabrik.farthest_m == pytest.approx(sum(fabrik.chain.lengths))
+    direction = np.array(closed_form.forward((0.0, 0.4, 0.0, 0.0))) - closed_form.root
+    target = tuple((np.array(closed_form.root) + 4 * direction).tolist())
+    for seed in (None, ((0.1, 0.9), (1.0,), (0.6,))):
+        result = fabrik.solve(target, seed, closed_form.root)
+        assert result.reach is Reach.TOO_FAR
+        assert not result.reached
+        tip = np.array(result.positions[-1]) - closed_form.root
+        assert tip @ direction / np.linalg.norm(tip) / np.linalg.norm(direction) > 0.99
+        assert not _violated(fabrik.chain, result.angles)
+
+
+def test_too_near_is_flagged() -> None:
+    # two bones of 3 and 2 with an elbow of at most 90 deg: nearest is sqrt(13)
+    links = (
+        Link(IDENTITY, Rotor((-1.0, 1.0), (-1.0, 1.0)), (0.0, 0.0, -0.03)),
+        Link(IDENTITY, Hinge(0.0, math.pi / 2), (0.0, 0.0, -0.02)),
+    )
+    assert nearest_reach(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
+    result = solve_chain(Chain(links), (0.0, -0.01, -0.01))
+    assert result.reach is Reach.TOO_NEAR
+    assert not result.reached
+    assert math.isfinite(result.residual_m)
+
+
+@given(
+    st.integers(0, 4),
+    st.one_of(
+        st.tuples(*[st.floats(-0.2, 0.2)] * 3),
+        st.sampled_from(
+            [(0.0, 0.0, 0.0), (0.0, 0.0, 0.05), (0.0, 0.0, -0.05), (1e-12, 0.0, 0.0), (1e8, 0.0, 0.0)]
+        ),
+    ),
+)
+def test_no_finite_target_gives_nan_or_raises(finger: int, local: Vector) -> None:
+    fabrik, closed_form = _finger("right", "D", finger)
+    target = tuple(a + b for a, b in zip(local, closed_form.root, strict=True))
+    for result in (
+        fabrik.solve((target[0], target[1], target[2]), None, closed_form.root),
+        solve_finger(fabrik, closed_form, (target[0], target[1], target[2])),
+    ):
+        assert np.isfinite(result.positions).all()
+        assert np.isfinite(result.orientations).all()
+        assert not _violated(fabrik.chain, result.angles)
+        assert result.residual_m == pytest.approx(
+            math.dist(result.positions[-1], target), rel=1e-9, abs=1e-12
+        )
+        assert result.reached == (result.residual_m <= 1e-5)
+        assert result.degenerate == (length(local) < 1e-9)
+
+
+def test_not_seen_is_nan_and_says_so() -> None:
+    fabrik, closed_form = _finger("right", "K", 0)
+    for result in (
+        fabrik.solve((math.nan, 0.0, 0.0)),
+        solve_finger(fabrik, closed_form, (0.0, math.inf, 0.0)),
+    ):
+        assert result.reach is Reach.NOT_SEEN
+        assert not result.reached
+        assert np.isnan(result.positions).all()
+        assert [len(joint) for joint in result.angles] == [2, 1, 1]
+
+
+def test_a_bone_without_length_is_flagged_and_solved_round() -> None:
+    links = (
+        Link(IDENTITY, Rotor((-1.0, 1.0), (-1.0, 1.0)), (0.0, 0.0, -0.03)),
+        Link(IDENTITY, Hinge(0.0, 1.5), (0.0, 0.0, 0.0)),
+        Link(IDENTITY, Hinge(0.0, 1.5), (0.0, 0.0, -0.02)),
+    )
+    chain = Chain(links)
+    target = chain.forward(((0.2, 0.3), (0.4,), (0.5,)))[0][-1]
+    result = solve_chain(chain, target)
+    assert result.degenerate
+    assert np.isfinite(result.positions).all()
+    assert result.residual_m < 1e-3
+
+
+def test_wrong_chains_and_settings_are_refused() -> None:
+    link = Link(IDENTITY, Hinge(0.0, 1.0), (0.0, 0.0, -0.1))
+    with pytest.raises(ValueError, match="needs a link"):
+        Chain(())
+    with pytest.raises(ValueError, match="coupling"):
+        Chain((link, link), Coupling(1, 0, 0.7))
+    with pytest.raises(ValueError, match="positive"):
+        Fabrik.of(Chain((link,)), 0.0)
+
+
+def test_uncoupled_finger_keeps_the_dip_free() -> None:
+    model = HandModel.of(generated_profile("made", "right"))
+    assert finger_chain(model, 1, np.zeros(3)).coupling == Coupling(1, 2, 2 / 3)
+    assert finger_chain(model, 1, np.zeros(3), coupled=False).coupling is None
+    assert finger_chain(model, 0, np.zeros(3)).coupling is None

@@ -1,0 +1,162 @@
+"""1 € filter: the published data, a double-precision reference, and what happens around gaps."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from master.filters import OneEuro, OneEuroParameters
+
+
+class _LowPass:
+    """Textbook exponential smoothing (Casiez 2012, algorithm 1), one object per signal."""
+
+    def __init__(self) -> None:
+        self.last: float | None = None
+
+    def filter(self, value: float, alpha: float) -> float:
+        self.last = value if self.last is None else alpha * value + (1.0 - alpha) * self.last
+        return self.last
+
+
+class _Reference:
+    """The paper's filter, written for reading; derivative against the previous filtered value."""
+
+    def __init__(self, min_cutoff: float, beta: float, d_cutoff: float) -> None:
+        self.min_cutoff, self.beta, self.d_cutoff = min_cutoff, beta, d_cutoff
+        self.x, self.dx = _LowPass(), _LowPass()
+        self.t: int | None = None
+
+    @staticmethod
+    def alpha(cutoff: float, dt: float) -> float:
+        tau = 1.0 / (2.0 * math.pi * cutoff)
+        return 1.0 / (1.0 + tau / dt)
+
+    def filter(self, t_ns: int, value: float) -> float:
+        if self.t is None or self.x.last is None:
+            self.t = t_ns
+            self.dx.filter(0.0, 1.0)
+            return self.x.filter(value, 1.0)
+        dt = (t_ns - self.t) * 1e-9
+        self.t = t_ns
+        speed = self.dx.filter((value - self.x.last) / dt, self.alpha(self.d_cutoff, dt))
+        return self.x.filter(value, self.alpha(self.min_cutoff + self.beta * abs(speed), dt))
+
+
+def _columns(datasets: Path) -> dict[str, Float]:
+    with (datasets / "one_euro" / "groundTruth.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+
+
+def test_equals_the_published_ground_truth(datasets: Path) -> None:
+    data = _columns(datasets)
+    machine = OneEuro(1.0, 0.1, 1.0)
+    # the file's times are rounded to six digits; it was made at exactly 120 Hz
+    ours = [machine.push(round(k * 1e9 / 120), np.array([v]))[0] for k, v in enumerate(data["noisy"])]
+    assert len(ours) == 1200
+    assert np.abs(np.array(ours) - data["filtered"]).max() < 1e-5
+    machine = OneEuro(1.0, 0.1, 1.0)
+    times = np.round(data["timestamp"] * 1e9).astype(np.int64).tolist()
+    ours = [machine.push(t, np.array([v]))[0] for t, v in zip(times, data["noisy"], strict=True)]
+    assert np.abs(np.array(ours) - data["filtered"]).max() < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("min_cutoff", "beta", "d_cutoff"), [(1.0, 0.1, 1.0), (0.3, 0.0, 2.0), (3.0, 25.0, 0.7)]
+)
+def test_equals_a_scalar_reference_to_1e_9(min_cutoff: float, beta: float, d_cutoff: float) -> None:
+    rng = np.random.default_rng(5)
+    times = np.cumsum(rng.integers(2_000_000, 40_000_000, 400)).tolist()
+    signals = np.cumsum(rng.normal(0.0, 0.01, (400, 6, 3)), axis=0)
+    machine = OneEuro(min_cutoff, beta, d_cutoff)
+    ours = np.stack([machine.push(t, s) for t, s in zip(times, signals, strict=True)])
+    references = [_Reference(min_cutoff, beta, d_cutoff) for _ in range(18)]
+    theirs = np.array(
+        [
+            [r.filter(t, v) for r, v in zip(references, s.ravel(), strict=True)]
+            for t, s in zip(times, signals, strict=True)
+        ]
+    )
+    assert np.abs(ours.reshape(400, 18) - theirs).max() < 1e-9
+
+
+def test_gap_of_one_signal_leaves_the_others_alone_and_continues_with_true_dt() -> None:
+    rng = np.random.default_rng(2)
+    times = [8_333_333 * k for k in range(60)]
+    signals = rng.normal(0.0, 1.0, (60, 3))
+    signals[20:32, 1] = np.nan
+    machine = OneEuro(1.0, 0.5, 1.0)
+    ours = np.stack([machine.push(t, s) for t, s in zip(times, signals, strict=True)])
+    for i in range(3):
+        reference = _Reference(1.0, 0.5, 1.0)
+        for k, t in enumerate(times):
+            if np.isnan(signals[k, i]):
+                assert np.isnan(ours[k, i])
+            else:
+                assert ours[k, i] == pytest.approx(reference.filter(t, signals[k, i]), abs=1e-9)
+
+
+def test_long_gap_restarts_from_the_value_itself() -> None:
+    machine = OneEuro(1.0, 0.0, 1.0, restart_gap_s=0.5)
+    machine.push(0, np.array([0.0, 5.0]))
+    machine.push(10_000_000, np.array([0.0, np.nan]))
+    assert machine.push(490_000_000, np.array([1.0, 9.0]))[1] < 9.0
+    assert machine.push(1_000_000_000, np.array([1.0, 2.0]))[0] == 1.0
+    # a gap of every signal at once is a gap too
+    machine = OneEuro(1.0, 0.0, 1.0)
+    machine.push(0, np.zeros(2))
+    assert machine.push(600_000_000, np.array([3.0, 4.0])).tolist() == [3.0, 4.0]
+
+
+def test_zero_is_a_time_and_a_late_sample_changes_nothing() -> None:
+    machine, twin = OneEuro(1.0, 0.1, 1.0), OneEuro(1.0, 0.1, 1.0)
+    for m in (machine, twin):
+        m.push(0, np.array([0.0]))
+    second = machine.push(10_000_000, np.array([1.0]))
+    assert 0.0 < second[0] < 1.0  # t = 0 was taken as the time before
+    assert twin.push(10_000_000, np.array([1.0])) == second
+    assert machine.push(10_000_000, np.array([50.0])) == second
+    assert machine.push(4, np.array([50.0])) == second
+    assert machine.late == 2
+    assert machine.push(20_000_000, np.array([2.0])) == twin.push(20_000_000, np.array([2.0]))
+
+
+@given(st.lists(st.sampled_from([0.3, -1.0, math.nan, math.inf]), min_size=2, max_size=40))
+def test_nothing_ever_poisons_later_output(values: list[float]) -> None:
+    machine = OneEuro(1.0, 0.1, 1.0)
+    for k, value in enumerate(values):
+        out = machine.push(10_000_000 * k, np.array([value, 1.0]))
+        assert math.isfinite(out[0]) == math.isfinite(value)
+        assert out[1] == pytest.approx(1.0, abs=1e-12)
+    assert -1.0 <= machine.push(10_000_000 * len(values), np.array([0.3, 1.0]))[0] <= 0.3
+
+
+@given(st.floats(-1e3, 1e3), st.integers(1, 60))
+def test_a_constant_stays(value: float, count: int) -> None:
+    machine = OneEuro(1.0, 0.1, 1.0)
+    for k in range(count):
+        out = machine.push(7_000_000 * k, np.array([value]))
+    assert out[0] == pytest.approx(value, abs=1e-9)  # pyright: ignore[reportPossiblyUnboundVariable]
+
+
+@pytest.mark.parametrize(
+    "bad", [(0.0, 0.1, 1.0), (1.0, -0.1, 1.0), (1.0, 0.1, math.nan), (math.inf, 0.1, 1.0)]
+)
+def test_parameters_are_checked(bad: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match="1 € filter"):
+        OneEuroParameters(*bad)
+    with pytest.raises(ValueError, match="1 € filter"):
+        OneEuro(*bad)
+
+
+def test_shape_is_kept_and_may_not_change() -> None:
+    machine = OneEuro.of(OneEuroParameters())
+    assert machine.push(0, np.full((6, 3), np.nan)).shape == (6, 3)
+    with pytest.raises(ValueError, match="shape"):
+        machine.push(1, np.zeros(18))

@@ -1,0 +1,230 @@
+"""Closed-form finger: angles out equal angles in, for real and generated hands; limits and unreachable targets."""
+
+import math
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import least_squares
+
+from common.arrays import Float
+from common.calibration import Couplings, HandProfile, load
+from common.hand_model import FINGERS, TIPS, HandModel, preset_couplings, preset_limits
+from common.hand_profiles import generated_profile
+from master.ik.bounded import Four
+from master.ik.finger import NOT_SEEN, FingerSolver
+
+Preset = Literal["K", "D"]
+DEGREE = math.pi / 180
+
+
+@cache
+def _model(side: str, preset: Preset) -> HandModel:
+    profile = generated_profile("made", side)
+    return HandModel.of(
+        msgspec.structs.replace(profile, limits_rad=preset_limits(preset), couplings=preset_couplings(preset))
+    )
+
+
+@cache
+def _solver(side: str, preset: Preset, finger: int) -> FingerSolver:
+    model = _model(side, preset)
+    return FingerSolver.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
+
+
+def _legal(model: HandModel, solver: FingerSolver, finger: int, shares: Float) -> Float:
+    """Angles (N, 4) inside the limits that obey the coupling, from shares (N, 4) of the ranges."""
+    low, high = model.limits_rad[finger, :, 0], model.limits_rad[finger, :, 1]
+    angles = low + shares * (high - low)
+    angles[:, 3] = np.clip(solver.ratio * angles[:, 2], low[3], high[3])
+    return angles
+
+
+def _points(model: HandModel, finger: int, angles: Float, offset: Float) -> Float:
+    """The observed point (N, 3) by the hand model's own kinematics."""
+    hand = np.zeros((len(angles), 5, 4))
+    hand[:, finger] = angles
+    joints = model.forward(np.broadcast_to(np.eye(4), (len(angles), 4, 4)), hand)
+    return joints.position_m[:, TIPS[finger]] + joints.rotation[:, TIPS[finger]] @ offset
+
+
+def _four(row: Float) -> Four:
+    a, f, p, d = row.tolist()
+    return a, f, p, d
+
+
+def _target(row: Float) -> tuple[float, float, float]:
+    x, y, z = row.tolist()
+    return x, y, z
+
+
+def _round_trip(model: HandModel, solver: FingerSolver, finger: int, shares: Float) -> None:
+    offset = model.mounts[FINGERS[finger]].offset_m
+    angles = _legal(model, solver, finger, shares)
+    points = _points(model, finger, angles, offset)
+    found = [solver.solve(_target(p)) for p in points]
+    back = _points(model, finger, np.array([s[:4] for s in found]), offset)
+    miss_mm = np.linalg.norm(back - points, axis=1) * 1e3
+    assert miss_mm.max() < 1e-3  # every reachable target is hit
+    assert all(s.reached for s in found)
+    solved = np.array([s[:4] for s in found])
+    assert model.within_limits(np.repeat(solved[:, None], 5, axis=1))[:, finger].all()
+    # the straight finger and the abduction's pole have two legal answers each: tell which is meant
+    near = np.array(
+        [solver.solve(_target(p), _four(a + 0.001))[:4] for p, a in zip(points, angles, strict=True)]
+    )
+    error_deg = np.abs(near - angles).max(axis=1) / DEGREE
+    assert np.quantile(error_deg, 0.99) < 1e-3
+    assert error_deg.max() < 0.3  # a whisker from the pole itself, where the answer is ill-conditioned
+
+
+@pytest.mark.parametrize("finger", range(5))
+@pytest.mark.parametrize(("side", "preset"), [("right", "K"), ("left", "D")])
+def test_angles_come_back(side: str, preset: Preset, finger: int) -> None:
+    shares = np.random.default_rng(finger).uniform(0.02, 0.98, (300, 4))
+    _round_trip(_model(side, preset), _solver(side, preset, finger), finger, shares)
+
+
+@pytest.mark.parametrize("name", ["webxr-right", "webxr-left-small"])
+def test_angles_come_back_on_measured_hands(datasets: Path, name: str) -> None:
+    model = HandModel.of(load(datasets / "hands" / f"{name}.json", HandProfile))
+    for finger in range(5):
+        solver = FingerSolver.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
+        _round_trip(model, solver, finger, np.random.default_rng(9).uniform(0.02, 0.98, (120, 4)))
+
+
+@given(
+    finger=st.integers(0, 4),
+    shares=st.tuples(*[st.sampled_from([0.0, 1e-9, 0.3, 0.5, 0.999999, 1.0])] * 4),
+    side=st.sampled_from(["right", "left"]),
+)
+def test_corners_of_the_limits_are_hit(finger: int, shares: tuple[float, ...], side: str) -> None:
+    model, solver = _model(side, "D"), _solver(side, "D", finger)
+    angles = _legal(model, solver, finger, np.array([shares]))
+    point = _points(model, finger, angles, model.mounts[FINGERS[finger]].offset_m)[0]
+    found = solver.solve(_target(point))
+    assert math.dist(solver.forward(found[:4]), point) * 1e3 < 1e-3
+    assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+
+
+def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
+    rng = np.random.default_rng(4)
+    for finger in range(5):
+        solver = _solver("right", "K", finger)
+        assert solver.bound_m < 1e-6
+        for _ in range(60):
+            target = _target(np.array(solver.root) + rng.normal(0.0, 0.06, 3))
+            found = solver.solve(target)
+            miss = math.dist(solver.forward(found[:4]), target)
+            assert miss <= found.residual_m + 1e-9
+            assert found.reached == (miss < 1e-6)
+            assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+
+
+def test_the_flat_index_by_hand() -> None:
+    # zero angles are the rest pose of the profile: no kinematics of ours needed
+    model, solver = _model("right", "K"), _solver("right", "K", 1)
+    tip = model.rest_position_m[TIPS[1]]
+    found = FingerSolver.of(model, 1, np.zeros(3)).solve(_target(tip))
+    assert np.array(found[:4]) / DEGREE == pytest.approx(np.zeros(4), abs=0.05)
+    assert solver.ratio == pytest.approx(2 / 3)
+    assert solver.chain.lengths[0] == pytest.approx(
+        np.linalg.norm(np.subtract(*model.rest_position_m[[8, 7]]))
+    )
+
+
+def test_out_of_reach_is_stretched_towards_the_target_and_flagged() -> None:
+    for finger in range(5):
+        solver = _solver("right", "K", finger)
+        straight = np.array(solver.forward((0.0, 0.3, 0.0, 0.0))) - solver.root
+        far = _target(np.array(solver.root) + 3.0 * straight)
+        found = solver.solve(far)
+        assert not found.reached
+        tip = np.array(solver.forward(found[:4])) - solver.root
+        cosine = tip @ straight / np.linalg.norm(tip) / np.linalg.norm(straight)
+        assert math.degrees(math.acos(min(cosine, 1.0))) < 0.1
+        assert found.residual_m == pytest.approx(3 * np.linalg.norm(straight) - np.linalg.norm(tip), abs=1e-5)
+
+
+@pytest.mark.parametrize("finger", [1, 2])
+def test_cut_by_a_limit_is_the_bounded_least_squares_pose(finger: int) -> None:
+    solver = _solver("right", "K", finger)
+    rng = np.random.default_rng(finger)
+    low, high = np.array(solver.limits).T
+    for _ in range(12):
+        a, f, pip = rng.uniform([25, 10, 10], [35, 60, 80]) * DEGREE
+        target = np.array(solver.forward((a, f, pip, solver.ratio * pip)))
+        found = solver.solve(_target(target))
+        assert not found.reached
+
+        def left(q: Float, target: Float = target) -> Float:
+            return np.array(solver.forward((q[0], q[1], q[2], solver.ratio * q[2]))) - target
+
+        best = least_squares(
+            left,
+            np.clip([0.01, f, pip], low[:3], high[:3]),
+            bounds=(low[:3] - 1e-9, high[:3] + 1e-9),
+            xtol=1e-12,
+        )
+        oracle = np.linalg.norm(left(best.x))
+        assert (found.residual_m - oracle) * 1e3 < 1e-3
+
+
+@given(
+    st.integers(0, 4),
+    st.tuples(*[st.one_of(st.floats(-1.0, 1.0), st.sampled_from([math.nan, math.inf, 0.0]))] * 3),
+)
+def test_any_target_gives_a_legal_pose_or_nan(finger: int, target: tuple[float, float, float]) -> None:
+    solver = _solver("right", "D", finger)
+    found = solver.solve(target)
+    if all(math.isfinite(v) for v in target):
+        assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+        assert math.isfinite(found.residual_m)
+    else:
+        assert found is NOT_SEEN
+        assert np.isnan(found[:5]).all()
+
+
+def test_target_at_the_root_is_flagged() -> None:
+    for finger in range(5):
+        solver = _solver("right", "K", finger)
+        found = solver.solve(solver.root)
+        assert not found.reached
+        assert found.residual_m > 0.005
+
+
+def test_left_is_the_mirror_of_right() -> None:
+    for finger in range(5):
+        right, left = _solver("right", "K", finger), _solver("left", "K", finger)
+        x, y, z = right.forward((0.0 if finger == 2 else 0.1, 0.5, 0.6, right.ratio * 0.6))
+        assert np.array(left.solve((-x, y, z))[:4]) == pytest.approx(
+            np.array(right.solve((x, y, z))[:4]), abs=1e-5
+        )
+
+
+def test_one_millimetre_is_about_one_and_a_half_degrees_of_pip() -> None:
+    # I8: 1 mm of tip noise is about 1.4 deg of PIP
+    solver, rng = _solver("right", "K", 1), np.random.default_rng(0)
+    true = (0.05, 0.6, 0.9, solver.ratio * 0.9)
+    tip = np.array(solver.forward(true))
+    errors = [solver.solve(_target(tip + rng.normal(0, 0.001, 3))).pip_rad - 0.9 for _ in range(400)]
+    assert 0.8 < np.std(errors) / DEGREE < 2.2
+
+
+def test_free_pairs_are_found_where_the_coupling_is_off() -> None:
+    profile = msgspec.structs.replace(
+        generated_profile("free", "right"), couplings=Couplings(dip_per_pip=None)
+    )
+    model, rng = HandModel.of(profile), np.random.default_rng(6)
+    for finger in (0, 1, 4):
+        solver = FingerSolver.of(model, finger, np.zeros(3))
+        low, high = np.array(solver.limits).T
+        for _ in range(60):
+            target = solver.forward(_four(rng.uniform(low, high)))
+            found = solver.solve(target)
+            assert math.dist(solver.forward(found[:4]), target) * 1e3 < 1e-3
