@@ -1,0 +1,57 @@
+"""`make bench`: prints the table of performance, section by section; `python -m bench NAME ...` runs some of them."""
+
+import argparse
+import importlib
+import json
+import os
+import platform
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+from bench.row import Row
+
+SECTIONS = {
+    "markers": "Marker detection, 640x480, six markers, one thread; baseline: the published pipeline rebuilt",
+    "filters": "1 euro filter, 18 signals; baseline: one object per signal",
+    "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
+    "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
+    "master": "The master above the bus; and 16 cameras over sealed UDP",
+    "replay": "Recorded frames with exact truth (PHALANX_DATASETS); exact truth, no baseline",
+    "live": "Two slaves and the master over real UDP, standard scene; baseline: an idle relay of datagrams",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the sections asked for; return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
+    parser.add_argument(
+        "sections", nargs="*", metavar="SECTION", help=f"{', '.join(SECTIONS)} (default: all)"
+    )
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
+    options = parser.parse_args(arguments)
+    wanted = cast(list[str], options.sections) or list(SECTIONS)
+    if unknown := sorted(set(wanted) - SECTIONS.keys()):
+        parser.error(f"unknown section {unknown[0]!r}; there are {', '.join(SECTIONS)}")
+    print(f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}")
+    everything: dict[str, list[Row]] = {}
+    for name in wanted:
+        print(f"\n{SECTIONS[name]}", flush=True)
+        rows = [Row(*row) for row in importlib.import_module(f"bench.{name}").rows()]
+        everything[name] = rows
+        for row in rows:
+            print(f"  {row.name:58s} {_number(row.value):>10s} {row.unit:8s} {row.note}", flush=True)
+    if options.json is not None:
+        options.json.write_text(
+            json.dumps({k: [r._asdict() for r in v] for k, v in everything.items()}, indent=1)
+        )
+    return 0
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if abs(value) < 1e4 else f"{value:.0f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
