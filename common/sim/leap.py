@@ -33,7 +33,7 @@ class LeapMotion:
     Attributes:
         centre_m: (3,) [m] middle of the volume, rig frame.
         position_m: (N, 3) palm centre [m] around 0, rig axes; quaternion: (N, 4) wxyz; angles_rad: (N, 5, 4).
-        middle_m: (3,) palm centre in the palm frame.
+        middle_m: (3,) the point of the palm frame that follows it, the middle of the flat hand.
         limits_rad: (5, 4, 2).
     """
 
@@ -98,7 +98,7 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
         position_m=place,
         quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         angles_rad=flat.reshape(-1, 5, 4),
-        middle_m=model.rest_position_m[0],
+        middle_m=np.array([0.0, 0.0, 0.5 * float(model.rest_position_m[:, 2].max())]),
         limits_rad=model.limits_rad,
     )
 
@@ -108,7 +108,8 @@ def palm_rotation(normal: Float, direction: Float) -> Float:
     y = -normal / np.linalg.norm(normal, axis=1, keepdims=True)
     z = direction - (direction * y).sum(axis=1, keepdims=True) * y
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
-    return np.stack([np.cross(y, z), y, z], axis=2)
+    x: Float = np.asarray(np.cross(y, z), dtype=np.float64)
+    return np.stack([x, y, z], axis=2)
 
 
 def joint_angles(model: HandModel, joints: Float, rotation: Float) -> Float:

@@ -16,7 +16,7 @@ Int32 = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
 
 FIXED_BITS = 4
-SUPER = 4
+SUPER = 6
 HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 ARC_POINTS = 8
 
@@ -86,7 +86,7 @@ def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
 def cover(
     outline: Shape, cut: Shape | None, nearer: Sequence[Shape], offsets_s: Float, size: tuple[int, int]
 ) -> Coverage:
-    """Measure what an outline covers, by drawing at four times the resolution at each moment of the exposure.
+    """Measure what an outline covers, by drawing at six times the resolution at each moment of the exposure.
 
     Args:
         outline: The marker.
@@ -100,20 +100,19 @@ def cover(
     high = np.ceil(outline.corners.max(axis=0) + reach).astype(int) + 1
     origin = low - 0.5 + 0.5 / SUPER
     shape = tuple((high - low)[::-1] * SUPER)
-    middle = outline.corners.mean(axis=0)
-    spread = outline.corners - middle
-    reach_px = np.hypot(spread[:, 0], spread[:, 1])[:, None]
-    drawn = middle + spread * np.maximum(1.0 - HALF_SUBPIXEL_PX / np.maximum(reach_px, 1e-6), 0.0)
+    drawn = _inset(outline.corners)
+    others = [Shape(_inset(other.corners), other.velocity) for other in nearer]
+    own_cut = None if cut is None else Shape(_inset(cut.corners), cut.velocity)
     level = 255 // len(offsets_s)
     total: Image | None = None
     own = 0
     for offset in offsets_s:
         mask = np.zeros(shape, dtype=np.uint8)
         _fill_fine(mask, drawn + offset * outline.velocity - origin, level)
-        if cut is not None:
-            _fill_fine(mask, cut.corners + offset * cut.velocity - origin, 0)
+        if own_cut is not None:
+            _fill_fine(mask, own_cut.corners + offset * own_cut.velocity - origin, 0)
         own += cv2.countNonZero(mask)
-        for other in nearer:
+        for other in others:
             _fill_fine(mask, other.corners + offset * other.velocity - origin, 0)
         total = mask if total is None else np.asarray(cv2.add(total, mask), dtype=np.uint8)
     assert total is not None
@@ -133,6 +132,13 @@ def centroid(coverage: Coverage) -> Float:
     u = float(columns @ np.arange(len(columns))) / total + coverage.x
     v = float(rows @ np.arange(len(rows))) / total + coverage.y
     return np.array([u, v])
+
+
+def _inset(corners: Float) -> Float:
+    """Corners moved inwards by what the fill adds."""
+    spread = corners - corners.mean(axis=0)
+    reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
+    return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
 
 
 def _fill_fine(mask: Image, points: Float, level: int) -> None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Float
 from common.errors import CalibrationError
 from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
 
@@ -63,7 +63,7 @@ class HandSurface:
         model: The hand.
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
-        owner: (K,) per key point, the marker whose moment it shares, or -1 for its own.
+        count: Number of key points.
     """
 
     model: HandModel
@@ -71,7 +71,7 @@ class HandSurface:
     radius_m: Float
     caps: tuple[Cap, ...]
     boxes: tuple[Box, ...]
-    owner: Int
+    count: int
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...]) -> "HandSurface":
@@ -87,30 +87,30 @@ class HandSurface:
         radius[list(WRIST_SPHERES)] = 0.76 * wrist
         radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
         radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
-        radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 1.9 * wrist
-        owner = [-1] * SPHERE_COUNT
+        radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
+        count = SPHERE_COUNT
         caps: list[Cap] = []
         boxes: list[Box] = []
         for m, name in enumerate(markers):
             mount = model.mount(name)
             finger = mount.finger
             if mount.joint is None:
-                boxes.append(Box(m, slice(len(owner), len(owner) + 8)))
-                owner += [m] * 8
+                boxes.append(Box(m, slice(count, count + 8)))
+                count += 8
             elif finger is not None and mount.joint == CHAINS[finger, 3]:
-                caps.append(Cap(m, finger, float(model.radius_m[mount.joint]), len(owner), len(owner) + 1))
+                caps.append(Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1))
                 radius[4 * finger + 3] *= SKIN_UNDER_PAINT
-                owner += [m, m]
+                count += 2
             else:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
                 )
-        return cls(model, markers, radius, tuple(caps), tuple(boxes), np.array(owner))
+        return cls(model, markers, radius, tuple(caps), tuple(boxes), count)
 
     def key_points(self, joints: HandJoints) -> Float:
         """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
         lead = joints.position_m.shape[:-2]
-        points = np.empty((*lead, len(self.owner), 3))
+        points = np.empty((*lead, self.count, 3))
         points[..., :20, :] = joints.position_m[..., CHAINS.ravel(), :]
         wrist = 0.45 * self.model.radius_m[1]
         T = joints.T_rig_palm
@@ -123,7 +123,7 @@ class HandSurface:
         cuff = T[..., :3, 3] - 0.018 * z
         arm = -0.55 * z + 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
         points[..., SLEEVE_SPHERES[0], :] = cuff
-        points[..., SLEEVE_SPHERES[1], :] = cuff + 0.26 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
+        points[..., SLEEVE_SPHERES[1], :] = cuff + 0.45 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
         centroid = self.model.marker_points(joints, self.markers)
         for cap in self.caps:
             ahead = -joints.rotation[..., CHAINS[cap.finger, 3], :, 2]

@@ -19,10 +19,12 @@ from common.sim.raster import Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
     CAPSULES,
+    CYLINDER_SHARE,
     PALM_HULL,
     SLEEVE_SPHERES,
     SPHERE_COUNT,
     HandSurface,
+    cap_centroid_ahead,
     cap_outline,
     rim,
     unit,
@@ -48,7 +50,7 @@ class Snapshot:
         discs_uv: (B, LAYERS, 2) [px], discs_px: (B, LAYERS): shading of the spheres, then of the caps' two ends each.
         outlines: (PHALANGES + C, LAYERS, N, 2) [px] phalanges, then the shading of the caps.
         cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
-        rim_uv: (C, n, 2) [px] the cap's edge towards the finger.
+        rim_uv: (C, n, 2) [px] the cap's edge towards the finger, and the finger's girth at its last joint.
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
         shine_uv: (C, 2) [px] where the paint mirrors the lamp.
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
@@ -92,18 +94,24 @@ class View:
         self.cap_radius = np.array([cap.radius_m for cap in caps])
         self.cap_centre = np.array([cap.centre for cap in caps], dtype=np.intp)
         self.cap_base = np.array([cap.base for cap in caps], dtype=np.intp)
+        self._cap_joint = np.array([4 * cap.finger + 2 for cap in caps], dtype=np.intp)
         ends = np.stack([self.cap_centre, self.cap_base], axis=1).ravel()
         self._bodies = np.concatenate([np.arange(SPHERE_COUNT), ends])
         self._radius = np.concatenate([self.surface.radius_m, np.repeat(self.cap_radius, 2)])
         first = SPHERE_COUNT + 2 * np.arange(len(caps))
         self._from = np.concatenate([CAPSULES[:, 0], first])
         self._to = np.concatenate([CAPSULES[:, 1], first + 1])
-        self._fine_circle = unit_circle(24)
-        count = len(self.surface.owner)
-        # Row k averages the rows of the points that share the moment of point k.
-        same = self.surface.owner[:, None] == self.surface.owner[None, :]
-        same[:SPHERE_COUNT] = np.eye(count, dtype=np.bool_)[:SPHERE_COUNT]
-        self._together = same / same.sum(axis=1, keepdims=True)
+        self._fine_circle = unit_circle(32)
+        count = self.surface.count
+        # Points of one marker share the moment of the marker's centroid: row k weighs the rows for point k.
+        together = np.eye(count)
+        for box in self.surface.boxes:
+            together[box.corners, box.corners] = 1.0 / 8.0
+        ahead = cap_centroid_ahead(1.0) / CYLINDER_SHARE
+        for cap in caps:
+            together[[cap.centre, cap.base], cap.centre] = 1.0 + ahead
+            together[[cap.centre, cap.base], cap.base] = -ahead
+        self._together = together
 
     def project(self, points: Float) -> Float:
         """Pixels (..., 2) of points (..., 3) [m] in the camera frame; what is too near or far out is held there."""
@@ -118,7 +126,9 @@ class View:
         size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
         discs_px = size[:, None] * LAYER_SINES
         centre, base = points[self.cap_centre], points[self.cap_base]
-        edge = base[:, None] + rim(unit(centre - base), 1.01 * self.cap_radius, self._fine_circle)
+        axis, joint = unit(centre - base), points[self._cap_joint]
+        behind = joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle)
+        edge = np.concatenate([base[:, None] + rim(axis, self.cap_radius, self._fine_circle), behind], axis=1)
         half = unit(self.to_light - unit(centre))
         parts = (
             lit,
@@ -154,11 +164,7 @@ class View:
         """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
         if not snapshot.from_behind[cap]:
             return None
-        joint = 4 * self.surface.caps[cap].finger + 2
-        disc = snapshot.discs_uv[joint, 0] + snapshot.discs_px[joint, 0] * self.circle
-        return Shape(
-            raster.hull(np.vstack([snapshot.rim_uv[cap], disc])), snapshot.speed_uv[self.cap_base[cap]]
-        )
+        return Shape(raster.hull(snapshot.rim_uv[cap]), snapshot.speed_uv[self.cap_base[cap]])
 
     def phalanx_depth(self, snapshot: Snapshot, uv: Float) -> Float:
         """Depth (..., PHALANGES) [m] of every phalanx where it passes nearest to the pixels `uv` (..., 2)."""

@@ -1,0 +1,131 @@
+"""The synthetic camera keeps time like a real one: on its own clock, never late by its drawing, never in a backlog."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.clock import SkewedClock
+from common.errors import CalibrationError
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+from slave.cameras.synthetic import SyntheticCamera
+
+ROOT = Path(__file__).resolve().parents[2]
+RIG = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
+CAMERAS = {name: load(ROOT / f"calib_json/cameras/{name}.json", CameraCalibration) for name in RIG.cameras}
+SCENE = Scene.standard(RIG, CAMERAS, load(ROOT / "calib_json/hands/default-right.json", HandProfile))
+PERIOD_NS = 1e9 / 60.0
+READOUT_NS = 2_500_000 + 480 * 20_600  # half the exposure, then all rows
+EPOCH_NS = 7_000_000_000_000
+
+
+class StageClock:
+    """A true clock that moves only when somebody sleeps or the test says so."""
+
+    def __init__(self, t_ns: int) -> None:
+        self.t_ns = t_ns
+        self.slept: list[float] = []
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.t_ns += max(round(seconds * 1e9), 1)
+
+
+def camera(clock: StageClock, name: str = "left", ppm: float = 0.0, late_ns: int = 0) -> SyntheticCamera:
+    own = SkewedClock(3_000_000_000, ppm, clock)
+    return SyntheticCamera(SCENE, name, EPOCH_NS, own, late_ns, clock, clock.sleep)
+
+
+def test_frames_come_one_per_period_at_the_end_of_the_readout() -> None:
+    clock = StageClock(EPOCH_NS - 100_000_000)
+    source = camera(clock)
+    for k in range(4):
+        frame = source.read()
+        assert frame is not None
+        assert frame.seq == k
+        true_ns = frame.t_ns - 3_000_000_000
+        assert abs(true_ns - EPOCH_NS - k * PERIOD_NS) < 3
+        assert 0 <= frame.ready_t_ns - frame.t_ns - READOUT_NS < 1_000
+        assert clock.now_ns() == frame.ready_t_ns - 3_000_000_000
+    assert source.skipped == 0
+
+
+def test_image_is_the_scene_at_the_true_time_of_the_frame() -> None:
+    clock = StageClock(EPOCH_NS + 20_000_000_000)
+    frame = camera(clock, "right", late_ns=5_000_000).read()
+    assert frame is not None
+    t_s = (frame.t_ns - 3_000_000_000 - EPOCH_NS) * 1e-9
+    assert (t_s - 0.005) * 60.0 == pytest.approx(frame.seq, abs=1e-4)
+    np.testing.assert_array_equal(frame.image, Renderer(SCENE, "right").render(t_s))
+
+
+def test_joins_at_any_time_with_the_number_of_that_moment() -> None:
+    clock = StageClock(EPOCH_NS + 10_000_000_000)
+    source = camera(clock)
+    frame = source.read()
+    assert frame is not None
+    assert frame.seq in (600, 601)
+    assert source.skipped == 0  # frames before it joined were never its own
+    assert clock.now_ns() - EPOCH_NS - 10_000_000_000 < PERIOD_NS + 1
+
+
+def test_rate_is_that_of_its_own_clock() -> None:
+    clock = StageClock(EPOCH_NS)
+    source = camera(clock, ppm=1000.0)
+    first = source.read()
+    clock.t_ns += 10_000_000_000
+    second = source.read()
+    assert first is not None
+    assert second is not None
+    count = second.seq - first.seq
+    assert abs((second.t_ns - first.t_ns) - count * PERIOD_NS) < 3  # its own clock sees its nominal rate
+    own = SkewedClock(0, 1000.0, StageClock(0))
+    assert own.to_true(10**9) < 10**9
+
+
+def test_a_slow_process_loses_frames_and_builds_no_backlog() -> None:
+    clock = StageClock(EPOCH_NS - 1)
+    source = camera(clock)
+    assert source.read() is not None
+    clock.t_ns += round(5.2 * PERIOD_NS)  # the caller was busy
+    frame = source.read()
+    assert frame is not None
+    assert source.skipped == frame.seq - 1 >= 4
+    assert frame.ready_t_ns - frame.t_ns - READOUT_NS < 1_000  # and is on time again
+    after = source.read()
+    assert after is not None
+    assert after.seq == frame.seq + 1
+
+
+def test_a_little_lateness_costs_no_frame() -> None:
+    clock = StageClock(EPOCH_NS - 1)
+    source = camera(clock)
+    seen = []
+    for _ in range(5):
+        frame = source.read()
+        assert frame is not None
+        seen.append(frame.seq)
+        clock.t_ns += round(1.3 * PERIOD_NS) if frame.seq == 1 else 0
+    assert seen == [0, 1, 2, 3, 4]
+    assert source.skipped == 0
+
+
+def test_waits_in_short_steps_so_that_a_signal_ends_it() -> None:
+    clock = StageClock(EPOCH_NS - 1_000_000_000)
+    assert camera(clock).read() is not None
+    assert max(clock.slept) <= 0.05
+
+
+def test_closed_camera_ends_the_stream_and_unknown_one_is_refused() -> None:
+    clock = StageClock(EPOCH_NS)
+    source = camera(clock)
+    source.close()
+    source.close()
+    assert source.read() is None
+    with pytest.raises(CalibrationError, match="third"):
+        camera(clock, "third")
