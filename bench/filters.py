@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from common.arrays import Float
 from master.filters import OneEuro
 
 _ROUNDS = 9
@@ -14,31 +15,51 @@ _SAMPLES = 400
 
 
 class _LowPass:
-    def __init__(self) -> None:
-        self.last: float | None = None
+    """Checked exponential smoothing that can be asked for its last value."""
 
-    def filter(self, value: float, alpha: float) -> float:
-        self.last = value if self.last is None else alpha * value + (1.0 - alpha) * self.last
-        return self.last
+    def __init__(self, alpha: float) -> None:
+        self._set_alpha(alpha)
+        self._raw: float | None = None
+        self._smooth: float | None = None
+
+    def _set_alpha(self, alpha: float) -> None:
+        if not 0.0 < alpha <= 1.0:
+            raise ValueError(f"alpha {alpha} is not in 0 ... 1")
+        self._alpha = alpha
+
+    def last_filtered(self) -> float | None:
+        return self._smooth
+
+    def filter(self, value: float, alpha: float | None = None) -> float:
+        if alpha is not None:
+            self._set_alpha(alpha)
+        smooth = value if self._smooth is None else self._alpha * value + (1.0 - self._alpha) * self._smooth
+        self._raw, self._smooth = value, smooth
+        return smooth
 
 
 class _Signal:
-    """Casiez's filter as it is usually written: one object per signal, two low passes inside."""
+    """The paper's filter in the paper's structure: one object per signal, two checked low passes inside."""
 
-    def __init__(self, min_cutoff: float, beta: float, d_cutoff: float) -> None:
-        self.min_cutoff, self.beta, self.d_cutoff = min_cutoff, beta, d_cutoff
-        self.x, self.dx = _LowPass(), _LowPass()
-        self.time: float | None = None
+    def __init__(self, frequency: float, min_cutoff: float, beta: float, d_cutoff: float) -> None:
+        self._frequency, self._min_cutoff, self._beta, self._d_cutoff = frequency, min_cutoff, beta, d_cutoff
+        self._x, self._dx = _LowPass(self._alpha(min_cutoff)), _LowPass(self._alpha(d_cutoff))
+        self._time: float | None = None
 
-    def alpha(self, cutoff: float, dt: float) -> float:
-        return 1.0 / (1.0 + 1.0 / (2.0 * math.pi * cutoff) / dt)
+    def _alpha(self, cutoff: float) -> float:
+        period = 1.0 / self._frequency
+        tau = 1.0 / (2.0 * math.pi * cutoff)
+        return 1.0 / (1.0 + tau / period)
 
     def filter(self, value: float, t: float) -> float:
-        dt = t - self.time if self.time is not None else 1.0 / 120.0
-        self.time = t
-        change = (value - self.x.last) / dt if self.x.last is not None else 0.0
-        speed = self.dx.filter(change, self.alpha(self.d_cutoff, dt))
-        return self.x.filter(value, self.alpha(self.min_cutoff + self.beta * abs(speed), dt))
+        if self._time is not None and t > self._time:
+            self._frequency = 1.0 / (t - self._time)
+        self._time = t
+        last = self._x.last_filtered()
+        change = 0.0 if last is None else (value - last) * self._frequency
+        speed = self._dx.filter(change, self._alpha(self._d_cutoff))
+        cutoff = self._min_cutoff + self._beta * abs(speed)
+        return self._x.filter(value, self._alpha(cutoff))
 
 
 def _median_us(run: Callable[[], None], calls: int) -> float:
@@ -53,24 +74,25 @@ def _median_us(run: Callable[[], None], calls: int) -> float:
 def rows() -> list[tuple[str, float, str, str]]:
     """(name, value, unit, goal) of each measurement."""
     samples = np.cumsum(np.random.default_rng(1).normal(0.0, 1e-3, (_SAMPLES, 6, 3)), axis=0)
-    flat: list[list[float]] = samples.reshape(_SAMPLES, 18).tolist()
     period = 8_333_333
-    theirs: list[list[float]] = []
-    ours: list[np.ndarray[tuple[int, ...], np.dtype[np.float64]]] = []
+    theirs: list[Float] = []
+    ours: list[Float] = []
 
     def reference() -> None:
-        signals = [_Signal(1.0, 0.1, 1.0) for _ in range(18)]
-        theirs[:] = [
-            [s.filter(v, k * period * 1e-9) for s, v in zip(signals, row, strict=True)]
-            for k, row in enumerate(flat)
-        ]
+        signals = [_Signal(120.0, 1.0, 0.1, 1.0) for _ in range(18)]
+        theirs.clear()
+        for k, sample in enumerate(samples):
+            values: list[float] = sample.ravel().tolist()
+            t = k * period * 1e-9
+            out = [s.filter(v, t) for s, v in zip(signals, values, strict=True)]
+            theirs.append(np.array(out).reshape(6, 3))
 
     def machine() -> None:
         one_euro = OneEuro(1.0, 0.1, 1.0)
         ours[:] = [one_euro.push(k * period, sample) for k, sample in enumerate(samples)]
 
     slow, fast = _median_us(reference, _SAMPLES), _median_us(machine, _SAMPLES)
-    difference = float(np.abs(np.stack(ours).reshape(_SAMPLES, 18) - np.array(theirs)).max())
+    difference = float(np.abs(np.stack(ours) - np.stack(theirs)).max())
     return [
         ("1 €, 18 signals, one object per signal (baseline)", slow, "µs", ""),
         ("1 €, 18 signals, Phalanx", fast, "µs", ""),

@@ -161,7 +161,7 @@ class FingerSolver:
         """The usual case, without a loop or a call: most bent branch, legal at once. Else None."""
         branch = self.branches[0]
         distance2 = x * x + y * y + z * z
-        if not branch.near2 <= distance2 < branch.far2 or x * x + z * z < _POLE * distance2:
+        if not branch.near2 <= distance2 < branch.far2:
             return None
         u = sqrt(branch.far2 - distance2) * branch.per_cell
         i = int(u)
@@ -173,6 +173,8 @@ class FingerSolver:
         wx += u * dx
         wy += u * dy
         wz += u * dz
+        if x * x + z * z < _POLE * distance2:
+            pip, (wx, wy, wz) = self._exact(branch, distance2)
         (ax, ay, az), (yx, yy, yz), (zx, zy, zz) = self.rest
         # as `swing_and_flex`, with one of the two flexions and fewer calls
         even, odd = yy * wy + yz * wz, yy * wz - yz * wy

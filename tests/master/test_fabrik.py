@@ -7,7 +7,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.hand_model import FINGERS, HandModel, preset_couplings, preset_limits
@@ -102,6 +102,7 @@ ARM = Chain(
 )
 
 
+@settings(max_examples=40)
 @given(
     st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)),
     st.floats(0.3, 1.2),
@@ -116,7 +117,7 @@ def test_iteration_itself_converges_from_a_nearby_pose(
     result = Fabrik.of(ARM, 1e-4, 200, restarts=0).solve(target, seed)
     assert math.dist(result.positions[-1], target) < 1e-4 + 1e-12
     assert result.reached
-    assert result.angles != seed or off == (0.0, 0.0)
+    assert result.iterations > 0 or max(map(abs, off)) < 1e-3
 
 
 def test_rotor_in_the_middle_and_world_hinge_obey_their_limits() -> None:
