@@ -136,6 +136,12 @@ class ReplayWindow:
         """Begin with nothing taken."""
         self._highest = 0
         self._taken = 1  # bit i: counter `highest - i`; 0 is never used and counts as taken
+        self._count = 0
+
+    @property
+    def missing(self) -> int:
+        """How many counters up to the highest never came: datagrams that were sent and lost."""
+        return self._highest - self._count
 
     def take(self, counter: int) -> Refusal | bool:
         """Take `counter` once: whether a later one came before it, or why it is refused."""
@@ -143,6 +149,7 @@ class ReplayWindow:
         if ahead > 0:
             self._taken = ((self._taken << ahead) | 1) & _MASK if ahead < WINDOW else 1
             self._highest = counter
+            self._count += 1
             return False
         if -ahead >= WINDOW:
             return Refusal.REPLAYED
@@ -150,6 +157,7 @@ class ReplayWindow:
         if self._taken & bit:
             return Refusal.DUPLICATE
         self._taken |= bit
+        self._count += 1
         return True
 
 
@@ -160,6 +168,11 @@ class Opener:
         """Open datagrams sealed with `key`."""
         self._cipher = ChaCha20Poly1305(key)
         self._window = ReplayWindow()
+
+    @property
+    def missing(self) -> int:
+        """How many datagrams the sender sealed and this side never saw, up to the newest one."""
+        return self._window.missing
 
     def open(self, header: Header, datagram: bytes) -> Opened | Refusal:
         """Return the body of a datagram whose header `parse` returned, or why it is refused."""

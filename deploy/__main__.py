@@ -19,6 +19,7 @@ _LABELS = {
     "latency_p50_ms": ("latency, median", "ms"),
     "latency_p99_ms": ("latency, 99 %", "ms"),
     "lost": ("frames lost on the way", ""),
+    "skipped": ("frames a slave had no time for", ""),
     "frames_without_pose": ("frames without a pose", ""),
     "marker_mm": ("marker error, median", "mm"),
     "joint_mm_visible": ("joint error, visible fingers", "mm"),

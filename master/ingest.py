@@ -85,8 +85,13 @@ class Ingest:
 
     @property
     def lost(self) -> int:
-        """Frames of all cameras that were skipped and never came."""
+        """Frames of all cameras that were sent and never came."""
         return sum(self.counts_of(camera).lost for camera in self._cameras)
+
+    @property
+    def skipped(self) -> int:
+        """Frames of all cameras that were never sent: the camera or its slave had no time for them."""
+        return sum(self.counts_of(camera).skipped for camera in self._cameras)
 
     @property
     def refused(self) -> dict[str, int]:
@@ -107,6 +112,7 @@ class Ingest:
             of = self.counts_of(camera)
             counts[f"{camera}.received"] = of.received
             counts[f"{camera}.lost"] = of.lost
+            counts[f"{camera}.skipped"] = of.skipped
             counts[f"{camera}.late"] = of.late
             counts[f"{camera}.duplicate"] = of.duplicate
             counts[f"{camera}.reordered"] = of.reordered

@@ -11,7 +11,7 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
 
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 
@@ -78,6 +78,7 @@ class _Camera:
     pending: _Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
     sequence: Sequence = field(default_factory=Sequence)
+    missing_before: int = 0  # datagrams lost in sessions that are over
 
 
 class MasterLink:
@@ -175,7 +176,10 @@ class MasterLink:
 
     def counts_of(self, camera: str) -> CameraCounts:
         """Return what was counted of `camera` since this master began."""
-        return self._cameras[camera].sequence.counts
+        of = self._cameras[camera]
+        gaps = of.sequence.counts.lost
+        lost = min(gaps, of.missing_before + (of.live.opener.missing if of.live is not None else 0))
+        return replace(of.sequence.counts, lost=lost, skipped=gaps - lost)
 
     def _beacon(self) -> Beacon:
         live = {name: camera.live for name, camera in self._cameras.items()}
@@ -249,6 +253,7 @@ class MasterLink:
 
     def _confirm(self, camera: _Camera, session: _Session, t_ns: int) -> None:
         if camera.live is not None:
+            camera.missing_before += camera.live.opener.missing
             del self._sessions[camera.live.key_id]
         camera.live, camera.pending = session, None
         camera.old_nonces.append(session.hello.slave_nonce)

@@ -114,6 +114,7 @@ def run_live(
         summary: dict[str, object] = {
             **figures.summary(),
             "lost": ingest.lost,
+            "skipped": ingest.skipped,
             "counts": report().counts,
             "stage_us": stages.mean_us(),
         }

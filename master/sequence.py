@@ -16,7 +16,9 @@ class CameraCounts:
 
     Attributes:
         received: Frames taken.
-        lost: Frame numbers skipped and not come so far.
+        lost: Frame numbers skipped and not come so far; `MasterLink.counts_of` tells those whose datagram
+            was lost on the way from those that were never sent.
+        skipped: Frames that the camera or the slave had no time for: nothing was sent.
         late: Frames that came after a newer one, dropped.
         duplicate: Datagrams that came twice, dropped.
         reordered: Datagrams of any kind that came after a later one of their session.
@@ -27,6 +29,7 @@ class CameraCounts:
     late: int = 0
     duplicate: int = 0
     reordered: int = 0
+    skipped: int = 0
 
 
 class Sequence:
