@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX
 from common.sim.raster import Coverage, Shape
@@ -20,6 +20,7 @@ BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
 SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 MARGIN_PX = 2
+REACH_PX = 8.0  # room for motion during the exposure
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,43 +69,41 @@ class Painter:
     def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> list[Painted]:
         """Every marker with what it covers, everything nearer cut out."""
         surface, view = self._view.surface, self._view
-        low, high = snapshot.outlines[:, 0].min(axis=1), snapshot.outlines[:, 0].max(axis=1)
-        palm = Shape(view.hulls(snapshot, PALM_HULL)[0], snapshot.speed_uv[list(PALM_HULL)].mean(axis=0))
-        skin = [
-            Shape(snapshot.outlines[k, 0], snapshot.speed_uv[CAPSULES[k]].mean(axis=0))
-            for k in range(PHALANGES)
-        ]
+        palm = Shape(view.hulls(snapshot, PALM_HULL, 1)[0], snapshot.speed_uv[list(PALM_HULL)].mean(axis=0))
         caps = [
             Shape(raster.hull(uv), snapshot.speed_uv[k])
             for uv, k in zip(snapshot.cap_uv, view.cap_centre, strict=True)
         ]
+        low, high = snapshot.cap_uv.min(axis=1) - REACH_PX, snapshot.cap_uv.max(axis=1) + REACH_PX
         centre = snapshot.points[view.cap_centre]
-        phalanx = view.phalanx_depth(snapshot, snapshot.uv[view.cap_centre]) < centre[:, 2:]
         hidden = view.behind_palm(snapshot, centre)
+        skin = self._skin_before(snapshot, snapshot.uv[view.cap_centre], centre[:, 2], low, high)
+        touching = raster.overlaps(low[:, None], high[:, None], low, high)
+        touching &= centre[:, None, 2] > centre[None, :, 2]
         painted: list[Painted] = []
         for c, cap in enumerate(surface.caps):
-            shape = caps[c]
-            touched = raster.overlaps(low[:PHALANGES], high[:PHALANGES], *_reach(shape)) & phalanx[c]
-            touched[3 * cap.finger + 2] = False
-            nearer = [skin[k] for k in np.flatnonzero(touched)]
-            nearer += [caps[n] for n in range(len(caps)) if n != c and centre[n, 2] < centre[c, 2]]
+            skin[c, 3 * cap.finger + 2] = False  # that one is the cap's own, see `own_finger`
+            nearer = [*_phalanges(snapshot, skin[c]), *(caps[n] for n in np.flatnonzero(touching[c]))]
             nearer += [*([palm] if hidden[c] else []), *cards]
-            cover = raster.cover(
-                shape, view.own_finger(snapshot, c), nearer, self._moments(shape), self._size
-            )
-            painted.append(Painted(cap.marker, cover, shape, float(snapshot.t_s[cap.centre])))
+            cut = view.own_finger(snapshot, c)
+            cover = raster.cover(caps[c], cut, nearer, self._moments(caps[c]), self._size)
+            painted.append(Painted(cap.marker, cover, caps[c], float(snapshot.t_s[cap.centre])))
         for box in surface.boxes:
-            corners = snapshot.points[box.corners]
-            shape = Shape(raster.hull(snapshot.uv[box.corners]), snapshot.speed_uv[box.corners].mean(axis=0))
-            before = (
-                view.phalanx_depth(snapshot, snapshot.uv[box.corners].mean(axis=0)) < corners[:, 2].mean()
-            )
-            touched = raster.overlaps(low[:PHALANGES], high[:PHALANGES], *_reach(shape)) & before
-            nearer = [skin[k] for k in np.flatnonzero(touched)]
-            nearer += [*([] if view.shows_back(snapshot) else [palm]), *cards]
+            uv = snapshot.uv[box.corners]
+            shape = Shape(raster.hull(uv), snapshot.speed_uv[box.corners].mean(axis=0))
+            depth = snapshot.points[box.corners, 2].mean(keepdims=True)
+            at = uv.min(axis=0)[None] - REACH_PX, uv.max(axis=0)[None] + REACH_PX
+            before = self._skin_before(snapshot, uv.mean(axis=0)[None], depth, *at)[0]
+            nearer = [*_phalanges(snapshot, before), *([] if view.shows_back(snapshot) else [palm]), *cards]
             cover = raster.cover(shape, None, nearer, self._moments(shape), self._size)
             painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
         return sorted(painted, key=lambda item: item.marker)
+
+    def _skin_before(self, snapshot: Snapshot, uv: Float, depth: Float, low: Float, high: Float) -> Bool:
+        """Which phalanges (N, PHALANGES) reach into the boxes `low`, `high` (N, 2) before the depths (N,) [m]."""
+        skin = snapshot.outlines[:PHALANGES, 0]
+        touched = raster.overlaps(low[:, None], high[:, None], skin.min(axis=1), skin.max(axis=1))
+        return touched & (self._view.phalanx_depth(snapshot, uv) < depth[:, None])
 
     def window(self, image: Image, group: list[Painted], snapshot: Snapshot) -> tuple[int, int, Image]:
         """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""
@@ -196,9 +195,15 @@ class Painter:
         )
 
 
-def _reach(shape: Shape) -> tuple[Float, Float]:
-    """Corners of a box around an outline, with room for motion during the exposure [px]."""
-    return shape.corners.min(axis=0) - 8.0, shape.corners.max(axis=0) + 8.0
+def _phalanges(snapshot: Snapshot, chosen: Bool) -> list[Shape]:
+    """Outlines of the chosen phalanges."""
+    return [
+        Shape(
+            snapshot.outlines[k, 0],
+            0.5 * (snapshot.speed_uv[CAPSULES[k, 0]] + snapshot.speed_uv[CAPSULES[k, 1]]),
+        )
+        for k in np.flatnonzero(chosen)
+    ]
 
 
 def _cross(a: Float, b: Float) -> Float:

@@ -31,7 +31,6 @@ from common.sim.surface import (
     unit_circle,
 )
 
-HALF_SPAN_ROWS = 130.0
 NEAREST_M = 0.05
 FURTHEST_PX = 4000.0
 LAYERS = len(LAYER_COSINES)
@@ -154,11 +153,12 @@ class View:
             cuff_uv=cuff_uv,
         )
 
-    def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...]) -> list[Float]:
-        """Hull of some spheres in every layer [px]."""
-        centre, radius = snapshot.discs_uv[list(spheres)], snapshot.discs_px[list(spheres)]
+    def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
+        """Hull of some spheres in the first `layers` layers [px]."""
+        chosen = list(spheres)
+        centre, radius = snapshot.discs_uv[chosen, :layers], snapshot.discs_px[chosen, :layers]
         points = centre[:, :, None] + radius[:, :, None, None] * self.circle
-        return [raster.hull(points[:, layer].reshape(-1, 2)) for layer in range(LAYERS)]
+        return [raster.hull(points[:, layer].reshape(-1, 2)) for layer in range(layers)]
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
         """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
@@ -199,10 +199,9 @@ class View:
 
     def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float]:
         """Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,)."""
-        middle = transform(self.T_camera_rig, self.scene.motion.at(t_s).T_rig_palm[:3, 3])
-        row = min(max(float(self.project(middle)[1]), 0.0), self.optics.height_px - 1.0)
-        t_middle = t_s + row * self.row_s
-        h = max(HALF_SPAN_ROWS * self.row_s, 0.5 * self.exposure_s, 1e-4)
+        readout_s = self.optics.height_px * self.row_s
+        t_middle = t_s + 0.5 * readout_s
+        h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         joints = self.scene.joints((t_middle - h, t_middle, t_middle + h))
         before, now, after = transform(self.T_camera_rig, self.surface.key_points(joints))
         slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)

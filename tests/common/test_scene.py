@@ -38,7 +38,7 @@ def test_hand_stays_in_both_views_and_at_working_distance() -> None:
         assert truth.markers_m[:, 2].max() < 0.62
         for name in RIG.cameras:
             uv = SCENE.optics[name].project(truth.markers_m)
-            assert (uv > 8.0).all() and (uv < np.array([632.0, 472.0])).all(), (t, name, uv)
+            assert ((uv > 8.0) & (uv < np.array([632.0, 472.0]))).all(), (t, name, uv)
 
 
 def test_truth_is_one_consistent_state() -> None:
