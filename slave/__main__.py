@@ -17,7 +17,9 @@ from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, PhalanxError
 from slave.cameras.source import FrameSource
 
-ABOUT = "The slave stands beside a camera: it finds the painted markers and sends their centroids, never images."
+ABOUT = (
+    "The slave stands beside a camera: it finds the painted markers and sends their centroids, never images."
+)
 EXAMPLES = """examples:
   phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
         one click per marker in, HSV ranges out; prints what collides with what
@@ -66,7 +68,9 @@ def _run(options: argparse.Namespace) -> int:
     detector = MarkerDetector(camera, rig.markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
-    reporter = Reporter(options.name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set)
+    reporter = Reporter(
+        options.name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set
+    )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
@@ -84,12 +88,18 @@ def _run(options: argparse.Namespace) -> int:
 def _calibration(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibration]:
     rig = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
     if options.name not in rig.cameras:
-        raise CalibrationError(f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}")
+        raise CalibrationError(
+            f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}"
+        )
     return rig, load(options.calibration / "cameras" / f"{options.name}.json", CameraCalibration)
 
 
 def _source(
-    options: argparse.Namespace, rig: RigCalibration, camera: CameraCalibration, clock: Clock, true_clock: Clock
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    clock: Clock,
+    true_clock: Clock,
 ) -> FrameSource:
     kind, _, folder = str(options.camera).partition(":")
     if kind == "replay" and folder:
@@ -101,7 +111,9 @@ def _source(
         from slave.cameras.synthetic import SyntheticCamera
 
         hand = load(options.calibration / "hands" / f"{rig.hand}.json", HandProfile)
-        cameras = {n: load(options.calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras}
+        cameras = {
+            n: load(options.calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras
+        }
         scene = Scene.standard(rig, cameras, hand, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
@@ -131,7 +143,9 @@ def _colours(options: argparse.Namespace) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     keep = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("phalanx-slave", description=ABOUT, epilog=EXAMPLES, formatter_class=keep)
+    parser = argparse.ArgumentParser(
+        "phalanx-slave", description=ABOUT, epilog=EXAMPLES, formatter_class=keep
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="detect live and send", epilog=EXAMPLES, formatter_class=keep)
@@ -139,27 +153,51 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
     run.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
     run.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
-    run.add_argument("--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s")
-    run.add_argument("--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)")
-    run.add_argument("--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY")
+    run.add_argument(
+        "--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
+    )
+    run.add_argument(
+        "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
+    )
+    run.add_argument(
+        "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
+    )
     sim = run.add_argument_group("synthetic camera")
     sim.add_argument("--scene", choices=["standard"], default="standard")
     sim.add_argument("--seed", type=int, default=7)
-    sim.add_argument("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
-    sim.add_argument("--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead")
+    sim.add_argument(
+        "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
+    )
+    sim.add_argument(
+        "--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead"
+    )
     sim.add_argument("--clock-ppm", type=float, default=0.0, metavar="Y", help="and gains on the true one")
     sim.add_argument("--start-offset-ms", type=float, default=0.0, metavar="Z", help="its frames come later")
 
-    detect = commands.add_parser("detect", help="detect in a recording", epilog=EXAMPLES, formatter_class=keep)
-    detect.add_argument("recording", type=Path, metavar="RECORDING", help="folder with recording.json, frames.csv")
+    detect = commands.add_parser(
+        "detect", help="detect in a recording", epilog=EXAMPLES, formatter_class=keep
+    )
+    detect.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="folder with recording.json, frames.csv"
+    )
     detect.add_argument("--camera", required=True, metavar="NAME")
-    detect.add_argument("--calibration", type=Path, metavar="DIR", help="its cameras/NAME.json gives the colours")
-    detect.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz")
+    detect.add_argument(
+        "--calibration", type=Path, metavar="DIR", help="its cameras/NAME.json gives the colours"
+    )
+    detect.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
+    )
 
-    colours = commands.add_parser("colours", help="colours from clicks", epilog=EXAMPLES, formatter_class=keep)
-    colours.add_argument("recording", type=Path, metavar="RECORDING", help="folder; recording.json has clicks")
+    colours = commands.add_parser(
+        "colours", help="colours from clicks", epilog=EXAMPLES, formatter_class=keep
+    )
+    colours.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="folder; recording.json has clicks"
+    )
     colours.add_argument("--camera", required=True, metavar="NAME")
-    colours.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write")
+    colours.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"
+    )
     return parser
 
 

@@ -60,7 +60,14 @@ def run(
         found = detector.push(frame.image, frame.t_ns)
         detect_ns = time.perf_counter_ns() - began_ns
         message = MarkerDetections(
-            camera, sender.session, frame.seq, frame.t_ns, frame.ready_t_ns, found.uv, found.area, found.quality
+            camera,
+            sender.session,
+            frame.seq,
+            frame.t_ns,
+            frame.ready_t_ns,
+            found.uv,
+            found.area,
+            found.quality,
         )
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)

@@ -93,5 +93,7 @@ def read_png(path: Path, size: tuple[int, int]) -> Image:
     if image is None:
         raise CameraError(f"{path}: not an image, or cut; record again or remove its line from frames.csv")
     if image.shape[:2] != size:
-        raise CameraError(f"{path}: {image.shape[1]}x{image.shape[0]} px, the camera file says {size[1]}x{size[0]}")
+        raise CameraError(
+            f"{path}: {image.shape[1]}x{image.shape[0]} px, the camera file says {size[1]}x{size[0]}"
+        )
     return np.asarray(image, dtype=np.uint8)

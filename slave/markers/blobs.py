@@ -84,7 +84,11 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float) -> Blob:
     left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
     reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
     for piece in options:
-        if piece is blob or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area) or piece.area > blob.area:
+        if (
+            piece is blob
+            or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area)
+            or piece.area > blob.area
+        ):
             continue
         gap = max(piece.left - right, left - piece.right, piece.top - bottom, top - piece.bottom)
         box = min(left, piece.left), min(top, piece.top), max(right, piece.right), max(bottom, piece.bottom)

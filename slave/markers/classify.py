@@ -112,8 +112,12 @@ def in_range(hsv: Image, colour: HsvRange) -> npt.NDArray[np.bool_]:
 
 
 def _build(ranges: Sequence[HsvRange]) -> Codes:
-    kind = next(t for t, n in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32), (np.uint64, 64)) if len(ranges) <= n)
-    table = np.zeros((256, 256, 256), kind)  # red, green, blue: the byte order of a packed little-endian pixel
+    kind = next(
+        t for t, n in ((np.uint8, 8), (np.uint16, 16), (np.uint32, 32), (np.uint64, 64)) if len(ranges) <= n
+    )
+    table = np.zeros(
+        (256, 256, 256), kind
+    )  # red, green, blue: the byte order of a packed little-endian pixel
     plane = np.empty((256, 256, 3), np.uint8)
     plane[..., 0] = np.arange(256)[None, :]
     plane[..., 1] = np.arange(256)[:, None]

@@ -126,7 +126,9 @@ def grow(hsv: Image, name: str, click: tuple[float, float]) -> Bool:
     label = labels[v, u]
     mask = labels == label
     if label == 0 or int(mask.sum()) < SMALLEST:
-        raise FitError(f"clicks.{name}: ({u}, {v}) is on a spot of fewer than {SMALLEST} pixels of one colour")
+        raise FitError(
+            f"clicks.{name}: ({u}, {v}) is on a spot of fewer than {SMALLEST} pixels of one colour"
+        )
     return mask
 
 
@@ -149,7 +151,9 @@ def _refuse_twins(hue: Mapping[str, float]) -> None:
     for a, b in zip(names, names[1:] + names[:1], strict=True):
         apart = (hue[b] - hue[a]) % HUES
         if a != b and min(apart, HUES - apart) < HUE_APART:
-            raise FitError(f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one")
+            raise FitError(
+                f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one"
+            )
 
 
 def _surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:

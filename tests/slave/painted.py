@@ -15,7 +15,9 @@ from common.calibration import CameraCalibration, HsvRange
 
 NAMES = ("thumb", "index", "middle", "ring", "little", "back")
 HUE = (89, 66, 111, 141, 167, 38)
-RANGES = {n: HsvRange(hsv_low=(h - 9, 80, 40), hsv_high=(h + 9, 255, 255)) for n, h in zip(NAMES, HUE, strict=True)}
+RANGES = {
+    n: HsvRange(hsv_low=(h - 9, 80, 40), hsv_high=(h + 9, 255, 255)) for n, h in zip(NAMES, HUE, strict=True)
+}
 DESK = (20, 27, 95)  # HSV
 SKIN = (12, 100, 200)
 OVER = 8
@@ -35,7 +37,9 @@ def paint(marker: int) -> tuple[int, int, int]:
     return (HUE[marker], 180, 150)
 
 
-def camera(width: int = 640, height: int = 480, ranges: dict[str, HsvRange] | None = None) -> CameraCalibration:
+def camera(
+    width: int = 640, height: int = 480, ranges: dict[str, HsvRange] | None = None
+) -> CameraCalibration:
     return CameraCalibration(
         version=1,
         name="left",
@@ -55,7 +59,9 @@ def linear(hsv: tuple[int, int, int]) -> Float:
     return np.where(bgr <= 0.04045, bgr / 12.92, ((bgr + 0.055) / 1.055) ** 2.4)
 
 
-def render(discs: Sequence[Disc], width: int = 640, height: int = 480, noise: float = 0.0, seed: int = 0) -> Image:
+def render(
+    discs: Sequence[Disc], width: int = 640, height: int = 480, noise: float = 0.0, seed: int = 0
+) -> Image:
     """The scene as (height, width, 3) BGR; `noise` is the standard deviation in grey levels."""
     light = np.broadcast_to(linear(DESK), (height, width, 3)).copy()
     for d in discs:

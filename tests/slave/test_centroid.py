@@ -25,7 +25,9 @@ def measured(image: Image, marker: int, extent: float = FAR) -> Measured:
 
 @settings(max_examples=40)
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(4.0, 14.0), st.integers(0, 5))
-def test_a_disc_on_the_desk_is_found_to_a_twentieth_of_a_pixel(du: float, dv: float, r: float, m: int) -> None:
+def test_a_disc_on_the_desk_is_found_to_a_twentieth_of_a_pixel(
+    du: float, dv: float, r: float, m: int
+) -> None:
     seen = measured(render([Disc(paint(m), 60.0 + du, 50.0 + dv, r)], 120, 100), m)
     assert math.hypot(seen.u - 60.0 - du, seen.v - 50.0 - dv) < 0.05
     assert seen.area == pytest.approx(math.pi * r * r, rel=0.04)
@@ -124,4 +126,6 @@ def test_a_marker_of_23000_px_at_20_cm_is_measured() -> None:
 
 
 def test_the_desk_is_no_paint() -> None:
-    assert not TABLE.codes(render([Disc(DESK, 60.0, 50.0, 20.0), Disc(SKIN, 30.0, 30.0, 10.0)], 120, 100)).any()
+    assert not TABLE.codes(
+        render([Disc(DESK, 60.0, 50.0, 20.0), Disc(SKIN, 30.0, 30.0, 10.0)], 120, 100)
+    ).any()

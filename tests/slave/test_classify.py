@@ -21,7 +21,8 @@ def by_opencv(image: np.ndarray, colour: HsvRange) -> np.ndarray:
     if low[0] <= high[0]:
         return cv2.inRange(hsv, low, high) != 0
     upper = cv2.inRange(hsv, low, (179, *high[1:]))
-    return (upper | cv2.inRange(hsv, (0, *low[1:]), high)) != 0
+    lower = cv2.inRange(hsv, (0, *low[1:]), high)
+    return np.asarray(cv2.bitwise_or(upper, lower)) != 0
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 40), st.integers(1, 40))
@@ -60,8 +61,12 @@ def test_more_than_eight_markers_get_wider_codes_and_keep_their_bits() -> None:
     image = np.random.default_rng(4).integers(0, 256, (30, 30, 3), np.uint8)
     codes = table.codes(image)
     assert table.bits[11] == 1 << 11
-    np.testing.assert_array_equal((codes & np.array(table.bits[11], codes.dtype)) != 0, by_opencv(image, WRAPPED))
-    np.testing.assert_array_equal((codes & np.array(table.bits[10], codes.dtype)) != 0, by_opencv(image, PLAIN))
+    np.testing.assert_array_equal(
+        (codes & np.array(table.bits[11], codes.dtype)) != 0, by_opencv(image, WRAPPED)
+    )
+    np.testing.assert_array_equal(
+        (codes & np.array(table.bits[10], codes.dtype)) != 0, by_opencv(image, PLAIN)
+    )
 
 
 def test_a_missing_range_names_the_marker_and_the_command_that_makes_it() -> None:

@@ -1,0 +1,164 @@
+import threading
+
+import numpy as np
+import pytest
+
+from common.bus import LoopbackBus
+from common.clock import SystemClock
+from common.errors import BusError, CameraError
+from common.messages import Command, Health, MarkerDetections, Message
+from slave.app import run, wait_for_start
+from slave.cameras.source import Frame
+from slave.markers.detector import MarkerDetector
+from slave.report import Reporter
+from slave.tally import Tally
+from tests.slave.painted import CENTRES, NAMES, camera, hand, render
+
+DETECTOR = MarkerDetector(camera(), NAMES)
+HAND, EMPTY = render(hand()), render([])
+
+
+class Source:
+    """A camera with a list of frames; an exception in the list is raised."""
+
+    def __init__(self, frames: list[Frame | CameraError]) -> None:
+        self.frames = frames
+
+    def read(self) -> Frame | None:
+        if not self.frames:
+            return None
+        frame = self.frames.pop(0)
+        if isinstance(frame, CameraError):
+            raise frame
+        return frame
+
+    def close(self) -> None:
+        self.frames = []
+
+
+class Wire:
+    """Stands for the uplink."""
+
+    session = 77
+    zenoh_endpoint: str | None = None
+    counts: dict[str, int] = {"sent": 3}
+
+    def __init__(self) -> None:
+        self.sent: list[MarkerDetections] = []
+        self.waits = [False, False, True]
+
+    def send(self, message: Message) -> None:
+        assert isinstance(message, MarkerDetections)
+        self.sent.append(message)
+
+    def wait_for_start(self, timeout_s: float) -> bool:
+        return self.waits.pop(0) if self.waits else False
+
+
+def frame(seq: int, image: np.ndarray) -> Frame:
+    return Frame(seq, 16_000_000 * seq, 16_000_000 * seq + 5, image)
+
+
+def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
+    wire, tally = Wire(), Tally(NAMES)
+    source = Source([frame(3, HAND), frame(4, EMPTY), frame(7, HAND)])
+    run(source, DETECTOR.fresh(), wire, "left", tally, threading.Event())
+    assert [(m.camera, m.session, m.seq, m.t_ns, m.ready_t_ns) for m in wire.sent] == [
+        ("left", 77, 3, 48_000_000, 48_000_005),
+        ("left", 77, 4, 64_000_000, 64_000_005),
+        ("left", 77, 7, 112_000_000, 112_000_005),
+    ]
+    np.testing.assert_allclose(wire.sent[0].uv, CENTRES + np.array([300.0, 200.0]), atol=0.3)
+    assert np.isnan(wire.sent[1].uv).all()
+    counts = tally.counts()
+    assert (counts["frames"], counts["dropped"], counts["empty"], counts["seen.back"]) == (3, 2, 1, 2)
+
+
+def test_the_loop_ends_when_told_and_passes_a_lost_camera_on() -> None:
+    wire, stop = Wire(), threading.Event()
+    stop.set()
+    run(Source([frame(0, HAND)]), DETECTOR.fresh(), wire, "left", Tally(NAMES), stop)
+    assert wire.sent == []
+    with pytest.raises(CameraError, match="unplugged"):
+        run(
+            Source([CameraError("unplugged")]),
+            DETECTOR.fresh(),
+            wire,
+            "left",
+            Tally(NAMES),
+            threading.Event(),
+        )
+
+
+def test_the_barrier_opens_with_the_start_and_with_stop() -> None:
+    stop = threading.Event()
+    assert wait_for_start(Wire(), stop)
+    stop.set()
+    assert not wait_for_start(Wire(), stop)
+
+
+def test_gauges_speak_of_the_time_since_the_last_look() -> None:
+    tally = Tally(NAMES)
+    for seq in range(4):
+        tally.frame(seq, 2_000_000 + seq, CENTRES)
+    first = tally.gauges()
+    assert first["rate_hz"] > 0.0
+    assert first["detect_us"] == pytest.approx(2000.0, rel=0.01)
+    assert first["detect_worst_us"] == pytest.approx(2000.003)
+    second = tally.gauges()
+    assert second["rate_hz"] == 0.0
+    assert second["detect_worst_us"] == 0.0
+
+
+def test_health_is_published_and_commands_are_answered_once_the_bus_is_known() -> None:
+    hub, wire, tally, stop = LoopbackBus(), Wire(), Tally(NAMES), threading.Event()
+    tally.frame(0, 1_000_000, CENTRES)
+    asked: list[str] = []
+
+    def connect(endpoint: str) -> LoopbackBus:
+        asked.append(endpoint)
+        return hub.join()
+
+    listener = hub.subscribe("health")
+    reporter = Reporter("left", wire, tally, SystemClock(), connect, stop.set, period_s=0.01)
+    try:
+        assert listener.get(0.05) is None  # no endpoint, no bus
+        wire.zenoh_endpoint = "tcp/127.0.0.1:1"
+        health = listener.get(5.0)
+        assert isinstance(health, Health)
+        assert (health.source, health.session) == ("left", 77)
+        assert (health.counts["frames"], health.counts["sent"]) == (1, 3)
+        assert "left" in hub.alive()
+        assert hub.ask(Command("left", "report"), 5.0).counts["frames"] == 1
+        with pytest.raises(BusError, match="there are report, stop"):
+            hub.ask(Command("left", "dance"), 5.0)
+        assert not stop.is_set()
+        hub.ask(Command("left", "stop"), 5.0)
+        assert stop.is_set()
+        wire.zenoh_endpoint = "tcp/127.0.0.1:2"  # another master took over
+        while len(asked) < 2:
+            assert listener.get(5.0) is not None
+    finally:
+        reporter.close()
+    assert asked == ["tcp/127.0.0.1:1", "tcp/127.0.0.1:2"]
+    assert "left" not in hub.alive()
+
+
+def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -> None:
+    hub, wire = LoopbackBus(), Wire()
+    wire.zenoh_endpoint = "tcp/127.0.0.1:1"
+    tries: list[str] = []
+
+    def connect(endpoint: str) -> LoopbackBus:
+        tries.append(endpoint)
+        if len(tries) < 3:
+            raise BusError("refused")
+        return hub.join()
+
+    listener = hub.subscribe("health")
+    reporter = Reporter("left", wire, Tally(NAMES), SystemClock(), connect, lambda: None, period_s=0.01)
+    try:
+        assert isinstance(listener.get(5.0), Health)
+        assert len(tries) == 3
+    finally:
+        reporter.close()
