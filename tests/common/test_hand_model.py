@@ -1,0 +1,323 @@
+"""Tests of the hand model: against a naive chain, conventions worked out by hand, limits, and rendered hands."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from common.arrays import Float
+from common.calibration import Couplings, HandProfile, MarkerMount, load
+from common.errors import CalibrationError
+from common.geometry import quaternion_to_matrix, rigid
+from common.hand_model import (
+    CHAINS,
+    FINGER_JOINTS,
+    JOINTS,
+    WEBXR_JOINTS,
+    HandModel,
+    preset_couplings,
+    preset_limits,
+)
+from common.hand_profiles import generated_profile
+from tests.hand_helpers import LEFT, MARKERS, RIGHT, any_rotation, palm
+
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+BY_SIDE = {"right": RIGHT, "left": LEFT}
+seeds = st.integers(0, 2**32 - 1)
+# OpenXR 1.0, XrHandJointEXT: the 26 joints and their numbers.
+OPENXR = {"palm": 0, "wrist": 1, "thumb-metacarpal": 2, "thumb-tip": 5, "index-finger-metacarpal": 6}
+OPENXR |= {
+    "index-finger-tip": 10,
+    "middle-finger-metacarpal": 11,
+    "ring-finger-tip": 20,
+    "pinky-finger-tip": 25,
+}
+
+
+def random_pose(seed: int) -> tuple[Float, Float]:
+    rng = np.random.default_rng(seed)
+    low, high = RIGHT.limits_rad[..., 0], RIGHT.limits_rad[..., 1]
+    T = rigid(any_rotation(rng), rng.normal(0.0, 0.5, 3))
+    return T, rng.uniform(low, high)
+
+
+def naive(profile: HandProfile, T_rig_palm: Float, angles: Float) -> dict[str, Float]:
+    """Joint poses (4, 4) by name, joint by joint, from the file alone."""
+    rest = {
+        name: rigid(quaternion_to_matrix(np.array(j.orientation_wxyz)), np.array(j.position_m))
+        for name, j in profile.rest_joints.items()
+    }
+    sign = 1.0 if profile.side == "right" else -1.0
+    out = {name: T_rig_palm @ T for name, T in rest.items()}
+
+    def about(axis: str, angle: float) -> Float:
+        return rigid(Rotation.from_euler(axis, angle).as_matrix(), np.zeros(3))
+
+    for f, joints in enumerate(FINGER_JOINTS):
+        names = [JOINTS[j] for j in joints][-4:]
+        abduction, flexion, pip, dip = (float(a) for a in angles[f])
+        root = rest[names[0]]
+        at, turn = rigid(np.eye(3), root[:3, 3]), rigid(root[:3, :3], np.zeros(3))
+        swing = about("y", sign * abduction)
+        now = at @ (turn @ swing if f == 0 else swing @ turn) @ about("x", -flexion)
+        out[names[0]] = T_rig_palm @ now
+        for before, name, bend in zip(names, names[1:], (pip, dip, 0.0), strict=False):
+            now = now @ np.linalg.inv(rest[before]) @ rest[name] @ about("x", -bend)
+            out[name] = T_rig_palm @ now
+    return out
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@given(seeds)
+def test_forward_is_the_naive_chain(side: str, seed: int) -> None:
+    model, (T, angles) = BY_SIDE[side], random_pose(seed)
+    joints = model.forward(T, angles)
+    expected = naive(model.profile, T, angles)
+    for name in WEBXR_JOINTS:
+        index = JOINTS.index(name)
+        np.testing.assert_allclose(joints.position_m[index], expected[name][:3, 3], atol=1e-9)
+        np.testing.assert_allclose(joints.rotation[index], expected[name][:3, :3], atol=1e-9)
+    middle = [expected[f"middle-finger-{part}"][:3, 3] for part in ("metacarpal", "phalanx-proximal")]
+    np.testing.assert_allclose(joints.position_m[0], np.mean(middle, axis=0), atol=1e-9)
+    np.testing.assert_allclose(joints.rotation[0], joints.rotation[1])
+
+
+@given(seeds)
+def test_left_hand_is_the_mirror_image_of_the_right(seed: int) -> None:
+    T, angles = random_pose(seed)
+    mirrored = rigid(MIRROR @ T[:3, :3] @ MIRROR, MIRROR @ T[:3, 3])
+    right, left = RIGHT.forward(T, angles), LEFT.forward(mirrored, angles)
+    np.testing.assert_allclose(left.position_m, right.position_m @ MIRROR, atol=2e-7)  # files hold 0.1 um
+    np.testing.assert_allclose(left.rotation, MIRROR @ right.rotation @ MIRROR, atol=1e-6)
+    points = [m.marker_points(j, MARKERS) for m, j in ((LEFT, left), (RIGHT, right))]
+    np.testing.assert_allclose(points[0], points[1] @ MIRROR, atol=3e-7)
+
+
+@given(seeds)
+def test_bones_keep_their_length_and_the_palm_its_shape(seed: int) -> None:
+    T, angles = random_pose(seed)
+    rest, bent = RIGHT.forward(np.eye(4), np.zeros((5, 4))), RIGHT.forward(T, angles)
+    for joints in FINGER_JOINTS:
+        length = [np.linalg.norm(np.diff(j.position_m[list(joints)], axis=0), axis=1) for j in (rest, bent)]
+        np.testing.assert_allclose(length[1], length[0], atol=1e-12)
+    fixed = [0, 1, *CHAINS[:, 0], 6, 11, 16, 21]
+    np.testing.assert_allclose(
+        bent.position_m[fixed], rest.position_m[fixed] @ T[:3, :3].T + T[:3, 3], atol=1e-12
+    )
+    identity = np.swapaxes(bent.rotation, 1, 2) @ bent.rotation
+    np.testing.assert_allclose(identity, np.broadcast_to(np.eye(3), (26, 3, 3)), atol=1e-12)
+
+
+def test_many_poses_at_once_are_the_same_as_one_by_one() -> None:
+    poses = [random_pose(seed) for seed in range(6)]
+    T, angles = np.array([p[0] for p in poses]), np.array([p[1] for p in poses])
+    together = RIGHT.forward(T.reshape(2, 3, 4, 4), angles.reshape(2, 3, 5, 4))
+    markers = RIGHT.marker_points(together, MARKERS)
+    assert markers.shape == (2, 3, 6, 3)
+    for i in range(6):
+        alone = RIGHT.forward(T[i], angles[i])
+        np.testing.assert_allclose(together.position_m.reshape(6, 26, 3)[i], alone.position_m, atol=1e-14)
+        np.testing.assert_allclose(together.rotation.reshape(6, 26, 3, 3)[i], alone.rotation, atol=1e-14)
+        np.testing.assert_allclose(
+            markers.reshape(6, 6, 3)[i], RIGHT.marker_points(alone, MARKERS), atol=1e-14
+        )
+
+
+def test_joint_order_is_that_of_openxr() -> None:
+    assert len(JOINTS) == 26
+    assert {name: JOINTS.index(name) for name in OPENXR} == OPENXR
+    for chain, joints in zip(CHAINS, FINGER_JOINTS, strict=True):
+        assert tuple(chain) == joints[-4:]
+
+
+# Conventions, worked out by hand on the generated hand of 0.19 m: index MCP, its straight bones along
+# (sin 1 deg, 0, cos 1 deg), proximal bone 0.245 of the hand's length.
+PROXIMAL_M = 0.245 * 0.19
+
+
+def bone(model: HandModel, finger: int, angles: Float) -> Float:
+    joints = model.forward(np.eye(4), angles)
+    return joints.position_m[CHAINS[finger, 1]] - joints.position_m[CHAINS[finger, 0]]
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_flexion_of_a_quarter_turn_points_the_finger_out_of_the_palm(side: str) -> None:
+    angles = np.zeros((5, 4))
+    angles[1, 1] = np.pi / 2
+    np.testing.assert_allclose(bone(BY_SIDE[side], 1, angles), [0.0, -PROXIMAL_M, 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("side", "to_thumb"), [("right", 1.0), ("left", -1.0)])
+def test_abduction_is_positive_towards_the_thumb(side: str, to_thumb: float) -> None:
+    model, angles = BY_SIDE[side], np.zeros((5, 4))
+    assert np.sign(model.rest_position_m[CHAINS[0, 0], 0]) == to_thumb
+    angles[1, 0] = np.radians(14.0)
+    expected = PROXIMAL_M * np.array([to_thumb * np.sin(np.radians(15.0)), 0.0, np.cos(np.radians(15.0))])
+    np.testing.assert_allclose(bone(model, 1, angles), expected, atol=1e-6)
+
+
+def test_pip_of_a_quarter_turn_bends_only_what_follows() -> None:
+    angles = np.zeros((5, 4))
+    angles[2, 2] = np.pi / 2
+    joints = RIGHT.forward(np.eye(4), angles)
+    rest = RIGHT.rest_position_m
+    np.testing.assert_allclose(joints.position_m[CHAINS[2, :2]], rest[CHAINS[2, :2]], atol=1e-15)
+    np.testing.assert_allclose(
+        joints.position_m[CHAINS[2, 2]], rest[CHAINS[2, 1]] + [0.0, -0.170 * 0.19, 0.0], atol=1e-6
+    )
+    others = np.delete(np.arange(26), CHAINS[2, 2:])
+    np.testing.assert_allclose(joints.position_m[others], rest[others], atol=1e-15)
+
+
+# Limits of the two presets [deg], formats.md: MCP flexion, abduction, PIP, DIP of index ... little.
+PRESETS = {
+    "K": ((0, 90), (-15, 15), (0, 110), (0, 90), (0, 0)),
+    "D": ((0, 100), (-20, 20), (0, 120), (0, 101), (-20, 20)),
+}
+
+
+@pytest.mark.parametrize("preset", ["K", "D"])
+def test_presets_hold_the_published_limits(preset: str) -> None:
+    limits = preset_limits("K" if preset == "K" else "D")
+    flexion, abduction, pip, dip, middle = PRESETS[preset]
+    for finger in ("index", "middle", "ring", "little"):
+        of = getattr(limits, finger)
+        np.testing.assert_allclose(np.degrees(of.flexion_rad), flexion)
+        np.testing.assert_allclose(np.degrees(of.abduction_rad), middle if finger == "middle" else abduction)
+        np.testing.assert_allclose(np.degrees(of.pip_rad), pip)
+        np.testing.assert_allclose(np.degrees(of.dip_rad), dip)
+    thumb = limits.thumb
+    np.testing.assert_allclose(np.degrees(thumb.flexion_rad), (-15, 50))
+    np.testing.assert_allclose(np.degrees(thumb.abduction_rad), (-20, 50))
+    np.testing.assert_allclose(np.degrees(thumb.pip_rad), (-10, 60))
+    np.testing.assert_allclose(np.degrees(thumb.dip_rad), (-15, 85))
+
+
+def test_presets_hold_the_published_couplings() -> None:
+    assert preset_couplings("K").dip_per_pip == pytest.approx(2 / 3)
+    assert preset_couplings("D") == Couplings(dip_per_pip=0.84, mcp_per_pip=0.54)
+    assert RIGHT.dip_per_pip == pytest.approx(2 / 3)  # K is what a profile without limits gets
+    np.testing.assert_allclose(np.degrees(RIGHT.limits_rad[1, 2]), (0, 110))
+
+
+def test_limits_are_checked_angle_by_angle() -> None:
+    angles = np.zeros((5, 4))
+    angles[3, 2] = np.radians(110.1)
+    inside = RIGHT.within_limits(angles)
+    assert not inside[3, 2]
+    assert inside.sum() == 19
+    assert not RIGHT.within_limits(np.full((5, 4), np.nan)).any()
+
+
+def test_marker_of_the_palm_follows_the_palm_and_of_a_tip_its_joint() -> None:
+    T = palm(np.array([20.0, -10.0, 5.0]))
+    joints = RIGHT.forward(T, np.zeros((5, 4)))
+    points = RIGHT.marker_points(joints, ("back", "index"))
+    offset = np.array(RIGHT.profile.markers["back"].offset_m)
+    np.testing.assert_allclose(points[0], T[:3, :3] @ offset + T[:3, 3])
+    ahead = -RIGHT.profile.markers["index"].offset_m[2]
+    np.testing.assert_allclose(points[1], joints.position_m[10] - ahead * joints.rotation[10, :, 2])
+    assert RIGHT.mount("back").finger is None
+    assert RIGHT.mount("little").finger == 4
+
+
+# Broken profiles: what is done to the file, and what the error must name.
+def without(profile: HandProfile) -> HandProfile:
+    joints = {k: v for k, v in profile.rest_joints.items() if k != "ring-finger-tip"}
+    return msgspec.structs.replace(profile, rest_joints=joints)
+
+
+def with_joint(profile: HandProfile, name: str, **changes: object) -> HandProfile:
+    old = profile.rest_joints.get(name, profile.rest_joints["wrist"])
+    return msgspec.structs.replace(
+        profile, rest_joints={**profile.rest_joints, name: msgspec.structs.replace(old, **changes)}
+    )
+
+
+def crossed(profile: HandProfile) -> HandProfile:
+    limits = preset_limits("K")
+    ring = msgspec.structs.replace(limits.ring, pip_rad=(1.0, 0.5))
+    return msgspec.structs.replace(profile, limits_rad=msgspec.structs.replace(limits, ring=ring))
+
+
+def mounted(profile: HandProfile) -> HandProfile:
+    mounts = {**profile.markers, "index": MarkerMount(joint="elbow", offset_m=(0.0, 0.0, 0.0))}
+    return msgspec.structs.replace(profile, markers=mounts)
+
+
+BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] = {
+    "missing joint": (without, ("rest_joints", "ring-finger-tip")),
+    "unknown joint": (lambda p: with_joint(p, "elbow"), ("rest_joints", "elbow")),
+    "no quaternion": (
+        lambda p: with_joint(p, "wrist", orientation_wxyz=(0.5, 0.0, 0.0, 0.0)),
+        ("orientation_wxyz",),
+    ),
+    "no bone": (
+        lambda p: with_joint(p, "thumb-tip", position_m=p.rest_joints["thumb-phalanx-distal"].position_m),
+        ("rest_joints", "1 mm"),
+    ),
+    "crossed limits": (crossed, ("limits_rad.ring",)),
+    "unknown mount": (mounted, ("markers.index.joint", "elbow")),
+    "unknown radius": (lambda p: msgspec.structs.replace(p, radius_m={"elbow": 0.01}), ("radius_m", "elbow")),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_profile_is_refused_by_hand_and_key(case: str) -> None:
+    spoil, words = BROKEN[case]
+    with pytest.raises(CalibrationError) as error:
+        HandModel.of(spoil(generated_profile("mine", "right")))
+    for word in ("'mine'", *words):
+        assert word in str(error.value)
+
+
+def test_unknown_marker_is_refused_with_those_there_are() -> None:
+    with pytest.raises(CalibrationError, match=r"made-right.*'tail'.*thumb, index"):
+        RIGHT.mount("tail")
+
+
+def test_radii_are_complete_where_the_profile_has_none() -> None:
+    model = HandModel.of(msgspec.structs.replace(generated_profile("mine", "right"), radius_m=None))
+    assert model.radius_m.shape == (26,)
+    # The share of the middle finger's proximal bone: 0.145 * 0.266 * 190 mm is a finger tip of 7.3 mm.
+    assert model.radius_m[15] == pytest.approx(0.145 * 0.266 * 0.19, rel=1e-3)
+    one = msgspec.structs.replace(model.profile, radius_m={"wrist": 0.03})
+    assert HandModel.of(one).radius_m[1] == 0.03
+
+
+def rendered(folder: Path) -> tuple[HandModel, Float, Float, Float]:
+    """Model, palm poses, rest-relative angles (N, 5, 4) and true joints of a rendered recording."""
+    meta = json.loads((folder / "truth_meta.json").read_text())
+    side = str(meta["side"])
+    model = HandModel.of(load(folder.parents[1] / "hands" / f"webxr-{side}.json", HandProfile))
+    names: list[str] = meta["angles"]
+    with np.load(folder / "truth.npz") as truth:
+        table, T, joints = truth["angles"], truth["T_palm"], truth["joints"]
+    angles = np.zeros((len(table), 5, 4))
+    angles[:, 0] = table[:, [names.index(f"thumb_{a}") for a in ("cmc_abd", "cmc_flex", "mcp", "ip")]]
+    for f, finger in enumerate(("index", "middle", "ring", "pinky"), 1):
+        for k, kind in enumerate(("mcp_abd", "mcp_flex", "pip", "dip")):
+            angles[:, f, k] = table[:, names.index(f"{finger}_{kind}")]
+        # There abduction counts from the palm's +z, here from the finger's own rest direction.
+        dx, _, dz = model.rest_position_m[CHAINS[f, 1]] - model.rest_position_m[CHAINS[f, 0]]
+        angles[:, f, 0] -= np.arctan2(model.side_sign * dx, dz)
+    return model, T, angles, joints
+
+
+@pytest.mark.parametrize(
+    "name", ["calib_colors", "static", "flex90", "poses_left", "translate_8ms", "lights_0_warm"]
+)
+def test_rendered_hands_have_their_joints_where_the_model_puts_them(datasets: Path, name: str) -> None:
+    model, T, angles, truth = rendered(datasets / "stereo" / name)
+    joints = model.forward(T, angles)
+    error_mm = 1e3 * np.linalg.norm(joints.position_m[:, 1:] - truth, axis=-1)
+    # The renderer's hinge axes are those of its mesh, ours the joints' own x: about a millimetre at bent tips.
+    fingers = np.r_[0, 5:25]
+    assert error_mm[:, fingers].mean() < 1.5
+    assert error_mm[:, [0, 5, 10, 15, 20]].max() < 0.01

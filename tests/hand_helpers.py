@@ -1,0 +1,107 @@
+"""What the tests of the hand share: hands, natural random poses, cameras that see exact points."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from common.arrays import Float
+from common.calibration import CameraCalibration, Intrinsics, RigCalibration
+from common.camera_model import CameraModel
+from common.geometry import rigid
+from common.hand_model import HandModel
+from common.hand_profiles import generated_profile
+from common.messages import MarkerDetections
+
+MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
+RIGHT = HandModel.of(generated_profile("made-right", "right"))
+LEFT = HandModel.of(generated_profile("made-left", "left"))
+
+# The back of the hand towards cameras at the origin that look along +z, fingers up (-y in the image).
+FACING = np.array([0.0, 0.0, -1.0])
+R_FRONT = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
+
+
+def palm(turn_deg: Float | None = None, at_m: Float | None = None) -> Float:
+    """Palm pose (4, 4) in front of the cameras, turned by Euler angles x, y, z [deg] in the rig frame."""
+    turn = np.zeros(3) if turn_deg is None else turn_deg
+    at = np.array([0.0, 0.08, 0.5]) if at_m is None else at_m
+    return rigid(Rotation.from_euler("xyz", turn, degrees=True).as_matrix() @ R_FRONT, at)
+
+
+def any_rotation(rng: np.random.Generator) -> Float:
+    """(3, 3), uniform: a normalised quaternion of normal numbers."""
+    return np.asarray(Rotation.from_quat(rng.normal(size=4)).as_matrix(), np.float64)
+
+
+def natural_angles(rng: np.random.Generator) -> Float:
+    """A relaxed hand: PIP 5-75 deg, MCP near 0.54 PIP (Digits), DIP = 2/3 PIP, spread about 5 deg."""
+    angles = np.zeros((5, 4))
+    common = rng.uniform(10.0, 70.0)
+    pip = np.clip(common + rng.normal(0.0, 12.0, 4), 2.0, 90.0)
+    angles[1:, 0] = rng.normal(0.0, 4.0, 4) * [1, 0, 1, 1]
+    angles[1:, 1] = np.clip(0.54 * pip + rng.normal(0.0, 8.0, 4), 0.0, 88.0)
+    angles[1:, 2], angles[1:, 3] = pip, pip * 2 / 3
+    angles[0] = rng.uniform([-5, 0, 0, 5], [20, 20, 25, 30])
+    return np.radians(angles)
+
+
+def within(model: HandModel, angles: Float) -> bool:
+    """Whether all angles (5, 4) are finite and inside the limits."""
+    return bool(model.within_limits(angles).all())
+
+
+def small_cov(sigma_m: float = 3e-4, count: int = 6) -> Float:
+    """(count, 3, 3) [m^2], three times worse along the sight than across."""
+    return np.tile(np.diag([sigma_m**2, sigma_m**2, (3 * sigma_m) ** 2]), (count, 1, 1))
+
+
+def camera_file(name: str, rate_hz: float = 60.0, row_time_us: float = 0.0) -> CameraCalibration:
+    """640x480, 500 px."""
+    return CameraCalibration(
+        version=1,
+        name=name,
+        width_px=640,
+        height_px=480,
+        frame_rate_hz=rate_hz,
+        exposure_us=4000.0,
+        analogue_gain=1.0,
+        colour_gains=(1.0, 1.0),
+        row_time_us=row_time_us,
+        intrinsics=Intrinsics(fx_px=500.0, fy_px=500.0, cx_px=319.5, cy_px=239.5),
+    )
+
+
+def rig_file(cameras: tuple[str, ...] = ("left", "right"), **changes: object) -> RigCalibration:
+    """Parallel cameras, 75 mm apart along x."""
+    poses = {name: rigid(np.eye(3), np.array([0.075 * c, 0.0, 0.0])) for c, name in enumerate(cameras)}
+    values: dict[str, object] = {
+        "version": 1,
+        "name": "bench",
+        "kind": "markers",
+        "cameras": cameras,
+        "hand": "made-right",
+        "T_rig_camera": {name: tuple(tuple(float(v) for v in row) for row in T) for name, T in poses.items()},
+    }
+    return RigCalibration(**(values | changes))  # pyright: ignore[reportArgumentType]
+
+
+def camera_models(rig: RigCalibration, row_time_us: float = 0.0) -> dict[str, CameraModel]:
+    """Models of the rig's cameras."""
+    return {
+        name: CameraModel.of(camera_file(name, row_time_us=row_time_us), rig.camera_pose(name))
+        for name in rig.cameras
+    }
+
+
+def detections(camera: str, seq: int, t_ns: int, uv: Float, area_px2: float = 400.0) -> MarkerDetections:
+    """One message; area and quality follow what is seen."""
+    seen = np.isfinite(uv[:, 0])
+    return MarkerDetections(
+        camera=camera,
+        session=1,
+        seq=seq,
+        t_ns=t_ns,
+        ready_t_ns=t_ns + 2_000_000,
+        uv=uv,
+        area=np.where(seen, area_px2, np.nan),
+        quality=np.where(seen, 1.0, np.nan),
+    )
