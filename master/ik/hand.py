@@ -18,6 +18,10 @@ from master.ik.hand_problem import Facing, HandProblem, Minimum, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 
+_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
+_LENGTH_M = 20e-3  # a line shorter than this has no direction
+_ACROSS = 0.9  # cosine to the sight, at most
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandSolution:
@@ -80,9 +84,9 @@ class HandSolver:
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
-            one line, or two where `facing` is known.
+            one line, or two where `facing` is known and not along theirs.
         """
-        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.sum(axis=(1, 2))))
+        seen = seen_markers(points_m, cov_m2)
         if last is None and not _determined(points_m[seen], facing):
             return None
         problem = HandProblem(
@@ -156,14 +160,24 @@ class HandSolver:
         )
 
 
+def seen_markers(points_m: Float, cov_m2: Float) -> Bool:
+    """(M,) which markers can be used: points (M, 3) and covariances (M, 3, 3) without a gap."""
+    return np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.sum(axis=(1, 2))))
+
+
 def _whitening(cov_m2: Float, model_m: float) -> Float:
     """Inverse square roots (N, 3, 3) of covariances (N, 3, 3), the model's own error added."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_m2 + model_m**2 * np.eye(3))), np.float64)
 
 
 def _determined(points: Float, facing: Float | None) -> bool:
-    """Whether points (N, 3) fix an orientation: not all in one line, or in a line with `facing` to turn about it."""
+    """Whether points (N, 3) fix an orientation: not all in one line, or in a line across `facing`.
+
+    What faces the cameras turns the hand about a line of markers, but not about one that points at them.
+    """
     if len(points) < 2:
         return False
-    singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    return bool(singular[0] > 2e-2) if facing is not None else len(points) > 2 and bool(singular[1] > 5e-3)
+    _, extent, axes = np.linalg.svd(points - points.mean(axis=0))
+    if len(points) > 2 and extent[1] > _SPREAD_M:
+        return True
+    return facing is not None and bool(extent[0] > _LENGTH_M and abs(axes[0] @ facing) < _ACROSS)

@@ -12,6 +12,7 @@ from common.arrays import Float
 from common.hand_model import HandModel
 from master.ik.parameters import HandParameters
 
+_DIP_PER_PIP = 2.0 / 3.0  # where no coupling fixes the DIP, it still tends to this
 _SHORTEST_S = 1e-3  # a step in time below this would weld the hand to its last pose
 
 
@@ -27,6 +28,7 @@ class Priors:
     neighbour_flexion: float = np.radians(30.0)
     neighbour_pip: float = np.radians(35.0)
     pip: float = np.radians(60.0)
+    free_dip: float = np.radians(15.0)
     thumb: float = np.radians(20.0)
     thumb_mean: tuple[float, float, float, float] = (
         float(np.radians(8.0)),
@@ -141,6 +143,8 @@ def _natural_rows(model: HandModel, parameters: HandParameters, priors: Priors) 
         add({a: 1.0}, 0.0, priors.abduction)
         add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
         add({a + 2: 1.0}, np.radians(25.0), priors.pip)
+        if model.dip_per_pip is None:
+            add({a + 3: 1.0, a + 2: -_DIP_PER_PIP}, 0.0, priors.free_dip)
         if f < 4:
             add({a + 1: 1.0, a + 5: -1.0}, 0.0, priors.neighbour_flexion)
             add({a + 2: 1.0, a + 6: -1.0}, 0.0, priors.neighbour_pip)

@@ -15,7 +15,7 @@ from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.fingers import FingerRefiner
-from master.ik.hand import HandSolution, HandSolver
+from master.ik.hand import HandSolution, HandSolver, seen_markers
 from master.ik.priors import Priors
 
 _COAST_S = 0.12  # a lost finger's motion fades with this time constant
@@ -34,8 +34,47 @@ class TrackedHand:
     source: Code
 
 
+class _Memory:
+    """What a continuous motion teaches: each finger's angular speed, and where and when it was lost."""
+
+    def __init__(self, model: HandModel) -> None:
+        self._low, self._high = model.limits_rad[..., 0], model.limits_rad[..., 1]
+        self._speed = np.zeros((5, 4))
+        self._lost_ns: list[int | None] = [None] * 5
+        self._anchor = np.zeros((5, 4))
+        self._anchor_speed = np.zeros((5, 4))
+
+    def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
+        """Learn from one step of the angles (5, 4)."""
+        self._speed = 0.5 * self._speed + 0.5 * (after_rad - before_rad) / dt_s
+
+    def belief(self, t_ns: int, last_ns: int, last_rad: Float, seen: frozenset[int]) -> tuple[Float, Float]:
+        """Where lost fingers are believed to be (5, 4) [rad], and how uncertain that is (5,) [rad].
+
+        Args:
+            t_ns: The instant, not before any earlier one.
+            last_ns, last_rad: When the last pose held, and its angles (5, 4).
+            seen: Fingers that have a marker now.
+        """
+        angles = last_rad.copy()
+        doubt = np.full(5, _DOUBT_RAD)
+        for f in range(5):
+            if f in seen:
+                self._lost_ns[f] = None
+                continue
+            since = self._lost_ns[f]
+            if since is None:
+                since = self._lost_ns[f] = last_ns
+                self._anchor[f], self._anchor_speed[f] = last_rad[f], self._speed[f]
+            gone_s = (t_ns - since) * 1e-9
+            coast = self._anchor_speed[f] * _COAST_S * (1.0 - np.exp(-gone_s / _COAST_S))
+            angles[f] = np.clip(self._anchor[f] + coast, self._low[f], self._high[f])
+            doubt[f] = min(_DOUBT_RAD + _DOUBT_RAD_S * gone_s, _DOUBT_MAX_RAD)
+        return angles, doubt
+
+
 class HandTracker:
-    """Push machine. Holds the last solution, each finger's angular speed, and since when it is lost."""
+    """Push machine. Holds the last solution, when it and any marker were last seen, and what its motion taught."""
 
     def __init__(
         self,
@@ -66,10 +105,7 @@ class HandTracker:
         self.last: HandSolution | None = None
         self._last_ns = 0
         self._seen_ns: int | None = None
-        self._speed = np.zeros((5, 4))
-        self._lost_ns: list[int | None] = [None] * 5
-        self._anchor = np.zeros((5, 4))
-        self._anchor_speed = np.zeros((5, 4))
+        self._memory = _Memory(model)
 
     def push(self, t_ns: int, points_m: Float, cov_m2: Float, towards_cameras: Float) -> TrackedHand:
         """Solve one instant.
@@ -80,58 +116,42 @@ class HandTracker:
             cov_m2: (M, 3, 3) [m^2].
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
         """
-        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1)))
+        seen = seen_markers(points_m, cov_m2)
         last = self.last if self._continuous else None
         dt_s = (t_ns - self._last_ns) * 1e-9
         if last is not None and not 0.0 < dt_s <= _FORGET_S:
             last = None
+        if last is None:
+            self._memory = _Memory(self.model)
         facing = towards_cameras if (seen & self._on_palm).any() else None
-        hidden = self._belief(t_ns, seen) if last is not None else None
+        hidden = None
+        if last is not None:
+            fingers = frozenset(self._finger[seen].tolist())
+            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, fingers)
         solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing)
         if solution is not None and last is not None and _worst(solution) > _BAD_FIT_M:
             # The last pose may have led into the wrong valley: look once without it.
             fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
             if fresh is not None and _worst(fresh) < 0.5 * _worst(solution):
-                solution = fresh
+                solution, last, self._memory = fresh, None, _Memory(self.model)  # the leap was no motion
         if solution is not None:
             solution = self._refine(solution, points_m, cov_m2)
-        if solution is not None and last is not None:
-            self._speed = 0.5 * self._speed + 0.5 * (solution.angles_rad - last.angles_rad) / dt_s
+            if last is not None:
+                self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)
         if seen.any():
             self._seen_ns = t_ns
-        bits = self._bits(t_ns, solution, seen, last is not None)
+        bits = self._bits(t_ns, solution, seen, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
 
     def peek(self, points_m: Float, cov_m2: Float, towards_cameras: Float) -> HandSolution | None:
         """Solve one instant afresh and remember nothing; arguments as `push`."""
-        seen: Bool = np.asarray(np.isfinite(points_m.sum(axis=1)))
+        seen = seen_markers(points_m, cov_m2)
         facing = towards_cameras if (seen & self._on_palm).any() else None
         return self._solver.solve(points_m, cov_m2, None, 0.0, None, facing)
 
-    def _belief(self, t_ns: int, seen: Bool) -> tuple[Float, Float]:
-        """Where lost fingers are believed to be (5, 4) [rad], and how uncertain that is (5,) [rad]."""
-        assert self.last is not None
-        fingers = set(self._finger[seen].tolist())
-        angles = self.last.angles_rad.copy()
-        doubt = np.full(5, _DOUBT_RAD)
-        low, high = self.model.limits_rad[..., 0], self.model.limits_rad[..., 1]
-        for f in range(5):
-            if f in fingers:
-                self._lost_ns[f] = None
-                continue
-            since = self._lost_ns[f]
-            if since is None:
-                since = self._lost_ns[f] = self._last_ns
-                self._anchor[f], self._anchor_speed[f] = self.last.angles_rad[f], self._speed[f]
-            gone_s = (t_ns - since) * 1e-9
-            coast = self._anchor_speed[f] * _COAST_S * (1.0 - np.exp(-gone_s / _COAST_S))
-            angles[f] = np.clip(self._anchor[f] + coast, low[f], high[f])
-            doubt[f] = min(_DOUBT_RAD + _DOUBT_RAD_S * gone_s, _DOUBT_MAX_RAD)
-        return angles, doubt
-
-    def _bits(self, t_ns: int, solution: HandSolution | None, seen: Bool, held: bool) -> TrackedHand:
+    def _bits(self, t_ns: int, solution: HandSolution | None, seen: Bool, *, held: bool) -> TrackedHand:
         valid = np.zeros(26, dtype=bool)
         tracked = np.zeros(26, dtype=bool)
         source = np.zeros(26, dtype=np.uint8)
