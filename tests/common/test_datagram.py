@@ -128,6 +128,7 @@ def test_the_window_takes_each_counter_once(counters: list[int]) -> None:
             assert result is (counter < highest)
             taken.add(counter)
         assert window._taken < 1 << WINDOW
+        assert window.missing == max(taken, default=0) - len(taken)
 
 
 def test_the_window_at_its_limits() -> None:

@@ -380,6 +380,25 @@ def test_a_frame_never_sent_is_skipped_and_a_datagram_that_never_came_is_lost() 
     assert (counts.received, counts.lost, counts.skipped) == (5, 1, 2)
 
 
+def test_lost_on_the_way_and_never_sent_are_told_apart() -> None:
+    wires = Wires()
+    master, left, _ = started_pair(wires)
+    process = left.process
+    wires.send(left, detections("left", process, 0))
+    wires.send(left, detections("left", process, 5))  # 1 to 4 never sent: no time for them
+    assert left.seal(detections("left", process, 6)) is not None  # sealed, and lost on the way
+    wires.send(left, detections("left", process, 7))
+    counts = master.counts_of("left")
+    assert (counts.received, counts.lost, counts.skipped) == (3, 1, 4)
+    wires.remove(left)  # a new session forgets neither
+    left = wires.new_slave("left")
+    assert wires.run(1.0, lambda: left.started)
+    wires.send(left, detections("left", left.process, 0))
+    wires.send(left, detections("left", left.process, 2))
+    counts = master.counts_of("left")
+    assert (counts.received, counts.lost, counts.skipped) == (5, 1, 5)
+
+
 def test_echo_and_start_out_of_order_are_fine() -> None:
     wires = Wires()
     _, left, _ = started_pair(wires)
