@@ -14,19 +14,8 @@ from common.streams import ALIVE_KEY, STREAMS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 CODE = set(re.findall(r"`([^`\n]+)`", TEXT))
-TRAVELS = (
-    MarkerDetections,
-    HandPose,
-    Health,
-    Command,
-    Beacon,
-    Hello,
-    Welcome,
-    Start,
-    Started,
-    EchoAsk,
-    EchoAnswer,
-)
+HANDSHAKES = (Beacon, Hello, Welcome, Start, Started, EchoAsk, EchoAnswer)
+TRAVELS = (*(row.message for row in STREAMS.values()), *HANDSHAKES)
 
 
 @pytest.mark.parametrize("kind", TRAVELS)
