@@ -25,7 +25,7 @@ class Renderer:
     """Images of one scene by one camera. It holds prepared desk, noise and colours; a frame is a pure function of t."""
 
     def __init__(self, scene: Scene, camera: str) -> None:
-        """Prepare desk, noise and colour tables (most of a second).
+        """Prepare desk, noise and colour tables (some tenths of a second).
 
         Raises:
             CalibrationError: No such camera, or a marker without paint.

@@ -21,8 +21,8 @@ from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
 # The skin below the paint is a little smaller and shorter, so that it does not shine out around it.
-SKIN_UNDER_PAINT = 0.93
-SKIN_BACK_SHARE = 0.3
+SKIN_UNDER_PAINT = 0.86
+SKIN_BACK_SHARE = 0.4
 
 # Sphere indices: 4 f + k is joint k of finger f; then the rest of palm, web and sleeve.
 WRIST_SPHERES = (20, 21)
