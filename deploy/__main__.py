@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     settings = DemoSettings(
-        options.seconds, options.headless, options.out, options.calibration, options.rig, options.seed
+        options.seconds, options.headless, options.out, options.calibration, options.rig, options.seed, options.scene
     )
     summary = run_demo(settings, stop_on_signals(), _say)
     _finish(summary, options.json)
@@ -104,6 +104,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--rig", default="desk", help="default: %(default)s")
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
+    demo.add_argument("--scene", default="standard", help="standard, or leap:FILE.npz for a recorded motion")
     replay = commands.add_parser(
         "replay",
         help="a recording of raw frames, offline",

@@ -41,6 +41,7 @@ class DemoSettings:
         calibration: calib_json tree.
         rig: Rig to simulate.
         seed: Seed of the scene.
+        scene: What moves: "standard", or "leap:FILE.npz" for a recorded motion.
     """
 
     seconds: float
@@ -49,6 +50,7 @@ class DemoSettings:
     calibration: Path
     rig: str
     seed: int
+    scene: str = "standard"
 
 
 @dataclass(slots=True)
@@ -104,7 +106,7 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     place = ["--rig", settings.rig, "--calibration", str(settings.calibration)]
     rows: list[tuple[str, list[str], dict[str, str]]] = []
     for index, camera in enumerate(_cameras(settings)):
-        scene = ["--scene", "standard", "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
+        scene = ["--scene", settings.scene, "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
         clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index)]
         link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
@@ -192,7 +194,8 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
     if not (out / "live.json").exists():
         raise DemoError(f"the master wrote no summary; see {out / 'master.log'}")
     say("comparing with the exact truth, drawing the hand ...")
-    place = ["--rig", settings.rig, "--calibration", str(settings.calibration), "--seed", str(settings.seed)]
+    scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
+    place = ["--rig", settings.rig, "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
     command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
     # A second Ctrl-C may end the report; it must not reach it with the first.

@@ -11,10 +11,10 @@ from typing import Annotated
 import typer
 
 from common.calibration import HandProfile, load
-from common.errors import PhalanxError
+from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
-from common.sim.scene import Scene
+from common.sim.scenes import NAMES, scene_by_name
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
 from master.rig import RigSetup, load_hand, load_setup
@@ -30,6 +30,7 @@ BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
 
 _HERE = Path("calib_json")
 _BUS = "tcp/127.0.0.1:47802"
+_TRY_AGAIN_S = 0.3
 
 
 @app.callback()
@@ -103,11 +104,14 @@ def view(
     ] = False,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd instead of showing anything.")] = None,
 ) -> None:
-    """Show a running master in Rerun. A process of its own: it only listens, and may come and go."""
+    """Show a running master in Rerun. A process of its own, which may come and go; it waits for the master."""
     from master.outputs.rerun import run_viewer
 
     setup = load_setup(calibration, rig, hand)
-    connection = ZenohBus(None, bus)
+    stop = _stop_on_signals()
+    connection = _bus_of_master(bus, stop)
+    if connection is None:
+        return
     try:
         mode = "save" if save is not None else "web" if web else "spawn"
         run_viewer(
@@ -117,7 +121,7 @@ def view(
             setup.hand,
             mode=mode,
             path=save,
-            stop=_stop_on_signals(),
+            stop=stop,
             on_ready=_say,
         )
     finally:
@@ -129,7 +133,7 @@ def report(
     poses: Annotated[Path, typer.Option(help="poses.npz of the run.")],
     scene_epoch_ns: Annotated[int, typer.Option(help="Scene time 0 on this machine's monotonic clock [ns].")],
     out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
-    scene: Annotated[str, typer.Option(help="Scene: standard.")] = "standard",
+    scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}.")] = "standard",
     seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
     rig: Rig = "desk",
     calibration: Calibration = _HERE,
@@ -138,11 +142,9 @@ def report(
     """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file."""
     from master.report import report_scene
 
-    if scene != "standard":
-        raise PhalanxError(f"--scene {scene!r}: known scenes: standard")
     setup = load_setup(calibration, rig)
     profile = load(calibration / "hands" / f"{setup.rig.hand}.json", HandProfile)
-    played = Scene.standard(setup.rig, setup.cameras, profile, seed)
+    played = scene_by_name(scene, setup.rig, setup.cameras, profile, seed)
     figures = {} if summary is None else read_json(summary)
     out.mkdir(parents=True, exist_ok=True)
     write_json(
@@ -165,6 +167,22 @@ def _stop_on_signals() -> threading.Event:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     return stop
+
+
+def _bus_of_master(endpoint: str, stop: threading.Event) -> ZenohBus | None:
+    """The bus as the master sees it, once one listens there; None when stopped before."""
+    said = False
+    while not stop.is_set():
+        try:
+            return ZenohBus(None, endpoint, beyond=True)
+        except BusError as error:
+            if error.__cause__ is None:  # refused by us, not by the network: the endpoint is malformed
+                raise
+            if not said:
+                _say(f"waiting for a master: {error}")
+            said = True
+            stop.wait(_TRY_AGAIN_S)
+    return None
 
 
 def _address(text: str, option: str) -> tuple[str, int]:

@@ -18,7 +18,8 @@ from common.errors import CalibrationError, CameraError, PhalanxError
 from slave.cameras.source import FrameSource
 
 ABOUT = (
-    "The slave stands beside a camera: it finds the painted markers and sends their centroids, never images."
+    "The slave stands beside a camera: it finds the painted markers and sends their centroids.\n"
+    "Images leave it only as small previews, on request, while somebody looks."
 )
 EXAMPLES = """examples:
   phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
@@ -53,6 +54,7 @@ def _run(options: argparse.Namespace) -> int:
     from common.zenoh_bus import ZenohBus
     from slave.app import run, wait_for_start
     from slave.markers.detector import MarkerDetector
+    from slave.preview import Previews
     from slave.report import Reporter
     from slave.tally import Tally
     from slave.uplink import Uplink
@@ -68,17 +70,25 @@ def _run(options: argparse.Namespace) -> int:
     detector = MarkerDetector(camera, rig.markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
+    previews = Previews(options.name, clock)
     reporter = Reporter(
-        options.name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set
+        options.name,
+        uplink,
+        tally,
+        clock,
+        lambda endpoint: ZenohBus(None, endpoint),
+        stop.set,
+        shown=previews,
     )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         print(f"{options.name}: ready, waiting for the master", flush=True)
         if wait_for_start(uplink, stop):
-            run(source, detector, uplink, options.name, tally, stop)
+            run(source, detector, uplink, options.name, tally, stop, previews.offer)
     finally:
         reporter.close()
+        previews.close()
         uplink.close()
         source.close()
     print(f"{options.name}: {tally.counts()['frames']} frames, sent {uplink.counts['sent']}", flush=True)
@@ -107,14 +117,14 @@ def _source(
 
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
     if kind == "synthetic" and not folder:
-        from common.sim.scene import Scene
+        from common.sim.scenes import scene_by_name
         from slave.cameras.synthetic import SyntheticCamera
 
         hand = load(options.calibration / "hands" / f"{rig.hand}.json", HandProfile)
         cameras = {
             n: load(options.calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras
         }
-        scene = Scene.standard(rig, cameras, hand, options.seed)
+        scene = scene_by_name(options.scene, rig, cameras, hand, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
         return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock)
@@ -163,7 +173,7 @@ def _parser() -> argparse.ArgumentParser:
         "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
     )
     sim = run.add_argument_group("synthetic camera")
-    sim.add_argument("--scene", choices=["standard"], default="standard")
+    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | leap:FILE.npz")
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(
         "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"

@@ -1,0 +1,29 @@
+"""Scenes by name, so that every process of a simulated rig renders the same one."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from common.calibration import CameraCalibration, HandProfile, RigCalibration
+from common.errors import PhalanxError
+from common.hand_model import HandModel
+from common.sim.leap import load_leap
+from common.sim.scene import Scene, view_centre
+
+NAMES = "standard | leap:FILE.npz"
+_LEAP = "leap:"
+
+
+def scene_by_name(
+    name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
+) -> Scene:
+    """The scene called `standard`, or one that follows a recorded motion, `leap:FILE.npz`.
+
+    Raises:
+        PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
+    """
+    if name == "standard":
+        return Scene.standard(rig, cameras, hand, seed)
+    if name.startswith(_LEAP):
+        motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
+        return Scene.of_motion(rig, cameras, hand, motion, seed)
+    raise PhalanxError(f"scene {name!r}: there are {NAMES}")
