@@ -2,10 +2,11 @@
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 from common.messages import MarkerDetections, Message
-from slave.cameras.source import FrameSource
+from slave.cameras.source import Frame, FrameSource
 from slave.markers.detector import MarkerDetector
 from slave.tally import Tally
 
@@ -49,8 +50,11 @@ def run(
     camera: str,
     tally: Tally,
     stop: threading.Event,
+    show: Callable[[Frame], None] = lambda _frame: None,
 ) -> None:
     """Detect and send until the source ends or `stop` is set. A frame without any marker is sent as well.
+
+    `show` is offered every frame once its message is sent; it must not wait.
 
     Raises:
         CameraError: The camera is gone.
@@ -71,3 +75,4 @@ def run(
         )
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)
+        show(frame)

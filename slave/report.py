@@ -50,8 +50,20 @@ class Numbers(Protocol):
         ...
 
 
+class Shown(Protocol):
+    """What shows the camera's picture; a `Previews`."""
+
+    def ask(self) -> None:
+        """Somebody looks."""
+        ...
+
+    def use(self, bus: Bus | None) -> None:
+        """Publish there from now on."""
+        ...
+
+
 class Reporter:
-    """Publishes `Health` and answers "report" and "stop".
+    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview".
 
     Holds the bus while a master is there, and the gauges of the last period.
     """
@@ -65,6 +77,7 @@ class Reporter:
         connect: Callable[[str], Bus],
         stop: Callable[[], None],
         period_s: float = PERIOD_S,
+        shown: Shown | None = None,
     ) -> None:
         """Start the thread.
 
@@ -76,6 +89,7 @@ class Reporter:
             connect: Opens a bus to an endpoint.
             stop: Called on the command "stop".
             period_s: Time between reports [s].
+            shown: Shows the camera's picture on the command "preview".
         """
         self._name = name
         self._link = link
@@ -84,6 +98,7 @@ class Reporter:
         self._connect = connect
         self._stop = stop
         self._period_s = period_s
+        self._shown = shown
         self._gauges: dict[str, float] = {}
         self._bus: Bus | None = None
         self._endpoint: str | None = None
@@ -97,14 +112,17 @@ class Reporter:
         return Health(self._name, self._link.session, self._clock.now_ns(), counts, dict(self._gauges))
 
     def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "stop" ends the slave after the answer.
+        """Obey a command: "report" says how it is, "preview" shows the picture for 3 s, "stop" ends the slave.
 
         Raises:
             ValueError: Another verb; the asker reads which ones there are.
         """
-        if command.verb not in ("report", "stop"):
-            raise ValueError(f"{self._name}: no command {command.verb!r}; there are report, stop")
+        verbs = ("report", "stop") if self._shown is None else ("report", "stop", "preview")
+        if command.verb not in verbs:
+            raise ValueError(f"{self._name}: no command {command.verb!r}; there are {', '.join(verbs)}")
         health = self.health()
+        if command.verb == "preview" and self._shown is not None:
+            self._shown.ask()
         if command.verb == "stop":
             self._stop()
         return health
@@ -139,8 +157,12 @@ class Reporter:
         bus.announce(self._name)
         bus.serve(self._name, self.answer)
         self._bus, self._endpoint = bus, endpoint
+        if self._shown is not None:
+            self._shown.use(bus)
 
     def _leave(self) -> None:
+        if self._shown is not None:
+            self._shown.use(None)
         if self._bus is not None:
             self._bus.close()
         self._bus, self._endpoint = None, None

@@ -15,7 +15,7 @@ class Frame:
         seq: Frame counter of this camera; a gap is a frame the camera dropped.
         t_ns: Middle of the exposure of row 0 [ns], slave's clock.
         ready_t_ns: When the frame was handed to the slave [ns], same clock.
-        image: (H, W, 3) BGR, or (H, W) grey, uint8.
+        image: (H, W, 3) BGR, or (H, W) grey, uint8. Nobody writes to it any more: others may still look at it.
         illumination: What lit the scene.
     """
 

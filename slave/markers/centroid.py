@@ -15,7 +15,6 @@ area, and light adds linearly, so in linear light the share is measurable:
 All windows lie in one stack of tiles, so that a step costs one call, not one per marker. (Fisher 1936.)
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias, cast
@@ -29,15 +28,17 @@ from slave.markers.blobs import FRAGMENT_GAP, FRAGMENT_SHARE, Blob
 from slave.markers.classify import ColourTable
 
 Float32: TypeAlias = npt.NDArray[np.float32]
-Index: TypeAlias = npt.NDArray[np.intp]
 
-PAD = 9  # px around the scanned box: 2 for the decimation, 5 for rim and ring, 2 to keep tiles apart
+PAD = 8  # px around the scanned box: 2 for the decimation, 5 for rim and ring, 1 to keep tiles apart
 RIM = cv2.getStructuringElement(cv2.MORPH_RECT, (7, 7))
 RING = cv2.getStructuringElement(cv2.MORPH_RECT, (5, 5))
 SQUARE = cv2.getStructuringElement(cv2.MORPH_RECT, (3, 3))
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 # Added to the variances: one grey level of noise, so that a flat colour stays solvable.
-NOISE = 4e-6 * np.eye(3, dtype=np.float32)
+NOISE = 4e-6 * np.eye(3)
+# The six different products of three channels, and where each stands in the symmetric 3 x 3 matrix.
+PAIR_A, PAIR_B = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 MIN_PIXELS = 4
 SHADING = (9, 9)  # px over which the shading of the paint is followed
 FAINT = 0.02  # weight of the mean level where no core is near
@@ -151,7 +152,7 @@ def _measure_stack(
     filled = cast(Image, cv2.morphologyEx(mask, cv2.MORPH_CLOSE, CROSS))
     core = cast(Image, cv2.erode(filled, CROSS))
     shape = (count, height, width)
-    core_pixels = core.reshape(count, -1).sum(axis=1, dtype=np.int64)
+    core_pixels = np.count_nonzero(core.reshape(count, -1), axis=1)
     for i in np.flatnonzero(core_pixels < MIN_PIXELS):
         core.reshape(shape)[i] = filled.reshape(shape)[i]
     near = cast(Image, cv2.dilate(filled, SQUARE)) ^ filled
@@ -166,11 +167,11 @@ def _measure_stack(
     share = share.reshape(shape)
     rows, columns = share.sum(axis=2), share.sum(axis=1)
     area = rows.sum(axis=1, dtype=np.float64)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        u = columns @ np.arange(width, dtype=np.float64) / area + stack.left
-        v = rows @ np.arange(height, dtype=np.float64) / area + stack.top
-        fringed = (near & others).reshape(count, -1).sum(axis=1, dtype=np.int64)
-        foreign = fringed / near.reshape(count, -1).sum(axis=1, dtype=np.int64)
+    whole = np.maximum(area, 1.0)  # smaller ones are dropped below
+    u = columns @ np.arange(width, dtype=np.float64) / whole + stack.left
+    v = rows @ np.arange(height, dtype=np.float64) / whole + stack.top
+    fringed = np.count_nonzero((near & others).reshape(count, -1), axis=1)
+    foreign = fringed / np.maximum(np.count_nonzero(near.reshape(count, -1), axis=1), 1)
     cut = [not stack.whole and _is_cut(filled.reshape(shape)[i], stack, i, image.shape) for i in range(count)]
     return [
         Measured(
@@ -217,7 +218,7 @@ def _joined(
         pixels[i] = sum(rows[k][4] for k in chosen)
     if keep[1:].all():
         return mask, pixels
-    return keep[cast(Image, labels)], pixels
+    return keep.take(cast(Image, labels)), pixels
 
 
 def _touches(row: list[int], blob: Blob, left: int, top: int) -> bool:
@@ -278,13 +279,7 @@ def _shares(tiles: Image, core: Image, ring: Image, rim: Image) -> tuple[Float32
     count = len(core)
     light = cast(Float32, cv2.LUT(tiles, LINEAR))
     colours = light.reshape(count, -1, 3)
-    w = np.empty((count, 3), np.float32)
-    zero = np.empty(count, np.float32)
-    contrast = np.empty(count)
-    for i in range(count):
-        w[i], zero[i], contrast[i] = _discriminant(
-            colours[i], np.flatnonzero(core[i].reshape(-1)), np.flatnonzero(ring[i].reshape(-1))
-        )
+    w, zero, contrast = _discriminants(light.reshape(-1, 3), core.reshape(count, -1), ring.reshape(count, -1))
     along = (colours @ w[:, :, None])[:, :, 0]
     along -= zero[:, None]
     along = along.reshape(rim.shape)
@@ -300,17 +295,41 @@ def _shares(tiles: Image, core: Image, ring: Image, rim: Image) -> tuple[Float32
     return along, contrast
 
 
-def _discriminant(colours: Float32, core: Index, ring: Index) -> tuple[Float, float, float]:
-    """Direction (3,), offset and contrast of the discriminant that is 0 at the ring's mean and 1 at the core's."""
-    if not core.size or not ring.size:
-        return np.zeros(3), 0.0, 0.0
-    inside, outside = colours.take(core, axis=0), colours.take(ring, axis=0)
-    mean_in, mean_out = np.add.reduce(inside) / core.size, np.add.reduce(outside) / ring.size
-    inside -= mean_in
-    outside -= mean_out
-    spread = inside.T @ inside / core.size + outside.T @ outside / ring.size + NOISE
+def _discriminants(light: Float32, core: Image, ring: Image) -> tuple[Float32, Float32, Float]:
+    """Of each tile the direction (M, 3), offset (M,) and contrast (M,) of the discriminant that is 0 at the
+    ring's mean and 1 at the core's; all zero where core or ring is empty.
+
+    Args:
+        light: (M * P, 3) linear light of all tiles.
+        core, ring: (M, P) 0 or 1.
+    """
+    count = len(core)
+    w, zero, contrast = np.zeros((count, 3), np.float32), np.zeros(count, np.float32), np.zeros(count)
+    usable = np.flatnonzero(core.any(axis=1) & ring.any(axis=1))
+    if not usable.size:
+        return w, zero, contrast
+    if usable.size < count:
+        light = np.ascontiguousarray(light.reshape(count, -1, 3)[usable]).reshape(-1, 3)
+        core, ring = core[usable], ring[usable]
+    mean_in, spread_in = _moments(light, core)
+    mean_out, spread_out = _moments(light, ring)
     step = mean_in - mean_out
-    w = np.asarray(np.linalg.solve(spread, step), dtype=np.float64)
-    distance = max(float(w @ step), 1e-6)
-    w /= distance
-    return w, float(w @ mean_out), math.sqrt(distance)
+    direction = np.linalg.solve(spread_in + spread_out + NOISE, step[:, :, None])[:, :, 0]
+    distance = np.maximum((direction * step).sum(axis=1), 1e-6)
+    direction /= distance[:, None]
+    w[usable] = direction
+    zero[usable] = (direction * mean_out).sum(axis=1)
+    contrast[usable] = np.sqrt(distance)
+    return w, zero, contrast
+
+
+def _moments(light: Float32, mask: Image) -> tuple[Float, Float]:
+    """Mean (M, 3) and covariance (M, 3, 3) of the light under the mask of each tile; no mask is empty."""
+    planes = np.ascontiguousarray(light.take(np.flatnonzero(mask.reshape(-1)), axis=0).T)
+    number = np.count_nonzero(mask, axis=1)
+    starts = np.zeros(len(mask), np.intp)
+    np.cumsum(number[:-1], out=starts[1:])
+    mean = np.add.reduceat(planes, starts, axis=1) / number
+    planes -= np.repeat(mean.astype(np.float32), number, axis=1)
+    second = np.add.reduceat(planes[PAIR_A] * planes[PAIR_B], starts, axis=1) / number
+    return mean.T, second[PAIR_OF].transpose(2, 0, 1)

@@ -24,6 +24,7 @@ from slave.markers.roi import Track, advance
 
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
+SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
 CLEAR_CONTRAST = 6.0
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 
@@ -103,7 +104,7 @@ class MarkerDetector:
         )
         for m, seen in zip(rows, measured, strict=True):
             blob, track = chosen[m], self._tracks[m]
-            if seen is None or (seen.thin and seen.foreign > FRINGE):
+            if seen is None or (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
                 continue
             self._tracks[m] = track = advance(track, seen, blob, t_ns)
             uv[m] = seen.u, seen.v

@@ -1,0 +1,126 @@
+"""The camera's picture for whoever looks: small JPEGs, at most 10 Hz, and nothing at all when nobody asked lately.
+
+The loop only offers its frames: one comparison when nobody looks, otherwise a reference is left behind ten times
+a second. A thread of its own shrinks, encodes and publishes; while it is busy the newest frame replaces the
+waiting one, so a slow bus costs pictures and never a measurement.
+"""
+
+import threading
+from collections import deque
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.bus import Bus
+from common.clock import Clock
+from common.errors import BusError
+from common.messages import MAX_PREVIEW_BYTES, Preview
+from slave.cameras.source import Frame
+
+PERIOD_NS = 100_000_000
+LOOK_NS = 3_000_000_000
+QUALITY = 80
+WAIT_S = 0.5
+_NEVER_NS = -(2**63)
+
+
+class Gate:
+    """Which frames are shown: at least 100 ms apart, until 3 s after the last request.
+
+    Holds the end of the looking and the earliest time of the next frame.
+    """
+
+    def __init__(self) -> None:
+        """Nobody looks yet."""
+        self._end_ns = _NEVER_NS
+        self._next_ns = _NEVER_NS
+
+    def ask(self, now_ns: int) -> None:
+        """Somebody looks at `now_ns` [ns], same clock as the frames."""
+        self._end_ns = now_ns + LOOK_NS
+
+    def wants(self, t_ns: int) -> bool:
+        """Whether the frame taken at `t_ns` [ns] is to be shown; a yes counts as shown."""
+        if t_ns > self._end_ns:
+            return False
+        if t_ns < self._next_ns:
+            return False
+        self._next_ns = t_ns + PERIOD_NS
+        return True
+
+
+class Previews:
+    """Publishes one camera on stream "preview" while somebody looks.
+
+    Holds the gate, the newest frame that waits, the bus while there is one, and how many pictures went out.
+    """
+
+    def __init__(self, camera: str, clock: Clock) -> None:
+        """Start the thread; nothing is published before `use` and `ask`.
+
+        Args:
+            camera: Name of the camera.
+            clock: Clock of the frames' times.
+        """
+        self._camera = camera
+        self._clock = clock
+        self._gate = Gate()
+        self._waiting: deque[Frame] = deque(maxlen=1)
+        self._wake = threading.Event()
+        self._closing = threading.Event()
+        self._lock = threading.Lock()  # a bus is never closed while it is published on
+        self._bus: Bus | None = None
+        self.published = 0
+        self._thread = threading.Thread(target=self._work, name=f"{camera} preview", daemon=True)
+        self._thread.start()
+
+    def ask(self) -> None:
+        """Somebody looks: show the camera for the next 3 s. Never waits."""
+        self._gate.ask(self._clock.now_ns())
+
+    def offer(self, frame: Frame) -> None:
+        """The loop has a new frame, which nobody will write to any more. Never waits."""
+        if self._gate.wants(frame.t_ns):
+            self._waiting.append(frame)
+            self._wake.set()
+
+    def use(self, bus: Bus | None) -> None:
+        """Publish on `bus` from now on, or on none; waits until the present picture is out."""
+        with self._lock:
+            self._bus = bus
+
+    def close(self) -> None:
+        """End the thread. Safe to call twice."""
+        self._closing.set()
+        self._wake.set()
+        self._thread.join()
+
+    def _work(self) -> None:
+        while not self._closing.is_set():
+            self._wake.wait(WAIT_S)
+            self._wake.clear()
+            if self._waiting and not self._closing.is_set():
+                frame = self._waiting.popleft()
+                self._publish(Preview(self._camera, frame.t_ns, small_jpeg(frame.image)))
+
+    def _publish(self, preview: Preview) -> None:
+        with self._lock:
+            if self._bus is None:
+                return
+            try:
+                self._bus.publish("preview", self._camera, preview)
+                self.published += 1
+            except BusError:
+                return  # the bus has gone; the reporter finds the next one
+
+
+def small_jpeg(image: Image) -> bytes:
+    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey at half its width and height, smaller still if it must be."""
+    while True:
+        height, width = image.shape[:2]
+        half = (max(width // 2, 1), max(height // 2, 1))
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
+        if len(data) <= MAX_PREVIEW_BYTES:
+            return data
