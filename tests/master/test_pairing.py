@@ -1,0 +1,271 @@
+"""Tests of pairing: which instants come out, when, in any order of messages, and where each marker was then."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from common.messages import MarkerDetections
+from master.stereo.pairing import SILENT_FRAMES, Instant, Pairing
+from tests.hand_helpers import camera_models, detections, rig_file
+
+MS = 1_000_000
+PERIOD = 16 * MS
+RATES = {"left": 62.5, "right": 62.5, "top": 62.5}
+
+
+def pairing(
+    row_time_us: float = 0.0, cameras: tuple[str, ...] = ("left", "right"), **options: object
+) -> Pairing:
+    models = camera_models(rig_file(cameras), row_time_us)
+    return Pairing(models, {name: RATES[name] for name in cameras}, **options)  # pyright: ignore[reportArgumentType]
+
+
+def path(t_s: Float) -> Float:
+    """Markers (..., 2, 2) [px] on two parabolas."""
+    t = np.asarray(t_s)[..., None]
+    return np.stack(
+        [
+            np.concatenate([300 + 400 * t - 2000 * t**2, 200 - 150 * t + 900 * t**2], -1),
+            np.concatenate([100 - 250 * t + 1000 * t**2, 400 + 80 * t - 700 * t**2], -1),
+        ],
+        axis=-2,
+    )
+
+
+def frame(
+    camera: str, seq: int, t_ns: int, shift: Float | None = None, row_time_us: float = 0.0
+) -> MarkerDetections:
+    """What a camera sees of the paths whose row 0 is exposed at t_ns; each row at its own time."""
+    uv = path(np.array(t_ns * 1e-9))
+    for _ in range(8):  # the row decides the time, the time the row
+        times = t_ns * 1e-9 + row_time_us * 1e-6 * uv[:, 1]
+        uv = np.stack([path(t)[m] for m, t in enumerate(times)])
+    return detections(camera, seq, t_ns, uv if shift is None else uv + shift)
+
+
+def push_all(machine: Pairing, messages: list[MarkerDetections]) -> list[Instant]:
+    out = [instant for message in messages for instant in machine.push(message)]
+    return out + machine.flush()
+
+
+def interleaved(*streams: list[MarkerDetections]) -> list[MarkerDetections]:
+    return sorted((m for stream in streams for m in stream), key=lambda m: m.t_ns)
+
+
+def stream(camera: str, count: int, late_ns: int = 0, **options: float) -> list[MarkerDetections]:
+    return [frame(camera, k, k * PERIOD + late_ns, **options) for k in range(count)]
+
+
+# -- when an instant comes out -----------------------------------------------------------------------------------
+
+
+def test_an_instant_waits_for_the_other_camera_and_no_longer() -> None:
+    machine = pairing()
+    for k in range(2):
+        machine.push(frame("left", k, k * PERIOD))
+        machine.push(frame("right", k, k * PERIOD + 5 * MS))
+    assert machine.push(frame("left", 2, 2 * PERIOD)) == []
+    [instant] = machine.push(frame("right", 2, 2 * PERIOD + 5 * MS))
+    assert instant.t_ns == 2 * PERIOD
+    assert not instant.missing.any()
+    assert instant.ready_t_ns == 2 * PERIOD + 5 * MS + 2 * MS
+
+
+def test_the_deadline_emits_what_there_is() -> None:
+    machine = pairing()
+    push_early = [frame("left", 0, 0), frame("right", 0, 5 * MS), frame("right", 1, PERIOD + 5 * MS)]
+    for message in push_early:
+        machine.push(message)
+    assert machine.push(frame("left", 2, 4 * PERIOD)) == []
+    assert machine.push(frame("left", 3, 5 * PERIOD)) == []
+    [instant] = machine.push(frame("left", 4, 6 * PERIOD))  # 1.25 periods are over for the first of the three
+    assert instant.t_ns == 4 * PERIOD
+    assert list(instant.missing) == [False, True]
+    assert np.isfinite(instant.uv[0]).all()
+    assert np.isnan(instant.uv[1]).all()
+
+
+def test_flush_emits_the_rest_once() -> None:
+    machine = pairing()
+    machine.push(frame("left", 0, 0))
+    assert [i.t_ns for i in machine.flush()] == [0]
+    assert machine.flush() == []
+
+
+def test_predict_does_not_wait() -> None:
+    machine = pairing(policy="predict")
+    messages = interleaved(stream("left", 6), stream("right", 6, 5 * MS))
+    early = {i.t_ns: m.t_ns for m in messages for i in machine.push(m)}
+    # From the third frame on, the instant comes with the leader's own message.
+    assert all(early[k * PERIOD] == k * PERIOD for k in range(2, 6))
+
+
+def test_predicted_tracks_follow_the_motion() -> None:
+    machine = pairing(policy="predict")
+    instants = push_all(machine, interleaved(stream("left", 8), stream("right", 8, 12 * MS)))
+    last = instants[-1]
+    np.testing.assert_allclose(last.uv[1], path(np.array(last.t_ns * 1e-9)), atol=1e-6)
+    waited = push_all(pairing(), interleaved(stream("left", 8), stream("right", 8, 12 * MS)))[-1]
+    assert (last.sigma_px[1] > waited.sigma_px[1]).all()  # and is less sure than an interpolated one
+
+
+@given(st.lists(st.booleans(), min_size=60, max_size=60))
+@settings(max_examples=30)
+def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(choices: list[bool]) -> None:
+    streams = stream("left", 20, row_time_us=20.0), stream("right", 20, 5 * MS, row_time_us=20.0)
+    expected = push_all(pairing(20.0), interleaved(*streams))
+    sent, order = [0, 0], [streams[0][0]]
+    sent[0] = 1
+    for left in choices:
+        ahead = sent[0] - sent[1]
+        # A camera may fall behind by a frame and run ahead by three: nothing is due before it is complete.
+        c = 0 if (left and ahead < 1) or ahead <= -3 else 1
+        c = c if sent[c] < 20 else 1 - c
+        if sent[c] < 20:
+            order.append(streams[c][sent[c]])
+            sent[c] += 1
+    found = push_all(pairing(20.0), order)
+    complete = min(sent[0], sent[1] - 1)
+    assert [i.t_ns for i in found[:complete]] == [i.t_ns for i in expected[:complete]]
+    # The very first may be due before its cameras have tracks.
+    for one, other in zip(found[1:complete], expected[1:complete], strict=True):
+        np.testing.assert_array_equal(one.uv, other.uv)
+        np.testing.assert_array_equal(one.sigma_px, other.sigma_px)
+        np.testing.assert_array_equal(one.missing, other.missing)
+        assert one.ready_t_ns == other.ready_t_ns
+
+
+# -- where the markers were --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row_time_us", [0.0, 20.6])
+@pytest.mark.parametrize("late_ms", [0.0, 3.0, 8.0, 15.0])
+def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, row_time_us: float) -> None:
+    streams = [
+        stream(c, 10, late, row_time_us=row_time_us)
+        for c, late in (("left", 0), ("right", int(late_ms * MS)))
+    ]
+    instants = push_all(pairing(row_time_us), interleaved(*streams))
+    assert len(instants) == 10
+    for k, instant in enumerate(instants):
+        assert instant.t_ns == k * PERIOD + round(239.5 * row_time_us * 1e3)  # the centre row of the leader
+        if k < 2:
+            continue  # the first two have no three sightings
+        truth = path(np.array(instant.t_ns * 1e-9))
+        np.testing.assert_allclose(instant.uv, [truth, truth], atol=1e-5)
+
+
+def test_a_single_sighting_is_held_and_its_doubt_is_a_hand_speed_times_the_time() -> None:
+    machine = pairing()
+    machine.push(frame("left", 0, 0))
+    machine.push(frame("right", 0, 4 * MS))
+    [instant] = machine.flush()
+    np.testing.assert_allclose(instant.uv[1], path(np.array(0.004)))
+    np.testing.assert_allclose(instant.sigma_px[0], 0.1)  # the floor: a whole marker at its own time
+    np.testing.assert_allclose(instant.sigma_px[1], np.hypot(0.1, 500.0 * 0.004))  # 500 px/s for 4 ms
+
+
+def test_a_dull_marker_is_less_sure() -> None:
+    machine = pairing()
+    clear = frame("left", 0, 0)
+    dull = MarkerDetections("left", 1, 0, 0, 0, clear.uv, clear.area, np.array([1.0, 0.5]))
+    machine.push(dull)
+    np.testing.assert_allclose(machine.flush()[0].sigma_px[0], [0.1, 0.1 + 0.6 * 0.5])
+
+
+def test_a_lost_marker_stays_lost_and_leaves_the_other_alone() -> None:
+    lost = np.array([[np.nan, np.nan], [0.0, 0.0]])
+    left, right = stream("left", 10), stream("right", 10, 5 * MS)
+    whole = push_all(pairing(), interleaved(left, right))
+    right = [frame("right", k, k * PERIOD + 5 * MS, lost if 4 <= k < 7 else None) for k in range(10)]
+    found = push_all(pairing(), interleaved(left, right))
+    for k in range(10):
+        np.testing.assert_array_equal(found[k].uv[:, 1], whole[k].uv[:, 1])
+        np.testing.assert_array_equal(found[k].uv[0], whole[k].uv[0])
+    # Nearest to an instant is the right frame 5 ms after it; where that has no marker there is none.
+    assert [bool(np.isnan(i.uv[1, 0]).all()) for i in found] == [4 <= k < 7 for k in range(10)]
+
+
+# -- cameras that come and go -------------------------------------------------------------------------------------
+
+
+def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
+    machine = pairing()
+    left, right = stream("left", 10), stream("right", 80, 5 * MS)
+    instants = push_all(machine, interleaved(left, right))
+    times = np.array([i.t_ns for i in instants])
+    assert (np.diff(times) > 0).all()
+    after = [i for i in instants if i.t_ns > 10 * PERIOD]
+    assert len(after) >= 80 - 10 - 2 * SILENT_FRAMES - 1
+    assert all(i.missing[0] and not i.missing[1] for i in after)
+    assert all(i.t_ns % PERIOD == 5 * MS for i in after)
+
+
+def test_when_the_other_camera_falls_silent_poses_go_on() -> None:
+    machine = pairing()
+    instants = push_all(machine, interleaved(stream("left", 60), stream("right", 10, 5 * MS)))
+    assert [i.t_ns for i in instants] == [k * PERIOD for k in range(60)]
+    assert all(i.missing[1] for i in instants[13:])
+
+
+def test_after_the_silence_an_instant_no_longer_waits_for_the_deadline() -> None:
+    machine = pairing()
+    for message in interleaved(stream("left", 60), stream("right", 2, 5 * MS)):
+        machine.push(message)
+    assert [i.t_ns for i in machine.push(frame("left", 60, 60 * PERIOD))] == [60 * PERIOD]
+
+
+def test_a_leader_that_returns_leads_again_and_time_never_steps_back() -> None:
+    machine = pairing()
+    left = stream("left", 10) + [frame("left", k, k * PERIOD) for k in range(60, 80)]
+    messages = interleaved(left, stream("right", 80, 5 * MS))
+    # Its first frame comes behind one of the other camera that was exposed later.
+    first = next(i for i, m in enumerate(messages) if m.camera == "left" and m.seq == 60)
+    messages[first], messages[first + 1] = messages[first + 1], messages[first]
+    instants = push_all(machine, messages)
+    times = np.array([i.t_ns for i in instants])
+    assert (np.diff(times) > 0).all()
+    assert (times[-15:] % PERIOD == 0).all()
+    assert not np.array([i.missing for i in instants[-15:]]).any()
+
+
+def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
+    machine = pairing()
+    for message in interleaved(stream("left", 5), stream("right", 5, 5 * MS)):
+        machine.push(message)
+    assert machine.push(frame("left", 5, 2 * PERIOD)) == []
+    assert machine.push(frame("left", 6, 4 * PERIOD)) == []
+    machine.push(frame("left", 7, 5 * PERIOD))
+    assert [i.t_ns for i in machine.push(frame("right", 5, 5 * PERIOD + 5 * MS))] == [5 * PERIOD]
+
+
+def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
+    cameras = ("left", "right", "top")
+    streams = [stream(camera, 10, late * MS) for camera, late in zip(cameras, (0, 5, 11), strict=True)]
+    instants = push_all(pairing(cameras=cameras), interleaved(*streams))
+    assert len(instants) == 10
+    for instant in instants[2:]:
+        assert instant.uv.shape == (3, 2, 2)
+        np.testing.assert_allclose(instant.uv, [path(np.array(instant.t_ns * 1e-9))] * 3, atol=1e-6)
+
+
+def test_unrelated_frames_are_never_mixed() -> None:
+    machine = pairing(continuous=False)
+    messages = [
+        detections(camera, k, k * 1_000 * MS + late, np.full((2, 2), 100.0 * k))
+        for k in range(3)
+        for camera, late in (("left", 0), ("right", 5 * MS))
+    ]
+    instants = push_all(machine, messages)
+    assert len(instants) == 3
+    for k, instant in enumerate(instants):
+        np.testing.assert_array_equal(instant.uv, np.full((2, 2, 2), 100.0 * k))
+    lonely = push_all(pairing(continuous=False), [messages[0], messages[3]])
+    assert list(lonely[0].missing) == [False, True]
+
+
+def test_a_stranger_is_a_mistake_of_the_caller() -> None:
+    with pytest.raises(ValueError, match="stranger"):
+        pairing().push(frame("stranger", 0, 0))
