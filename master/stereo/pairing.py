@@ -55,7 +55,7 @@ class Instant:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sighting:
     centre_ns: int
-    t_ns: Float  # (M,) capture time of each marker's row, relative to nothing: float64 of ns since the first frame
+    t_ns: Float  # (M,) capture time of each marker's row, since the first frame of all: float64 is exact to 1 ns
     uv: Float
     sigma_px: Float
     area: Float
@@ -101,6 +101,10 @@ class Pairing:
         Raises:
             ValueError: The camera is not of this rig (ingest lets no such message pass).
         """
+        if message.camera not in self._names:
+            raise ValueError(
+                f"camera {message.camera!r} is not of this rig, which has {', '.join(self._names)}"
+            )
         index = self._names.index(message.camera)
         camera = self._cameras[index]
         if self._origin_ns is None:
@@ -122,7 +126,8 @@ class Pairing:
         )
         self._newest_ns = max(self._newest_ns, centre_ns)
         self._waiting = [0 if c == index else count + 1 for c, count in enumerate(self._waiting)]
-        if index == self._leader() and centre_ns > self._emitted_ns:
+        newest_instant = self._pending[-1] if self._pending else self._emitted_ns
+        if index == self._leader() and centre_ns > newest_instant:
             self._pending.append(centre_ns)
         return self._emit(flush=False)
 
@@ -154,8 +159,8 @@ class Pairing:
                 return False
             newest = seen[-1].centre_ns
             if newest >= t_ns:
-                # At the very start one sighting after the instant is not yet a track.
-                if newest == t_ns or not self._continuous or len(seen) > 1:
+                # At the very start one sighting is not yet a track.
+                if not self._continuous or len(seen) > 1:
                     continue
                 return False
             if self._policy == "interpolate" or t_ns - newest > self._deadline_ns:
@@ -179,8 +184,14 @@ class Pairing:
         return Instant(t_ns, uv, sigma, area, ready, missing)
 
     def _neighbours(self, camera: int, t_ns: int) -> list[_Sighting]:
-        """Up to three sightings around the instant, nearest first, each at most a gap from the next."""
-        seen = sorted(self._seen[camera], key=lambda s: abs(s.centre_ns - t_ns))
+        """Up to three sightings around the instant, nearest first, none farther away than a gap.
+
+        Of those after the instant only the first counts (two where there are none before), as if the others had
+        not yet come: what is emitted does not depend on how far a camera's messages ran ahead of another's.
+        """
+        known = list(self._seen[camera])
+        before = sum(s.centre_ns < t_ns for s in known)
+        seen = sorted(known[: max(before + 1, 2)], key=lambda s: abs(s.centre_ns - t_ns))
         reach = self._gap_ns if self._continuous else self._deadline_ns // 2
         near = [s for s in seen if abs(s.centre_ns - t_ns) <= reach]
         return near[:3] if self._continuous else near[:1]
