@@ -14,7 +14,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
-import numpy as np
 
 from common.arrays import Image
 from slave.markers.blobs import SCALE, Blob
@@ -29,6 +28,7 @@ CLICKED = 10.0
 TRACKED = 1.0
 SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
 STRANGE_SIZE = 2.5
+SECOND_HAND = 3
 STRANGE_SHARE = 0.6
 STRANGE_FILL = 0.3
 
@@ -95,14 +95,21 @@ def linked(a: Candidate, b: Candidate) -> bool:
 
 
 def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
-    """The markers among the candidates: marker row -> candidate. A marker without a plausible blob is absent."""
+    """The markers among the candidates: marker row -> candidate. A marker without a plausible blob is absent.
+
+    The best group is a hand. Markers that it has not may be on a second hand: a group of at least `SECOND_HAND`
+    markers with skin. Less than that is clutter that happens to lie together.
+    """
     rest = list(candidates)
     while True:
         best = _best_group(rest)
         strange = [c for c in best.values() if _strange(c, [o for o in best.values() if o is not c])]
         if not strange:
-            return best
+            break
         rest = [c for c in rest if c not in strange]  # what it kept out may be the marker
+    second = _best_group([c for c in rest if c.marker not in best])
+    solid = [c for c in second.values() if c.blob.area >= SPECK and c.skin >= 2.0 * SKINLESS]
+    return best | {c.marker: c for c in solid} if len(solid) >= SECOND_HAND else best
 
 
 def _best_group(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
@@ -139,8 +146,8 @@ def _fit(candidate: Candidate, members: Sequence[Candidate]) -> float:
     others = [c for c in members if c.marker != candidate.marker and c.blob.area >= SPECK]
     if not others:
         return candidate.score + 1e-4 * candidate.blob.area
-    typical = float(np.median([c.size for c in others]))
-    u, v = float(np.median([c.blob.u for c in others])), float(np.median([c.blob.v for c in others]))
+    typical = _median([c.size for c in others])
+    u, v = _median([c.blob.u for c in others]), _median([c.blob.v for c in others])
     away = math.hypot(candidate.blob.u - u, candidate.blob.v - v) / (REACH * typical)
     return candidate.score - 0.5 * abs(math.log(candidate.size / typical)) - 0.3 * away
 
@@ -152,11 +159,17 @@ def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
     others = [c for c in others if c.blob.area >= SPECK]
     if not others or candidate.bonus >= TRACKED or candidate.skin >= SKINLESS:
         return False
-    if float(np.median([c.skin for c in others])) < 3.0 * SKINLESS:
+    if _median([c.skin for c in others]) < 3.0 * SKINLESS:
         return False
     blob = candidate.blob
     fill = blob.area / ((blob.right - blob.left) * (blob.bottom - blob.top))
-    largest, typical = max(c.blob.area for c in others), float(np.median([c.blob.area for c in others]))
+    largest, typical = max(c.blob.area for c in others), _median([c.blob.area for c in others])
     return blob.area > min(STRANGE_SIZE * typical, STRANGE_SHARE * largest) or (
         blob.area >= SPECK and fill < STRANGE_FILL
     )
+
+
+def _median(values: Sequence[float]) -> float:
+    """Median of a few numbers; numpy's takes 50 times as long for six."""
+    ordered = sorted(values)
+    return 0.5 * (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
