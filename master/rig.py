@@ -80,7 +80,11 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
         hand_file = calibration / "hands" / f"{name}.json"
         if not hand_file.exists():
             raise CalibrationError(f"{hand_file}: no such hand profile: give --hand FILE")
-    return HandModel.of(load(hand_file, HandProfile))
+    profile = load(hand_file, HandProfile)
+    try:
+        return HandModel.of(profile)
+    except CalibrationError as error:
+        raise CalibrationError(f"{hand_file}: {error}") from error
 
 
 def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = True) -> MarkerPipeline:

@@ -4,6 +4,7 @@ A finger counts as *visible* where its marker is at least half seen by two camer
 visible fingers (the palm's joints with them), and over all.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.hand_model import FINGER_JOINTS
+from master.npz import read_npz
 from master.outputs.poses import Poses
 
 _MATCH_NS = 1_000_000
@@ -52,12 +54,11 @@ def load_truth(folder: Path, shown: Bool) -> Truth | None:
     path = folder / "truth.npz"
     if not path.exists():
         return None
+    data = read_npz(path)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: np.asarray(file[name]) for name in file.files}
         return _sweep(data, shown) if "depth" in data else _hand(data)
-    except (OSError, KeyError, ValueError) as error:
-        raise RecordingError(f"{path}: {error}") from error
+    except (KeyError, ValueError, IndexError, TypeError) as error:
+        raise RecordingError(f"{path}: not the truth of a marker recording: {error}") from error
 
 
 def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
@@ -70,7 +71,8 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
 
     Returns:
         marker_mm (median over markers seen at least half by two cameras), marker_raw_mm (the same before the
-        filter), marker_count, joint_mm, joint_mm_visible, pip_deg, pip_deg_visible, frames_without_pose.
+        filter), markers_missed (such markers not found), joint_mm, joint_mm_visible, pip_deg, pip_deg_visible,
+        frames_without_pose.
         A score with nothing to average is left out.
     """
     rows, columns = _match(poses.t_ns, truth.t_ns)
@@ -96,9 +98,9 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
     return out
 
 
-def _put(out: dict[str, float], name: str, values: Float, reduce: object) -> None:
+def _put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:
     if values.size:
-        out[name] = round(float(np.median(values) if reduce is np.median else np.mean(values)), 4)
+        out[name] = round(float(np.asarray(reduce(values))), 4)
 
 
 def _fingers_clear(clear: Bool, fingers: tuple[int, ...]) -> Bool:

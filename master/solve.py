@@ -11,10 +11,10 @@ from typing import cast
 
 import numpy as np
 
-from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording
 from common.messages import HandPose, MarkerDetections
+from master.npz import read_npz
 from master.outputs.files import PosesFile
 from master.outputs.poses import Poses
 from master.rig import RigSetup, build_pipeline
@@ -119,17 +119,17 @@ def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
 
 def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
     path = folder / f"detections_{camera}.npz"
+    fix = f"run `phalanx-slave detect` for camera {camera!r} first"
+    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix)
     try:
-        with np.load(path, allow_pickle=False) as file:
-            t_ns: Int = np.asarray(file["t_ns"], dtype=np.int64)
-            seq: Int = np.asarray(file["seq"], dtype=np.int64)
-            uv: Float = np.asarray(file["uv"], dtype=np.float64)
-            area: Float = np.asarray(file["area_px2"], dtype=np.float64)
-            quality: Float = np.asarray(file["quality"], dtype=np.float64)
-    except (OSError, KeyError, ValueError) as error:
+        t_ns, seq = (data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq"))
+        uv, area, quality = (data[name].astype(np.float64) for name in ("uv", "area_px2", "quality"))
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"{path}: {error}: {fix}") from error
+    if t_ns.ndim != 1 or seq.shape != t_ns.shape:
         raise RecordingError(
-            f"{path}: {error}: run `phalanx-slave detect` for camera {camera!r} first"
-        ) from error
+            f"{path}: t_ns and seq have shapes {t_ns.shape} and {seq.shape}, expected one (T,)"
+        )
     if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
     for row in range(len(t_ns)):
