@@ -19,6 +19,7 @@ WIRE_VERSION = 1
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
+MAX_PREVIEW_BYTES = 256 * 1024
 
 # The look-ahead: in Python `$` also matches before a final line feed, and names become keys and file names.
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
@@ -159,11 +160,31 @@ class Command(Message, frozen=True, eq=False, tag=True):
     verb: Name
 
 
-AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command
+class Preview(Message, frozen=True, eq=False, tag=True):
+    """What a camera sees, small, for the eyes of whoever asked. Nothing is measured in it.
 
+    Attributes:
+        camera: Camera name.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock.
+        jpeg: A whole JPEG file of the view, usually of half the camera's width and height.
+    """
+
+    camera: Name
+    t_ns: TimeNs
+    jpeg: Annotated[bytes, Meta(max_length=MAX_PREVIEW_BYTES)]
+
+    def __post_init__(self) -> None:
+        if len(self.jpeg) > MAX_PREVIEW_BYTES or not self.jpeg.startswith(_JPEG_START):
+            raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_PREVIEW_BYTES}")
+
+
+AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command | Preview
+
+_JPEG_START = b"\xff\xd8\xff"
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
-    MarkerDetections | HandPose | Health | Command, dec_hook=lambda kind, raw: _from_bytes(kind, raw)
+    MarkerDetections | HandPose | Health | Command | Preview,
+    dec_hook=lambda kind, raw: _from_bytes(kind, raw),
 )
 
 

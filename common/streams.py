@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from common.messages import Command, HandPose, Health, MarkerDetections, Message
+from common.messages import Command, HandPose, Health, MarkerDetections, Message, Preview
 
 
 class Path(StrEnum):
@@ -36,10 +36,12 @@ STREAMS = {
     "markers": Stream(MarkerDetections, Path.DATAGRAM, None, 90.0, True),
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", 90.0, True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", 1.0, True),
+    "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", 10.0, False),
     "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", 0.0, False),
 }
 
 ALIVE_KEY = "phalanx/alive/{name}"
+MASTER = "master"  # its name on the bus
 
 
 def key_of(stream: str, name: str) -> str:

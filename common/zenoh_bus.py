@@ -29,6 +29,7 @@ SCHEMES = ("tcp", "tls", "quic")
 LEASE_MS = 1000
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 MAX_MESSAGE_BYTES = 1 << 20
+CLIENT_TIMEOUT_MS = 500
 ASK_AGAIN_S = 0.05
 JOIN_S = 1.0
 LIVELINESS_TIMEOUT_S = 0.5
@@ -45,19 +46,26 @@ class ZenohBus:
     holds again once the peer is back.
     """
 
-    def __init__(self, listen: str | None, connect: str | None) -> None:
+    def __init__(self, listen: str | None, connect: str | None, *, beyond: bool = False) -> None:
         """Listen on an endpoint, connect to one, or both; for example `tcp/127.0.0.1:47802`.
 
+        With `beyond`, this process sees and asks also those that are connected to the one it connects to:
+        a viewer at the master reaches the slaves. It is a client then, listens nowhere, and that one must be there.
+
         Raises:
-            BusError: An endpoint is malformed or not tcp, tls or quic, or its address is taken.
+            BusError: An endpoint is malformed or not tcp, tls or quic, or its address is taken; with `beyond`,
+                nobody listens there yet.
         """
         ends = (("listening on", listen), ("connecting to", connect))
         self._where = ", ".join(f"{what} {endpoint}" for what, endpoint in ends if endpoint)
         try:
-            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(_settings(listen, connect))))
+            self._session = zenoh.open(
+                zenoh.Config.from_json5(json.dumps(_settings(listen, connect, beyond)))
+            )
         except zenoh.ZError as error:
             raise BusError(
-                f"cannot open the bus ({self._where or 'no endpoint'}): {error}. Is the address taken or mistyped?"
+                f"cannot open the bus ({self._where or 'no endpoint'}): {error}. "
+                + ("Is the master running?" if beyond else "Is the address taken or mistyped?")
             ) from error
         self._inboxes: list[Inbox] = []
         self._undeclare: list[Callable[[], None]] = []
@@ -197,7 +205,7 @@ class ZenohBus:
         return text + f"{self.peers} connected, alive: {names}. Is the target running and named so?"
 
 
-def _settings(listen: str | None, connect: str | None) -> dict[str, object]:
+def _settings(listen: str | None, connect: str | None, beyond: bool) -> dict[str, object]:
     """Return zenoh's configuration: everything that is not safe or quick by default is set here."""
     endpoints = [endpoint for endpoint in (listen, connect) if endpoint is not None]
     for endpoint in endpoints:
@@ -206,11 +214,14 @@ def _settings(listen: str | None, connect: str | None) -> dict[str, object]:
                 f"bus endpoint {endpoint!r}: must begin with {', '.join(s + '/' for s in SCHEMES)}"
             )
     return {
-        "mode": "peer",
+        # A peer passes messages between its clients and its peers, never from one peer to another.
+        "mode": "client" if beyond else "peer",
         "listen": {"endpoints": [listen] if listen else [], "exit_on_failure": True},
         "connect": {
             "endpoints": [connect] if connect else [],
-            "timeout_ms": -1,  # 0 would try once and give up for ever; either way `open` returns after 0.5 s
+            # A client that has not found its peer is no session at all: zenoh gives up after this, or never returns.
+            # For a peer 0 would try once and give up for ever; `open` returns after 0.5 s in any case.
+            "timeout_ms": CLIENT_TIMEOUT_MS if beyond else -1,
             "exit_on_failure": False,
             "retry": RETRY,
         },

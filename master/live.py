@@ -11,6 +11,7 @@ from pathlib import Path
 from common.bus import Bus
 from common.clock import Clock, SystemClock
 from common.messages import Command, Health
+from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
 from master.ingest import Ingest
@@ -21,7 +22,6 @@ from master.rig import RigSetup, build_pipeline
 from master.solve import write_json
 from master.stages import StageTimes
 
-NAME = "master"
 _REPORT_S = 1.0
 
 _log = logging.getLogger(__name__)
@@ -101,8 +101,8 @@ def run_live(
                 stop.set()
             return report()
 
-        bus.announce(NAME)
-        bus.serve(NAME, obey)
+        bus.announce(MASTER)
+        bus.serve(MASTER, obey)
         reporter = threading.Thread(
             target=_report, args=(bus, ingest, figures, report, stop, say), daemon=True
         )
@@ -136,7 +136,7 @@ def _report(
     started = False
     poses = 0
     while not stop.wait(_REPORT_S):
-        bus.publish("health", NAME, report())
+        bus.publish("health", MASTER, report())
         if ingest.connected != connected:
             connected = ingest.connected
             say(f"cameras: {', '.join(sorted(connected)) or 'none yet'}")

@@ -1,8 +1,9 @@
 """The viewer, in a process of its own: reads hands and health from the bus and never slows the tracking.
 
-It only subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses
-pictures, not poses. The native and the web viewer are child processes that listen on 127.0.0.1 only, with
-a memory limit and with their makers' usage statistics switched off (docs/viewer.md).
+It subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses pictures,
+not poses; the only thing it says is "preview" to the cameras, which then show themselves for three seconds.
+The native and the web viewer are child processes that listen on 127.0.0.1 only, with a memory limit and with
+their makers' usage statistics switched off (docs/viewer.md).
 """
 
 import logging
@@ -10,9 +11,10 @@ import os
 import tempfile
 import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import rerun as rr
 
@@ -22,8 +24,10 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
 from common.hand_model import HandModel
-from common.messages import HandPose, Health, MarkerDetections
+from common.messages import HandPose, Health, MarkerDetections, Message, Preview
+from common.streams import MASTER
 from master.outputs.poses import Poses
+from master.outputs.previews import PreviewAsker
 from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
@@ -37,9 +41,32 @@ _IDLE_S = 0.1
 _FLUSH_PERIOD_NS = 1_000_000_000
 _FLUSH_TIMEOUT_S = 5.0
 _DEPTH = 256
+_PREVIEW_DEPTH = 16
 _ROWS_A_CHUNK = 512
 
 _log = logging.getLogger(__name__)
+_Kind = TypeVar("_Kind", bound=Message)
+
+
+@dataclass(frozen=True, slots=True)
+class _Feeds:
+    """What comes from the bus."""
+
+    hands: Subscription
+    reports: Subscription
+    pictures: Subscription
+
+    @classmethod
+    def of(cls, bus: Bus) -> "_Feeds":
+        return cls(
+            bus.subscribe("hand", depth=_DEPTH),
+            bus.subscribe("health", depth=_DEPTH),
+            bus.subscribe("preview", depth=_PREVIEW_DEPTH),
+        )
+
+    def close(self) -> None:
+        for feed in (self.hands, self.reports, self.pictures):
+            feed.close()
 
 
 def run_viewer(
@@ -57,7 +84,7 @@ def run_viewer(
     """Show what is on the bus until `stop` is set or the viewer's window is closed.
 
     Args:
-        bus: Where stream "hand" and "health" are published; only read, and left open.
+        bus: Where hands, health and previews are published and the cameras can be asked; left open.
         rig, cameras, hand: What is tracked; `cameras` by name, with intrinsics.
         mode: "spawn" a window, serve the "web" viewer on 127.0.0.1, or "save" an .rrd.
         path: The .rrd of mode "save"; None otherwise.
@@ -76,15 +103,15 @@ def run_viewer(
     """
     if (mode == "save") != (path is not None):
         raise ValueError(f"mode {mode!r} with path {path}: a path belongs to mode 'save' and only to it")
-    hands, reports = bus.subscribe("hand", depth=_DEPTH), bus.subscribe("health", depth=_DEPTH)
-    try:
-        with _opened(mode, path, web_port, on_ready) as (recording, alive):
-            recording.send_blueprint(blueprint(rig, live=mode != "save", with_truth=False))
-            scene = RerunScene(recording, rig, cameras, hand)
-            return _pump(scene, recording, hands, reports, lambda: alive() and not stop.is_set())
-    finally:
-        hands.close()
-        reports.close()
+    with ExitStack() as stack:
+        feeds = _Feeds.of(bus)
+        stack.callback(feeds.close)
+        recording, alive = stack.enter_context(_opened(mode, path, web_port, on_ready))
+        recording.send_blueprint(blueprint(rig, _rate_hz(cameras), live=mode != "save", with_truth=False))
+        scene = RerunScene(recording, rig, cameras, hand)
+        asker = PreviewAsker(bus, rig.cameras)
+        stack.callback(asker.close)
+        return _pump(scene, recording, feeds, lambda: alive() and not stop.is_set())
 
 
 def write_rrd(
@@ -111,7 +138,7 @@ def write_rrd(
         RecordingError: The file cannot be written; nothing half written is left.
     """
     with _saved(path) as recording:
-        recording.send_blueprint(blueprint(rig, live=False, with_truth=truth is not None))
+        recording.send_blueprint(blueprint(rig, _rate_hz(cameras), live=False, with_truth=truth is not None))
         scene = RerunScene(recording, rig, cameras, hand)
         for start in range(0, len(poses), _ROWS_A_CHUNK):
             stop = min(start + _ROWS_A_CHUNK, len(poses))
@@ -122,25 +149,25 @@ def write_rrd(
             scene.log_image(camera, image, t_ns)
 
 
-def _pump(
-    scene: RerunScene,
-    recording: rr.RecordingStream,
-    hands: Subscription,
-    reports: Subscription,
-    go_on: Callable[[], bool],
-) -> int:
+def _pump(scene: RerunScene, recording: rr.RecordingStream, feeds: _Feeds, go_on: Callable[[], bool]) -> int:
     """Move messages from the bus to the scene while `go_on`, and the last ones after it."""
     shown, flush_ns, going = 0, now_ns(), True
+    at_ns: int | None = None  # newest time of the master, on whose clock the timeline is
     while going:
         going = go_on()
-        received = _waiting(reports)  # before the poses: a report never overtakes a pose sent before it
-        for poses in _by_hand(_drain(hands)):
+        # Before the poses: a report or picture never overtakes a pose sent before it.
+        reports, pictures = _waiting(feeds.reports, Health), _waiting(feeds.pictures, Preview)
+        for health in reports:
+            at_ns = health.t_ns if health.source == MASTER else at_ns
+        for poses in _by_hand(_drain(feeds.hands)):
             scene.log_poses(poses)
             shown += len(poses)
-        for health in received:
-            # A health report has the clock of its sender; the timeline has the master's.
             at_ns = scene.last_t_ns
-            scene.log_health(health, health.t_ns if at_ns is None else at_ns)
+        if at_ns is not None:  # the slaves' clocks are their own: what they send stands at the master's time
+            for health in reports:
+                scene.log_health(health, at_ns)
+            for picture in pictures:
+                scene.log_image(picture.camera, picture.jpeg, picture.t_ns, at_ns)
         if now_ns() - flush_ns > _FLUSH_PERIOD_NS:
             # The SDK queues without bound towards a viewer that hangs; one second's data is the bound here.
             _flush(recording)
@@ -148,13 +175,18 @@ def _pump(
     return shown
 
 
-def _waiting(reports: Subscription) -> list[Health]:
-    """The health reports that have arrived."""
-    received: list[Health] = []
-    while (message := reports.get(0.0)) is not None:
-        if isinstance(message, Health):
+def _waiting(feed: Subscription, kind: type[_Kind]) -> list[_Kind]:
+    """The messages that have arrived."""
+    received: list[_Kind] = []
+    while (message := feed.get(0.0)) is not None:
+        if isinstance(message, kind):
             received.append(message)
     return received
+
+
+def _rate_hz(cameras: Mapping[str, CameraCalibration]) -> float:
+    """Frame rate of the fastest camera."""
+    return max((camera.frame_rate_hz for camera in cameras.values()), default=0.0)
 
 
 def _drain(hands: Subscription) -> list[HandPose]:

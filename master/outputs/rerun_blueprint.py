@@ -10,16 +10,21 @@ from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
 TIMELINE = "capture"
 WORLD = "world"
 
-_PLOTS = (
-    ("Latency [ms]", "plots/latency_ms"),
-    ("Rate [Hz]", "plots/rate_hz"),
-    ("Error against the truth [mm]", "plots/error_mm"),
-    ("Marker: raw to filtered [mm]", "plots/jitter_mm"),
-    ("PIP flexion (thumb MCP) [deg]", "plots/pip_deg"),
-    ("Joints tracked, markers seen", "plots/seen"),
-    ("Health", "plots/health"),
+_RATE = "Rate [poses/s]"
+# title, entity, range of the axis (None: as the data is), whether its lines need a legend
+_PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
+    ("Latency [ms]", "plots/latency_ms", (0.0, 60.0), False),
+    (_RATE, "plots/rate_hz", None, False),
+    ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
+    ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
+    ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
+    ("Joints tracked, markers seen", "plots/seen", (0.0, 30.0), True),
+    ("Health", "plots/health", None, True),
 )
-_EYE_HEIGHT_M, _EYE_BACK_M, _HAND_M = 0.12, 0.18, 0.42
+_TABS = 4  # the last so many share one place
+_BACKGROUND = rrb.Background(color=(22, 24, 28))
+# Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
+_EYE_M, _TARGET_M = (0.22, -0.13, -0.03), (0.02, 0.02, 0.36)
 _PLOT_SPAN_S = 10.0
 
 
@@ -28,11 +33,12 @@ def camera_path(camera: str) -> str:
     return rr.new_entity_path([WORLD, "cameras", camera])
 
 
-def blueprint(rig: RigCalibration, *, live: bool, with_truth: bool) -> rrb.Blueprint:
+def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bool) -> rrb.Blueprint:
     """The saved layout for `rig`; plots follow the last 10 s of a live run and show all of a recorded one.
 
     Args:
         rig: Names the cameras.
+        rate_hz: Of the fastest camera; sets the range of that plot.
         live: The data streams in.
         with_truth: There is a truth to show errors against.
     """
@@ -41,28 +47,41 @@ def blueprint(rig: RigCalibration, *, live: bool, with_truth: bool) -> rrb.Bluep
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SPAN_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    eye = rrb.EyeControls3D(
-        position=(0.25, -_EYE_HEIGHT_M, -_EYE_BACK_M),
-        look_target=(0.04, 0.0, _HAND_M),
-        eye_up=(0.0, -1.0, 0.0),
+    eye = rrb.EyeControls3D(position=_EYE_M, look_target=_TARGET_M, eye_up=(0.0, -1.0, 0.0))
+    scene = rrb.Spatial3DView(
+        origin=WORLD,
+        name="Hand and rig",
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=eye,
     )
-    scene = rrb.Spatial3DView(origin=WORLD, name="Hand and rig", eye_controls=eye)
     cameras = [
-        rrb.Spatial2DView(origin=camera_path(name), contents=["$origin/**", f"{WORLD}/hand/**"], name=name)
+        rrb.Spatial2DView(
+            origin=camera_path(name),
+            contents=["$origin/**", f"{WORLD}/hand/**"],
+            name=f"Camera {name}",
+            background=_BACKGROUND,
+        )
         for name in rig.cameras
     ]
+    rows = [(n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several) for n, p, r, several in _PLOTS]
     plots = [
-        rrb.TimeSeriesView(origin=path, name=name, time_ranges=span if live else None)
-        for name, path in _PLOTS
+        rrb.TimeSeriesView(
+            origin=path,
+            name=name,
+            time_ranges=span if live else None,
+            axis_y=None if fixed is None else rrb.ScalarAxis(range=fixed),
+            plot_legend=rrb.PlotLegend(visible=several, corner=rrb.Corner2D.LeftTop),
+        )
+        for name, path, fixed, several in rows
         if with_truth or path != "plots/error_mm"
     ]
-    legend = rrb.TextDocumentView(origin="about", name="Colours")
+    legend_view = rrb.TextDocumentView(origin="about", name="Colours")
+    tabs = rrb.Tabs(*plots[-_TABS:], legend_view, active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, rrb.Horizontal(*cameras), row_shares=[3, 1.4]),
-            rrb.Vertical(
-                rrb.Tabs(*plots[-3:], legend, active_tab=0), *plots[:-3], row_shares=[1] * (len(plots) - 2)
-            ),
+            rrb.Vertical(scene, rrb.Horizontal(*cameras), row_shares=[3, 2]),
+            rrb.Vertical(tabs, *plots[:-_TABS], row_shares=[1.5] + [1] * (len(plots) - _TABS)),
             column_shares=[3, 2],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE),
@@ -81,5 +100,5 @@ def legend() -> str:
         + "\n- **red joint**: an angle is at its limit\n- **thin grey hand**: the truth, where it is known\n"
         "- **small dim / large bright markers**: before / after the filter\n"
         "- **ellipsoids**: 2 sigma of the finger tips\n"
-        "- camera views draw the hand without lens distortion"
+        "- camera views: dots are the markers as triangulated, the hand is drawn without lens distortion"
     )

@@ -2,10 +2,11 @@
 
 Poses are logged as columns, a batch at a time, so that a live viewer (2 or 3 poses a batch) and a file
 of a whole run take the same path. Every row stands on the timeline "capture" at its `t_ns`.
-The scene holds the times of the last second (rate) and of the last image of each camera (10 Hz limit).
+The scene holds the times of the last second (rate), and time and size of the last image of each camera.
 
     about                                text: what the colours mean
-    world/cameras/CAM                    place, pinhole, image; /detections: centroids
+    world/cameras/CAM                    place, pinhole; /image; /markers: the raw caps as this camera should see them;
+                                         /detections: centroids as it saw them, where they are known
     world/hand/HAND/skeleton             5 finger strips and the palm, coloured by source
     world/hand/HAND/joints               valid joints, bright = tracked; /at_limit: angle at its limit
     world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips
@@ -31,6 +32,7 @@ from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
 from common.messages import Health, MarkerDetections, Source
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
 from master.outputs.poses import Poses
+from master.outputs.previews import jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
 from master.outputs.truth import Truth, distance_m, mean_known
 
@@ -42,9 +44,11 @@ _HINGE_OF_ANGLE = np.array(
     [[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS]
 )  # joint that angle (5, 4) turns
 _PIP = 2
+_MARKER_PX = 3.0
 _JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
 _AT_LIMIT_RAD = np.deg2rad(0.5)
 _JPEG_QUALITY = 80
+_FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0006, 0.015
 
 
 class RerunScene:
@@ -68,6 +72,7 @@ class RerunScene:
         self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
         self._recent_ns: Int = np.empty(0, np.int64)
         self._image_ns: dict[str, int] = {}
+        self._image_size: dict[str, tuple[int, int]] = {}
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
         recording.log("about", rr.TextDocument(legend(), media_type="text/markdown"), static=True)
         for name, model in self._models.items():
@@ -108,27 +113,40 @@ class RerunScene:
             seen.sum(axis=1),
         )
 
-    def log_image(self, camera: str, image: Image | bytes, t_ns: int) -> bool:
-        """Show an image of a camera; more than 10 a second are left out.
+    def log_image(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
+        """Show an image of a camera at its full size, however small it is.
+
+        More than 10 a second are left out, and so are images of a camera that the rig does not have, and
+        bytes that are no JPEG.
 
         Args:
             camera: A camera of the rig.
             image: (H, W, 3) BGR, (H, W) grey, or a whole JPEG file as bytes.
             t_ns: Capture time [ns].
+            shown_ns: Where it stands on the timeline [ns]; None: at `t_ns`.
 
         Returns:
             Whether it was logged.
         """
         last = self._image_ns.get(camera)
+        size = jpeg_size(image) if isinstance(image, bytes) else (image.shape[1], image.shape[0])
         if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
+            return False
+        if size is None or camera not in self._models:
             return False
         self._image_ns[camera] = t_ns
         if isinstance(image, bytes):
             jpeg = image
         else:
             jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns, "ns"))
-        self._rec.log(camera_path(camera), rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        path, model = f"{camera_path(camera)}/image", self._models[camera]
+        if self._image_size.get(camera) != size:
+            # The pinhole and all centroids are in pixels of the camera; a preview has fewer.
+            scale = [model.width_px / size[0], model.height_px / size[1], 1.0]
+            self._rec.log(path, rr.Transform3D(scale=scale), static=True)
+            self._image_size[camera] = size
+        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns if shown_ns is None else shown_ns, "ns"))
+        self._rec.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         return True
 
     def log_health(self, health: Health, t_ns: int) -> None:
@@ -145,10 +163,16 @@ class RerunScene:
             image_from_camera=matrix,
             resolution=(model.width_px, model.height_px),
             camera_xyz=rr.ViewCoordinates.RDF,
-            image_plane_distance=0.08,
+            image_plane_distance=_FRUSTUM_M,
+            color=TRUTH_RGB,
+            line_width=_FRUSTUM_LINE_M,
         )
         self._rec.log(
-            path, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]), pinhole, static=True
+            path,
+            rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
+            rr.TransformAxes3D(_AXES_M),
+            pinhole,
+            static=True,
         )
 
     def _log_hand(self, root: str, poses: Poses) -> None:
@@ -213,6 +237,12 @@ class RerunScene:
                 colors=np.full(len(rays), pack([RAY_RGB], alpha=110)[0]),
             )
             self._send(rr.new_entity_path([WORLD, "rays", name]), poses.t_ns, columns, seen.sum(axis=1))
+            uv = model.project(raw) + _PIXEL_CENTRE
+            there = _seen(uv)
+            points = rr.Points2D.columns(
+                positions=uv[there], colors=colours[there], radii=np.full(there.sum(), _MARKER_PX)
+            )
+            self._send(f"{camera_path(name)}/markers", poses.t_ns, points, there.sum(axis=1))
 
     def _log_plots(self, poses: Poses) -> None:
         t = poses.t_ns
@@ -268,9 +298,8 @@ class RerunScene:
         self._send(path, t_ns, columns, shown.sum(axis=1))
 
     def _scalars(self, path: str, t_ns: Int, values: Float) -> None:
-        known = ~np.isnan(values)
-        if known.any():
-            self._send(path, t_ns[known], rr.Scalars.columns(scalars=values[known]), None)
+        # NaN is sent as such: the viewer breaks the line there, and would bridge a missing row.
+        self._send(path, t_ns, rr.Scalars.columns(scalars=values), None)
 
     def _send(self, path: str, t_ns: Int, columns: rr.ComponentColumnList, lengths: Int | None) -> None:
         """Send rows at `t_ns`; `lengths` (T,) instances each (0 clears the last row), None: one each."""

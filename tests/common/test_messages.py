@@ -16,12 +16,14 @@ from common.messages import (
     FINGER_COUNT,
     JOINT_COUNT,
     MAX_MARKERS,
+    MAX_PREVIEW_BYTES,
     AnyMessage,
     Command,
     HandPose,
     Health,
     MarkerDetections,
     Message,
+    Preview,
     Source,
     decode,
     encode,
@@ -80,6 +82,9 @@ healths = st.builds(
     gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names)
+previews = st.builds(
+    Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: b"\xff\xd8\xff" + tail)
+)
 
 
 def sample_pose(markers: int = 6) -> HandPose:
@@ -111,6 +116,7 @@ SAMPLES: tuple[Message, ...] = (
     sample_pose(),
     Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}),
     Command("left", "stop"),
+    Preview("left", 2, b"\xff\xd8\xff\xe0jpeg"),
 )
 
 
@@ -130,7 +136,7 @@ def as_map(message: Message) -> dict[str, object]:
     return msgspec.msgpack.decode(encode(message), type=dict[str, object])
 
 
-@given(st.one_of(detections(), hand_poses(), healths, commands))
+@given(st.one_of(detections(), hand_poses(), healths, commands, previews))
 def test_round_trip_keeps_every_bit(message: Message) -> None:
     wire = encode(message)
     assert_same(decode(wire), message)
@@ -202,6 +208,10 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (2, {"gauges": {"rate_hz": float("inf")}}),
         (2, {"gauges": {"a b": 1.0}}),
         (3, {"verb": ""}),
+        (4, {"jpeg": b""}),
+        (4, {"jpeg": b"GIF89a"}),
+        (4, {"jpeg": "text"}),
+        (4, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 2)}),
     ],
 )
 def test_one_wrong_field_is_refused(sample: int, change: dict[str, object]) -> None:
@@ -301,6 +311,13 @@ def test_hundred_thousand_random_and_mutated_byte_strings_raise_nothing_else() -
 @given(st.binary(max_size=300))
 def test_any_bytes_are_a_message_or_a_message_error(data: bytes) -> None:
     check_total(data)
+
+
+def test_the_largest_preview_travels_and_one_byte_more_does_not() -> None:
+    jpeg = b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 3)
+    assert_same(decode(encode(Preview("left", 1, jpeg))), Preview("left", 1, jpeg))
+    with pytest.raises(ValueError, match="jpeg: 262145 bytes"):
+        Preview("left", 1, jpeg + b"\0")
 
 
 def test_constructors_refuse_what_does_not_fit() -> None:

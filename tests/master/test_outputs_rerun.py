@@ -3,6 +3,7 @@ import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import rerun as rr
@@ -15,7 +16,7 @@ from common.errors import PhalanxError, RecordingError
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import JOINTS, TIPS, HandModel
 from common.hand_profiles import generated_profile
-from common.messages import HandPose, Health, MarkerDetections, Source
+from common.messages import Command, HandPose, Health, MarkerDetections, Preview, Source
 from master.outputs.bus import BusSink
 from master.outputs.poses import Poses
 from master.outputs.rerun import run_viewer, write_rrd
@@ -87,6 +88,10 @@ def moving_hand(rows: int) -> list[HandPose]:
     return poses
 
 
+def small_jpeg(width: int, height: int) -> bytes:
+    return cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
+
+
 def truth_of(poses: Poses, off_m: float) -> Truth:
     return Truth(poses.position_m + np.array([off_m, 0.0, 0.0]), poses.markers_raw_m)
 
@@ -128,10 +133,13 @@ def test_a_run_written_as_rrd_is_all_there(tmp_path: Path) -> None:
     for entity in ("markers/raw", "markers/filtered", "rays/left", "rays/right", "truth/skeleton"):
         assert rows[f"/world/{entity}"] == 6
     assert rows["/world/cameras/left/detections"] == 6
-    assert rows["/world/cameras/right"] == 1  # 83 ms of images: one at 10 Hz
+    assert rows["/world/cameras/right/image"] == 1  # 83 ms of images: one at 10 Hz
     assert rows["/plots/latency_ms"] == 6
-    assert rows["/plots/jitter_mm/middle"] == 5  # lost in one row
-    assert rows["/plots/jitter_mm/index"] == 6
+    assert rows["/world/cameras/left/markers"] == 6
+    _, jitter = column(path, "/plots/jitter_mm/middle", "scalars")
+    assert np.isnan(np.array(jitter, float).ravel()).tolist() == [
+        row == 3 for row in range(6)
+    ]  # lost in row 3
     assert rows["/plots/error_mm/joints"] == 6
     assert len(rr.chunk.RrdReader(path).blueprints()) == 1
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
@@ -158,7 +166,7 @@ def test_rows_hold_what_the_poses_say_at_their_exact_times(tmp_path: Path) -> No
     _, jitter = column(path, "/plots/jitter_mm/index", "scalars")
     np.testing.assert_allclose(np.array(jitter).ravel(), np.sqrt(3.0), rtol=1e-6)
     _, rate = column(path, "/plots/rate_hz", "scalars")
-    np.testing.assert_allclose(np.array(rate).ravel(), 60.0, rtol=1e-6)
+    np.testing.assert_allclose(np.array(rate).ravel(), [np.nan] + 5 * [60.0], rtol=1e-6)
     _, size = column(path, "/world/hand/test-hand/uncertainty", "half_sizes")
     np.testing.assert_allclose(np.sort(np.array(size[0])[0]), [0.002, 0.002, 0.006], rtol=1e-5)  # 2 sigma
 
@@ -189,10 +197,14 @@ def test_an_offline_run_has_no_latency_plot_and_an_empty_run_is_a_valid_file(tmp
 
 def test_images_are_limited_to_ten_a_second_for_each_camera() -> None:
     scene = RerunScene(rr.RecordingStream("test"), RIG, CAMERAS, MODEL)
-    image = np.zeros((8, 8), np.uint8)
+    image = np.zeros((240, 320), np.uint8)
+    jpeg = small_jpeg(320, 240)
     taken = [scene.log_image("left", image, t * 1_000_000) for t in range(0, 1000, 16)]
     assert sum(taken) == 9  # every 7th of 63 frames, 112 ms apart
-    assert scene.log_image("right", b"\xff\xd8jpeg", 1_000_000)
+    assert scene.log_image("right", jpeg, 1_000_000)
+    assert not scene.log_image("right", b"\xff\xd8\xff jpeg", 201_000_000)
+    assert not scene.log_image("wrist", jpeg, 201_000_000)
+    assert scene.log_image("right", jpeg, 201_000_000)  # what was refused did not count
     assert scene.log_image("left", image, 5)  # a replay that starts over is shown again
 
 
@@ -251,6 +263,74 @@ def test_the_viewer_records_what_the_sink_publishes_and_ends_on_stop(tmp_path: P
     assert times[0] >= 10**15
     assert value == [[60.0]]
     bus.close()
+
+
+def test_the_cameras_are_asked_and_show_themselves_in_the_recording(tmp_path: Path) -> None:
+    path = tmp_path / "live.rrd"
+    bus = LoopbackBus()
+    asked = threading.Event()
+
+    def answer(command: Command) -> Health:
+        assert command.verb == "preview"
+        asked.set()
+        return Health("left", 1, 5, {}, {})
+
+    bus.serve("left", answer)  # the right camera is not there, which keeps nothing waiting
+    pose = moving_hand(1)[0]
+    with Viewing(bus, path):
+        assert asked.wait(5.0)
+        bus.publish("hand", pose.hand, pose)
+        for i in range(4):  # 20 Hz, on the slave's own clock
+            bus.publish("preview", "left", Preview("left", 7 + i * 50_000_000, small_jpeg(320, 240)))
+        bus.publish("preview", "wrist", Preview("wrist", 7, small_jpeg(320, 240)))
+    rows = rows_of(path)
+    assert rows["/world/cameras/left/image"] == 2
+    assert "/world/cameras/wrist/image" not in rows
+    times, _ = column(path, "/world/cameras/left/image", "blob")
+    assert set(times) == {pose.t_ns}  # the timeline has the master's clock
+    bus.close()
+
+
+def test_without_a_pose_the_master_tells_the_time_and_without_a_master_nothing_is_shown(
+    tmp_path: Path,
+) -> None:
+    bus = LoopbackBus()
+    picture = Preview("left", 7, small_jpeg(320, 240))
+    with Viewing(bus, tmp_path / "alone.rrd"):
+        bus.publish("health", "left", Health("left", 1, 5, {"frames": 20}, {}))
+        bus.publish("preview", "left", picture)
+    assert not [
+        entity for entity in rows_of(tmp_path / "alone.rrd") if entity.startswith(("/world", "/plots"))
+    ]
+    with Viewing(bus, tmp_path / "master.rrd"):
+        bus.publish("health", "master", Health("master", 1, 10**12, {}, {}))
+        bus.publish("preview", "left", picture)
+    times, _ = column(tmp_path / "master.rrd", "/world/cameras/left/image", "blob")
+    assert times == [10**12]
+    bus.close()
+
+
+def test_a_small_image_fills_the_view_of_its_camera(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    poses = Poses.of(moving_hand(1))
+    write_rrd(path, poses, RIG, CAMERAS, MODEL, images=[("left", 0, small_jpeg(320, 120))])
+    chunks = [c for c in rr.chunk.RrdReader(path).stream() if c.entity_path == "/world/cameras/left/image"]
+    table = next(c for c in chunks if c.is_static).to_record_batch()
+    scale = next(name for name in table.schema.names if name.endswith("scale"))
+    assert table.column(scale).to_pylist() == [[[2.0, 4.0, 1.0]]]
+
+
+def test_markers_stand_in_the_camera_view_where_a_pinhole_sees_them(tmp_path: Path) -> None:
+    path = tmp_path / "run.rrd"
+    poses = Poses.of(moving_hand(4))
+    write_rrd(path, poses, RIG, CAMERAS, MODEL)
+    _, right = column(path, "/world/cameras/right/markers", "positions")
+    assert [len(row) for row in right] == [6, 6, 6, 5]
+    x, y, z = (poses.markers_raw_m[0] - [0.075, 0.0, 0.0]).T
+    # Rerun's pixels begin at the corner of the first, ours at its centre: 319.5 becomes 320.
+    np.testing.assert_allclose(
+        np.array(right[0]), np.stack([500.0 * x / z + 320.0, 500.0 * y / z + 240.0], axis=-1), atol=1e-3
+    )
 
 
 def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
