@@ -147,10 +147,11 @@ class RestJoint(_File, frozen=True):
 
 
 class MarkerMount(_File, frozen=True):
-    """Where a painted cap sits: the joint it is fixed to (or palm_frame) and its centroid in that frame."""
+    """Where a painted cap sits: the joint it is fixed to (or palm_frame), its centroid there, its painted length."""
 
     joint: str
     offset_m: Vector3
+    painted_m: Positive = 0.016
 
 
 Span = tuple[Number, Number]

@@ -83,10 +83,11 @@ class HandJoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Mount:
-    """Where a marker sits: joint index (None: the palm frame) and centroid in that frame (3,) [m]."""
+    """Where a marker sits: joint index (None: the palm frame), centroid in that frame (3,) [m], painted length [m]."""
 
     joint: int | None
     offset_m: Float
+    painted_m: float
 
     @property
     def finger(self) -> int | None:
@@ -343,5 +344,5 @@ def _mounts(profile: HandProfile, where: str) -> dict[str, Mount]:
         if mount.joint != PALM_FRAME and mount.joint not in WEBXR_JOINTS:
             raise CalibrationError(f"{where}: markers.{name}.joint: unknown joint {mount.joint!r}")
         joint = None if mount.joint == PALM_FRAME else JOINTS.index(mount.joint)
-        mounts[name] = Mount(joint, np.array(mount.offset_m))
+        mounts[name] = Mount(joint, np.array(mount.offset_m), mount.painted_m)
     return mounts

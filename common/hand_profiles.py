@@ -65,7 +65,12 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
     radius = {joint: round(share * hand_length_m, 6) for joint, share in _radii().items()}
     back = _vector(np.array(_BACK_MARKER) * mirror * hand_length_m)
     markers = {
-        marker: MarkerMount(joint=joint, offset_m=(0.0, 0.0, -round(_CAP_AHEAD * radius[joint], 7)))
+        marker: MarkerMount(
+            joint=joint,
+            offset_m=(0.0, 0.0, -round(_CAP_AHEAD * radius[joint], 7)),
+            # Half a sphere and the cylinder that puts the centroid there, see `master.stereo.caps`.
+            painted_m=round((2.0 - 2.0 * _CAP_AHEAD) * radius[joint], 7),
+        )
         for marker, joint in _MARKER_JOINT.items()
     }
     markers["back"] = MarkerMount(joint="palm_frame", offset_m=back)

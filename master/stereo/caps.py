@@ -14,7 +14,6 @@ from common.camera_model import CameraModel
 from common.hand_model import HandJoints, HandModel
 
 _RINGS, _SPOKES = 8, 16
-_PAINTED_M = 0.016  # the last 16 mm of a finger are painted; seen from the side that is 2 r x 16 mm
 _WHOLE_SHARE = 0.6  # seen from its end a whole cap still shows this share of that
 
 
@@ -41,6 +40,7 @@ class CapModel:
             areas.append(a)
             self._joint.append(mount.joint)
             self._marker.append(index)
+        self._painted = np.array([model.mount(markers[index]).painted_m for index in self._marker])
         self._radius = np.array([model.radius_m[joint] for joint in self._joint])
         self._points, self._normals, self._areas = np.array(points), np.array(normals), np.array(areas)
 
@@ -61,7 +61,7 @@ class CapModel:
         for c, camera in enumerate(cameras):
             distance = np.linalg.norm(points_m[self._marker] - camera.centre, axis=1)
             scale = _project_scale(camera) / distance
-            share = area_px2[c, self._marker] / (2.0 * self._radius * _PAINTED_M * scale**2)
+            share = area_px2[c, self._marker] / (2.0 * self._radius * self._painted * scale**2)
             doubt[c, self._marker] = np.maximum(_WHOLE_SHARE - share, 0.0) * self._radius * scale
         return np.nan_to_num(doubt)
 
