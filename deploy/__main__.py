@@ -41,7 +41,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     settings = DemoSettings(
-        options.seconds, options.headless, options.out, options.calibration, options.rig, options.seed, options.scene
+        options.seconds,
+        options.headless,
+        options.out,
+        options.calibration,
+        options.rig,
+        options.seed,
+        options.scene,
+        options.web,
     )
     summary = run_demo(settings, stop_on_signals(), _say)
     _finish(summary, options.json)
@@ -91,7 +98,11 @@ def _parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    demo.add_argument("--headless", action="store_true", help="no viewer; write hand.png and run.rrd")
+    view = demo.add_mutually_exclusive_group()
+    view.add_argument(
+        "--headless", action="store_true", help="no viewer; hand.png and run.rrd are always written"
+    )
+    view.add_argument("--web", action="store_true", help="the viewer as a page on 127.0.0.1, not a window")
     demo.add_argument(
         "--seconds", type=_positive, default=30.0, metavar="N", help="length (default: %(default)s)"
     )

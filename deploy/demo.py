@@ -36,12 +36,13 @@ class DemoSettings:
 
     Attributes:
         seconds: Length of the tracked run.
-        headless: No viewer; a picture and an .rrd are written instead.
+        headless: No viewer. A picture and an .rrd are written in any case.
         out: Folder for logs and results.
         calibration: calib_json tree.
         rig: Rig to simulate.
         seed: Seed of the scene.
         scene: What moves: "standard", or "leap:FILE.npz" for a recorded motion.
+        web: The viewer is a page on 127.0.0.1 instead of a window.
     """
 
     seconds: float
@@ -51,6 +52,7 @@ class DemoSettings:
     rig: str
     seed: int
     scene: str = "standard"
+    web: bool = False
 
 
 @dataclass(slots=True)
@@ -60,6 +62,8 @@ class _State:
     tracking: threading.Event = field(default_factory=threading.Event)
     rate: float = 0.0
     viewer: str | None = None
+    viewer_ended: bool = False
+    told: set[str] = field(default_factory=set[str])
 
 
 def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str], None]) -> dict[str, object]:
@@ -116,7 +120,8 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
     rows.append(("master", [sys.executable, "-m", "master", "run", *place, *address, *files], key))
     if not settings.headless:
-        rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus], key))
+        page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))] if settings.web else []
+        rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus, *page], key))
     return rows
 
 
@@ -143,7 +148,7 @@ def _listener(state: _State) -> Callable[[str, str], None]:
                 state.tracking.set()
             elif match := re.search(r"rate (\d+) poses/s", line):
                 state.rate = float(match[1])
-        elif name == "viewer" and line.startswith("master: "):
+        elif name == "viewer" and line.startswith("master: ") and "waiting" not in line:
             state.viewer = line.removeprefix("master: ")
 
     return on_line
@@ -157,11 +162,29 @@ def _wait_until_tracking(
     while not state.tracking.wait(0.1):
         if stop.is_set():
             return
-        failed = next((p for p in processes if p.ended() is not None), None)
+        _look_at_viewer(state, processes, say)
+        failed = next((p for p in processes if p.name != "viewer" and p.ended() is not None), None)
         if failed is not None or time.monotonic() > deadline:
-            late = failed or processes[-1]
+            late = failed or next(p for p in processes if p.name == "master")
             what = "ended" if failed else f"no pose after {_READY_S:.0f} s"
             raise DemoError(f"{late.name}: {what}; its last lines:\n  " + "\n  ".join(late.tail))
+
+
+def _look_at_viewer(state: _State, processes: list[Process], say: Callable[[str], None]) -> None:
+    """Say once where the viewer is, and once that it ended: nobody needs it, the run goes on without."""
+    viewer = next((p for p in processes if p.name == "viewer"), None)
+    if viewer is None:
+        return
+    line = f"viewer: {state.viewer}" if state.viewer else ""
+    if (code := viewer.ended()) is not None:
+        if not state.viewer_ended:  # its last words come a moment later
+            state.viewer_ended = True
+            return
+        reason = viewer.tail[-1].removeprefix("phalanx-master: ") if viewer.tail else f"exit code {code}"
+        line = f"no viewer: {reason}; the run goes on" if code else "the viewer was closed; the run goes on"
+    if line and line not in state.told:
+        state.told.add(line)
+        say(line)
 
 
 def _play(
@@ -177,16 +200,16 @@ def _play(
     next_line = 0.0
     while not stop.is_set() and (left := end - time.monotonic()) > 0:
         stop.wait(min(0.2, left))
+        _look_at_viewer(state, processes, say)
         for process in processes:
             if process.name == "viewer":
-                continue  # its window may be closed; the run goes on
+                continue
             if (code := process.check()) is not None:
                 say(f"{process.name} ended with code {code}: started again")
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + 1.0
             done = min(settings.seconds, max(0.0, settings.seconds - left))
-            viewer = f"  |  {state.viewer}" if state.viewer else ""
-            say(f"\r{done:4.0f} of {settings.seconds:.0f} s   {state.rate:3.0f} poses/s{viewer}")
+            say(f"\r{done:4.0f} of {settings.seconds:.0f} s   {state.rate:3.0f} poses/s")
 
 
 def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -> dict[str, object]:

@@ -102,6 +102,7 @@ def view(
     web: Annotated[
         bool, typer.Option(help="Serve the viewer to a browser on 127.0.0.1 instead of a window.")
     ] = False,
+    web_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of that page.")] = 9090,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd instead of showing anything.")] = None,
 ) -> None:
     """Show a running master in Rerun. A process of its own, which may come and go; it waits for the master."""
@@ -122,6 +123,7 @@ def view(
             mode=mode,
             path=save,
             stop=stop,
+            web_port=web_port,
             on_ready=_say,
         )
     finally:

@@ -229,9 +229,11 @@ def _opened(
         on_ready(viewer.address)
         try:
             yield recording, viewer.alive
+            viewer.check()
             if viewer.alive():
                 _flush(recording)
         except PhalanxError:
+            viewer.check()
             if viewer.alive():
                 raise
             _log.info("the viewer was closed")

@@ -7,6 +7,7 @@ Its usage statistics are switched off in a private settings folder, the user's o
 import os
 import socket
 import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -23,6 +24,8 @@ VIEWER_MEMORY = "1GB"  # the viewer drops its oldest data beyond it
 SERVER_MEMORY = "256MB"
 _START_TIMEOUT_NS = 15_000_000_000
 _END_TIMEOUT_S = 5.0
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+_FIX = "without a display use --web or --save FILE.rrd; a busy port needs another one"
 
 
 class ViewerProcess:
@@ -34,6 +37,15 @@ class ViewerProcess:
         Raises:
             PhalanxError: It ended at once (no display, port taken) or does not listen; the text has its reason.
         """
+        if (
+            web_port is None
+            and sys.platform == "linux"
+            and not any(os.environ.get(name) for name in _DISPLAYS)
+        ):
+            # The viewer would listen before it finds that out.
+            raise PhalanxError(
+                f"the viewer cannot open a window: none of {', '.join(_DISPLAYS)} is set; {_FIX}"
+            )
         self._port = _free_port()
         self._web_port = web_port
         self._folder = tempfile.TemporaryDirectory(prefix="phalanx-viewer-")
@@ -104,17 +116,20 @@ class ViewerProcess:
         """End it."""
         self.close()
 
+    def check(self) -> None:
+        """Nothing while it runs, or when its user closed it.
+
+        Raises:
+            PhalanxError: It ended by itself; the text has its reason.
+        """
+        if not self.alive() and self._child.returncode != 0:
+            last = self._errors.read_text(errors="replace").strip().splitlines()[-1:] or ["no reason given"]
+            raise PhalanxError(f"the viewer ended (exit {self._child.returncode}): {last[0]}; {_FIX}")
+
     def _wait_for(self, port: int) -> None:
         end_ns = now_ns() + _START_TIMEOUT_NS
         while now_ns() < end_ns:
-            if not self.alive():
-                reason = self._errors.read_text(errors="replace").strip().splitlines()[-1:] or [
-                    "no reason given"
-                ]
-                fix = "without a display use --web or --save FILE.rrd; a busy port needs another one"
-                raise PhalanxError(
-                    f"the viewer ended at once (exit {self._child.returncode}): {reason[0]}; {fix}"
-                )
+            self.check()
             try:
                 socket.create_connection((LOOPBACK, port), timeout=1.0).close()
                 return

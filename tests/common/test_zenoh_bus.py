@@ -184,3 +184,31 @@ def test_a_program_that_ends_without_closing_is_not_aborted(code: int) -> None:
         [sys.executable, "-c", LEFT_OPEN, str(code)], cwd=root, capture_output=True, timeout=30, check=False
     )
     assert (done.returncode, done.stderr) == (code, b"")
+
+
+def test_a_client_reaches_beyond_the_master_and_still_does_after_its_restart() -> None:
+    endpoint = free_endpoint()
+    with pytest.raises(BusError, match="Is the master running"):
+        ZenohBus(None, endpoint, beyond=True)
+    master, slave = ZenohBus(endpoint, None), ZenohBus(None, endpoint)
+    viewer, stranger = ZenohBus(None, endpoint, beyond=True), ZenohBus(None, endpoint)
+    try:
+        slave.announce("left")
+        slave.serve("left", lambda command: health("left", 7))
+        seen, unseen = viewer.subscribe("health"), stranger.subscribe("health")
+        for _ in range(2):
+            assert viewer.ask(Command("left", "report"), 10.0).counts == {"frames": 7}
+            assert until(lambda: "left" in viewer.alive())
+
+            def arrives() -> bool:
+                slave.publish("health", "left", health("left"))
+                return seen.get(0.1) is not None
+
+            assert until(arrives, 10.0)
+            master.close()
+            master = ZenohBus(endpoint, None)
+        assert unseen.get(0.1) is None  # a peer sees only the one it is connected to
+        assert "left" not in stranger.alive()
+    finally:
+        for bus in (viewer, stranger, slave, master):
+            bus.close()

@@ -383,8 +383,19 @@ def test_every_viewer_is_bound_to_this_machine_with_a_memory_limit(web_port: int
 def test_a_viewer_without_a_display_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
         monkeypatch.delenv(name, raising=False)
-    with pytest.raises(PhalanxError, match=r"viewer ended at once.*--web or --save"), ViewerProcess(None):
+    with pytest.raises(PhalanxError, match=r"cannot open a window.*--web or --save"), ViewerProcess(None):
         pass
+
+
+def test_a_viewer_whose_display_does_not_answer_is_an_error_also_when_it_began_to_listen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("DISPLAY", ":4711")
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    bus = LoopbackBus()
+    with pytest.raises(PhalanxError, match=r"viewer ended \(exit \d+\): .+--web or --save"):
+        run_viewer(bus, RIG, CAMERAS, MODEL, mode="spawn", path=None, stop=threading.Event())
+    bus.close()
 
 
 def test_the_web_viewer_takes_poses_is_closed_to_other_addresses_and_ends_on_stop() -> None:
