@@ -1,13 +1,16 @@
 """What the tests of the hand share: hands, natural random poses, cameras that see exact points."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, Intrinsics, RigCalibration
+from common.calibration import CameraCalibration, HandProfile, Intrinsics, RigCalibration, load
 from common.camera_model import CameraModel
 from common.geometry import rigid
-from common.hand_model import HandModel
+from common.hand_model import CHAINS, HandModel
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
 
@@ -105,3 +108,22 @@ def detections(camera: str, seq: int, t_ns: int, uv: Float, area_px2: float = 40
         area=np.where(seen, area_px2, np.nan),
         quality=np.where(seen, 1.0, np.nan),
     )
+
+
+def rendered(folder: Path) -> tuple[HandModel, Float, Float, Float]:
+    """Model, palm poses, rest-relative angles (N, 5, 4) and true joints of a rendered recording."""
+    meta = json.loads((folder / "truth_meta.json").read_text())
+    side = str(meta["side"])
+    model = HandModel.of(load(folder.parents[1] / "hands" / f"webxr-{side}.json", HandProfile))
+    names: list[str] = meta["angles"]
+    with np.load(folder / "truth.npz") as truth:
+        table, T, joints = truth["angles"], truth["T_palm"], truth["joints"]
+    angles = np.zeros((len(table), 5, 4))
+    angles[:, 0] = table[:, [names.index(f"thumb_{a}") for a in ("cmc_abd", "cmc_flex", "mcp", "ip")]]
+    for f, finger in enumerate(("index", "middle", "ring", "pinky"), 1):
+        for k, kind in enumerate(("mcp_abd", "mcp_flex", "pip", "dip")):
+            angles[:, f, k] = table[:, names.index(f"{finger}_{kind}")]
+        # There abduction counts from the palm's +z, here from the finger's own rest direction.
+        dx, _, dz = model.rest_position_m[CHAINS[f, 1]] - model.rest_position_m[CHAINS[f, 0]]
+        angles[:, f, 0] -= np.arctan2(model.side_sign * dx, dz)
+    return model, T, angles, joints

@@ -1,6 +1,5 @@
 """Tests of the hand model: against a naive chain, conventions worked out by hand, limits, and rendered hands."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.calibration import Couplings, HandProfile, MarkerMount, load
+from common.calibration import Couplings, HandProfile, MarkerMount
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix, rigid
 from common.hand_model import (
@@ -25,7 +24,7 @@ from common.hand_model import (
     preset_limits,
 )
 from common.hand_profiles import generated_profile
-from tests.hand_helpers import LEFT, MARKERS, RIGHT, any_rotation, palm
+from tests.hand_helpers import LEFT, MARKERS, RIGHT, any_rotation, palm, rendered
 
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 BY_SIDE = {"right": RIGHT, "left": LEFT}
@@ -289,25 +288,6 @@ def test_radii_are_complete_where_the_profile_has_none() -> None:
     assert model.radius_m[15] == pytest.approx(0.145 * 0.266 * 0.19, rel=1e-3)
     one = msgspec.structs.replace(model.profile, radius_m={"wrist": 0.03})
     assert HandModel.of(one).radius_m[1] == 0.03
-
-
-def rendered(folder: Path) -> tuple[HandModel, Float, Float, Float]:
-    """Model, palm poses, rest-relative angles (N, 5, 4) and true joints of a rendered recording."""
-    meta = json.loads((folder / "truth_meta.json").read_text())
-    side = str(meta["side"])
-    model = HandModel.of(load(folder.parents[1] / "hands" / f"webxr-{side}.json", HandProfile))
-    names: list[str] = meta["angles"]
-    with np.load(folder / "truth.npz") as truth:
-        table, T, joints = truth["angles"], truth["T_palm"], truth["joints"]
-    angles = np.zeros((len(table), 5, 4))
-    angles[:, 0] = table[:, [names.index(f"thumb_{a}") for a in ("cmc_abd", "cmc_flex", "mcp", "ip")]]
-    for f, finger in enumerate(("index", "middle", "ring", "pinky"), 1):
-        for k, kind in enumerate(("mcp_abd", "mcp_flex", "pip", "dip")):
-            angles[:, f, k] = table[:, names.index(f"{finger}_{kind}")]
-        # There abduction counts from the palm's +z, here from the finger's own rest direction.
-        dx, _, dz = model.rest_position_m[CHAINS[f, 1]] - model.rest_position_m[CHAINS[f, 0]]
-        angles[:, f, 0] -= np.arctan2(model.side_sign * dx, dz)
-    return model, T, angles, joints
 
 
 @pytest.mark.parametrize(

@@ -54,8 +54,8 @@ def interleaved(*streams: list[MarkerDetections]) -> list[MarkerDetections]:
     return sorted((m for stream in streams for m in stream), key=lambda m: m.t_ns)
 
 
-def stream(camera: str, count: int, late_ns: int = 0, **options: float) -> list[MarkerDetections]:
-    return [frame(camera, k, k * PERIOD + late_ns, **options) for k in range(count)]
+def stream(camera: str, count: int, late_ns: int = 0, row_time_us: float = 0.0) -> list[MarkerDetections]:
+    return [frame(camera, k, k * PERIOD + late_ns, row_time_us=row_time_us) for k in range(count)]
 
 
 # -- when an instant comes out -----------------------------------------------------------------------------------

@@ -1,0 +1,114 @@
+"""Tests of the live loop with a source, a clock and sinks of the test's own."""
+
+import threading
+
+import pytest
+
+from common.messages import HandPose, MarkerDetections
+from master.app import RunFigures, health, run
+from master.rig import build_pipeline
+from master.stages import StageTimes
+from tests.synthetic_run import SyntheticRun, synthetic_run
+
+
+class ScriptedSource:
+    """Gives messages in turn, with pauses (None), then sets `stop`."""
+
+    def __init__(self, messages: list[MarkerDetections | None], stop: threading.Event) -> None:
+        self._messages, self._stop = iter(messages), stop
+
+    def get(self, timeout_s: float) -> MarkerDetections | None:
+        assert timeout_s > 0
+        try:
+            return next(self._messages)
+        except StopIteration:
+            self._stop.set()
+            return None
+
+
+class ScriptedClock:
+    """The time is whatever the last message said, and 3 ms."""
+
+    t_ns = 0
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+class Collector:
+    def __init__(self) -> None:
+        self.poses: list[HandPose] = []
+
+    def write(self, pose: HandPose) -> None:
+        self.poses.append(pose)
+
+    def close(self) -> None:
+        raise AssertionError("the loop does not own its sinks")
+
+
+@pytest.fixture(scope="module")
+def short_run() -> SyntheticRun:
+    return synthetic_run(6)
+
+
+def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun) -> None:
+    stop, clock, figures = threading.Event(), ScriptedClock(), RunFigures()
+    sinks = [Collector(), Collector()]
+    script: list[MarkerDetections | None] = [
+        m for pair in zip(short_run.messages, strict=True) for m in (*pair, None)
+    ]
+    source = ScriptedSource(script, stop)
+    clock.t_ns = short_run.messages[-1].t_ns + 3_000_000
+    run(source, build_pipeline(short_run.setup, StageTimes()), sinks, clock, figures, stop)
+    assert figures.poses == len(sinks[0].poses) >= 5
+    assert [p.t_ns for p in sinks[0].poses] == [p.t_ns for p in sinks[1].poses]
+    last = sinks[0].poses[-1]
+    assert last.latency_ns == 1_000_000  # handed over 2 ms after its capture, published after 3 ms
+
+
+def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:
+    stop = threading.Event()
+    stop.set()
+    sink = Collector()
+    source = ScriptedSource(list(short_run.messages), stop)
+    run(source, build_pipeline(short_run.setup, StageTimes()), [sink], ScriptedClock(), RunFigures(), stop)
+    assert sink.poses == []
+
+
+def test_figures_are_rate_and_quantiles() -> None:
+    figures = RunFigures()
+    assert figures.summary() == {"poses": 0.0}
+    for k in range(101):
+        figures.add(1_000_000_000 + k * 20_000_000, k * 1_000_000)
+    assert figures.summary() == {
+        "poses": 101.0,
+        "poses_per_s": 50.0,
+        "latency_p50_ms": 50.0,
+        "latency_p99_ms": 99.0,
+    }
+
+
+def test_one_pose_has_no_rate() -> None:
+    figures = RunFigures()
+    figures.add(0, 4_000_000)
+    assert figures.summary() == {"poses": 1.0, "latency_p50_ms": 4.0, "latency_p99_ms": 4.0}
+
+
+def test_health_carries_counts_and_gauges() -> None:
+    figures, clock = RunFigures(), ScriptedClock()
+    figures.add(0, 4_000_000)
+    clock.t_ns = 77
+    report = health(5, clock, figures, {"left received": 9})
+    assert (report.source, report.session, report.t_ns) == ("master", 5, 77)
+    assert report.counts == {"poses": 1, "left received": 9}
+    assert report.gauges == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0}
+
+
+def test_stages_are_means_and_survive_an_error() -> None:
+    stages = StageTimes()
+    with pytest.raises(ZeroDivisionError), stages("hand"):
+        raise ZeroDivisionError
+    with stages("filter"):
+        pass
+    assert list(stages.mean_us()) == ["hand", "filter"]
+    assert all(value >= 0 for value in stages.mean_us().values())

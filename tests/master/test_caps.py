@@ -1,0 +1,127 @@
+"""Tests of the painted caps: centroids worked out by hand, and rendered hands whose true caps are known."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from common.arrays import Float
+from common.camera_model import CameraModel
+from common.frame_recording import open_recording
+from common.hand_model import HandJoints
+from master.stereo.caps import CapModel, cap_surface
+from master.stereo.triangulate import Triangulator
+from tests.hand_helpers import MARKERS, RIGHT, camera_models, natural_angles, palm, rendered, rig_file
+
+CAMERAS = tuple(camera_models(rig_file()).values())
+CAPS = CapModel(RIGHT, MARKERS)
+RADIUS_M = 0.038 * 0.19  # index tip of the generated hand; its cap's centroid lies 0.15 of it ahead
+
+
+def pointing(rotation: Float) -> HandJoints:
+    """All joints with the same orientation; caps use nothing else."""
+    return HandJoints(np.zeros((26, 3)), np.broadcast_to(rotation, (26, 3, 3)), np.eye(4))
+
+
+@given(st.floats(3e-3, 12e-3), st.floats(-0.5, 0.5))
+def test_the_sampled_centroid_is_the_profiles_point(radius_m: float, share: float) -> None:
+    """Half a sphere: r / 2 ahead of its centre; with a cylinder of length L behind: (r - L) / 2."""
+    points, normals, areas = cap_surface(radius_m, share * radius_m)
+    np.testing.assert_allclose(
+        np.average(points, axis=0, weights=areas), [0, 0, -share * radius_m], atol=1e-12
+    )
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    length = radius_m - 2 * share * radius_m
+    assert areas.sum() == pytest.approx(2 * np.pi * radius_m * (radius_m + length))
+
+
+def test_a_cap_more_pointed_than_half_a_sphere_is_taken_for_one() -> None:
+    points, _, areas = cap_surface(0.01, 0.02)
+    assert np.average(points[:, 2], weights=areas) == pytest.approx(-0.005)
+
+
+def test_a_cap_seen_from_its_end_has_no_bias_sideways() -> None:
+    points = np.tile([0.0, 0.0, 0.5], (6, 1))
+    bias = CAPS.bias_px(
+        pointing(np.eye(3)), points, CAMERAS
+    )  # -z, the finger's end, looks at the left camera
+    np.testing.assert_allclose(bias[0], 0.0, atol=1e-9)
+    assert (np.abs(bias[1, :5, 0]) > 0.01).all()  # the right one sees it from the side
+
+
+def test_a_cap_seen_from_the_side_is_seen_behind_its_centroid() -> None:
+    """Silhouette: half a disc (centroid 4 r / 3 pi ahead) and a rectangle 2 r x L behind, L = 0.7 r."""
+    disc, rectangle = np.pi / 2, 2 * 0.7
+    seen = (disc * 4 / (3 * np.pi) - rectangle * 0.35) / (disc + rectangle)
+    expected_px = (seen - 0.15) * RADIUS_M * 500.0 / 0.5
+    to_the_right = np.array(
+        [[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
+    )  # -z of the joint is +x of the rig
+    points = np.tile([0.0, 0.0, 0.5], (6, 1))
+    bias = CAPS.bias_px(pointing(to_the_right), points, CAMERAS)[0, 1]
+    # What is seen lies nearer by up to a radius, which on the axis moves nothing.
+    np.testing.assert_allclose(bias, [expected_px, 0.0], rtol=0.05, atol=1e-6)
+    assert expected_px == pytest.approx(-0.654, abs=1e-3)
+
+
+def test_a_flat_marker_and_one_not_found_have_no_bias() -> None:
+    points = np.tile([0.02, 0.01, 0.5], (6, 1))
+    points[2] = np.nan
+    bias = CAPS.bias_px(pointing(np.eye(3)), points, CAMERAS)
+    np.testing.assert_array_equal(bias[:, 5], 0.0)
+    np.testing.assert_array_equal(bias[:, 2], 0.0)
+    assert (np.abs(bias[:, 0]).max(axis=-1) > 0).all()
+
+
+def test_markers_without_caps_need_no_correction() -> None:
+    back = CapModel(RIGHT, ("back",))
+    points = np.array([[0.0, 0.0, 0.5]])
+    np.testing.assert_array_equal(back.bias_px(pointing(np.eye(3)), points, CAMERAS), np.zeros((2, 1, 2)))
+    np.testing.assert_array_equal(back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS), np.zeros((2, 1)))
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_a_bias_is_never_larger_than_a_finger_tip(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    joints = RIGHT.forward(palm(rng.uniform(-180, 180, 3)), natural_angles(rng))
+    points = rng.uniform([-0.1, -0.1, 0.3], [0.1, 0.1, 1.0], (6, 3))
+    bias_m = CAPS.bias_px(joints, points, CAMERAS) * points[:, 2:] / 500.0
+    assert (np.linalg.norm(bias_m, axis=-1) < 1.3 * RIGHT.radius_m.max()).all()
+
+
+def test_a_sliver_of_a_cap_is_doubted_and_a_whole_one_is_not() -> None:
+    points = np.tile([0.0, 0.0, 0.5], (6, 1))
+    whole_px2 = 2 * RADIUS_M * 1.7 * RADIUS_M * (500.0 / 0.5) ** 2  # painted: the sphere and 0.7 r behind it
+    doubt = CAPS.doubt_px(np.array([[whole_px2] * 6, [0.1 * whole_px2] * 6]), points, CAMERAS)
+    assert (doubt[0] == 0).all()
+    away = np.linalg.norm(points[1] - CAMERAS[1].centre)
+    scale = 500.0 / away
+    expected = (0.6 - 0.1 * (away / 0.5) ** 2) * RADIUS_M * scale
+    assert doubt[1, 1] == pytest.approx(expected)
+    assert doubt[1, 5] == 0
+    np.testing.assert_array_equal(CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS), np.zeros((2, 6)))
+
+
+@pytest.mark.parametrize("name", ["static", "flex90"])
+def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path, name: str) -> None:
+    folder = datasets / "stereo" / name
+    model, T, angles, _ = rendered(folder)
+    manifest = open_recording(folder).manifest
+    rig = manifest.marker_rig()
+    cameras = tuple(CameraModel.of(manifest.cameras[c], rig.camera_pose(c)) for c in rig.cameras)
+    caps, triangulator = CapModel(model, MARKERS), Triangulator.of(cameras)
+    with np.load(folder / "truth.npz") as truth:
+        uv, clear, centroid = truth["uv_ref"], truth["frac_ref"].min(axis=1) > 0.9, truth["paint_centroid"]
+    error_mm: dict[str, list[float]] = {"plain": [], "corrected": []}
+    for row in range(len(uv)):
+        plain = triangulator.triangulate(uv[row]).points
+        bias = caps.bias_px(model.forward(T[row], angles[row]), plain, cameras)
+        corrected = triangulator.triangulate(uv[row] - bias).points
+        fingers = clear[row] & (np.arange(6) < 5)
+        for key, points in (("plain", plain), ("corrected", corrected)):
+            error_mm[key] += list(1e3 * np.linalg.norm(points - centroid[row], axis=1)[fingers])
+    assert len(error_mm["plain"]) >= 3
+    assert np.median(error_mm["plain"]) > 2.0
+    assert np.median(error_mm["corrected"]) < 1.0

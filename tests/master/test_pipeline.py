@@ -1,0 +1,155 @@
+"""Tests of the straight line from detections to poses, on exact detections of a moving hand."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import AffineDisparityCalibration, PowerLawCalibration
+from common.hand_model import CHAINS
+from common.messages import HandPose, MarkerDetections
+from master.rig import build_pipeline
+from master.stages import StageTimes
+from master.stereo.pipeline import MarkerPipeline
+from tests.hand_helpers import MARKERS, RIGHT
+from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
+
+
+@pytest.fixture(scope="module")
+def exact_run() -> SyntheticRun:
+    return synthetic_run()
+
+
+def solve_all(pipeline: MarkerPipeline, messages: list[MarkerDetections]) -> list[HandPose]:
+    solved = [one for message in messages for one in pipeline.push(message)]
+    return [one.pose for one in solved + pipeline.flush()]
+
+
+def marker_mm(pose: HandPose, raw: bool = True) -> Float:
+    truth = RIGHT.marker_points(hand_at(pose.t_ns * 1e-9), MARKERS)
+    return 1e3 * np.linalg.norm((pose.markers_raw_m if raw else pose.markers_m) - truth, axis=1)
+
+
+def joint_mm(pose: HandPose) -> Float:
+    return 1e3 * np.linalg.norm(pose.position_m - hand_at(pose.t_ns * 1e-9).position_m, axis=1)
+
+
+def changed(message: MarkerDetections, marker: int, uv: Float) -> MarkerDetections:
+    new = message.uv.copy()
+    new[marker] = uv
+    return msgspec.structs.replace(message, uv=new)
+
+
+def test_exact_detections_give_the_hand_back(exact_run: SyntheticRun) -> None:
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, exact_run.messages)
+    assert len(poses) == 40
+    assert [p.t_ns for p in poses[:2]] == [
+        1_000_000_000 + k * PERIOD_NS + round(239.5 * 20.6e3) for k in range(2)
+    ]
+    settled = poses[3:]
+    assert np.median([marker_mm(p) for p in settled]) < 0.5
+    assert np.mean([joint_mm(p)[1:].mean() for p in settled]) < 4.0
+    assert all(p.valid.all() and p.tracked.all() for p in settled)
+    assert pipeline.counts["poses"] == 40
+    assert pipeline.counts["epipolar_misfits"] == 0
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        # Of parallel cameras: f B = 500 px * 75 mm, no offset.
+        {"depth_model": "power_law", "power_law": PowerLawCalibration(k_m=37.5, z=-1.0)},
+        {
+            "depth_model": "affine_disparity",
+            "affine_disparity": AffineDisparityCalibration(a_m_px=37.5, x0_px=0.0),
+        },
+    ],
+)
+def test_the_laws_of_a_parallel_pair_are_its_stereo_geometry(
+    exact_run: SyntheticRun, law: dict[str, object]
+) -> None:
+    run = synthetic_run(12, **law)
+    poses = solve_all(build_pipeline(run.setup, StageTimes()), run.messages)
+    stereo = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages[:24])
+    for one, other in zip(poses[3:], stereo[3:], strict=True):
+        np.testing.assert_allclose(one.markers_raw_m, other.markers_raw_m, atol=5e-4)
+        assert joint_mm(one)[1:].mean() < 5.0
+
+
+def test_rays_that_pass_each_other_are_dropped_and_counted(exact_run: SyntheticRun) -> None:
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    false = [
+        changed(m, 1, m.uv[1] + [0.0, 40.0]) if m.camera == "right" and m.seq >= 20 else m
+        for m in exact_run.messages
+    ]
+    poses = solve_all(pipeline, false)
+    assert np.isfinite(poses[15].markers_raw_m[1]).all()
+    assert all(np.isnan(p.markers_raw_m[1]).all() for p in poses[22:])
+    assert all(np.isfinite(np.delete(p.markers_raw_m, 1, axis=0)).all() for p in poses[22:])
+    assert pipeline.counts["epipolar_misfits"] >= 18
+    assert not any(p.tracked[CHAINS[1]].any() for p in poses[22:])
+
+
+def test_a_marker_one_camera_loses_is_kept_on_the_ray_of_the_other(exact_run: SyntheticRun) -> None:
+    nowhere = np.array([np.nan, np.nan])
+    half = [changed(m, 1, nowhere) if m.camera == "right" and m.seq >= 15 else m for m in exact_run.messages]
+    none = [changed(m, 1, nowhere) if m.seq >= 15 else m for m in exact_run.messages]
+    seen, unseen = (solve_all(build_pipeline(exact_run.setup, StageTimes()), m) for m in (half, none))
+    assert np.isnan(seen[30].markers_raw_m[1]).all()
+    index = CHAINS[1]
+    assert all(p.tracked[index].all() for p in seen[18:])
+    assert not any(p.tracked[index].any() for p in unseen[18:])
+    assert np.mean([joint_mm(p)[index[3]] for p in seen[18:]]) < 8.0
+    # Sideways, where one camera measures, it is as good as two.
+    sideways_mm = [
+        1e3 * abs(p.position_m[index[3]] - hand_at(p.t_ns * 1e-9).position_m[index[3]])[0] for p in seen[18:]
+    ]
+    assert np.mean(sideways_mm) < 3.0
+
+
+def test_a_silent_camera_leaves_poses_and_is_counted(exact_run: SyntheticRun) -> None:
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, [m for m in exact_run.messages if m.camera == "left" or m.seq < 10])
+    assert len(poses) == 40
+    assert pipeline.counts["instants_with_missing_camera"] >= 25
+    assert not poses[-1].tracked[CHAINS[1:, 3]].all() or not poses[-1].valid.all()
+
+
+def test_nothing_seen_at_all_is_a_pose_that_is_not_valid(exact_run: SyntheticRun) -> None:
+    blind = [
+        msgspec.structs.replace(
+            m, uv=np.full((6, 2), np.nan), area=np.full(6, np.nan), quality=np.full(6, np.nan)
+        )
+        for m in exact_run.messages[:10]
+    ]
+    poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), blind)
+    assert len(poses) == 5
+    assert not any(p.valid.any() for p in poses)
+
+
+def test_unrelated_frames_are_not_filtered(exact_run: SyntheticRun) -> None:
+    together = [
+        msgspec.structs.replace(m, t_ns=m.t_ns - (m.camera == "right") * 5_000_000)
+        for m in exact_run.messages
+    ]
+    poses = solve_all(
+        build_pipeline(exact_run.setup, StageTimes(), continuous=False), together[::20] + together[1::20]
+    )
+    for pose in poses:
+        np.testing.assert_array_equal(pose.markers_m, pose.markers_raw_m)
+
+
+def test_every_stage_is_measured(exact_run: SyntheticRun) -> None:
+    stages = StageTimes()
+    solve_all(build_pipeline(exact_run.setup, stages), exact_run.messages[:8])
+    assert set(stages.mean_us()) == {"pairing", "triangulate", "filter", "hand"}
+    assert all(value > 0 for value in stages.mean_us().values())
+
+
+def test_when_the_last_frame_was_handed_over_is_passed_on(exact_run: SyntheticRun) -> None:
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    solved = [one for m in exact_run.messages for one in pipeline.push(m)]
+    for one in solved[2:]:
+        k = (one.pose.t_ns - 1_000_000_000) // PERIOD_NS
+        assert one.ready_t_ns == 1_000_000_000 + k * PERIOD_NS + 5_000_000 + 2_000_000
