@@ -13,14 +13,14 @@ stacked products and no loop over fingers.
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.calibration import Couplings, FingerLimits, HandProfile, Limits
+from common.calibration import Couplings, HandProfile, Limits
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix
+from common.hand_presets import preset_limits, radius_share
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 WEBXR_JOINTS = (
@@ -234,39 +234,6 @@ class HandModel:
         return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
 
 
-def preset_limits(preset: Literal["K", "D"]) -> Limits:
-    """Joint limits of Kalbfleisch (K) or Digits (D), relative to the rest pose."""
-    k = preset == "K"
-    abduction = 15.0 if k else 20.0
-    thumb = _degrees((-20.0, 50.0), (-15.0, 50.0), (-10.0, 60.0), (-15.0, 85.0))
-
-    def finger(spread: float) -> FingerLimits:
-        flexion, pip, dip = (90.0, 110.0, 90.0) if k else (100.0, 120.0, 101.0)
-        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip))
-
-    side = finger(abduction)
-    return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
-
-
-def preset_couplings(preset: Literal["K", "D"]) -> Couplings:
-    """DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion."""
-    return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
-
-
-def _degrees(
-    abduction: tuple[float, float],
-    flexion: tuple[float, float],
-    pip: tuple[float, float],
-    dip: tuple[float, float],
-) -> FingerLimits:
-    def span(value: tuple[float, float]) -> tuple[float, float]:
-        return float(np.radians(value[0])), float(np.radians(value[1]))
-
-    return FingerLimits(
-        abduction_rad=span(abduction), flexion_rad=span(flexion), pip_rad=span(pip), dip_rad=span(dip)
-    )
-
-
 def _rotate(axis: int, angle: Float) -> Float:
     """Rotations (..., 3, 3) about coordinate axis 0 or 1."""
     c, s = np.cos(angle), np.sin(angle)
@@ -296,17 +263,6 @@ def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:
     return np.vstack([palm, position]), np.concatenate([rotation[:1], rotation])
 
 
-# Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
-_RADIUS_SHARE = {
-    "wrist": 0.5,
-    "metacarpal": 0.3,
-    "proximal": 0.2,
-    "intermediate": 0.175,
-    "distal": 0.16,
-    "tip": 0.145,
-}
-
-
 def _radii(profile: HandProfile, where: str) -> Float:
     joints = profile.rest_joints
     unknown = (profile.radius_m or {}).keys() - set(JOINTS)
@@ -316,10 +272,8 @@ def _radii(profile: HandProfile, where: str) -> Float:
         np.array(joints[f"middle-finger-phalanx-{part}"].position_m) for part in ("proximal", "intermediate")
     )
     length = float(np.linalg.norm(b - a))
-    default = [length * _RADIUS_SHARE["metacarpal"]]
-    default += [length * _RADIUS_SHARE[name.rsplit("-", 1)[-1]] for name in WEBXR_JOINTS]
     given = profile.radius_m or {}
-    return np.array([given.get(name, value) for name, value in zip(JOINTS, default, strict=True)])
+    return np.array([given.get(name, length * radius_share(name)) for name in JOINTS])
 
 
 def _limits(limits: Limits, where: str) -> Float:

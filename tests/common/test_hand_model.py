@@ -20,9 +20,8 @@ from common.hand_model import (
     JOINTS,
     WEBXR_JOINTS,
     HandModel,
-    preset_couplings,
-    preset_limits,
 )
+from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from tests.hand_helpers import LEFT, MARKERS, RIGHT, any_rotation, palm, rendered
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.hand_model import FINGERS, HandModel, preset_couplings, preset_limits
+from common.hand_model import FINGERS, HandModel
+from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.chain import Chain, Coupling, Link, finger_chain, nearest_reach
 from master.ik.fabrik import ChainResult, Fabrik, Reach, solve_chain, solve_finger

@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 
 from common.arrays import Float
 from common.calibration import Couplings, HandProfile, load
-from common.hand_model import FINGERS, TIPS, HandModel, preset_couplings, preset_limits
+from common.hand_model import FINGERS, TIPS, HandModel
+from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.bounded import Four
 from master.ik.finger import NOT_SEEN, FingerSolver

@@ -11,7 +11,8 @@ from common.arrays import Float
 from common.calibration import Couplings
 from common.errors import CalibrationError
 from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import TIPS, HandModel, preset_couplings, preset_limits
+from common.hand_model import TIPS, HandModel
+from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.attached import Attached
 from master.ik.hand import HandSolution, HandSolver
@@ -114,11 +115,11 @@ def test_gradient_is_the_derivative_of_the_cost(name: str, seed: int) -> None:
 # -- finding the hand -------------------------------------------------------------------------------------------
 
 
-def believed(model: HandModel, bend_deg: float = 25.0) -> tuple[Float, Priors]:
+def believed(model: HandModel) -> tuple[Float, Priors]:
     """A pose that every prior expects, and the priors with a thumb that can be like that."""
     thumb = np.radians([8.0, 8.0, 12.0, 12.0])
     angles = np.zeros((5, 4))
-    pip = np.radians(bend_deg)
+    pip = Priors().pip_mean
     assert model.dip_per_pip is not None
     angles[1:] = [0.0, model.mcp_per_pip * pip, pip, model.dip_per_pip * pip]
     angles[0] = thumb

@@ -1,0 +1,56 @@
+"""What a hand profile may leave out: joint limits and couplings as the two papers give them, and radii."""
+
+from typing import Literal
+
+import numpy as np
+
+from common.calibration import Couplings, FingerLimits, Limits
+
+# Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
+_RADIUS_SHARE = {
+    "palm": 0.3,
+    "wrist": 0.5,
+    "metacarpal": 0.3,
+    "proximal": 0.2,
+    "intermediate": 0.175,
+    "distal": 0.16,
+    "tip": 0.145,
+}
+
+
+def preset_limits(preset: Literal["K", "D"]) -> Limits:
+    """Joint limits of Kalbfleisch (K) or Digits (D), relative to the rest pose."""
+    k = preset == "K"
+    abduction = 15.0 if k else 20.0
+    thumb = _degrees((-20.0, 50.0), (-15.0, 50.0), (-10.0, 60.0), (-15.0, 85.0))
+
+    def finger(spread: float) -> FingerLimits:
+        flexion, pip, dip = (90.0, 110.0, 90.0) if k else (100.0, 120.0, 101.0)
+        return _degrees((-spread, spread), (0.0, flexion), (0.0, pip), (0.0, dip))
+
+    side = finger(abduction)
+    return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
+
+
+def preset_couplings(preset: Literal["K", "D"]) -> Couplings:
+    """DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion."""
+    return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
+
+
+def _degrees(
+    abduction: tuple[float, float],
+    flexion: tuple[float, float],
+    pip: tuple[float, float],
+    dip: tuple[float, float],
+) -> FingerLimits:
+    def span(value: tuple[float, float]) -> tuple[float, float]:
+        return float(np.radians(value[0])), float(np.radians(value[1]))
+
+    return FingerLimits(
+        abduction_rad=span(abduction), flexion_rad=span(flexion), pip_rad=span(pip), dip_rad=span(dip)
+    )
+
+
+def radius_share(joint: str) -> float:
+    """Radius of an OpenXR joint, as a share of the middle finger's proximal bone."""
+    return _RADIUS_SHARE[joint.rsplit("-", 1)[-1]]
