@@ -24,7 +24,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
 _TABS = 4  # the last so many share one place
 _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
-_EYE_M, _TARGET_M = (0.22, -0.13, -0.03), (0.02, 0.02, 0.36)
+_EYE_M, _TARGET_M = (0.2, -0.11, 0.02), (0.015, 0.015, 0.36)
 _PLOT_SPAN_S = 10.0
 
 
@@ -58,7 +58,7 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
     cameras = [
         rrb.Spatial2DView(
             origin=camera_path(name),
-            contents=["$origin/**", f"{WORLD}/hand/**"],
+            contents=["$origin/**", f"{WORLD}/hand/**", f"- {WORLD}/hand/{rig.hand}/uncertainty"],
             name=f"Camera {name}",
             background=_BACKGROUND,
         )
@@ -99,6 +99,6 @@ def legend() -> str:
         + "\n".join(lines)
         + "\n- **red joint**: an angle is at its limit\n- **thin grey hand**: the truth, where it is known\n"
         "- **small dim / large bright markers**: before / after the filter\n"
-        "- **ellipsoids**: 2 sigma of the finger tips\n"
+        "- **ellipsoids**: 2 sigma of the finger tips, where that is less than 3 cm\n"
         "- camera views: dots are the markers as triangulated, the hand is drawn without lens distortion"
     )

@@ -2,14 +2,15 @@
 
 Poses are logged as columns, a batch at a time, so that a live viewer (2 or 3 poses a batch) and a file
 of a whole run take the same path. Every row stands on the timeline "capture" at its `t_ns`.
-The scene holds the times of the last second (rate), and time and size of the last image of each camera.
+The scene holds the times of the last second (rate), time and size of the last image of each camera,
+and which entities have got their style.
 
     about                                text: what the colours mean
     world/cameras/CAM                    place, pinhole; /image; /markers: the raw caps as this camera should see them;
                                          /detections: centroids as it saw them, where they are known
     world/hand/HAND/skeleton             5 finger strips and the palm, coloured by source
     world/hand/HAND/joints               valid joints, bright = tracked; /at_limit: angle at its limit
-    world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips
+    world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips, up to 3 cm
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
     world/truth/skeleton, markers        where a truth is known
@@ -45,6 +46,8 @@ _HINGE_OF_ANGLE = np.array(
 )  # joint that angle (5, 4) turns
 _PIP = 2
 _MARKER_PX = 3.0
+_ELLIPSE_LINE_M = 0.0002
+_LARGEST_M = 0.03  # half axis of the largest ellipsoid shown
 _JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
 _AT_LIMIT_RAD = np.deg2rad(0.5)
 _JPEG_QUALITY = 80
@@ -71,6 +74,7 @@ class RerunScene:
         self._hand = hand
         self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
         self._recent_ns: Int = np.empty(0, np.int64)
+        self._styled: set[str] = set()
         self._image_ns: dict[str, int] = {}
         self._image_size: dict[str, tuple[int, int]] = {}
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
@@ -210,6 +214,8 @@ class RerunScene:
     def _log_uncertainty(self, path: str, poses: Poses) -> None:
         cov = poses.cov_m2[:, TIPS]
         known = np.isfinite(cov).all(axis=(-1, -2)) & poses.valid[:, TIPS]
+        # A cloud larger than the fingers would hide the hand; what is that uncertain is seen by its colour.
+        known[known] &= np.linalg.eigvalsh(cov[known])[:, -1] <= (_LARGEST_M / 2.0) ** 2
         variance, axes = np.linalg.eigh(cov[known])
         axes[np.linalg.det(axes) < 0, :, 0] *= -1.0  # a mirror image is no rotation
         wxyz = matrix_to_quaternion(axes)
@@ -219,6 +225,10 @@ class RerunScene:
             quaternions=np.roll(wxyz, -1, axis=-1),
             colors=np.full(known.sum(), pack([TRUTH_RGB])[0]),
         )
+        if path not in self._styled:
+            style = rr.Ellipsoids3D.from_fields(fill_mode="MajorWireframe", line_radii=_ELLIPSE_LINE_M)
+            self._rec.log(path, style, static=True)
+            self._styled.add(path)
         self._send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
 
     def _log_markers(self, poses: Poses) -> None:

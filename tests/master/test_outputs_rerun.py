@@ -333,6 +333,16 @@ def test_markers_stand_in_the_camera_view_where_a_pinhole_sees_them(tmp_path: Pa
     )
 
 
+def test_an_uncertainty_larger_than_the_fingers_is_not_drawn(tmp_path: Path) -> None:
+    pose = moving_hand(1)[0]
+    cov = pose.cov_m2.copy()
+    cov[TIPS[1]] = np.diag([1e-6, 1e-6, 0.016**2])  # 2 sigma: 32 mm
+    cov[TIPS[2]] = np.nan
+    write_rrd(tmp_path / "run.rrd", Poses.of([replace(pose, cov_m2=cov)]), RIG, CAMERAS, MODEL)
+    _, centres = column(tmp_path / "run.rrd", "/world/hand/test-hand/uncertainty", "centers")
+    np.testing.assert_allclose(np.array(centres[0]), pose.position_m[TIPS[[0, 3, 4]]], atol=1e-6)
+
+
 def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
     bus = LoopbackBus()
     pose = moving_hand(1)[0]
