@@ -51,7 +51,7 @@ _LARGEST_M = 0.03  # half axis of the largest ellipsoid shown
 _JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
 _AT_LIMIT_RAD = np.deg2rad(0.5)
 _JPEG_QUALITY = 80
-_FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0006, 0.015
+_FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0004, 0.01
 
 
 class RerunScene:
