@@ -139,10 +139,7 @@ class FingerSolver:
         Returns:
             Angles inside the limits; NaN where the target is not finite.
         """
-        root = self.root
-        x, y, z = target[0] - root[0], target[1] - root[1], target[2] - root[2]
-        if self.before is not None:
-            x, y, z = rotate_back(self.before, (x, y, z))
+        x, y, z = self._local(target)
         if near is None:
             quick = self._quick(x, y, z)
             if quick is not None:
@@ -150,6 +147,16 @@ class FingerSolver:
         if not isfinite(x + y + z):
             return NOT_SEEN
         return self._thorough((x, y, z), near)
+
+    def reachable(self, target: Vector) -> FingerSolution | None:
+        """The coupled, legal pose that hits `target` (palm frame, [m]), or None: a few microseconds either way."""
+        return self._quick(*self._local(target))
+
+    def _local(self, target: Vector) -> Vector:
+        """The target from the root, in the frame the tables are made in."""
+        root = self.root
+        here = (target[0] - root[0], target[1] - root[1], target[2] - root[2])
+        return here if self.before is None else rotate_back(self.before, here)
 
     def forward(self, angles: Four) -> Vector:
         """The point [m] in the palm frame at given angles [rad]."""

@@ -3,17 +3,18 @@
 The fit balances all markers and priors. A finger whose cap is explained within its noise stays as fitted: to pull
 it onto the last millimetre of noise costs 1.4 degrees of PIP a millimetre. Where the balance leaves a finger off by
 more than the noise allows, the palm is kept and the finger solved alone within its limits: closed form for the
-seed, FABRIK to the end.
+seed, FABRIK to the end. The thumb has four angles for three numbers, so its seed is the fit itself. A cap out of
+reach changes nothing: the fit is already the best compromise, and a search for a better one would cost a frame.
 """
 
 from dataclasses import replace
-from math import isfinite
 
 import numpy as np
 
 from common.arrays import Float
 from common.geometry import invert, transform
 from common.hand_model import HandModel
+from master.ik.chain import THUMB
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
 from master.ik.hand import HandSolution
@@ -64,7 +65,7 @@ class FingerRefiner:
             if off @ np.linalg.solve(cov_m2[marker] + _MODEL_M**2 * np.eye(3), off) < _EXPLAINED:
                 continue
             x, y, z = (float(value) for value in transform(T_palm_rig, points_m[marker]))
-            found = _solve(closed_form, fabrik, (x, y, z), angles[finger])
+            found = _solve(closed_form, fabrik, (x, y, z), angles[finger] if finger == THUMB else None)
             if found is not None:
                 angles[finger] = found
         limits = self._model.limits_rad
@@ -74,11 +75,22 @@ class FingerRefiner:
         return replace(hand, angles_rad=angles, joints=joints, residual_m=residual)
 
 
-def _solve(closed_form: FingerSolver, fabrik: Fabrik, target: Vector, now: Float) -> tuple[float, ...] | None:
-    """Angles (4,) [rad] that bring the finger to the target, or as near as the limits allow; None: no better."""
-    a, f, pip, dip = (float(value) for value in now)
-    seed = closed_form.solve(target, (a, f, pip, dip))
-    if not isfinite(seed.residual_m):
-        return None
-    result = fabrik.solve(target, ((seed[0], seed[1]), (seed[2],), (seed[3],)), closed_form.root)
-    return tuple(angle for joint in result.angles for angle in joint) if isfinite(result.residual_m) else None
+def _solve(
+    closed_form: FingerSolver, fabrik: Fabrik, target: Vector, fitted: Float | None
+) -> tuple[float, ...] | None:
+    """Angles (4,) [rad] that bring the finger onto the target; None where it cannot be reached.
+
+    Args:
+        closed_form, fabrik: The finger.
+        target: Cap [m], palm frame.
+        fitted: (4,) [rad] to start from instead of the closed form.
+    """
+    if fitted is not None:
+        a, f, pip, dip = (float(value) for value in fitted)
+    else:
+        found = closed_form.reachable(target)
+        if found is None:
+            return None
+        a, f, pip, dip = found[:4]
+    result = fabrik.solve(target, ((a, f), (pip,), (dip,)), closed_form.root)
+    return tuple(angle for joint in result.angles for angle in joint) if result.reached else None
