@@ -229,13 +229,13 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that Ctrl-C or SIGTERM sets; the second one ends this process at once."""
+    """An event that Ctrl-C, SIGTERM or a closed terminal sets; the second one ends this process at once."""
     stop = threading.Event()
 
     def on_signal(number: int, _frame: object) -> None:
         stop.set()
         signal.signal(number, signal.SIG_DFL)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, on_signal)
     return stop

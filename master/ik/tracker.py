@@ -107,7 +107,14 @@ class HandTracker:
         self._seen_ns: int | None = None
         self._memory = _Memory(model)
 
-    def push(self, t_ns: int, points_m: Float, cov_m2: Float, towards_cameras: Float) -> TrackedHand:
+    def push(
+        self,
+        t_ns: int,
+        points_m: Float,
+        cov_m2: Float,
+        towards_cameras: Float,
+        measured: Bool | None = None,
+    ) -> TrackedHand:
         """Solve one instant.
 
         Args:
@@ -115,6 +122,7 @@ class HandTracker:
             points_m: Cap centroids (M, 3) [m], rig frame; NaN: not seen.
             cov_m2: (M, 3, 3) [m^2].
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
+            measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
         """
         seen = seen_markers(points_m, cov_m2)
         last = self.last if self._continuous else None
@@ -140,7 +148,8 @@ class HandTracker:
                 self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)
         if seen.any():
             self._seen_ns = t_ns
-        bits = self._bits(t_ns, solution, seen, held=hidden is not None)
+        placed = seen if measured is None else seen & measured
+        bits = self._bits(t_ns, solution, seen, placed, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
@@ -151,7 +160,9 @@ class HandTracker:
         facing = towards_cameras if (seen & self._on_palm).any() else None
         return self._solver.solve(points_m, cov_m2, None, 0.0, None, facing)
 
-    def _bits(self, t_ns: int, solution: HandSolution | None, seen: Bool, *, held: bool) -> TrackedHand:
+    def _bits(
+        self, t_ns: int, solution: HandSolution | None, seen: Bool, placed: Bool, *, held: bool
+    ) -> TrackedHand:
         valid = np.zeros(26, dtype=bool)
         tracked = np.zeros(26, dtype=bool)
         source = np.zeros(26, dtype=np.uint8)
@@ -165,10 +176,11 @@ class HandTracker:
             palm = [0, 1, *METACARPALS]
             tracked[palm] = True
             source[palm] = Source.SOLVED
-        for f in self._finger[seen & (self._finger >= 0)]:
+        on_finger = self._finger >= 0
+        for f in self._finger[seen & on_finger]:
             tracked[CHAINS[f]] = True
             source[CHAINS[f]] = Source.SOLVED
-            source[TIPS[f]] = Source.MEASURED
+        source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
         return TrackedHand(solution, valid, tracked & valid, source)
 
 

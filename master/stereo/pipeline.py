@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
@@ -26,6 +26,9 @@ from master.stereo.triangulate import Triangulator
 Stage = Callable[[str], AbstractContextManager[None]]
 _MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0
 _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
+_HELD_DEPTH_M = (
+    0.004  # where one camera sees all there is, its depth is held: perspective alone lets it drift
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,15 +95,16 @@ class MarkerPipeline:
         if last is None:
             # The caps' tilt is not known yet: a first solution without correction tells it.
             with self._stage("hand"):
-                first = self._tracker.peek(*self._with_rays(instant, raw, cov), self._towards(raw))
+                first = self._tracker.peek(*self._with_rays(instant, raw, cov, None), self._towards(raw))
             if first is not None:
                 with self._stage("triangulate"):
                     raw, cov = self._locate(instant, first)
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
         with self._stage("hand"):
-            aims = self._with_rays(instant, markers, cov)
-            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers))
+            aims = self._with_rays(instant, markers, cov, last)
+            measured = np.isfinite(markers[:, 0])
+            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
         self.counts["poses"] += 1
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
@@ -122,31 +126,47 @@ class MarkerPipeline:
             points[misfit], cov[misfit] = np.nan, np.nan
         return points, cov
 
-    def _with_rays(self, instant: Instant, points: Float, cov: Float) -> tuple[Float, Float]:
+    def _with_rays(
+        self, instant: Instant, points: Float, cov: Float, last: HandSolution | None
+    ) -> tuple[Float, Float]:
         """Points and covariances with those markers added that only one camera sees.
 
-        Such a marker is somewhere on its ray. It is put there at the depth of the other markers, with a
-        covariance as long as a hand along the ray and as thin as a centroid across: the fit takes the two
-        numbers that were measured and no more.
+        Such a marker is somewhere on its ray. It is put there as far away as it was on the last hand, or as the
+        other markers are, with a covariance as long as a hand along the ray and as thin as a centroid across: the fit takes
+        the two numbers that were measured and no more. So tracking goes on while a camera is gone.
         """
         seen = np.isfinite(instant.uv[..., 0])
         lone = np.flatnonzero((seen.sum(axis=0) == 1) & np.isnan(points[:, 0]))
         found = points[np.isfinite(points[:, 0])]
-        if not len(lone) or not len(found):
+        if not len(lone) or (last is None and not len(found)):
             return points, cov
         points, cov = points.copy(), cov.copy()
-        middle = found.mean(axis=0)
-        for marker in lone:
-            c = int(np.argmax(seen[:, marker]))
-            camera = self._cameras[c]
-            direction = camera.ray(instant.uv[c, marker])
-            points[marker] = camera.centre + np.linalg.norm(middle - camera.centre) * direction
-            doubt = self._caps.doubt_px(instant.area, points, self._cameras)[c, marker]
-            away = float(np.linalg.norm(points[marker] - camera.centre))
-            across = np.hypot(instant.sigma_px[c, marker], doubt) * away / camera.matrix[0, 0]
-            along = np.outer(direction, direction)
-            cov[marker] = across**2 * (np.eye(3) - along) + _HAND_DEPTH_M**2 * along
+        near = np.broadcast_to(found.mean(axis=0), points.shape) if last is None else self._caps_of(last)
+        view = np.argmax(seen[:, lone], axis=0)
+        uv = instant.uv[view, lone]
+        self._place(points, lone, view, uv, near)
+        doubt = self._caps.doubt_px(instant.area, points, self._cameras)[view, lone]
+        if last is not None:
+            bias = self._caps.bias_px(last.joints, points, self._cameras)[view, lone]
+            self._place(points, lone, view, uv - bias, near)
+        depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
+        for k, marker in enumerate(lone):
+            camera = self._cameras[int(view[k])]
+            sight = points[marker] - camera.centre
+            away = float(np.linalg.norm(sight))
+            across = np.hypot(instant.sigma_px[view[k], marker], doubt[k]) * away / camera.matrix[0, 0]
+            along = np.outer(sight, sight) / away**2
+            cov[marker] = across**2 * (np.eye(3) - along) + depth_m**2 * along
         return points, cov
+
+    def _caps_of(self, hand: HandSolution) -> Float:
+        return self.model.marker_points(hand.joints, self.markers)
+
+    def _place(self, points: Float, markers: Int, view: Int, uv: Float, near: Float) -> None:
+        """Put each marker on the ray of its camera, as far away as its point of `near` (M, 3) is."""
+        for k, marker in enumerate(markers):
+            camera = self._cameras[int(view[k])]
+            points[marker] = camera.centre + np.linalg.norm(near[marker] - camera.centre) * camera.ray(uv[k])
 
     def _triangulate(self, uv: Float, sigma_px: Float) -> tuple[Float, Float, Float]:
         """Points (M, 3) [m], covariances (M, 3, 3) and reprojection residuals (M,) [px] by the rig's depth model."""
