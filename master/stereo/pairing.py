@@ -186,6 +186,8 @@ class Pairing:
     def _neighbours(self, camera: int, t_ns: int) -> list[_Sighting]:
         """Up to three sightings around the instant, nearest first, none farther away than a gap.
 
+        None at all where even the nearest is farther than the deadline: a track carried over two frames into
+        the unknown is a guess of decimetres in depth, and the ray of the camera that does see is worth more.
         Of those after the instant only the first counts (two where there are none before), as if the others had
         not yet come: what is emitted does not depend on how far a camera's messages ran ahead of another's.
         """
@@ -194,6 +196,8 @@ class Pairing:
         seen = sorted(known[: max(before + 1, 2)], key=lambda s: abs(s.centre_ns - t_ns))
         reach = self._gap_ns if self._continuous else self._deadline_ns // 2
         near = [s for s in seen if abs(s.centre_ns - t_ns) <= reach]
+        if near and abs(near[0].centre_ns - t_ns) > self._deadline_ns:
+            return []
         return near[:3] if self._continuous else near[:1]
 
 

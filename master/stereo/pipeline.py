@@ -132,8 +132,8 @@ class MarkerPipeline:
         """Points and covariances with those markers added that only one camera sees.
 
         Such a marker is somewhere on its ray. It is put there as far away as it was on the last hand, or as the
-        other markers are, with a covariance as long as a hand along the ray and as thin as a centroid across: the fit takes
-        the two numbers that were measured and no more. So tracking goes on while a camera is gone.
+        other markers are, with a covariance as long as a hand along the ray and as thin as a centroid across:
+        the fit takes the two numbers that were measured and no more. So tracking goes on while a camera is gone.
         """
         seen = np.isfinite(instant.uv[..., 0])
         lone = np.flatnonzero((seen.sum(axis=0) == 1) & np.isnan(points[:, 0]))
