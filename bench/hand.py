@@ -1,5 +1,6 @@
 """The whole-hand solver on a moving hand: time, accuracy, and what a fixed palm would cost."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,12 @@ def rows() -> list[Row]:
         error = last.joints.position_m - model.forward(T, truth).position_m
         joint_mm.append(1e3 * float(np.linalg.norm(error, axis=1).mean()))
         pip_deg.append(float(np.degrees(np.abs(last.angles_rad[1:, 2] - truth[1:, 2])).mean()))
-    assert last is not None
-    index = [0]
+    frames = itertools.cycle(points)
+    state = [last]
 
     def warm() -> object:
-        index[0] = (index[0] + 1) % (_FRAMES - 1)
-        return solver.solve(points[index[0]], cov, last, 1 / 60)
+        state[0] = solver.solve(next(frames), cov, state[0], 1 / 60)
+        return state[0]
 
     one, spread = median_us(warm, 300)
     general, general_spread = median_us(lambda: _general(model, points[0], poses[0]), 5, 1)
