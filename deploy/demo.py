@@ -199,7 +199,7 @@ def _play(
     end = max(time.monotonic(), epoch_ns * 1e-9) + settings.seconds
     next_line = 0.0
     while not stop.is_set() and (left := end - time.monotonic()) > 0:
-        stop.wait(min(0.2, left))
+        stop.wait(min(0.05, left))
         _look_at_viewer(state, processes, say)
         for process in processes:
             if process.name == "viewer":

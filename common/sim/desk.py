@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.camera_model import CameraModel
@@ -38,19 +39,25 @@ def desk_image(optics: CameraModel, depth_m: float, seed: int) -> Image:
     return np.asarray(cv2.GaussianBlur(image, (3, 3), LENS_SIGMA_PX), dtype=np.uint8)
 
 
-def _wear(seed: int) -> Float:
-    """Relative brightness (SIDE, SIDE, 3) about 1: blotches, grain and brushed streaks."""
+def _wear(seed: int) -> npt.NDArray[np.float32]:
+    """Relative brightness (SIDE, SIDE, 3) about 1: blotches, grain and brushed streaks.
+
+    Single precision and one plane for what has no colour: a slave that starts again waits for this.
+    """
     rng = np.random.default_rng([seed, 1])
-    wear = np.ones((SIDE, SIDE, 3))
+    grey = np.ones((SIDE, SIDE), dtype=np.float32)
+    tinted = np.zeros((SIDE // 4, SIDE // 4, 3), dtype=np.float32)
     for cell, depth in ((256, 0.06), (64, 0.045), (16, 0.04), (4, 0.05), (1, 0.07)):
         n = SIDE // cell
-        coarse = rng.normal(0.0, 1.0, (n, n))
-        wear += depth * cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)[..., None]
-        tint = rng.normal(0.0, 0.12, (n, n, 3))
-        wear += depth * cv2.resize(tint, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
-    streaks = cv2.blur(rng.normal(0.0, 1.0, (SIDE, SIDE)), (61, 1))
-    wear += 0.18 * streaks[..., None]
-    return np.clip(wear, 0.5, 1.6)
+        coarse = depth * rng.standard_normal((n, n), dtype=np.float32)
+        grey += coarse if cell == 1 else cv2.resize(coarse, (SIDE, SIDE), interpolation=cv2.INTER_CUBIC)
+        if cell > 1:
+            tint = 0.12 * depth * rng.standard_normal((n, n, 3), dtype=np.float32)
+            tinted += cv2.resize(tint, tinted.shape[1::-1], interpolation=cv2.INTER_CUBIC)
+    grey += 0.18 * cv2.blur(rng.standard_normal((SIDE, SIDE), dtype=np.float32), (61, 1))
+    wear = cv2.resize(tinted, (SIDE, SIDE), interpolation=cv2.INTER_LINEAR)
+    wear += grey[..., None]
+    return np.asarray(np.clip(wear, 0.5, 1.6, out=wear), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
