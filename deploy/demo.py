@@ -78,7 +78,10 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
         DemoError: A process does not come up, or the results cannot be made.
     """
     out = settings.out
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DemoError(f"--out {out}: cannot make the folder: {error.strerror}") from error
     for stale in ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd"):
         (out / stale).unlink(missing_ok=True)
     epoch_ns = time.monotonic_ns() + _LEAD_NS

@@ -36,10 +36,16 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    settings.out.mkdir(parents=True, exist_ok=True)
+    cameras = _cameras(settings.recording)
+    if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
+        raise ReplayError(f"{settings.hand}: no such hand profile")
+    try:
+        settings.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ReplayError(f"--out {settings.out}: cannot make the folder: {error.strerror}") from error
     recording = str(settings.recording)
     calibration = [] if settings.calibration is None else ["--calibration", str(settings.calibration)]
-    for camera in _cameras(settings.recording):
+    for camera in cameras:
         say(f"detecting markers in camera {camera} ...")
         target = ["-o", str(settings.out / f"detections_{camera}.npz")]
         _step("slave", "detect", recording, "--camera", camera, *calibration, *target)
@@ -60,10 +66,12 @@ def _cameras(recording: Path) -> list[str]:
     path = recording / "recording.json"
     try:
         manifest = json.loads(path.read_text())
-        rigs = [*manifest.get("rigs", []), *([manifest["rig"]] if "rig" in manifest else [])]
+        rigs = [rig for rig in (manifest.get("rig"), *(manifest.get("rigs") or ())) if rig is not None]
         marker_rigs = [rig for rig in rigs if rig["kind"] == "markers"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ReplayError(f"{path}: not a recording of raw frames ({error})") from error
-    if not marker_rigs:
+        cameras = list[str](marker_rigs[0]["cameras"]) if marker_rigs else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise ReplayError(f"{path}: not a recording of raw frames ({reason})") from error
+    if cameras is None:
         raise ReplayError(f"{path}: no rig of kind 'markers'; wrist recordings are not solved yet")
-    return cast(list[str], marker_rigs[0]["cameras"])
+    return cameras

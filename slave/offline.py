@@ -130,8 +130,21 @@ def calibrate_colours(folder: Path, camera: str, output: Path) -> list[ColourRow
     own = recording.manifest.cameras[camera]
     image = read_png(folder / rows[0].file, (own.height_px, own.width_px))
     table = calibrate(image, {name: clicks[name] for name in names})
+    make_folder(output.parent)
     save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
     return table
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder a result goes to; a new calibration tree begins with its first file.
+
+    Raises:
+        RecordingError: It cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
 def save_detections(path: Path, found: RecordedDetections) -> None:
@@ -140,6 +153,7 @@ def save_detections(path: Path, found: RecordedDetections) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
+    make_folder(path.parent)
     try:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
             for name in found.__slots__:

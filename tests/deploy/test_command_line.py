@@ -27,6 +27,37 @@ def test_a_wrist_recording_is_refused_by_name(tmp_path: Path, capsys: pytest.Cap
     assert "no rig of kind 'markers'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("content", ["[]", "null", "{", '{"rigs": 5}', '{"rig": {}}', '{"rig": 1}'])
+def test_a_manifest_of_another_form_is_named(
+    content: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recording.json").write_text(content)
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+    assert "recording.json: not a recording of raw frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", [["demo", "--headless"], ["replay", "RECORDING"]])
+def test_an_out_that_is_a_file_is_said(
+    command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = {"kind": "markers", "cameras": ["left", "right"]}
+    (tmp_path / "recording.json").write_text(json.dumps({"rig": None, "rigs": [rig]}))
+    (tmp_path / "taken").write_text("")
+    place = [str(tmp_path) if word == "RECORDING" else word for word in command]
+    assert main([*place, "--out", str(tmp_path / "taken")]) == 1
+    assert "cannot make the folder" in capsys.readouterr().err
+
+
+def test_a_missing_hand_is_said_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = {"kind": "markers", "cameras": ["left", "right"]}
+    (tmp_path / "recording.json").write_text(json.dumps({"rig": rig}))
+    hand = tmp_path / "nobody.json"
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--hand", str(hand)]) == 1
+    printed = capsys.readouterr()
+    assert "nobody.json: no such hand profile" in printed.err
+    assert "detecting" not in printed.out
+
+
 def test_a_missing_rig_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = [
         "demo",

@@ -96,8 +96,10 @@ def test_wrong_camera_broken_frame_and_unwritable_file(tmp_path: Path) -> None:
     folder = recording(tmp_path)
     with pytest.raises(RecordingError, match="no camera 'up'; it has left"):
         detect_recording(folder, "up")
-    with pytest.raises(RecordingError, match=r"none/d\.npz: cannot write"):
-        save_detections(tmp_path / "none/d.npz", detect_recording(folder, "left"))
+    with pytest.raises(RecordingError, match=r"0\.png: cannot make the folder"):
+        save_detections(folder / "0.png/d.npz", detect_recording(folder, "left"))
+    with pytest.raises(RecordingError, match="cannot write"):
+        save_detections(tmp_path, detect_recording(folder, "left"))
     (folder / "1.png").write_bytes(b"junk")
     with pytest.raises(CameraError, match=r"1\.png: not an image"):
         detect_recording(folder, "left")
@@ -107,7 +109,6 @@ def test_the_colours_command_writes_what_detect_reads(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = recording(tmp_path, coloured=False)
-    (tmp_path / "cameras").mkdir()
     out = str(tmp_path / "cameras/left.json")
     assert main(["colours", str(folder), "--camera", "left", "-o", out]) == 0
     assert "no collisions" in capsys.readouterr().out
