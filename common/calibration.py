@@ -5,9 +5,7 @@ names where they are not SI. The JSON schema of each file is exported to docs/ f
 """
 
 import inspect
-import os
 import re
-import tempfile
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -17,6 +15,7 @@ from msgspec import Meta, Struct
 
 from common.arrays import Float
 from common.errors import CalibrationError
+from common.replacing import replacing
 
 Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
@@ -272,23 +271,15 @@ def save(path: Path, value: Struct) -> None:
         CalibrationError: The folder is missing, read-only or full, or the value would not come back
             as it is (a NaN, a number out of range); the old file is untouched.
     """
-    text = compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()) + "\n"
-    if parse(text.encode(), type(value), str(path)) != value:
+    text = (
+        compact_numbers(msgspec.json.format(msgspec.json.encode(value), indent=1).decode()).encode() + b"\n"
+    )
+    if parse(text, type(value), str(path)) != value:
         raise CalibrationError(f"{path}: a NaN, or a list in place of a tuple, would not come back as it is")
-    temporary = None
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=f".{path.name}.", delete=False
-        ) as file:
-            temporary = Path(file.name)
+        with replacing(path) as file:
             file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise CalibrationError(f"{path}: cannot write: {error.strerror}") from error
 
 

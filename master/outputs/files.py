@@ -6,7 +6,6 @@ uncompressed, with fixed time stamps, hence byte-identical for identical poses; 
 its name complete or not at all.
 """
 
-import os
 import tempfile
 import zipfile
 import zlib
@@ -19,6 +18,7 @@ from numpy.lib import format as npy
 
 from common.errors import RecordingError
 from common.messages import HandPose
+from common.replacing import replacing
 from master.outputs.poses import Poses, record
 
 _ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -81,7 +81,7 @@ class PosesFile:
             return
         try:
             self._spool.flush()
-            _write_atomically(self._path, self._hand, self._table())
+            _write(self._path, self._hand, self._table())
         except OSError as error:
             raise _cannot_write(self._path, error) from error
         finally:
@@ -134,23 +134,11 @@ def load_poses(path: Path) -> Poses:
         raise RecordingError(f"{path}: not a poses.npz: {error}") from error
 
 
-def _write_atomically(path: Path, hand: str, table: npt.NDArray[np.void]) -> None:
-    temporary = None
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name in table.dtype.names or ():
-                    _add(archive, name, table[name])
-                _add(archive, "hand", np.array(hand))
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
-        raise
+def _write(path: Path, hand: str, table: npt.NDArray[np.void]) -> None:
+    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        for name in table.dtype.names or ():
+            _add(archive, name, table[name])
+        _add(archive, "hand", np.array(hand))
 
 
 def _add(archive: zipfile.ZipFile, name: str, array: npt.NDArray[np.generic]) -> None:

@@ -5,7 +5,6 @@ as that camera sees it, turned a little to the side, so it stands upright. All a
 the rig have one scale.
 """
 
-import tempfile
 from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +21,7 @@ from common.errors import RecordingError
 from common.geometry import axis_rotation
 from common.hand_model import FINGER_JOINTS, TIPS, WRIST, HandModel
 from common.messages import Source
+from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
@@ -244,15 +244,9 @@ def _source_rgb(code: int) -> Rgb:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    temporary = None
     try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = Path(file.name)
+        with replacing(path) as file:
             # No creation date or version inside: the same run gives the same picture.
             figure.savefig(file, format="png", dpi=_DPI, facecolor=PAPER, metadata={"Software": None})
-        temporary.chmod(0o644)
-        temporary.replace(path)
     except OSError as error:
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
         raise RecordingError(f"{path}: cannot write: {error.strerror or error}") from error
