@@ -13,7 +13,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.hand_model import FINGER_JOINTS
-from master.npz import read_npz
+from common.npz import read_npz
 from master.outputs.poses import Poses
 
 _MATCH_NS = 1_000_000

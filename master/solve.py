@@ -14,7 +14,7 @@ import numpy as np
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording
 from common.messages import HandPose, MarkerDetections
-from master.npz import read_npz
+from common.npz import read_npz
 from master.outputs.files import PosesFile
 from master.outputs.poses import Poses
 from master.rig import RigSetup, build_pipeline

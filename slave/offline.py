@@ -1,9 +1,7 @@
 """Detect a whole recording offline: deterministic, without clock or network, into one file per camera."""
 
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 
 import msgspec
@@ -13,11 +11,10 @@ from common.arrays import Float, Int
 from common.calibration import CameraCalibration, load, save
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording, open_recording
+from common.npz import write_npz
 from slave.cameras.replay import read_png
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.detector import MarkerDetector
-
-EPOCH = (1980, 1, 1, 0, 0, 0)  # the earliest time a zip file can carry: the same bytes on every run
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,10 +152,6 @@ def save_detections(path: Path, found: RecordedDetections) -> None:
     """
     make_folder(path.parent)
     try:
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as archive:
-            for name in found.__slots__:
-                content = BytesIO()
-                np.lib.format.write_array(content, getattr(found, name), allow_pickle=False)
-                archive.writestr(zipfile.ZipInfo(f"{name}.npy", EPOCH), content.getvalue())
+        write_npz(path, {name: getattr(found, name) for name in found.__slots__})
     except OSError as error:
         raise RecordingError(f"{path}: cannot write: {error.strerror}") from error

@@ -7,7 +7,6 @@ axes: x right, y up from the device, z to the user, so a camera looking down has
 Palm pose and joint angles are taken from them and played by our own hand, within its limits; bones are ours.
 """
 
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from common.arrays import Float
 from common.errors import RecordingError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rigid
 from common.hand_model import CHAINS, HandModel
+from common.npz import read_npz
 from common.sim.motion import HandState, smooth_step
 
 KEYS = ("t", "hand0_joints", "hand0_palm", "hand0_normal", "hand0_direction", "hand0_type")
@@ -64,15 +64,11 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
     Raises:
         RecordingError: The file is missing, or lacks a key or a sample that is needed.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {key: file[key] for key in KEYS}
-    except FileNotFoundError as error:
+    if not path.exists():
         raise RecordingError(
             f"{path}: no such recording; set PHALANX_DATASETS to the data folder (its leapjs/*.npz are needed)"
-        ) from error
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{path}: not a Leap recording with {', '.join(KEYS)}: {error}") from error
+        )
+    data = read_npz(path, KEYS, f"not a Leap recording with {', '.join(KEYS)}")
     t = np.asarray(data["t"], dtype=np.float64)
     joints, palm = (np.asarray(data[key], dtype=np.float64) for key in ("hand0_joints", "hand0_palm"))
     normal, direction = (

@@ -7,21 +7,16 @@ its name complete or not at all.
 """
 
 import tempfile
-import zipfile
-import zlib
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, cast
 
 import numpy as np
 import numpy.typing as npt
-from numpy.lib import format as npy
 
 from common.errors import RecordingError
 from common.messages import HandPose
-from common.replacing import replacing
+from common.npz import read_npz, write_npz
 from master.outputs.poses import Poses, record
-
-_ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 class PosesFile:
@@ -81,7 +76,9 @@ class PosesFile:
             return
         try:
             self._spool.flush()
-            _write(self._path, self._hand, self._table())
+            table = self._table()
+            columns = {name: table[name] for name in self._dtype.names or ()}
+            write_npz(self._path, {**columns, "hand": np.array(self._hand)})
         except OSError as error:
             raise _cannot_write(self._path, error) from error
         finally:
@@ -120,32 +117,12 @@ def load_poses(path: Path) -> Poses:
         RecordingError: Missing, not an .npz, a key missing or of the wrong type or shape.
     """
     names = [*(record(0).names or ()), "hand"]
+    arrays = read_npz(path, names, "not a poses.npz of ours")
+    hand = str(arrays.pop("hand"))
     try:
-        with np.load(path, allow_pickle=False) as data:
-            missing = [name for name in names if name not in data.files]
-            if missing:
-                raise RecordingError(f"{path}: key {missing[0]!r} is missing; not a poses.npz of ours")
-            arrays = {name: np.asarray(data[name]) for name in names}
-        hand = str(arrays.pop("hand"))
-        return Poses(hand=hand, **arrays)
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot read: {error.strerror or error}") from error
-    except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        return Poses(hand=hand, **cast(dict[str, Any], arrays))
+    except (ValueError, AttributeError) as error:
         raise RecordingError(f"{path}: not a poses.npz: {error}") from error
-
-
-def _write(path: Path, hand: str, table: npt.NDArray[np.void]) -> None:
-    with replacing(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-        for name in table.dtype.names or ():
-            _add(archive, name, table[name])
-        _add(archive, "hand", np.array(hand))
-
-
-def _add(archive: zipfile.ZipFile, name: str, array: npt.NDArray[np.generic]) -> None:
-    """Add one array; `write_array` walks a strided map in small buffers, so memory stays constant."""
-    info = zipfile.ZipInfo(f"{name}.npy", _ZIP_EPOCH)
-    with archive.open(info, "w", force_zip64=True) as member:
-        npy.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
 def _cannot_write(path: Path, error: OSError) -> RecordingError:
