@@ -18,7 +18,8 @@ from common.sim.scenes import NAMES, scene_by_name
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
 from master.rig import RigSetup, load_hand, load_setup
-from master.solve import read_json, solve, write_json
+from master.solve import solve
+from master.summary import read_summary, write_summary
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -147,9 +148,9 @@ def report(
     setup = load_setup(calibration, rig)
     profile = load(calibration / "hands" / f"{setup.rig.hand}.json", HandProfile)
     played = scene_by_name(scene, setup.rig, setup.cameras, profile, seed)
-    figures = {} if summary is None else read_json(summary)
+    figures = {} if summary is None else read_summary(summary)
     out.mkdir(parents=True, exist_ok=True)
-    write_json(
+    write_summary(
         out / "summary.json", report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)
     )
 
@@ -157,6 +158,7 @@ def report(
 def main() -> None:
     """Entry point `phalanx-master`."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     try:
         app()
     except PhalanxError as error:

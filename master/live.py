@@ -19,8 +19,8 @@ from master.outputs.bus import BusSink
 from master.outputs.files import PosesFile
 from master.outputs.sink import Sink
 from master.rig import RigSetup, build_pipeline
-from master.solve import write_json
 from master.stages import StageTimes
+from master.summary import write_summary
 
 _REPORT_S = 1.0
 
@@ -104,7 +104,9 @@ def run_live(
         bus.announce(MASTER)
         bus.serve(MASTER, obey)
         reporter = threading.Thread(
-            target=_report, args=(bus, ingest, figures, report, stop, say), daemon=True
+            target=_report,
+            args=(bus, ingest, figures, report, setup.rig.cameras, stop, say),
+            daemon=True,
         )
         reporter.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
@@ -119,7 +121,7 @@ def run_live(
             "stage_us": stages.mean_us(),
         }
     if settings.summary is not None:
-        write_json(settings.summary, summary)
+        write_summary(settings.summary, summary)
     return summary
 
 
@@ -128,10 +130,11 @@ def _report(
     ingest: Ingest,
     figures: RunFigures,
     report: Callable[[], Health],
+    cameras: tuple[str, ...],
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> None:
-    """Once a second: health on the bus, and a line whenever the set of cameras changes."""
+    """Once a second: health on the bus and the rate; and a line whenever the set of cameras changes."""
     connected: frozenset[str] | None = None
     started = False
     poses = 0
@@ -139,11 +142,19 @@ def _report(
         bus.publish("health", MASTER, report())
         if ingest.connected != connected:
             connected = ingest.connected
-            say(f"cameras: {', '.join(sorted(connected)) or 'none yet'}")
+            say(cameras_line(cameras, connected))
         if ingest.started and not started:
             started = True
             say("started")
         if figures.poses and not poses:
             say("tracking")
-        say(f"rate {figures.poses - poses} poses/s")
+        if started:
+            say(f"rate {figures.poses - poses} poses/s")
         poses = figures.poses
+
+
+def cameras_line(cameras: tuple[str, ...], connected: frozenset[str]) -> str:
+    """What a person is told when a camera comes or goes: who is there, and who is waited for."""
+    here = ", ".join(name for name in cameras if name in connected) or "none yet"
+    absent = ", ".join(name for name in cameras if name not in connected)
+    return f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"

@@ -16,6 +16,7 @@ from common.messages import Command, Health
 
 PERIOD_S = 1.0
 LOG_EVERY = 10  # reports
+ALONE_AT = 3  # the report after which a slave without a master says what it hears
 _LOG = logging.getLogger(__name__)
 
 
@@ -135,6 +136,8 @@ class Reporter:
     def _work(self) -> None:
         count = 0
         while not self._closing.wait(self._period_s):
+            if count % LOG_EVERY == ALONE_AT and self._link.zenoh_endpoint is None:
+                _LOG.warning("%s", _why_alone(self._link.counts))
             self._gauges = dict(self._numbers.gauges())
             try:
                 self._follow(self._link.zenoh_endpoint)
@@ -166,3 +169,12 @@ class Reporter:
         if self._bus is not None:
             self._bus.close()
         self._bus, self._endpoint = None, None
+
+
+def _why_alone(counts: Mapping[str, int]) -> str:
+    """What to look at when no master has answered, from the reasons of what was refused."""
+    if counts.get("refused.foreign", 0):
+        return "a master is heard, but of another rig key (or another program): compare the key files of both sides"
+    if counts.get("refused.version", 0):
+        return "a master is heard, but of another version of the wire: install the same version on both sides"
+    return "no master heard yet: is it running, and does its --beacon reach this network and port?"

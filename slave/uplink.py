@@ -10,9 +10,10 @@ import os
 import threading
 import time
 from collections.abc import Callable
-from ipaddress import IPv4Address
+from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock
+from common.errors import BusError
 from common.messages import Message
 from common.udp import READ_TIMEOUT_S, UdpSocket
 from slave.link import Random, SlaveLink
@@ -157,7 +158,12 @@ def _hosts(bind: str) -> tuple[str, str]:
     A socket bound to one address of the machine hears no broadcast (Linux, ip(7)), hence the
     loopback's broadcast address for a loopback address, and every network for any other.
     """
-    address = IPv4Address(bind)
+    try:
+        address = IPv4Address(bind)
+    except AddressValueError as error:
+        raise BusError(
+            f"bind address {bind!r}: must be an IPv4 address of this machine, or {ANYWHERE}"
+        ) from error
     if address.is_loopback:
         return LOOPBACK_BROADCAST, "127.0.0.1" if bind == LOOPBACK_BROADCAST else bind
     return ANYWHERE, bind

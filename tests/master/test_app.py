@@ -6,6 +6,7 @@ import pytest
 
 from common.messages import HandPose, MarkerDetections
 from master.app import RunFigures, health, run
+from master.live import cameras_line
 from master.rig import build_pipeline
 from master.stages import StageTimes
 from tests.synthetic_run import SyntheticRun, synthetic_run
@@ -112,3 +113,15 @@ def test_stages_are_means_and_survive_an_error() -> None:
         pass
     assert list(stages.mean_us()) == ["hand", "filter"]
     assert all(value >= 0 for value in stages.mean_us().values())
+
+
+@pytest.mark.parametrize(
+    ("connected", "said"),
+    [
+        ([], "cameras: none yet; waiting for left, right"),
+        (["right"], "cameras: right; waiting for left"),
+        (["right", "left"], "cameras: left, right"),
+    ],
+)
+def test_who_is_waited_for_is_said(connected: list[str], said: str) -> None:
+    assert cameras_line(("left", "right"), frozenset(connected)) == said

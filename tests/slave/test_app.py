@@ -10,7 +10,7 @@ from common.messages import Command, Health, MarkerDetections, Message
 from slave.app import run, wait_for_start
 from slave.cameras.source import Frame
 from slave.markers.detector import MarkerDetector
-from slave.report import Reporter
+from slave.report import ALONE_AT, Reporter
 from slave.tally import Tally
 from tests.slave.painted import CENTRES, NAMES, camera, hand, render
 
@@ -162,3 +162,41 @@ def test_a_bus_that_cannot_be_opened_is_tried_again_and_never_ends_the_slave() -
         assert len(tries) == 3
     finally:
         reporter.close()
+
+
+@pytest.mark.parametrize(
+    ("counts", "said"),
+    [
+        ({"sent": 0}, "no master heard yet"),
+        ({"refused.foreign": 5}, "of another rig key"),
+        ({"refused.version": 5}, "of another version"),
+    ],
+)
+def test_a_slave_without_a_master_says_what_it_hears(
+    counts: dict[str, int], said: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    wire = Wire()
+    wire.counts = counts
+    looked = threading.Event()
+    reporter = Reporter(
+        "left", wire, Seen(looked), SystemClock(), lambda _: LoopbackBus(), lambda: None, period_s=0.01
+    )
+    try:
+        assert looked.wait(10.0)
+    finally:
+        reporter.close()
+    assert said in caplog.text
+
+
+class Seen(Tally):
+    """Figures that tell when they have been read often enough for the slave to have spoken."""
+
+    def __init__(self, looked: threading.Event) -> None:
+        super().__init__(NAMES)
+        self._looked, self._left = looked, ALONE_AT + 2
+
+    def gauges(self) -> dict[str, float]:
+        self._left -= 1
+        if self._left == 0:
+            self._looked.set()
+        return super().gauges()

@@ -77,7 +77,7 @@ def test_close_ends_the_wait_and_frees_the_port(port: int) -> None:
 def test_an_address_that_is_not_ours_is_an_error(port: int) -> None:
     with pytest.raises(BusError, match=r"cannot bind UDP 192\.0\.2\.1"):
         Uplink("left", KEY, SystemClock(), port, "192.0.2.1")
-    with pytest.raises(ValueError, match="nonsense"):
+    with pytest.raises(BusError, match="'nonsense': must be an IPv4 address"):
         Uplink("left", KEY, SystemClock(), port, "nonsense")
 
 
