@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.row import Row
-from master.solve import read_json
+from master.summary import read_summary
 
 _ROOT = Path(__file__).parent.parent
 _SECONDS = 30
@@ -47,7 +47,7 @@ def rows() -> list[Row]:
         subprocess.run(command, check=True, cwd=_ROOT, stdout=subprocess.DEVNULL)
         stop.set()
         thread.join()
-        summary = read_json(Path(folder) / "summary.json")
+        summary = read_summary(Path(folder) / "summary.json")
     p50, p99 = np.percentile(relay, [50, 99])
     out = [
         Row("idle relay, there and back, median", float(p50), "ms", "baseline, same machine, same time"),

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 
 from bench.row import Row
-from master.solve import read_json
+from master.summary import read_summary
 
 _ROOT = Path(__file__).parent.parent
 _RECORDINGS = (
@@ -38,7 +38,7 @@ def rows() -> list[Row]:
         for name in _RECORDINGS:
             result = Path(folder) / name
             _run("deploy", "replay", data / "stereo" / name, "--calibration", calibration, "--out", result)
-            summary = read_json(result / "summary.json")
+            summary = read_summary(result / "summary.json")
             for key, label, unit, goal in _SCORES:
                 if isinstance(value := summary.get(key), int | float):
                     out.append(Row(f"{name}: {label}", float(value), unit, goal))

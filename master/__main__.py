@@ -10,7 +10,6 @@ from typing import Annotated
 
 import typer
 
-from common.calibration import HandProfile, load
 from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
@@ -146,13 +145,11 @@ def report(
     from master.report import report_scene
 
     setup = load_setup(calibration, rig)
-    profile = load(calibration / "hands" / f"{setup.rig.hand}.json", HandProfile)
-    played = scene_by_name(scene, setup.rig, setup.cameras, profile, seed)
+    played = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, seed)
     figures = {} if summary is None else read_summary(summary)
     out.mkdir(parents=True, exist_ok=True)
-    write_summary(
-        out / "summary.json", report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)
-    )
+    full = report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)
+    write_summary(out / "summary.json", full)
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from master.outputs.files import load_poses
 from master.outputs.picture import draw_summary
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.outputs.truth import Truth as Ghost
+from master.outputs.truth import PosesTruth
 from master.rig import RigSetup
 from master.score import Truth, score
 from master.solve import fingers_of
@@ -53,7 +53,7 @@ def report_scene(
         return summary
     truth = truth_of(poses, scene, epoch_ns, tell)
     full = summary | score(poses, truth, fingers_of(setup))
-    ghost = Ghost.of_webxr(truth.joints_m, truth.markers_m)
+    ghost = PosesTruth.of_webxr(truth.joints_m, truth.markers_m)
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
     draw_summary(out / "hand.png", poses, setup.rig, setup.hand, figures, ghost)

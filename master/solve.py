@@ -4,10 +4,8 @@ No clock is read for the poses: messages are pushed in the order of their captur
 same bytes. Only the stage times of the summary are measured.
 """
 
-import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
 
 import numpy as np
 
@@ -20,6 +18,7 @@ from master.outputs.poses import Poses
 from master.rig import RigSetup, build_pipeline
 from master.score import load_truth, score
 from master.stages import StageTimes
+from master.summary import write_summary
 
 
 def solve(
@@ -61,7 +60,7 @@ def solve(
         "counts": dict(sorted(pipeline.counts.items())),
         "stage_us": stages.mean_us(),
     }
-    write_json(out / "summary.json", summary)
+    write_summary(out / "summary.json", summary)
     return summary
 
 
@@ -80,33 +79,6 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
     """For each marker of the rig the finger it sits on, or -1."""
     mounts = [setup.hand.mount(name) for name in setup.rig.markers]
     return tuple(-1 if mount.finger is None else mount.finger for mount in mounts)
-
-
-def write_json(path: Path, value: dict[str, object]) -> None:
-    """Write a summary.
-
-    Raises:
-        RecordingError: The file cannot be written.
-    """
-    try:
-        path.write_text(json.dumps(value, indent=1) + "\n")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
-
-
-def read_json(path: Path) -> dict[str, object]:
-    """Read a summary.
-
-    Raises:
-        RecordingError: Missing, or not a JSON object.
-    """
-    try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: cannot read the summary: {error}") from error
-    if not isinstance(value, dict):
-        raise RecordingError(f"{path}: not a JSON object")
-    return cast(dict[str, object], value)
 
 
 def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:

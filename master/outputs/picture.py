@@ -26,7 +26,7 @@ from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
 from master.outputs.poses import Poses
-from master.outputs.truth import Truth
+from master.outputs.truth import PosesTruth
 
 WIDTH_PX, HEIGHT_PX = 1600, 900
 _DPI = 100
@@ -55,7 +55,7 @@ def draw_summary(
     rig: RigCalibration,
     model: HandModel,
     summary: Mapping[str, float],
-    truth: Truth | None = None,
+    truth: PosesTruth | None = None,
     row: int | None = None,
 ) -> None:
     """Write the picture as PNG.
@@ -108,7 +108,7 @@ def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapp
         figure.text(x, 0.905, label, color=INK, alpha=0.75, size=10, ha="center", va="center")
 
 
-def _hand(figure: Figure, poses: Poses, row: int, model: HandModel, truth: Truth | None) -> None:
+def _hand(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
     view = fit_view(
         at, axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)
@@ -178,7 +178,7 @@ def _scale_bar(axes: Axes, view: View) -> None:
     axes.text(x + length / 2, y - 9, "5 cm", color=INK, size=11, ha="center", va="bottom")
 
 
-def _legend(figure: Figure, poses: Poses, truth: Truth | None) -> None:
+def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None) -> None:
     used = [source for source in Source if (poses.source[poses.valid] == source).any()]
     entries = [
         Line2D([], [], color=unit(SOURCE_RGB[s]), marker="o", mfc=PAPER, mew=2, lw=3, label=SOURCE_MEANING[s])

@@ -8,7 +8,7 @@ from common.arrays import Float
 from common.hand_model import FINGERS, HandModel
 from master.outputs.palette import Rgb, series_rgb
 from master.outputs.poses import Poses
-from master.outputs.truth import Truth, distance_m, mean_known
+from master.outputs.truth import PosesTruth, distance_m, mean_known
 
 Colour = tuple[float, float, float]
 
@@ -36,7 +36,7 @@ def style(axes: Axes, title: str) -> None:
         spine.set_alpha(0.25)
 
 
-def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: Truth | None) -> None:
+def draw_panels(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
     """Three panels down the right side; a thin line marks the row that is shown as a hand."""
     boxes = [figure.add_axes((_LEFT, bottom, _WIDTH, _HEIGHT)) for bottom in _BOTTOMS]
     seconds = (poses.t_ns - poses.t_ns[0]).astype(np.float64) * 1e-9
@@ -69,7 +69,7 @@ def _angles(axes: Axes, poses: Poses, seconds: Float, model: HandModel) -> None:
     _legend_above(axes)
 
 
-def _errors(axes: Axes, poses: Poses, seconds: Float, truth: Truth) -> None:
+def _errors(axes: Axes, poses: Poses, seconds: Float, truth: PosesTruth) -> None:
     style(axes, "Mean error to the truth [mm]")
     joints = mean_known(truth.joint_error_m(poses)) * 1e3
     markers = mean_known(truth.marker_error_m(poses)) * 1e3

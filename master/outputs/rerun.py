@@ -31,7 +31,7 @@ from master.outputs.previews import PreviewAsker
 from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
-from master.outputs.truth import Truth
+from master.outputs.truth import PosesTruth
 
 Mode = Literal["spawn", "web", "save"]
 
@@ -121,7 +121,7 @@ def write_rrd(
     cameras: Mapping[str, CameraCalibration],
     hand: HandModel,
     detections: Mapping[str, Iterable[MarkerDetections]] | None = None,
-    truth: Truth | None = None,
+    truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
 ) -> None:
     """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.

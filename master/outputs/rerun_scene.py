@@ -35,7 +35,7 @@ from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rg
 from master.outputs.poses import Poses
 from master.outputs.previews import jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
-from master.outputs.truth import Truth, distance_m, mean_known
+from master.outputs.truth import PosesTruth, distance_m, mean_known
 
 IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
 _PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its centre
@@ -91,7 +91,7 @@ class RerunScene:
         """Time of the newest pose logged, or None."""
         return int(self._recent_ns[-1]) if len(self._recent_ns) else None
 
-    def log_poses(self, poses: Poses, truth: Truth | None = None) -> None:
+    def log_poses(self, poses: Poses, truth: PosesTruth | None = None) -> None:
         """Log a batch of poses of one hand, in the order of time, and their truth row by row."""
         if not len(poses):
             return
@@ -269,7 +269,7 @@ class RerunScene:
         markers = _seen(poses.markers_raw_m).sum(axis=1)
         self._scalars("plots/seen/markers", t, markers.astype(np.float64))
 
-    def _log_truth(self, poses: Poses, truth: Truth) -> None:
+    def _log_truth(self, poses: Poses, truth: PosesTruth) -> None:
         t, at = poses.t_ns, truth.joints_m
         known = np.stack([np.isfinite(at[:, list(strip)]).all(axis=(1, 2)) for strip in _STRIPS], axis=1)
         strips = _strips(at, known)

@@ -10,7 +10,7 @@ from master.outputs.poses import Poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Truth:
+class PosesTruth:
     """True joints and caps at the instants of T poses. NaN: unknown there.
 
     Attributes:
@@ -22,14 +22,14 @@ class Truth:
     markers_m: Float
 
     @classmethod
-    def of_webxr(cls, joints_m: Float, markers_m: Float) -> "Truth":
+    def of_webxr(cls, joints_m: Float, markers_m: Float) -> "PosesTruth":
         """From the 25 WebXR joints (T, 25, 3) of a rendered recording; the palm is derived."""
         palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
         return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m)
 
-    def rows(self, start: int, stop: int) -> "Truth":
+    def rows(self, start: int, stop: int) -> "PosesTruth":
         """Rows start..stop-1, without copying."""
-        return Truth(self.joints_m[start:stop], self.markers_m[start:stop])
+        return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop])
 
     def joint_error_m(self, poses: Poses) -> Float:
         """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""

@@ -9,7 +9,7 @@ from common.errors import RecordingError
 from common.messages import HandPose
 from master.outputs.files import PosesFile, load_poses, save_poses
 from master.outputs.poses import Poses
-from master.outputs.truth import Truth
+from master.outputs.truth import PosesTruth
 
 FIXED = "t_ns position_m orientation_wxyz radius_m valid tracked cov_m2 angles_rad markers_m markers_raw_m"
 
@@ -175,7 +175,7 @@ def test_truth_gives_millimetres_and_leaves_invalid_joints_out() -> None:
     pose = random_pose(3)
     poses = Poses.of([pose])
     webxr = poses.position_m[:, 1:] + np.array([0.003, 0.0, 0.004])  # 5 mm off
-    truth = Truth.of_webxr(webxr, poses.markers_raw_m + np.array([0.0, 0.002, 0.0]))
+    truth = PosesTruth.of_webxr(webxr, poses.markers_raw_m + np.array([0.0, 0.002, 0.0]))
     error = truth.joint_error_m(poses)
     np.testing.assert_array_equal(np.isnan(error), ~poses.valid[:, 1:])
     np.testing.assert_allclose(error[poses.valid[:, 1:]], 0.005, rtol=1e-9)

@@ -17,7 +17,7 @@ from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_RGB
 from master.outputs.picture import best_row, draw_summary, fit_view
 from master.outputs.poses import Poses
-from master.outputs.truth import Truth
+from master.outputs.truth import PosesTruth
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -57,7 +57,9 @@ def pose(index: int = 0, flexion: float = 0.0) -> HandPose:
     )
 
 
-def draw(path: Path, poses: Poses, truth: Truth | None = None, **summary: float) -> npt.NDArray[np.uint8]:
+def draw(
+    path: Path, poses: Poses, truth: PosesTruth | None = None, **summary: float
+) -> npt.NDArray[np.uint8]:
     draw_summary(path, poses, RIG, MODEL, summary, truth)
     image = cv2.imread(str(path))
     assert image is not None
@@ -94,7 +96,7 @@ def test_held_joints_and_the_truth_can_be_seen(tmp_path: Path) -> None:
     # The orange ring of the thumb's marker is in both; the held finger's bones only in one.
     assert near(held, SOURCE_RGB[Source.HELD]) > near(free, SOURCE_RGB[Source.HELD]) + 400
     poses = Poses.of([whole, pose(1)])
-    shifted = Truth(poses.position_m + np.array([0.0, -0.015, 0.0]), poses.markers_m)
+    shifted = PosesTruth(poses.position_m + np.array([0.0, -0.015, 0.0]), poses.markers_m)
     ghost = draw(tmp_path / "ghost.png", poses, shifted)[130:880, 380:990]
     assert (ghost != draw(tmp_path / "alone.png", poses)[130:880, 380:990]).any(axis=-1).sum() > 500
 

@@ -22,7 +22,7 @@ from master.outputs.poses import Poses
 from master.outputs.rerun import run_viewer, write_rrd
 from master.outputs.rerun_process import ViewerProcess, viewer_arguments
 from master.outputs.rerun_scene import RerunScene
-from master.outputs.truth import Truth
+from master.outputs.truth import PosesTruth
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -92,8 +92,8 @@ def small_jpeg(width: int, height: int) -> bytes:
     return cv2.imencode(".jpg", np.full((height, width, 3), 90, np.uint8))[1].tobytes()
 
 
-def truth_of(poses: Poses, off_m: float) -> Truth:
-    return Truth(poses.position_m + np.array([off_m, 0.0, 0.0]), poses.markers_raw_m)
+def truth_of(poses: Poses, off_m: float) -> PosesTruth:
+    return PosesTruth(poses.position_m + np.array([off_m, 0.0, 0.0]), poses.markers_raw_m)
 
 
 def rows_of(path: Path) -> dict[str, int]:

@@ -10,7 +10,8 @@ import pytest
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Manifest
 from master.outputs.files import load_poses
-from master.solve import fingers_of, read_json, solve, write_json
+from master.solve import fingers_of, solve
+from master.summary import read_summary, write_summary
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, hand_at, synthetic_run
 
@@ -153,11 +154,11 @@ def test_unrelated_frames_are_solved_without_memory(tmp_path: Path, short_run: S
 
 def test_summaries_are_json_objects(tmp_path: Path) -> None:
     path = tmp_path / "summary.json"
-    write_json(path, {"poses": 3, "counts": {"a": 1}})
-    assert read_json(path) == {"poses": 3, "counts": {"a": 1}}
+    write_summary(path, {"poses": 3, "counts": {"a": 1}})
+    assert read_summary(path) == {"poses": 3, "counts": {"a": 1}}
     for content in (b"[1]", b"{", b"\xff", b""):
         path.write_bytes(content)
         with pytest.raises(RecordingError, match=r"summary\.json"):
-            read_json(path)
+            read_summary(path)
     with pytest.raises(RecordingError, match="cannot write"):
-        write_json(tmp_path / "nowhere" / "summary.json", {})
+        write_summary(tmp_path / "nowhere" / "summary.json", {})
