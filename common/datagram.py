@@ -25,6 +25,8 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 
 from common.messages import WIRE_VERSION
 
+Address = tuple[str, int]  # IPv4 address and UDP port
+
 MAGIC = b"PHLX"
 HEADER = struct.Struct("!4sBBHIQQ")
 TAG_BYTES = 16

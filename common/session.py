@@ -8,7 +8,7 @@ From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA25
   sides: what was captured in one session opens in no other, whoever restarted.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Annotated, NamedTuple
 
 import msgspec
@@ -22,6 +22,7 @@ from common.messages import Count, Name, TimeNs
 
 NONCE_BYTES = 16
 MAX_CAMERAS = 32
+Random = Callable[[int], bytes]  # so many random bytes, as `os.urandom` gives them
 Nonce = Annotated[bytes, Meta(min_length=NONCE_BYTES, max_length=NONCE_BYTES)]
 
 

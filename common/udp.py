@@ -4,10 +4,9 @@ import errno
 import socket
 import struct
 
-from common.datagram import MAX_DATAGRAM
+from common.datagram import MAX_DATAGRAM, Address
 from common.errors import BusError
 
-Address = tuple[str, int]
 READ_TIMEOUT_S = 0.01  # the grid of everything that a reading thread repeats in between
 _RECEIVE_BUFFER = 1 << 20
 

@@ -10,10 +10,12 @@ from collections import deque
 from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock, ClockEstimate
+from common.datagram import Address
 from common.errors import BusError
 from common.messages import MarkerDetections
+from common.session import Random
 from common.udp import UdpSocket
-from master.link import MasterLink, Random
+from master.link import MasterLink
 from master.sequence import CameraCounts
 
 QUEUE = 64
@@ -30,8 +32,8 @@ class Ingest:
         cameras: tuple[str, ...],
         key: bytes,
         clock: Clock,
-        beacon: tuple[str, int],
-        bind: tuple[str, int],
+        beacon: Address,
+        bind: Address,
         zenoh_endpoint: str,
         start_timeout_s: float = 5.0,
         random: Random = os.urandom,
@@ -67,7 +69,7 @@ class Ingest:
         self._thread.start()
 
     @property
-    def address(self) -> tuple[str, int]:
+    def address(self) -> Address:
         """Own address and port."""
         return self._socket.address
 

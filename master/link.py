@@ -10,13 +10,12 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
 """
 
 from collections import Counter, deque
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import msgspec
 
 from common.clock import Clock, ClockEstimate, OffsetEstimator
-from common.datagram import Header, Kind, Opened, Opener, Refusal, Sealer, parse
+from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
 from common.messages import MarkerDetections, decode
 from common.session import (
@@ -26,6 +25,7 @@ from common.session import (
     EchoAnswer,
     EchoAsk,
     Hello,
+    Random,
     RigKeys,
     Start,
     Started,
@@ -35,9 +35,6 @@ from common.session import (
     seal,
 )
 from master.sequence import CameraCounts, Sequence
-
-Address = tuple[str, int]
-Random = Callable[[int], bytes]
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # until the clock is settled

@@ -8,11 +8,10 @@ Rules that must stay in step with `master.link` and docs/wire.md:
 """
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from common.clock import Clock
-from common.datagram import Header, Kind, Opener, Refusal, Sealer, parse
+from common.datagram import Address, Header, Kind, Opener, Refusal, Sealer, parse
 from common.messages import Message, encode
 from common.session import (
     NONCE_BYTES,
@@ -20,6 +19,7 @@ from common.session import (
     EchoAnswer,
     EchoAsk,
     Hello,
+    Random,
     RigKeys,
     Start,
     Started,
@@ -28,9 +28,6 @@ from common.session import (
     read,
     seal,
 )
-
-Address = tuple[str, int]
-Random = Callable[[int], bytes]
 
 WELL_NS = 500_000_000  # a master heard this recently is well, and rivals are ignored
 VANISHED_NS = 2_000_000_000  # a master silent for so long is gone

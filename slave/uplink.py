@@ -13,10 +13,12 @@ from collections.abc import Callable
 from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock
+from common.datagram import Address
 from common.errors import BusError
 from common.messages import Message
+from common.session import Random
 from common.udp import READ_TIMEOUT_S, UdpSocket
-from slave.link import Random, SlaveLink
+from slave.link import SlaveLink
 
 ANYWHERE = "0.0.0.0"
 LOOPBACK_BROADCAST = "127.255.255.255"
@@ -137,7 +139,7 @@ class Uplink:
         self._beacons.close()
         self._data.close()
 
-    def _hear(self, source: UdpSocket, take: Callable[[bytes, tuple[str, int], int], None]) -> None:
+    def _hear(self, source: UdpSocket, take: Callable[[bytes, Address, int], None]) -> None:
         while not self._closing.is_set():
             arrived = source.receive()
             t_ns = self._clock.now_ns()

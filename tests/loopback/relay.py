@@ -14,7 +14,8 @@ import threading
 import time
 from dataclasses import dataclass
 
-Address = tuple[str, int]
+from common.datagram import Address
+
 LOOPBACK_BROADCAST = "127.255.255.255"
 LONGEST = 8192
 

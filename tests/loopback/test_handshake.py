@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from common.clock import SkewedClock
-from common.datagram import Header, Kind, Refusal, Sealer, parse
+from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
 from common.messages import Command, MarkerDetections, encode
 from common.session import Hello, RigKeys, seal
 from master.link import MasterLink
@@ -24,7 +24,6 @@ STEP_NS = 5_000_000
 HOP_NS = 300_000
 MASTER = ("10.0.0.1", 47801)
 BROADCAST = ("10.0.0.255", 47800)
-Address = tuple[str, int]
 
 
 @dataclass
