@@ -1,4 +1,4 @@
-"""The one table of streams: what travels, by which path, under which key, how often, recorded or not."""
+"""The one table of streams: what travels, by which path, under which key, recorded or not."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,23 +21,21 @@ class Stream:
         message: Type that travels.
         path: Datagram or zenoh.
         key: Key on the zenoh bus, with {name} for the sender or target; None for datagrams.
-        rate_hz: Nominal rate; 0 for "when asked".
         recorded: Whether the message recorder keeps it.
     """
 
     message: type[Message]
     path: Path
     key: str | None
-    rate_hz: float
     recorded: bool
 
 
 STREAMS = {
-    "markers": Stream(MarkerDetections, Path.DATAGRAM, None, 90.0, True),
-    "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", 90.0, True),
-    "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", 1.0, True),
-    "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", 10.0, False),
-    "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", 0.0, False),
+    "markers": Stream(MarkerDetections, Path.DATAGRAM, None, True),
+    "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
+    "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
+    "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
+    "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", False),
 }
 
 ALIVE_KEY = "phalanx/alive/{name}"

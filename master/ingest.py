@@ -7,6 +7,7 @@ pipeline takes detections from a queue that drops the oldest, so a slow pipeline
 import os
 import threading
 from collections import deque
+from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
 
 from common.clock import Clock, ClockEstimate
@@ -111,13 +112,8 @@ class Ingest:
             "unsynchronised": self._link.unsynchronised,
         }
         for camera in self._cameras:
-            of = self.counts_of(camera)
-            counts[f"{camera}.received"] = of.received
-            counts[f"{camera}.lost"] = of.lost
-            counts[f"{camera}.skipped"] = of.skipped
-            counts[f"{camera}.late"] = of.late
-            counts[f"{camera}.duplicate"] = of.duplicate
-            counts[f"{camera}.reordered"] = of.reordered
+            of = asdict(self.counts_of(camera))
+            counts |= {f"{camera}.{event}": number for event, number in of.items()}
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def counts_of(self, camera: str) -> CameraCounts:

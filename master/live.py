@@ -1,6 +1,5 @@
 """A live master: opens bus, ingest and sinks, runs the loop, reports once a second, writes the summary."""
 
-import logging
 import secrets
 import threading
 from collections.abc import Callable
@@ -20,11 +19,11 @@ from master.outputs.files import PosesFile
 from master.outputs.sink import Sink
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
+from master.stereo.pipeline import MarkerPipeline
 from master.summary import write_summary
 
 _REPORT_S = 1.0
-
-_log = logging.getLogger(__name__)
+_JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +69,6 @@ def run_live(
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
     pipeline = build_pipeline(setup, stages)
-    session = secrets.randbits(63)
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
         stack.callback(bus.close)
@@ -89,35 +87,18 @@ def run_live(
             sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.rig.markers)))
         for sink in sinks:
             stack.callback(sink.close)
-
-        def report() -> Health:
-            counts = dict(pipeline.counts) | {
-                k: v for k, v in ingest.counts.items() if v or k.endswith("received")
-            }
-            return health(session, clock, figures, counts)
-
-        def obey(command: Command) -> Health:
-            if command.verb == "stop":
-                stop.set()
-            return report()
-
-        bus.announce(MASTER)
-        bus.serve(MASTER, obey)
-        reporter = threading.Thread(
-            target=_report,
-            args=(bus, ingest, figures, report, setup.rig.cameras, stop, say),
-            daemon=True,
-        )
-        reporter.start()
+        reporter = _Reporter(setup.rig.cameras, clock, bus, ingest, pipeline, figures, stop, say)
+        thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
+        thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         run(ingest, pipeline, sinks, clock, figures, stop)
         stop.set()
-        reporter.join(2.0)
+        thread.join(_JOIN_S)
         summary: dict[str, object] = {
             **figures.summary(),
             "lost": ingest.lost,
             "skipped": ingest.skipped,
-            "counts": report().counts,
+            "counts": reporter.health().counts,
             "stage_us": stages.mean_us(),
         }
     if settings.summary is not None:
@@ -125,32 +106,62 @@ def run_live(
     return summary
 
 
-def _report(
-    bus: Bus,
-    ingest: Ingest,
-    figures: RunFigures,
-    report: Callable[[], Health],
-    cameras: tuple[str, ...],
-    stop: threading.Event,
-    say: Callable[[str], None],
-) -> None:
-    """Once a second: health on the bus and the rate; and a line whenever the set of cameras changes."""
-    connected: frozenset[str] | None = None
-    started = False
-    poses = 0
-    while not stop.wait(_REPORT_S):
-        bus.publish("health", MASTER, report())
-        if ingest.connected != connected:
-            connected = ingest.connected
-            say(cameras_line(cameras, connected))
-        if ingest.started and not started:
-            started = True
-            say("started")
-        if figures.poses and not poses:
-            say("tracking")
-        if started:
-            say(f"rate {figures.poses - poses} poses/s")
-        poses = figures.poses
+class _Reporter:
+    """Tells how the master is: on the bus, to whoever asks there, and a line for each change.
+
+    Holds the id of this run, and what it reports on.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        clock: Clock,
+        bus: Bus,
+        ingest: Ingest,
+        pipeline: MarkerPipeline,
+        figures: RunFigures,
+        stop: threading.Event,
+        say: Callable[[str], None],
+    ) -> None:
+        """Be there on the bus from now on; `work` belongs to a thread."""
+        self._session = secrets.randbits(63)
+        self._cameras, self._clock, self._bus = cameras, clock, bus
+        self._ingest, self._pipeline, self._figures = ingest, pipeline, figures
+        self._stop, self._say = stop, say
+        bus.announce(MASTER)
+        bus.serve(MASTER, self.answer)
+
+    def health(self) -> Health:
+        """The report of this moment; of what never happened only `received` is told, to keep it short."""
+        events = self._ingest.counts.items()
+        told = {name: number for name, number in events if number or name.endswith("received")}
+        return health(self._session, self._clock, self._figures, dict(self._pipeline.counts) | told)
+
+    def answer(self, command: Command) -> Health:
+        """Obey "stop"; any other command is answered by a report."""
+        if command.verb == "stop":
+            self._stop.set()
+        return self.health()
+
+    def work(self) -> None:
+        """Once a second until the stop: health on the bus and the rate; and a line whenever something changes."""
+        connected: frozenset[str] | None = None
+        started = False
+        poses = 0
+        while not self._stop.wait(_REPORT_S):
+            self._bus.publish("health", MASTER, self.health())
+            heard = self._ingest.connected
+            if heard != connected:
+                connected = heard
+                self._say(cameras_line(self._cameras, connected))
+            if self._ingest.started and not started:
+                started = True
+                self._say("started")
+            if self._figures.poses and not poses:
+                self._say("tracking")
+            if started:
+                self._say(f"rate {self._figures.poses - poses} poses/s")
+            poses = self._figures.poses
 
 
 def cameras_line(cameras: tuple[str, ...], connected: frozenset[str]) -> str:

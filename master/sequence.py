@@ -1,8 +1,9 @@
-"""Counts what becomes of one camera's frames on the way: received, lost, late, duplicate, reordered.
+"""Counts what becomes of one camera's frames on the way: received, lost, skipped, late, duplicate, reordered.
 
-A frame is *lost* when its number was skipped and never came; *late* when it came after a newer
-one, and is dropped then, because the newer one was used already. So received + lost + late is the
-number of frames between the first and the last. A restarted slave is a new sequence.
+A frame is *lost* when it was sent and never came, *skipped* when nothing was sent under its number: numbers
+alone cannot tell, so `Sequence` counts both as lost and `MasterLink.counts_of` parts them. It is *late* when it
+came after a newer one, and is dropped then, because the newer one was used already. So received + lost + skipped
++ late is the number of frames between the first and the last. A restarted slave is a new sequence.
 """
 
 from dataclasses import dataclass, replace
@@ -16,9 +17,8 @@ class CameraCounts:
 
     Attributes:
         received: Frames taken.
-        lost: Frame numbers skipped and not come so far; `MasterLink.counts_of` tells those whose datagram
-            was lost on the way from those that were never sent.
-        skipped: Frames that the camera or the slave had no time for: nothing was sent.
+        lost: Frames sent and not come so far; in a `Sequence` all frame numbers not come so far.
+        skipped: Frames that the camera or the slave had no time for: nothing was sent. 0 in a `Sequence`.
         late: Frames that came after a newer one, dropped.
         duplicate: Datagrams that came twice, dropped.
         reordered: Datagrams of any kind that came after a later one of their session.
@@ -26,10 +26,10 @@ class CameraCounts:
 
     received: int = 0
     lost: int = 0
+    skipped: int = 0
     late: int = 0
     duplicate: int = 0
     reordered: int = 0
-    skipped: int = 0
 
 
 class Sequence:
