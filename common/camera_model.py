@@ -44,7 +44,7 @@ class CameraModel:
         k = camera.intrinsics
         if k is None:
             raise CalibrationError(
-                f"camera {camera.name!r} has no 'intrinsics': run `phalanx-master calibrate intrinsics`"
+                f"camera {camera.name!r} has no 'intrinsics': its file needs fx_px, fy_px, cx_px, cy_px and distortion"
             )
         matrix = np.array([[k.fx_px, 0.0, k.cx_px], [0.0, k.fy_px, k.cy_px], [0.0, 0.0, 1.0]])
         return cls(

@@ -208,7 +208,8 @@ def _play(
             if process.name == "viewer":
                 continue
             if (code := process.check()) is not None:
-                say(f"{process.name} ended with code {code}: started again")
+                reason = f" ({process.tail[-1]})" if code > 0 and process.tail else ""
+                say(f"{process.name} ended with code {code}{reason}: started again")
         if time.monotonic() >= next_line:
             next_line = time.monotonic() + 1.0
             done = min(settings.seconds, max(0.0, settings.seconds - left))
@@ -218,7 +219,9 @@ def _play(
 def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -> dict[str, object]:
     out = settings.out
     if not (out / "live.json").exists():
-        raise DemoError(f"the master wrote no summary; see {out / 'master.log'}")
+        log = out / "master.log"
+        last = (log.read_text(errors="replace").splitlines() or ["nothing"])[-1].partition(" ")[2]
+        raise DemoError(f"the master wrote no summary; its last line in {log}: {last}")
     say("comparing with the exact truth, drawing the hand ...")
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
     place = ["--rig", settings.rig, "--calibration", str(settings.calibration), *scene]
