@@ -57,6 +57,7 @@ def solve(
         sink.write(pose)
     sink.close()
     summary = summarise(recording, setup, poses) | {
+        "lost": _gaps(messages),
         "counts": dict(sorted(pipeline.counts.items())),
         "stage_us": stages.mean_us(),
     }
@@ -87,6 +88,14 @@ def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
     messages = [message for camera in setup.rig.cameras for message in _of_camera(folder, camera, count)]
     order = {camera: index for index, camera in enumerate(setup.rig.cameras)}
     return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
+
+
+def _gaps(messages: list[MarkerDetections]) -> int:
+    """Frame numbers that a camera skipped: frames lost before they were recorded."""
+    seen: dict[str, set[int]] = {}
+    for message in messages:
+        seen.setdefault(message.camera, set()).add(message.seq)
+    return sum(max(numbers) - min(numbers) + 1 - len(numbers) for numbers in seen.values())
 
 
 def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:

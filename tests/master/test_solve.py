@@ -80,6 +80,14 @@ def test_a_run_is_written_scored_and_repeated_byte_by_byte(tmp_path: Path, short
     assert stored["counts"]["poses"] == 10
 
 
+def test_frames_lost_before_they_were_recorded_are_counted(tmp_path: Path, short_run: SyntheticRun) -> None:
+    first = next(m.seq for m in short_run.messages if m.camera == "left")
+    gaps = np.array([first + k + (2 if k >= 4 else 0) + (k >= 7) for k in range(10)])
+    write_detections(tmp_path, short_run, seq=gaps)
+    summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
+    assert summary["lost"] == 6  # three of each camera
+
+
 def test_without_a_truth_there_are_no_scores(tmp_path: Path, short_run: SyntheticRun) -> None:
     write_detections(tmp_path, short_run)
     summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
