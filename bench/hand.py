@@ -55,7 +55,7 @@ def rows() -> list[Row]:
         ),
         Row("times faster", general / one, "x", ""),
         Row("joint error, palm turning ± 20 deg", float(np.mean(joint_mm)), "mm", "goal 6"),
-        Row("the same with the palm's rotation taken as fixed", fixed, "mm", "baseline (I7: about 15)"),
+        Row("the same with the palm's rotation taken as fixed", fixed, "mm", "baseline (about 15)"),
         Row("PIP error", float(np.mean(pip_deg)), "deg", "goal 7.5"),
     ]
 

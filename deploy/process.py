@@ -35,7 +35,7 @@ class Process:
             name: For messages.
             command: Program and arguments.
             environment: Added to this process's own.
-            log: File that its output is appended to.
+            log: File that its output goes to, begun anew; a restarted child goes on in it.
             on_line: Called with name and line.
 
         Raises:

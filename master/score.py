@@ -1,4 +1,4 @@
-"""Errors against exact truth, in millimetres and degrees, as defined in the formats of the project.
+"""Errors against exact truth, in millimetres and degrees.
 
 A finger counts as *visible* where its marker is at least half seen by two cameras. Scores come twice: over
 visible fingers (the palm's joints with them), and over all.

@@ -1,4 +1,4 @@
-"""General solver for limited chains: FABRIK with the joint limits in both passes (K24, K25).
+"""General solver for limited chains: FABRIK with the joint limits in both passes.
 
 Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011. One iteration:
 
@@ -14,7 +14,7 @@ joints keep full orientations, so bones need not be straight or planar. A couple
 forward pass.
 
 FABRIK as published deadlocks on reachable targets: a limit flattens a finger and a straight limited chain cannot
-leave its line (I8). Hence the seed (from the closed form, `master.ik.finger`, it starts on the target), and, when
+leave its line. Hence the seed (from the closed form, `master.ik.finger`, it starts on the target), and, when
 an attempt stalls, restarts from bent poses turned to the target. The best pose found is returned with its
 residual; nothing is claimed that is not so, and no finite target raises or gives NaN.
 """
@@ -54,7 +54,7 @@ Pose = tuple[Angles, ...]
 
 
 class Reach(Enum):
-    """Where the target lies, by distance from the root alone (I6)."""
+    """Where the target lies, by distance from the root alone."""
 
     WITHIN = "within"
     TOO_FAR = "farther than the sum of the bones"

@@ -1,4 +1,4 @@
-"""Finger angles from one point on the finger, in closed form: seed and oracle of FABRIK (I8).
+"""Finger angles from one point on the finger, in closed form: seed and oracle of FABRIK.
 
 A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the MCP's frame the
 point lies at w(PIP), which neither flexion nor abduction can stretch:

@@ -1,7 +1,7 @@
 """What a joint allows: hinge (1 degree of freedom) and rotor (2), as limits on the direction of the bone behind it.
 
 A joint is asked in a frame: the orientation its bone has at rest, that is the parent's orientation times the
-rest turn (`local`), or one that stays with the chain's root (`world`: a global axis, K25). In that frame
+rest turn (`local`), or one that stays with the chain's root (`world`: a global axis). In that frame
 
     hinge   Q = R(axis, a)                                      a in [low, high]
     rotor   Q = R_y(sign a) rest R_x(-f)                        a abduction, f flexion

@@ -1,10 +1,9 @@
 """Depth from the raw disparity of a parallel pair, and the position that follows from depth and centroid.
 
-Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectified. Three laws (K16, K17,
-I3):
+Kalbfleisch measures u_left - u_right [px] on the images as they are, not rectified. Three laws:
 
     ideal     D = f B / x, f = width / (2 tan(fov / 2))   pinhole, perfectly parallel cameras
-    power     D = k x^z                                   fitted; holds on the axis only (I3)
+    power     D = k x^z                                   fitted; holds on the axis only
     affine    x = a / D + x0                              fitted; a = f B, x0 = yaw misalignment as disparity
 
 Every law maps both ways and gives its own sensitivity |dD/dx|, of which the error budget is made. The full
@@ -47,7 +46,7 @@ def _positive(values: Float) -> Float:
 
 @dataclass(frozen=True, slots=True)
 class PowerLaw:
-    """D = k x^z (K17; the published pair is k = 45.433 m, z = -1.035)."""
+    """D = k x^z (Kalbfleisch; the published pair is k = 45.433 m, z = -1.035)."""
 
     k_m: float
     z: float
@@ -72,7 +71,7 @@ class PowerLaw:
 
 @dataclass(frozen=True, slots=True)
 class AffineDisparity:
-    """x = a / D + x0 (I3): focal length times baseline, and the disparity of an infinitely far point."""
+    """x = a / D + x0: focal length times baseline, and the disparity of an infinitely far point."""
 
     a_m_px: float
     x0_px: float
@@ -96,7 +95,7 @@ class AffineDisparity:
 
 
 def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDisparity:
-    """The law of perfectly parallel pinhole cameras (K16): affine with a = f B and x0 = 0.
+    """The law of perfectly parallel pinhole cameras: affine with a = f B and x0 = 0.
 
     Args:
         baseline_m: Distance of the optical centres [m].
@@ -132,7 +131,7 @@ def depth_law(rig: RigCalibration) -> DepthLaw | None:
 
 
 def position_at_depth(camera: CameraModel, uv: Float, depth: Float) -> Float:
-    """Where a centroid of the reference camera is, given its depth (K18): the undistorted ray, scaled.
+    """Where a centroid of the reference camera is, given its depth: the undistorted ray, scaled.
 
     Args:
         camera: The camera to whose axis the depth belongs.
@@ -152,9 +151,9 @@ class ErrorBudget:
     """What spoils a depth [m], one standard cause each, at one distance.
 
     Attributes:
-        per_pixel_m: One whole pixel of disparity, D^2 / (f B) for the ideal law (I4).
+        per_pixel_m: One whole pixel of disparity, D^2 / (f B) for the ideal law.
         centroid_m: Both centroids' noise, sqrt(2) sigma |dD/dx|.
-        sync_m: Sideways motion between the two exposures, D v dt / B (I5).
+        sync_m: Sideways motion between the two exposures, D v dt / B.
     """
 
     per_pixel_m: float
@@ -165,7 +164,7 @@ class ErrorBudget:
 def error_budget(
     law: DepthLaw, depth_m: float, baseline_m: float, *, sigma_px: float, speed_m_s: float, skew_s: float
 ) -> ErrorBudget:
-    """Depth errors to expect at `depth_m` (K16, I4, I5).
+    """Depth errors to expect at `depth_m`, from the derivatives of the ideal law.
 
     Args:
         law: Depth law of the rig.

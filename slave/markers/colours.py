@@ -1,4 +1,4 @@
-"""Make the HSV range of every marker from one click on each, and report what collides (K6, K8).
+"""Make the HSV range of every marker from one click on each, and report what collides.
 
 A tight range around the clicked paint fails under the next lamp ("a broader range at calibration worked better"), so
 each range is as broad as its neighbours allow: in hue half-way to the next marker or to the skin, at most

@@ -1,4 +1,4 @@
-"""Depth laws: table I1, the ideal pinhole pair, misalignment, and the budget of I4 and I5."""
+"""Depth laws: the published table, the ideal pinhole pair, misalignment, and the error budget."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ LAWS = [KALBFLEISCH, AffineDisparity(37.7, 2.5), ideal_law(0.075, FOV_RAD, 640)]
 POSE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
 
-def test_table_i1_to_a_hundredth_of_a_pixel() -> None:
+def test_the_published_table_to_a_hundredth_of_a_pixel() -> None:
     depth = np.array([0.20, 0.30, 0.40, 0.50, 0.60, 0.70, 0.80, 0.90, 1.00])
     published = np.array([189.09, 127.80, 96.79, 78.01, 65.41, 56.36, 49.54, 44.21, 39.93])
     assert np.abs(KALBFLEISCH.disparity(depth) - published).max() < 0.01
@@ -33,7 +33,7 @@ def test_table_i1_to_a_hundredth_of_a_pixel() -> None:
 
 
 def test_ideal_pair_by_hand() -> None:
-    # f = 320 / tan(31.25 deg) = 527.3 px; 0.075 m * 527.3 px = 39.55 px at 1 m (K16)
+    # f = 320 / tan(31.25 deg) = 527.3 px; 0.075 m * 527.3 px = 39.55 px at 1 m
     law = ideal_law(0.075, FOV_RAD, 640)
     assert law.a_m_px == pytest.approx(0.075 * 527.35, abs=2e-3)
     assert float(law.disparity(np.array(1.0))) == pytest.approx(39.55, abs=0.005)
@@ -47,7 +47,7 @@ def test_one_pixel_costs_what_i4_says() -> None:
     assert at_one.per_pixel_m == pytest.approx(0.0253, abs=5e-5)
     assert at_half.per_pixel_m == pytest.approx(0.0063, abs=5e-5)
     assert at_half.centroid_m < 0.001  # 0.1 px stays under 1 mm at 50 cm
-    assert at_half.sync_m == pytest.approx(0.11, abs=0.002)  # 11 cm, I5
+    assert at_half.sync_m == pytest.approx(0.11, abs=0.002)  # 11 cm
     assert at_one.sync_m == 0.0
 
 
@@ -87,7 +87,7 @@ def test_affine_law_absorbs_a_yaw_of_the_right_camera() -> None:
     points = np.stack([np.zeros(9), np.zeros(9), np.linspace(0.4, 1.2, 9)], axis=-1)
     disparity = left.project(points)[:, 0] - right.project(points)[:, 0]
     offset = f * np.tan(-yaw)
-    assert abs(offset) == pytest.approx(2.5, abs=0.02)  # I3
+    assert abs(offset) == pytest.approx(2.5, abs=0.02)  # px
     fitted = AffineDisparity(f * 0.075, -offset if disparity[-1] < f * 0.075 / 1.2 else offset)
     assert np.abs(fitted.depth(disparity) / points[:, 2] - 1.0).max() < 2e-3
 

@@ -90,7 +90,7 @@ def test_without_a_seed_restarts_heal_the_deadlock() -> None:
         assert not _violated(fabrik.chain, result.angles)
         assert _consistent(fabrik.chain, result, closed_form.root)
     assert missed == 0
-    assert plain > 60  # I8: published FABRIK misses most reachable targets from the rest pose
+    assert plain > 60  # published FABRIK misses most reachable targets from the rest pose
 
 
 WIDE = Hinge(-2.8, 2.8)

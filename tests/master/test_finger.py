@@ -209,7 +209,7 @@ def test_left_is_the_mirror_of_right() -> None:
 
 
 def test_one_millimetre_is_about_one_and_a_half_degrees_of_pip() -> None:
-    # I8: 1 mm of tip noise is about 1.4 deg of PIP
+    # 1 mm of tip noise is about 1.4 deg of PIP
     solver, rng = _solver("right", "K", 1), np.random.default_rng(0)
     true = (0.05, 0.6, 0.9, solver.ratio * 0.9)
     tip = np.array(solver.forward(true))

@@ -144,7 +144,7 @@ def test_a_hand_that_obeys_the_priors_is_found_exactly_in_any_orientation(
 
 
 def test_a_turned_palm_does_not_become_a_wrong_hand() -> None:
-    """I7: a palm taken for fixed costs about 15 mm mean joint error for +-20 deg, an estimated one 3-4 mm."""
+    """A palm taken for fixed costs about 15 mm mean joint error for +-20 deg, an estimated one 3-4 mm."""
     rng = np.random.default_rng(11)
     fixed = HandSolver(RIGHT, MARKERS, Priors(palm_walk_rad_s=1e-3, walk_rad_s=1e3))
     ours: list[float] = []

@@ -85,7 +85,7 @@ def test_found_never_wrong_and_precise(datasets: Path, colours: Path, name: str)
 def test_jitter_of_a_resting_hand_is_below_a_tenth_of_a_pixel(datasets: Path, colours: Path) -> None:
     for camera in ("left", "right"):
         found = detect_recording(datasets / "stereo/static", camera, colours)
-        assert float(np.sqrt(found.uv.var(axis=0).mean())) <= 0.1  # K28
+        assert float(np.sqrt(found.uv.var(axis=0).mean())) <= 0.1  # px
 
 
 def test_frames_of_unrelated_poses_do_not_know_of_each_other(datasets: Path, colours: Path) -> None:
