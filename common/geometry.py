@@ -59,6 +59,15 @@ def skew(vector: Float) -> Float:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def cross(a: Float, b: Float) -> Float:
+    """Cross products of (..., 3) arrays; several times faster than numpy's for small ones."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
+    out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]
+    out[..., 2] = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+    return out
+
+
 def axis_rotation(axis: int, angle: float) -> Float:
     """Rotation (3, 3) by `angle` [rad] about coordinate axis 0 (x), 1 (y) or 2 (z)."""
     c, s = np.cos(angle), np.sin(angle)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Image
+from common.geometry import cross
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX
 from common.sim.raster import Coverage, Shape
@@ -152,7 +153,7 @@ class Painter:
                 uv = snapshot.uv[side.corners] - corner
                 look[:] = light.face_shade(self._paint[item.marker], 0.25)
                 top = snapshot.points[side.corners][:4]
-                normal = unit(_cross(top[1] - top[0], top[3] - top[0]))
+                normal = unit(cross(top[1] - top[0], top[3] - top[0]))
                 facing = float(normal @ view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
                 raster.fill(look, raster.fixed(uv[:4]), light.face_shade(self._paint[item.marker], facing))
         return look
@@ -204,8 +205,3 @@ def _phalanges(snapshot: Snapshot, chosen: Bool) -> list[Shape]:
         )
         for k in np.flatnonzero(chosen)
     ]
-
-
-def _cross(a: Float, b: Float) -> Float:
-    (ax, ay, az), (bx, by, bz) = a, b
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -68,8 +68,8 @@ def skin_share(image: Image, blob: Blob) -> float:
     top, left = max(blob.top - RING, 0), max(blob.left - RING, 0)
     window = image[top : blob.bottom + RING, left : blob.right + RING]
     hsv = cv2.cvtColor(window, cv2.COLOR_BGR2HSV)
-    # Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red, orange
-    # and yellow markers, which is why those are not used).
+    # Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red,
+    # orange and yellow markers, which is why those are not used).
     skin = cv2.countNonZero(cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)))
     skin += cv2.countNonZero(cv2.inRange(hsv, (174, 60, 70), (179, 190, 255)))
     around = window.shape[0] * window.shape[1] - blob.area
