@@ -30,13 +30,16 @@ _LABELS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage."""
+    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
         return _demo(options) if options.command == "demo" else _replay(options)
     except (DemoError, ReplayError) as error:
         print(f"phalanx: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # of a replay, or the second of a demo
+        print("\nphalanx: interrupted", file=sys.stderr)
+        return 130
 
 
 def _demo(options: argparse.Namespace) -> int:

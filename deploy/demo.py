@@ -94,15 +94,25 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
         _wait_until_tracking(state, processes, stop, say)
         _play(settings, state, processes, epoch_ns, stop, say)
     finally:
-        # The master first: slaves that end under it would look like lost frames.
-        for process in sorted(processes, key=lambda p: p.name not in ("master", "viewer")):
-            process.stop()
+        _stop(processes)
     restarts = {p.name: p.restarts for p in processes if p.restarts}
     summary = _report(settings, epoch_ns, say)
     if restarts:
         summary["restarts"] = restarts
         (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     return summary
+
+
+def _stop(processes: list[Process]) -> None:
+    """End all of them; whoever presses Ctrl-C again while they take their time leaves none behind either."""
+    try:
+        # The master first: slaves that end under it would look like lost frames.
+        for process in sorted(processes, key=lambda p: p.name not in ("master", "viewer")):
+            process.stop()
+    except KeyboardInterrupt:
+        for process in processes:
+            process.kill()
+        raise
 
 
 def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], dict[str, str]]]:
@@ -227,7 +237,7 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
     place = ["--rig", settings.rig, "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
     command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
-    # A second Ctrl-C may end the report; it must not reach it with the first.
+    # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.
     done = subprocess.run(command, env=dict(os.environ), start_new_session=True, check=False)
     if done.returncode != 0:
         raise DemoError("the report failed, see above")
@@ -235,12 +245,12 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
 
 
 def stop_on_signals() -> threading.Event:
-    """An event that Ctrl-C, SIGTERM or a closed terminal sets; the second one ends this process at once."""
+    """An event that Ctrl-C, SIGTERM or a closed terminal sets; the second one is a KeyboardInterrupt."""
     stop = threading.Event()
 
     def on_signal(number: int, _frame: object) -> None:
         stop.set()
-        signal.signal(number, signal.SIG_DFL)
+        signal.signal(number, signal.default_int_handler)
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, on_signal)

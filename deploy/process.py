@@ -82,6 +82,12 @@ class Process:
         self._log.close()
         return code
 
+    def kill(self) -> None:
+        """End it at once (SIGKILL), without a last word."""
+        self._stopping = True
+        self._child.kill()
+        self._child.wait()
+
     def _start(self) -> subprocess.Popen[str]:
         # A session of its own: Ctrl-C reaches the launcher alone, which then stops the children in order.
         child = subprocess.Popen(

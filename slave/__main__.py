@@ -46,6 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except PhalanxError as error:
         print(f"phalanx-slave: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:  # while detecting offline; a live run ends by its event
+        return 130
 
 
 def _run(options: argparse.Namespace) -> int:

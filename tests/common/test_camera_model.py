@@ -119,8 +119,8 @@ def test_every_shape_comes_back(shape: tuple[int, ...]) -> None:
     assert camera.project(camera.ray(uv)).shape == shape
 
 
-def test_a_camera_without_intrinsics_says_what_to_run() -> None:
-    with pytest.raises(CalibrationError, match=r"'left' has no 'intrinsics'.*calibrate"):
+def test_a_camera_without_intrinsics_says_what_its_file_needs() -> None:
+    with pytest.raises(CalibrationError, match=r"'left' has no 'intrinsics'.*fx_px"):
         CameraModel.of(calibration(None), np.eye(4))
 
 

@@ -114,3 +114,16 @@ def test_ctrl_c_ends_every_process_and_still_sums_up(tmp_path: Path) -> None:
         log = (tmp_path / f"{name}.log").read_text()
         assert "Traceback" not in log
         assert "FATAL" not in log
+
+
+def test_a_second_ctrl_c_ends_at_once_and_leaves_nobody_behind(tmp_path: Path) -> None:
+    demo = _demo(tmp_path, 60.0)
+    heard: list[str] = []
+    for line in _lines(demo):
+        heard.append(line)
+        if "1 of 60 s" in line:
+            demo.send_signal(signal.SIGINT)
+            time.sleep(0.1)
+            demo.send_signal(signal.SIGINT)
+    assert demo.wait(10) == 130, "\n".join(heard)
+    assert _gone(_pids(heard[0]))
