@@ -8,7 +8,12 @@ import threading
 from pathlib import Path
 from typing import Annotated
 
-import typer
+try:
+    import typer
+except ModuleNotFoundError as error:  # a slave's machine has the scripts of both, and the packages of one
+    sys.exit(
+        f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
+    )
 
 from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
