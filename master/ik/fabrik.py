@@ -21,11 +21,10 @@ residual; nothing is claimed that is not so, and no finite target raises or give
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum
 from math import dist, isfinite
-from typing import NamedTuple
 
 from master.ik.chain import Chain, nearest_reach
+from master.ik.chain_result import ChainResult, Pose, Reach, not_seen
 from master.ik.finger import FingerSolver
 from master.ik.joints import Angles, Hinge, Rotor
 from master.ik.vectors import (
@@ -42,48 +41,12 @@ from master.ik.vectors import (
     turned,
 )
 
-_NAN = float("nan")
 _RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
 """How a restart shares out its bend between the front and the back of the chain."""
 _RESTART_HALVINGS = 14
 _STALL = 0.995
 _STALL_ITERATIONS = 6
 _SHORTEST_M = 1e-9
-
-Pose = tuple[Angles, ...]
-
-
-class Reach(Enum):
-    """Where the target lies, by distance from the root alone."""
-
-    WITHIN = "within"
-    TOO_FAR = "farther than the sum of the bones"
-    TOO_NEAR = "nearer than the joint limits allow"
-    NOT_SEEN = "not finite"
-
-
-class ChainResult(NamedTuple):
-    """One solved pose.
-
-    Attributes:
-        positions: Joints, root first, and the end (links + 1) [m].
-        orientations: Link frames in the frame of the target.
-        angles: Of every joint [rad], legal.
-        residual_m: Distance of the end to the target.
-        iterations: Of all attempts.
-        reached: Residual within the tolerance.
-        reach: Verdict of the distance bounds.
-        degenerate: A bone has no length, or the target is at the root and says no direction.
-    """
-
-    positions: tuple[Vector, ...]
-    orientations: tuple[Matrix, ...]
-    angles: Pose
-    residual_m: float
-    iterations: int
-    reached: bool
-    reach: Reach
-    degenerate: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,7 +115,7 @@ class Fabrik:
         reach = self._reach(goal)
         links = self.chain.links
         if reach is Reach.NOT_SEEN:
-            return _not_seen(self.chain)
+            return not_seen(self.chain)
         rest: Pose = tuple((0.0, 0.0) if isinstance(link.joint, Rotor) else (0.0,) for link in links)
         best: _Attempt | None = None
         iterations = 0
@@ -331,21 +294,5 @@ def solve_finger(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> C
     """
     a, f, pip, dip, _, _ = closed_form.solve(target)
     if not isfinite(a):
-        return _not_seen(fabrik.chain)
+        return not_seen(fabrik.chain)
     return fabrik.solve(target, ((a, f), (pip,), (dip,)), closed_form.root)
-
-
-def _not_seen(chain: Chain) -> ChainResult:
-    nowhere = (_NAN, _NAN, _NAN)
-    angles = tuple((_NAN,) * (2 if isinstance(link.joint, Rotor) else 1) for link in chain.links)
-    count = len(chain.links)
-    return ChainResult(
-        positions=(nowhere,) * (count + 1),
-        orientations=((nowhere, nowhere, nowhere),) * count,
-        angles=angles,
-        residual_m=_NAN,
-        iterations=0,
-        reached=False,
-        reach=Reach.NOT_SEEN,
-        degenerate=False,
-    )

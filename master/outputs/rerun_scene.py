@@ -2,8 +2,8 @@
 
 Poses are logged as columns, a batch at a time, so that a live viewer (2 or 3 poses a batch) and a file
 of a whole run take the same path. Every row stands on the timeline "capture" at its `t_ns`.
-The scene holds the times of the last second (rate), time and size of the last image of each camera,
-and which entities have got their style.
+The scene holds the times of the last second (rate), the images' state, and which entities have got their
+style.
 
     about                                text: what the colours mean
     world/cameras/CAM                    place, pinhole; /image; /markers: the raw caps as this camera should see them;
@@ -20,7 +20,6 @@ and which entities have got their style.
 from collections.abc import Iterable, Mapping
 from typing import cast
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
@@ -33,11 +32,10 @@ from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
 from common.messages import Health, MarkerDetections, Source
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
 from master.outputs.poses import Poses
-from master.outputs.previews import jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
+from master.outputs.rerun_images import CameraImages
 from master.outputs.truth import PosesTruth, distance_m, mean_known
 
-IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
 _PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its centre
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)
@@ -50,7 +48,6 @@ _ELLIPSE_LINE_M = 0.0002
 _LARGEST_M = 0.03  # half axis of the largest ellipsoid shown
 _JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
 _AT_LIMIT_RAD = np.deg2rad(0.5)
-_JPEG_QUALITY = 80
 _FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0004, 0.01
 
 
@@ -75,8 +72,7 @@ class RerunScene:
         self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
         self._recent_ns: Int = np.empty(0, np.int64)
         self._styled: set[str] = set()
-        self._image_ns: dict[str, int] = {}
-        self._image_size: dict[str, tuple[int, int]] = {}
+        self._images = CameraImages(recording, self._models)
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
         recording.log("about", rr.TextDocument(legend(), media_type="text/markdown"), static=True)
         for name, model in self._models.items():
@@ -118,40 +114,8 @@ class RerunScene:
         )
 
     def log_image(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
-        """Show an image of a camera at its full size, however small it is.
-
-        More than 10 a second are left out, and so are images of a camera that the rig does not have, and
-        bytes that are no JPEG.
-
-        Args:
-            camera: A camera of the rig.
-            image: (H, W, 3) BGR, (H, W) grey, or a whole JPEG file as bytes.
-            t_ns: Capture time [ns].
-            shown_ns: Where it stands on the timeline [ns]; None: at `t_ns`.
-
-        Returns:
-            Whether it was logged.
-        """
-        last = self._image_ns.get(camera)
-        size = jpeg_size(image) if isinstance(image, bytes) else (image.shape[1], image.shape[0])
-        if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
-            return False
-        if size is None or camera not in self._models:
-            return False
-        self._image_ns[camera] = t_ns
-        if isinstance(image, bytes):
-            jpeg = image
-        else:
-            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        path, model = f"{camera_path(camera)}/image", self._models[camera]
-        if self._image_size.get(camera) != size:
-            # The pinhole and all centroids are in pixels of the camera; a preview has fewer.
-            scale = [model.width_px / size[0], model.height_px / size[1], 1.0]
-            self._rec.log(path, rr.Transform3D(scale=scale), static=True)
-            self._image_size[camera] = size
-        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns if shown_ns is None else shown_ns, "ns"))
-        self._rec.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
-        return True
+        """Show an image of a camera; see `CameraImages.log`."""
+        return self._images.log(camera, image, t_ns, shown_ns)
 
     def log_health(self, health: Health, t_ns: int) -> None:
         """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from common.arrays import Float
 from common.geometry import (
     axis_rotation,
+    cross,
     fit_rigid,
     intersect_plane,
     invert,
@@ -81,6 +82,14 @@ def test_small_rotation_vectors_stay_rotations(size: float) -> None:
     np.testing.assert_allclose(
         rotation_vector_to_matrix(vector), Rotation.from_rotvec(vector).as_matrix(), atol=1e-15
     )
+
+
+@given(
+    arrays(np.float64, (5, 1, 3), elements=st.floats(-1e3, 1e3)),
+    arrays(np.float64, (4, 3), elements=st.floats(-1e3, 1e3)),
+)
+def test_cross_is_numpys_also_over_many_at_once(a: Float, b: Float) -> None:
+    np.testing.assert_allclose(cross(a, b), np.cross(a, b), rtol=1e-12, atol=1e-9)
 
 
 @given(vectors, vectors)

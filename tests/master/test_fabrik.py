@@ -14,7 +14,8 @@ from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.chain import Chain, Coupling, Link, finger_chain, nearest_reach
-from master.ik.fabrik import ChainResult, Fabrik, Reach, solve_chain, solve_finger
+from master.ik.chain_result import ChainResult, Reach
+from master.ik.fabrik import Fabrik, solve_chain, solve_finger
 from master.ik.finger import FingerSolver
 from master.ik.joints import Angles, Hinge, Rotor
 from master.ik.vectors import IDENTITY, Vector, length, product, rotate, rotate_back, rotation_about

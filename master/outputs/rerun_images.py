@@ -1,0 +1,62 @@
+"""The cameras' pictures in the viewer: few enough, and at the size in which all centroids are."""
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from common.arrays import Image
+from common.camera_model import CameraModel
+from master.outputs.previews import jpeg_size
+from master.outputs.rerun_blueprint import TIMELINE, camera_path
+
+IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
+_JPEG_QUALITY = 80
+
+
+class CameraImages:
+    """Logs images to `recording`, which belongs to the caller. Holds time and size of each camera's last one."""
+
+    def __init__(self, recording: rr.RecordingStream, models: Mapping[str, CameraModel]) -> None:
+        """Take the cameras of the rig by name."""
+        self._rec = recording
+        self._models = models
+        self._last_ns: dict[str, int] = {}
+        self._size: dict[str, tuple[int, int]] = {}
+
+    def log(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
+        """Show an image of a camera at its full size, however small it is.
+
+        More than 10 a second are left out, and so are images of a camera that the rig does not have, and
+        bytes that are no JPEG.
+
+        Args:
+            camera: A camera of the rig.
+            image: (H, W, 3) BGR, (H, W) grey, or a whole JPEG file as bytes.
+            t_ns: Capture time [ns].
+            shown_ns: Where it stands on the timeline [ns]; None: at `t_ns`.
+
+        Returns:
+            Whether it was logged.
+        """
+        last = self._last_ns.get(camera)
+        size = jpeg_size(image) if isinstance(image, bytes) else (image.shape[1], image.shape[0])
+        if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
+            return False
+        if size is None or camera not in self._models:
+            return False
+        self._last_ns[camera] = t_ns
+        if isinstance(image, bytes):
+            jpeg = image
+        else:
+            jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+        path, model = f"{camera_path(camera)}/image", self._models[camera]
+        if self._size.get(camera) != size:
+            # The pinhole and all centroids are in pixels of the camera; a preview has fewer.
+            scale = [model.width_px / size[0], model.height_px / size[1], 1.0]
+            self._rec.log(path, rr.Transform3D(scale=scale), static=True)
+            self._size[camera] = size
+        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns if shown_ns is None else shown_ns, "ns"))
+        self._rec.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        return True
