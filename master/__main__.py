@@ -11,9 +11,9 @@ from typing import Annotated
 try:
     import typer
 except ModuleNotFoundError as error:  # a slave's machine has the scripts of both, and the packages of one
-    sys.exit(
+    raise SystemExit(
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
-    )
+    ) from error
 
 from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
