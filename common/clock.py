@@ -22,7 +22,7 @@ BEST_FRACTION = 10  # one in ten: the best 10 % by round trip carry the estimate
 BEST_AT_LEAST = 5  # while there are few samples
 FLOOR_NS = 5_000.0  # scatter of a sample without queueing: scheduling of two threads [ns]
 DRIFT_PRIOR = 200e-6  # two crystals differ by less than this (Raspberry Pi: +-100 ppm each)
-STEPS_TO_RESTART = 3
+STEPS_TO_RESTART = 3  # contradicting echoes in a row: one may be a freak of the network
 
 
 def now_ns() -> int:

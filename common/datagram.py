@@ -33,7 +33,7 @@ TAG_BYTES = 16
 OVERHEAD = HEADER.size + TAG_BYTES
 MAX_DATAGRAM = 4096  # 48 markers take 1.8 kB
 KEY_BYTES = 32
-WINDOW = 1024
+WINDOW = 1024  # counters behind the newest within which a late datagram is still told from a replayed one
 
 
 class Kind(IntEnum):

@@ -26,14 +26,14 @@ from common.messages import Command, Health, Message, encode
 from common.streams import ALIVE_KEY, key_of
 
 SCHEMES = ("tcp", "tls", "quic")
-LEASE_MS = 1000
+LEASE_MS = 1000  # so soon a pulled cable is noticed
 RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
 MAX_MESSAGE_BYTES = 1 << 20
-CLIENT_TIMEOUT_MS = 500
-ASK_AGAIN_S = 0.05
-JOIN_S = 1.0
+CLIENT_TIMEOUT_MS = 500  # a viewer tries a master that is not there for so long, then says that it waits
+ASK_AGAIN_S = 0.05  # a target that has just connected is not known everywhere yet
+JOIN_S = 1.0  # a thread that zenoh does not release is left to the end of the process
 LIVELINESS_TIMEOUT_S = 0.5
-FIFO_DEPTH = 64
+FIFO_DEPTH = 64  # between zenoh and the thread that empties it at once
 
 _LOG = logging.getLogger(__name__)
 

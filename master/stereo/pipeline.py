@@ -24,11 +24,10 @@ from master.stereo.pairing import Instant, Pairing
 from master.stereo.triangulate import Triangulator
 
 Stage = Callable[[str], AbstractContextManager[None]]
-_MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0
+_MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0  # residual above the larger of the two: not rays of one cap
 _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
-_HELD_DEPTH_M = (
-    0.004  # where one camera sees all there is, its depth is held: perspective alone lets it drift
-)
+# Where one camera sees all there is, its depth is held: perspective alone lets it drift.
+_HELD_DEPTH_M = 0.004
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from slave.markers.classify import Codes
 
 SCALE = 2  # the scan looks at every second pixel of every second row
-MAX_CANDIDATES = 6
+MAX_CANDIDATES = 6  # of one colour, the largest ones
 FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest piece's size
 FRAGMENT_LEAST = 8.0  # px^2

@@ -39,10 +39,10 @@ NOISE = 4e-6 * np.eye(3)
 # The six different products of three channels, and where each stands in the symmetric 3 x 3 matrix.
 PAIR_A, PAIR_B = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 PAIR_OF = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-MIN_PIXELS = 4
+MIN_PIXELS = 4  # a covariance of three channels needs four
 SHADING = (9, 9)  # px over which the shading of the paint is followed
 FAINT = 0.02  # weight of the mean level where no core is near
-UNEQUAL = 3.0
+UNEQUAL = 3.0  # largest to smallest window of one stack: beyond it, padding costs more than another stack
 
 
 def _linear_light() -> Float32:

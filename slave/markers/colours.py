@@ -19,12 +19,12 @@ from common.errors import FitError
 from slave.markers.classify import HUES, in_range
 
 HUE_GROW = 10  # how far the hue of one paint wanders between its lit and its shadow side
-HUE_MARGIN = 14
-HUE_APART = 8
-SATURATION_SHARE = 0.45
+HUE_MARGIN = 14  # widest half range; other paints and skin narrow it
+HUE_APART = 8  # two paints nearer than this look the same
+SATURATION_SHARE = 0.45  # of the paint's median: a rim pixel is about half paint
 SATURATION_LEAST = 50
-VALUE_SHARE = 0.3
-VALUE_LEAST = 25
+VALUE_SHARE = 0.3  # of the paint's median: the shadow side belongs to the cap
+VALUE_LEAST = 25  # below, hue is noise
 PALE = 60  # saturation below which nothing is a paint that can be told from a grey desk
 AROUND = 25  # px around the markers in which skin is sampled
 RIM = 4  # px around a marker that are partly paint

@@ -25,7 +25,7 @@ from slave.markers.roi import Track, advance
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
 SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
-CLEAR_CONTRAST = 6.0
+CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that deserve full quality
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 
 

@@ -18,19 +18,19 @@ import cv2
 from common.arrays import Image
 from slave.markers.blobs import SCALE, Blob
 
-REACH = 8.5
-SKIN_REACH = 0.8
+REACH = 8.5  # marker sizes between neighbours of one hand
+SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
 RING = 4  # px around the box in which skin is sought
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
 FRINGE = 0.3  # what a fringe counts
-FRINGE_RATIO = 4.0
-CLICKED = 10.0
-TRACKED = 1.0
+FRINGE_RATIO = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
+CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every rival of its marker
+TRACKED = 1.0  # bonus of the blob where the marker is expected: as much as being there
 SKINLESS = 0.06  # caps on rendered hands have 0.12 and more
-STRANGE_SIZE = 2.5
-SECOND_HAND = 3
-STRANGE_SHARE = 0.6
-STRANGE_FILL = 0.3
+STRANGE_SIZE = 2.5  # typical areas of the group, and
+STRANGE_SHARE = 0.6  # of its largest: above the lesser of the two, a skinless blob is clutter
+STRANGE_FILL = 0.3  # of its box; less is thin like a pen
+SECOND_HAND = 3  # markers
 
 
 @dataclass(frozen=True, slots=True)
