@@ -15,13 +15,12 @@ from msgspec import Meta, Struct
 
 from common.arrays import Float
 from common.errors import CalibrationError
+from common.messages import MAX_MARKERS, Name
 from common.replacing import replacing
 
 Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
 NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
 Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
-# The look-ahead: in Python `$` also matches before a final line feed, and names become file names.
-Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
 Vector3 = tuple[Number, Number, Number]
 Quaternion = tuple[Number, Number, Number, Number]
 Row4 = tuple[Number, Number, Number, Number]
@@ -30,7 +29,7 @@ Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
 Json = Annotated[object, Meta(extra_json_schema={"description": "any JSON value"})]
-Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=48)]
+Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
 
 
 StructT = TypeVar("StructT", bound=Struct)
