@@ -9,7 +9,7 @@ From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA25
 """
 
 from collections.abc import Callable, Mapping
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import msgspec
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from msgspec import Meta, Struct
 
-from common.datagram import KEY_BYTES, Header, Kind, Sealer, unseal
+from common.datagram import KEY_BYTES, Header, Kind, Refusal, Sealer, unseal
 from common.messages import Count, Name, TimeNs
 
 NONCE_BYTES = 16
@@ -28,6 +28,9 @@ Nonce = Annotated[bytes, Meta(min_length=NONCE_BYTES, max_length=NONCE_BYTES)]
 
 class Handshake(Struct, frozen=True, forbid_unknown_fields=True):
     """Base of what travels in a datagram besides data; unknown fields are refused."""
+
+
+HandshakeT = TypeVar("HandshakeT", bound=Handshake)
 
 
 class Beacon(Handshake, frozen=True):
@@ -150,6 +153,14 @@ class RigKeys:
     def open(self, header: Header, datagram: bytes) -> bytes | None:
         """Return the body of a handshake datagram if its seal fits, else None."""
         return unseal(ChaCha20Poly1305(self._process_key(header.key_id)), header, datagram)
+
+    def hear(self, header: Header, datagram: bytes, expected: type[HandshakeT]) -> HandshakeT | Refusal:
+        """Return the message of a handshake datagram, or why it is refused."""
+        body = self.open(header, datagram)
+        if body is None:
+            return Refusal.FORGED
+        message = read(header.kind, body)
+        return message if isinstance(message, expected) else Refusal.UNDECODABLE
 
     def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
         """Return the keys of the session that `hello` and the master's `session_nonce` make."""

@@ -184,12 +184,9 @@ class MasterLink:
         return Beacon(self._nonce, self._zenoh_endpoint, known)
 
     def _hear_hello(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        body = self._keys.open(header, datagram)
-        if body is None:
-            return Refusal.FORGED
-        hello = read(Kind.HELLO, body)
-        if not isinstance(hello, Hello):
-            return Refusal.UNDECODABLE
+        hello = self._keys.hear(header, datagram, Hello)
+        if isinstance(hello, Refusal):
+            return hello
         if hello.master_nonce != self._nonce:
             return Refusal.REPLAYED
         camera = self._cameras.get(hello.name)

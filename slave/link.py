@@ -152,12 +152,9 @@ class SlaveLink:
             return header
         if header.kind is not Kind.BEACON:
             return Refusal.UNEXPECTED
-        body = self._keys.open(header, datagram)
-        if body is None:
-            return Refusal.FORGED
-        beacon = read(Kind.BEACON, body)
-        if not isinstance(beacon, Beacon):
-            return Refusal.UNDECODABLE
+        beacon = self._keys.hear(header, datagram, Beacon)
+        if isinstance(beacon, Refusal):
+            return beacon
         session = self._session
         if session is not None:
             if beacon.master_nonce == session.master_nonce:
@@ -185,12 +182,9 @@ class SlaveLink:
         return Hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
 
     def _hear_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
-        body = self._keys.open(header, datagram)
-        if body is None:
-            return Refusal.FORGED
-        welcome = read(Kind.WELCOME, body)
-        if not isinstance(welcome, Welcome):
-            return Refusal.UNDECODABLE
+        welcome = self._keys.hear(header, datagram, Welcome)
+        if isinstance(welcome, Refusal):
+            return welcome
         offer = self._offer
         if self._session is not None and welcome.slave_nonce == self._session.slave_nonce:
             return Refusal.DUPLICATE
