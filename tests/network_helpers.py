@@ -24,7 +24,7 @@ def free_udp_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 5.0) -> bool:
+def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
     """Wait until `condition` holds; False if it never did."""
     deadline = time.monotonic() + timeout_s
     while not condition():

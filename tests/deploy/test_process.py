@@ -1,18 +1,10 @@
 """Watched children: their lines are heard, a crash is followed by a new start, a stop is clean."""
 
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 from deploy.process import Process
-
-
-def _wait(what: Callable[[], bool], seconds: float = 10.0) -> bool:
-    end = time.monotonic() + seconds
-    while not what() and time.monotonic() < end:
-        time.sleep(0.02)
-    return what()
+from tests.network_helpers import until
 
 
 def _process(tmp_path: Path, code: str, lines: list[str], **environment: str) -> Process:
@@ -36,7 +28,7 @@ time.sleep(60)
 def test_lines_and_environment_reach_the_launcher_and_the_log(tmp_path: Path) -> None:
     lines: list[str] = []
     process = _process(tmp_path, FOREVER, lines, COLOUR="teal")
-    assert _wait(lambda: "child up teal" in lines)
+    assert until(lambda: "child up teal" in lines)
     assert process.stop() == 7  # it ended by its own handler of SIGINT, it was not killed
     assert "up teal" in (tmp_path / "child.log").read_text()
 
@@ -44,7 +36,7 @@ def test_lines_and_environment_reach_the_launcher_and_the_log(tmp_path: Path) ->
 def test_a_killed_child_is_started_again_and_counted(tmp_path: Path) -> None:
     lines: list[str] = []
     process = _process(tmp_path, FOREVER, lines)
-    assert _wait(lambda: len(lines) == 1)
+    assert until(lambda: len(lines) == 1)
     assert process.check() is None
     first = process.pid
     process._child.kill()
@@ -56,11 +48,11 @@ def test_a_killed_child_is_started_again_and_counted(tmp_path: Path) -> None:
             codes.append(code)
         return bool(codes)
 
-    assert _wait(reported)
+    assert until(reported)
     assert codes == [-9]
     assert process.pid != first
     assert process.restarts == 1
-    assert _wait(lambda: len(lines) == 2)
+    assert until(lambda: len(lines) == 2)
     process.stop()
 
 
@@ -70,14 +62,14 @@ def test_a_child_that_ignores_the_request_is_killed(tmp_path: Path) -> None:
         "import signal, time\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nprint('deaf')\ntime.sleep(60)\n"
     )
     process = _process(tmp_path, deaf, lines)
-    assert _wait(lambda: "child deaf" in lines)
+    assert until(lambda: "child deaf" in lines)
     assert process.stop() == -9
 
 
 def test_the_end_after_a_stop_is_no_crash(tmp_path: Path) -> None:
     lines: list[str] = []
     process = _process(tmp_path, FOREVER, lines)
-    assert _wait(lambda: len(lines) == 1)
+    assert until(lambda: len(lines) == 1)
     process.stop()
     assert process.check() is None
     assert process.restarts == 0
@@ -86,7 +78,7 @@ def test_the_end_after_a_stop_is_no_crash(tmp_path: Path) -> None:
 def test_the_last_lines_are_kept_for_an_error_message(tmp_path: Path) -> None:
     lines: list[str] = []
     process = _process(tmp_path, "for k in range(30): print(k)\nraise SystemExit(3)", lines)
-    assert _wait(lambda: process.ended() is not None and len(lines) == 30)
+    assert until(lambda: process.ended() is not None and len(lines) == 30)
     assert list(process.tail)[-2:] == ["28", "29"]
     assert len(process.tail) == 12
     process.stop()
