@@ -144,7 +144,7 @@ class Health(Message, frozen=True, eq=False, tag=True):
     source: Name
     session: Count
     t_ns: TimeNs
-    counts: Annotated[dict[Name, Count], Meta(max_length=64)]
+    counts: Annotated[dict[Name, Count], Meta(max_length=512)]
     gauges: Annotated[dict[Name, Finite], Meta(max_length=64)]
 
 

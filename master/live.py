@@ -138,7 +138,13 @@ class _Reporter:
         return health(self._session, self._clock, self._figures, dict(self._pipeline.counts) | told)
 
     def answer(self, command: Command) -> Health:
-        """Obey "stop"; any other command is answered by a report."""
+        """Obey a command: "report" says how it is, "stop" ends the master.
+
+        Raises:
+            ValueError: Another verb; the asker reads which ones there are.
+        """
+        if command.verb not in ("report", "stop"):
+            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are report, stop")
         if command.verb == "stop":
             self._stop.set()
         return self.health()

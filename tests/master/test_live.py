@@ -1,0 +1,67 @@
+"""The live master end to end in one process: a slave that sends, a command that asks, a command that ends it."""
+
+import json
+import socket
+import threading
+from pathlib import Path
+
+import pytest
+
+from common.clock import SystemClock
+from common.errors import BusError
+from common.keys import new_key
+from common.messages import Command
+from common.zenoh_bus import ZenohBus
+from master.live import LiveSettings, run_live
+from master.outputs.files import load_poses
+from master.rig import load_setup
+from slave.uplink import Uplink
+from tests.network_helpers import detections, free_udp_port
+
+
+def free_tcp_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) -> None:
+    key = bytes.fromhex(new_key())
+    beacon, bus = free_udp_port(), f"tcp/127.0.0.1:{free_tcp_port()}"
+    files = {"poses": tmp_path / "poses.npz", "summary": tmp_path / "live.json"}
+    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, **files)
+    setup = load_setup(root / "calib_json", "desk")
+    lines: list[str] = []
+    stop = threading.Event()
+    master = threading.Thread(target=run_live, args=(setup, key, settings, stop, lines.append))
+    master.start()
+    clock = SystemClock()
+    left, right = (Uplink(name, key, clock, beacon, "127.0.0.1") for name in ("left", "right"))
+    asker = ZenohBus(None, bus)
+    try:
+        assert left.wait_for_start(10.0)
+        assert right.wait_for_start(10.0)
+        for seq in range(40):
+            t_ns = clock.now_ns()
+            left.send(detections("left", left.session, seq, t_ns))
+            right.send(detections("right", right.session, seq, t_ns))
+            stop.wait(0.01)
+        report = asker.ask(Command("master", "report"), 5.0)
+        assert report.source == "master"
+        assert report.counts["left.received"] > 30
+        with pytest.raises(BusError, match="there are report, stop"):
+            asker.ask(Command("master", "dance"), 5.0)
+        assert not stop.is_set()
+        asker.ask(Command("master", "stop"), 5.0)
+        master.join(10.0)
+        assert not master.is_alive()
+    finally:
+        stop.set()
+        master.join(10.0)
+        for end in (left, right, asker):
+            end.close()
+    summary = json.loads((tmp_path / "live.json").read_text())
+    poses = load_poses(tmp_path / "poses.npz")
+    assert len(poses) == summary["poses"] > 20
+    assert summary["lost"] == 0
+    assert lines[0].startswith("listening on 127.0.0.1:")
