@@ -1,7 +1,6 @@
 """The live loop: messages in, poses out to every sink; and the figures of a run."""
 
 import threading
-from collections import deque
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -29,7 +28,8 @@ class RunFigures:
 
     def __init__(self) -> None:
         self.poses = 0
-        self.latency_ms: deque[float] = deque(maxlen=_KEPT)
+        # A ring of fixed size: the report of every second reads it in one copy, however long the run.
+        self._latency_ms = np.zeros(_KEPT)
         self._first_ns = self._last_ns = 0
 
     def add(self, t_ns: int, latency_ns: int) -> None:
@@ -37,8 +37,8 @@ class RunFigures:
         if self.poses == 0:
             self._first_ns = t_ns
         self._last_ns = t_ns
+        self._latency_ms[self.poses % _KEPT] = latency_ns * 1e-6
         self.poses += 1
-        self.latency_ms.append(latency_ns * 1e-6)
 
     def summary(self) -> dict[str, float]:
         """poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms."""
@@ -46,8 +46,8 @@ class RunFigures:
         out = {"poses": float(self.poses)}
         if self.poses > 1 and span_s > 0:
             out["poses_per_s"] = round((self.poses - 1) / span_s, 2)
-        if self.latency_ms:
-            p50, p99 = np.percentile(np.array(self.latency_ms), [50, 99])
+        if self.poses:
+            p50, p99 = np.percentile(self._latency_ms[: self.poses], [50, 99])
             out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
         return out
 

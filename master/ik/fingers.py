@@ -68,6 +68,8 @@ class FingerRefiner:
             found = _solve(closed_form, fabrik, (x, y, z), angles[finger] if finger == THUMB else None)
             if found is not None:
                 angles[finger] = found
+        if np.array_equal(angles, hand.angles_rad):
+            return hand
         limits = self._model.limits_rad
         angles = np.clip(angles, limits[..., 0], limits[..., 1])
         joints = self._model.forward(hand.T_rig_palm, angles)

@@ -72,9 +72,10 @@ class MarkerPipeline:
         self._triangulator = Triangulator.of(self._cameras)
         self._caps = CapModel(model, markers)
         self._stage = stage
-        centres = np.array([camera.centre for camera in self._cameras])
+        self._centres = np.array([camera.centre for camera in self._cameras])
+        self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
         axes = np.array([camera.T_rig_camera[:3, 2] for camera in self._cameras])
-        self._eye = centres.mean(axis=0)
+        self._eye = self._centres.mean(axis=0)
         self._ahead = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
@@ -148,14 +149,11 @@ class MarkerPipeline:
         if last is not None:
             bias = self._caps.bias_px(last.joints, points, self._cameras)[view, lone]
             self._place(points, lone, view, uv - bias, near)
+        sight = points[lone] - self._centres[view]
+        across = np.hypot(instant.sigma_px[view, lone], doubt) / self._focal_px[view]
+        across = across * np.linalg.norm(sight, axis=1)
         depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
-        for k, marker in enumerate(lone):
-            camera = self._cameras[int(view[k])]
-            sight = points[marker] - camera.centre
-            away = float(np.linalg.norm(sight))
-            across = np.hypot(instant.sigma_px[view[k], marker], doubt[k]) * away / camera.matrix[0, 0]
-            along = np.outer(sight, sight) / away**2
-            cov[marker] = across**2 * (np.eye(3) - along) + depth_m**2 * along
+        cov[lone] = _ray_covariance(sight, across, np.full(len(lone), depth_m))
         return points, cov
 
     def _caps_of(self, hand: HandSolution) -> Float:
@@ -181,11 +179,7 @@ class MarkerPipeline:
         points = position_at_depth(camera, uv[0], depth)
         along = law.metres_per_pixel(depth) * np.hypot(sigma_px[0], sigma_px[1])
         across = depth / camera.matrix[0, 0] * sigma_px[0]
-        sight = points - camera.centre
-        sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-        outer = sight[:, :, None] * sight[:, None, :]
-        cov = across[:, None, None] ** 2 * (np.eye(3) - outer) + along[:, None, None] ** 2 * outer
-        return points, cov
+        return points, _ray_covariance(points - camera.centre, across, along)
 
     def _towards(self, points: Float) -> Float:
         """Unit vector (3,) from what is seen of the hand to the cameras."""
@@ -194,3 +188,10 @@ class MarkerPipeline:
             return -self._ahead
         back = self._eye - seen.mean(axis=0)
         return back / np.linalg.norm(back)
+
+
+def _ray_covariance(sight: Float, across: Float, along: Float) -> Float:
+    """Covariances (N, 3, 3) [m^2] of points seen along `sight` (N, 3), from two standard deviations (N,) [m]."""
+    direction = sight / np.linalg.norm(sight, axis=1, keepdims=True)
+    outer = direction[:, :, None] * direction[:, None, :]
+    return across[:, None, None] ** 2 * (np.eye(3) - outer) + along[:, None, None] ** 2 * outer

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from common.sim.scene import APART_PPM, LATE_NS
+from deploy import demo
 from deploy.__main__ import main
 
 
@@ -80,3 +82,9 @@ def test_a_length_that_is_none_is_refused(seconds: str) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["demo", "--seconds", seconds])
     assert ended.value.code == 2
+
+
+def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:
+    # The launcher imports nothing of what it starts, so the two numbers stand twice.
+    assert demo._LATE_MS * 1e6 == LATE_NS
+    assert demo._APART_PPM == APART_PPM
