@@ -27,6 +27,7 @@ FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a
 SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
 CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that deserve full quality
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
+CLEAR_SIGMA_PX, DOUBT_SIGMA_PX = 0.1, 0.6  # of a centroid of full quality; added where there is none
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,11 +38,16 @@ class Detections:
         uv: (M, 2) centroids of the visible paint [px], distorted image.
         area: (M,) visible area [px^2].
         quality: (M,) 0..1; 1 is a whole, unambiguous, clear marker.
+        sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
+            would see of the whole cap: noise, doubt of occlusion, size.
+        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; NaN: none.
     """
 
     uv: Float
     area: Float
     quality: Float
+    sigma_px: Float
+    rival_uv: Float
 
 
 class MarkerDetector:
@@ -94,6 +100,7 @@ class MarkerDetector:
         self._seeds = {}
         count = len(self._names)
         uv, area, quality = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
+        rival_uv = np.full((count, 2), np.nan)
         rows = list(chosen)
         extents = [self._extent(m, t_ns) for m in rows]
         for m, extent in zip(rows, extents, strict=True):
@@ -109,8 +116,13 @@ class MarkerDetector:
             self._tracks[m] = track = advance(track, seen, blob, t_ns)
             uv[m] = seen.u, seen.v
             area[m] = seen.area
-            quality[m] = _quality(seen, track, blob, blobs[m])
-        return Detections(uv, area, quality)
+            rivals = _rivals(blob, blobs[m])
+            quality[m] = _quality(seen, track, near_rival=bool(rivals))
+            if rivals:
+                largest = max(rivals, key=lambda b: b.area)
+                rival_uv[m] = largest.u, largest.v
+        sigma_px = CLEAR_SIGMA_PX + DOUBT_SIGMA_PX * (1.0 - quality)
+        return Detections(uv, area, quality, sigma_px, rival_uv)
 
     def _extent(self, m: int, t_ns: int) -> float:
         """Largest side of the whole marker [px] as far as its track knows, else inf."""
@@ -167,7 +179,7 @@ def _connected(chosen: Mapping[int, Blob]) -> bool:
     return len(nodes) < 2 or all(any(linked(a, b) for b in nodes if b is not a) for a in nodes)
 
 
-def _quality(seen: Measured, track: Track, blob: Blob, options: list[Blob]) -> float:
+def _quality(seen: Measured, track: Track, *, near_rival: bool) -> float:
     """0..1: how far the centroid can be trusted to be the centroid of the whole cap's visible side."""
     quality = math.sqrt(min(1.0, seen.area / track.whole)) * min(1.0, seen.contrast / CLEAR_CONTRAST)
     quality *= math.sqrt(min(1.0, seen.area / SMALL))
@@ -175,10 +187,15 @@ def _quality(seen: Measured, track: Track, blob: Blob, options: list[Blob]) -> f
         quality *= 0.5
     if seen.thin:
         quality *= 0.4
-    rivals = [b for b in options if b.area > 0.3 * blob.area and not _within(b, blob)]
-    if any(math.hypot(b.u - blob.u, b.v - blob.v) < 3.0 * math.sqrt(blob.area) for b in rivals):
+    if near_rival:
         quality *= 0.5
     return max(0.01, min(1.0, quality))
+
+
+def _rivals(blob: Blob, options: list[Blob]) -> list[Blob]:
+    """The other blobs of its colour, near it and not much smaller, that may be the marker instead."""
+    others = [b for b in options if b.area > 0.3 * blob.area and not _within(b, blob)]
+    return [b for b in others if math.hypot(b.u - blob.u, b.v - blob.v) < 3.0 * math.sqrt(blob.area)]
 
 
 def _within(piece: Blob, blob: Blob) -> bool:
