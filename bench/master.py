@@ -61,12 +61,14 @@ def _messages(setup: RigSetup) -> list[MarkerDetections]:
     rng = np.random.default_rng(7)
     out: list[MarkerDetections] = []
     full = np.full(len(setup.rig.markers), 150.0)
+    sigma, nowhere = np.full(len(full), 0.1), np.full((len(full), 2), np.nan)
     for seq in range(_FRAMES):
         for index, (name, model) in enumerate(setup.models.items()):
             t_s = seq / 60.0 + 0.005 * index
             uv = model.project(scene.truth(t_s).markers_m) + rng.normal(size=(len(full), 2)) * 0.08
             t_ns = round(t_s * 1e9)
-            out.append(MarkerDetections(name, 1, seq, t_ns, t_ns, uv, full, np.ones(len(full))))
+            quality = np.ones(len(full))
+            out.append(MarkerDetections(name, 1, seq, t_ns, t_ns, uv, full, quality, sigma, nowhere))
     return sorted(out, key=lambda message: message.t_ns)
 
 

@@ -22,12 +22,13 @@ def main() -> None:
         if not uplink.wait_for_start(20.0):
             raise SystemExit("no master")
     uv = np.tile(np.array([[320.0, 240.0]]), (6, 1))
-    full = np.ones(6)
+    full, sigma, nowhere = np.ones(6), np.full(6, 0.1), np.full((6, 2), np.nan)
     ticker = Ticker(10**9 // rate, clock)
     for seq in range(rate * seconds):
         t_ns = ticker.next()
         for k, uplink in enumerate(uplinks):
-            uplink.send(MarkerDetections(f"camera{k}", uplink.session, seq, t_ns, t_ns, uv, full, full))
+            seen = (uv, full, full, sigma, nowhere)
+            uplink.send(MarkerDetections(f"camera{k}", uplink.session, seq, t_ns, t_ns, *seen))
     for uplink in uplinks:
         uplink.close()
 

@@ -31,7 +31,7 @@ MAGIC = b"PHLX"
 HEADER = struct.Struct("!4sBBHIQQ")
 TAG_BYTES = 16
 OVERHEAD = HEADER.size + TAG_BYTES
-MAX_DATAGRAM = 4096  # 48 markers take 1.8 kB
+MAX_DATAGRAM = 4096  # 48 markers take 2.2 kB, 2.9 kB where they have rivals
 KEY_BYTES = 32
 WINDOW = 1024  # counters behind the newest within which a late datagram is still told from a replayed one
 

@@ -1,10 +1,13 @@
 """Messages that cross a process boundary. Arrays are read-only; NaN means "not seen".
 
 On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
-travels as itself and a message costs no Python loop. `decode` is the only way in: whatever
-it returns has the right shapes and no infinity. Every field is described in docs/wire.md.
+travels as itself and a message costs no Python loop. Rivals of markers are rare, and none at
+all travel as no bytes: so the detections of 24 markers fit one Ethernet packet. `decode` is
+the only way in: whatever it returns has the right shapes and no infinity. Every field is
+described in docs/wire.md.
 """
 
+from copy import copy
 from enum import IntEnum
 from typing import Annotated, TypeAlias, cast
 
@@ -15,7 +18,7 @@ from msgspec import Meta, Struct
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 1
+WIRE_VERSION = 2
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
@@ -54,7 +57,11 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         uv: Marker centroids (M, 2) [px], distorted image, (0, 0) = centre of the top-left pixel.
         area: Blob areas (M,) [px^2].
         quality: Confidence (M,) in 0..1: 1 is a whole, unambiguous, well exposed marker.
-            A row that is NaN in all three was not seen.
+        sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
+            the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
+        rival_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
+            this is the marker. NaN: none, the usual case. Only where `uv` is seen.
+            A row that is NaN in all was not seen.
     """
 
     camera: Name
@@ -65,6 +72,8 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
     uv: Float
     area: Float
     quality: Float
+    sigma_px: Float
+    rival_uv: Float
 
     def __post_init__(self) -> None:
         m = len(self.area)
@@ -73,6 +82,15 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "uv", np.float64, (m, 2))
         _freeze(self, "area", np.float64, (m,))
         _freeze(self, "quality", np.float64, (m,))
+        _freeze(self, "sigma_px", np.float64, (m,))
+        if self.rival_uv.size == 0:
+            msgspec.structs.force_setattr(self, "rival_uv", np.full((m, 2), np.nan))
+        _freeze(self, "rival_uv", np.float64, (m, 2))
+        unseen = np.isnan(self.uv[:, 0])
+        if not np.where(unseen, np.isnan(self.sigma_px), self.sigma_px > 0.0).all():
+            raise ValueError("sigma_px: must be positive where uv is seen and NaN elsewhere")
+        if not np.isnan(self.rival_uv[unseen]).all():
+            raise ValueError("rival_uv: a rival of a marker that is not seen")
 
 
 class HandPose(Message, frozen=True, eq=False, tag=True):
@@ -181,6 +199,7 @@ class Preview(Message, frozen=True, eq=False, tag=True):
 AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command | Preview
 
 _JPEG_START = b"\xff\xd8\xff"
+_NONE = np.empty((0, 2))
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
     MarkerDetections | HandPose | Health | Command | Preview,
@@ -190,6 +209,9 @@ _DECODER = msgspec.msgpack.Decoder(
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack bytes."""
+    if isinstance(message, MarkerDetections) and np.isnan(message.rival_uv).all():
+        message = copy(message)
+        msgspec.structs.force_setattr(message, "rival_uv", _NONE)
     return _ENCODER.encode(message)
 
 

@@ -29,13 +29,16 @@ def write_npz(path: Path, arrays: Mapping[str, npt.NDArray[np.generic]]) -> None
                 npy.write_array(member, array, version=(1, 0), allow_pickle=False)
 
 
-def read_npz(path: Path, names: Sequence[str] | None = None, fix: str = "") -> dict[str, Float]:
+def read_npz(
+    path: Path, names: Sequence[str] | None = None, fix: str = "", also: Sequence[str] = ()
+) -> dict[str, Float]:
     """Arrays by name, as they are stored.
 
     Args:
         path: The file.
         names: Which must be there; None: all there are.
         fix: Said after the error: what the user can do.
+        also: Which are read as well where they are there.
 
     Raises:
         RecordingError: Missing, broken, or without one of the names.
@@ -46,7 +49,8 @@ def read_npz(path: Path, names: Sequence[str] | None = None, fix: str = "") -> d
             for name in names or ():
                 if name not in file.files:
                     raise RecordingError(f"{path}: key {name!r} is missing{hint}")
-            return {name: np.asarray(file[name]) for name in names or file.files}
+            found = [*names, *(name for name in also if name in file.files)] if names else file.files
+            return {name: np.asarray(file[name]) for name in found}
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror or error}{hint}") from error
     except (ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from common.arrays import Float
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording
 from common.messages import HandPose, MarkerDetections
@@ -19,6 +20,11 @@ from master.rig import RigSetup, build_pipeline
 from master.score import load_truth, score
 from master.stages import StageTimes
 from master.summary import write_summary
+
+_CLEAR_PX, _DOUBT_PX = (
+    0.1,
+    0.6,
+)  # sigma of detections that state none: of full quality, and added where it is 0
 
 
 def solve(
@@ -101,10 +107,12 @@ def _gaps(messages: list[MarkerDetections]) -> int:
 def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
     path = folder / f"detections_{camera}.npz"
     fix = f"run `phalanx-slave detect` for camera {camera!r} first"
-    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix)
+    data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "rival_uv"))
     try:
         t_ns, seq = (data[name].astype(np.int64, casting="same_kind") for name in ("t_ns", "seq"))
         uv, area, quality = (data[name].astype(np.float64) for name in ("uv", "area_px2", "quality"))
+        sigma = data["sigma_px"].astype(np.float64) if "sigma_px" in data else _sigma_of(uv, quality)
+        rival = data["rival_uv"].astype(np.float64) if "rival_uv" in data else np.full_like(uv, np.nan)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{path}: {error}: {fix}") from error
     if t_ns.ndim != 1 or seq.shape != t_ns.shape:
@@ -113,14 +121,34 @@ def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetectio
         )
     if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
-    for row in range(len(t_ns)):
-        yield MarkerDetections(
-            camera=camera,
-            session=0,
-            seq=int(seq[row]),
-            t_ns=int(t_ns[row]),
-            ready_t_ns=int(t_ns[row]),
-            uv=uv[row],
-            area=area[row],
-            quality=quality[row],
+    if sigma.shape != uv.shape[:2] or rival.shape != uv.shape:
+        raise RecordingError(
+            f"{path}: sigma_px and rival_uv have shapes {sigma.shape} and {rival.shape}, expected {uv.shape[:2]}"
+            f" and {uv.shape}: {fix}"
         )
+    for row in range(len(t_ns)):
+        try:
+            yield MarkerDetections(
+                camera=camera,
+                session=0,
+                seq=int(seq[row]),
+                t_ns=int(t_ns[row]),
+                ready_t_ns=int(t_ns[row]),
+                uv=uv[row],
+                area=area[row],
+                quality=quality[row],
+                sigma_px=sigma[row],
+                rival_uv=rival[row],
+            )
+        except ValueError as error:
+            raise RecordingError(f"{path}: row {row}: {error}: {fix}") from error
+
+
+def _sigma_of(uv: Float, quality: Float) -> Float:
+    """Standard deviations (T, M) [px] of centroids whose file states none, from their quality (T, M).
+
+    A whole, clear marker is known to a tenth of a pixel; one of no quality, to as much as the part of a cap that
+    may be hidden moves its centroid at half a metre. Without a quality the worst is assumed.
+    """
+    doubt = 1.0 - np.clip(np.nan_to_num(quality, nan=0.0), 0.0, 1.0)
+    return np.where(np.isnan(uv[..., 0]), np.nan, _CLEAR_PX + _DOUBT_PX * doubt)

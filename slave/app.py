@@ -72,6 +72,8 @@ def run(
             found.uv,
             found.area,
             found.quality,
+            found.sigma_px,
+            found.rival_uv,
         )
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)

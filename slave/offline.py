@@ -27,6 +27,8 @@ class RecordedDetections:
         uv: (T, M, 2) centroids [px], distorted image.
         area_px2: (T, M) visible areas [px^2].
         quality: (T, M) 0..1.
+        sigma_px: (T, M) standard deviation of the centroids per axis [px].
+        rival_uv: (T, M, 2) second places of the same colour [px]; NaN: none.
     """
 
     t_ns: Int
@@ -34,6 +36,8 @@ class RecordedDetections:
     uv: Float
     area_px2: Float
     quality: Float
+    sigma_px: Float
+    rival_uv: Float
 
 
 def camera_of(recording: FrameRecording, camera: str, calibration: Path | None) -> CameraCalibration:
@@ -87,16 +91,19 @@ def detect_recording(
     names = recording.manifest.marker_rig().markers
     detector = MarkerDetector(model, names, recording.manifest.clicks.get(camera))
     shape = (len(rows), len(names))
-    uv, area, quality = np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
+    uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
+    area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)
     for i, row in enumerate(rows):
         if i > 0 and not recording.manifest.continuous:
             detector = detector.fresh()
         image = read_png(folder / row.file, (model.height_px, model.width_px))
         found = detector.push(image, row.t_ns)
         uv[i], area[i], quality[i] = found.uv, found.area, found.quality
+        sigma_px[i], rival_uv[i] = found.sigma_px, found.rival_uv
         progress(i + 1, len(rows))
     t_ns = np.array([row.t_ns for row in rows], np.int64)
-    return RecordedDetections(t_ns, np.array([row.seq for row in rows], np.int64), uv, area, quality)
+    seq = np.array([row.seq for row in rows], np.int64)
+    return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, rival_uv)
 
 
 def calibrate_colours(folder: Path, camera: str, output: Path) -> list[ColourRow]:

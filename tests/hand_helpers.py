@@ -96,7 +96,7 @@ def camera_models(rig: RigCalibration, row_time_us: float = 0.0) -> dict[str, Ca
 
 
 def detections(camera: str, seq: int, t_ns: int, uv: Float, area_px2: float = 400.0) -> MarkerDetections:
-    """One message; area and quality follow what is seen."""
+    """One message; area, quality and sigma follow what is seen, and nothing has a rival."""
     seen = np.isfinite(uv[:, 0])
     return MarkerDetections(
         camera=camera,
@@ -107,6 +107,8 @@ def detections(camera: str, seq: int, t_ns: int, uv: Float, area_px2: float = 40
         uv=uv,
         area=np.where(seen, area_px2, np.nan),
         quality=np.where(seen, 1.0, np.nan),
+        sigma_px=np.where(seen, 0.1, np.nan),
+        rival_uv=np.full_like(uv, np.nan),
     )
 
 

@@ -52,7 +52,10 @@ class ManualClock:
 def detections(camera: str, session: int, seq: int, t_ns: int = 0) -> MarkerDetections:
     """Return a frame with six markers."""
     uv = np.arange(12.0).reshape(6, 2)
-    return MarkerDetections(camera, session, seq, t_ns, t_ns + 1000, uv, np.full(6, 50.0), np.ones(6))
+    ones, nowhere = np.ones(6), np.full((6, 2), np.nan)
+    return MarkerDetections(
+        camera, session, seq, t_ns, t_ns + 1000, uv, 50.0 * ones, ones, 0.1 * ones, nowhere
+    )
 
 
 def seeded(seed: int) -> Callable[[int], bytes]:

@@ -8,7 +8,7 @@ newest capture time seen: no clock is read here, so a replay pairs exactly as th
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
 than the back of the hand. A track is carried to the instant by the polynomial through up to three neighbouring
-sightings. The error this leaves is added to the marker's pixel sigma; sideways error Dt v turns into a depth
+sightings. The error this leaves is added to the sigma that the slave gave; sideways error Dt v turns into a depth
 error D v Dt / B, the largest error of an unsynchronised rig.
 """
 
@@ -28,7 +28,6 @@ SILENT_FRAMES = 12
 _SPEED_PX_S = 500.0
 _ACCELERATION_PX_S2 = 1.0e4
 _JERK_PX_S3 = 2.0e5
-_FLOOR_PX, _DOUBT_PX = 0.1, 0.6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +118,7 @@ class Pairing:
                 centre_ns=centre_ns,
                 t_ns=(message.t_ns - self._origin_ns) + camera.row_time_ns * rows,
                 uv=message.uv,
-                sigma_px=_FLOOR_PX + _DOUBT_PX * (1.0 - message.quality),
+                sigma_px=message.sigma_px,
                 area=message.area,
                 ready_t_ns=message.ready_t_ns,
             )

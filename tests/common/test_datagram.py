@@ -93,7 +93,7 @@ def test_another_key_another_rig_another_version() -> None:
 
 
 def test_the_largest_message_fits_and_a_larger_body_is_the_callers_error() -> None:
-    assert MAX_MARKERS * (16 + 8 + 8) + 300 + OVERHEAD < MAX_DATAGRAM
+    assert MAX_MARKERS * (16 + 8 + 8 + 8 + 16) + 300 + OVERHEAD < MAX_DATAGRAM
     with pytest.raises(ValueError, match="at most"):
         Sealer(KEY, RIG, ID).seal(Kind.DATA, bytes(MAX_DATAGRAM))
 

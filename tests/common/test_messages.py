@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from common.arrays import Float
+from common.arrays import Bool, Float
+from common.datagram import MAX_DATAGRAM, OVERHEAD
 from common.errors import MessageError
 from common.messages import (
     FINGER_COUNT,
@@ -34,6 +35,12 @@ counts = st.integers(0, 2**63 - 1)
 times = st.integers(-(2**63), 2**63 - 1)
 
 
+def positive(draw: st.DrawFn, seen: Bool) -> Float:
+    """A sigma where `seen` (M,), NaN elsewhere."""
+    sigma = draw(arrays(np.float64, len(seen), elements=st.floats(1e-6, 1e6)))
+    return np.where(seen, sigma, np.nan)
+
+
 def floats(*shape: int) -> st.SearchStrategy[Float]:
     return arrays(np.float64, shape, elements=st.floats(allow_nan=True, allow_infinity=False))
 
@@ -41,15 +48,19 @@ def floats(*shape: int) -> st.SearchStrategy[Float]:
 @st.composite
 def detections(draw: st.DrawFn) -> MarkerDetections:
     m = draw(st.integers(0, MAX_MARKERS))
+    uv = draw(floats(m, 2))
+    seen = ~np.isnan(uv[:, 0])
     return MarkerDetections(
         camera=draw(names),
         session=draw(counts),
         seq=draw(counts),
         t_ns=draw(times),
         ready_t_ns=draw(times),
-        uv=draw(floats(m, 2)),
+        uv=uv,
         area=draw(floats(m)),
         quality=draw(floats(m)),
+        sigma_px=positive(draw, seen),
+        rival_uv=np.where(seen[:, None], draw(floats(m, 2)), np.nan),
     )
 
 
@@ -105,10 +116,12 @@ def sample_pose(markers: int = 6) -> HandPose:
     )
 
 
-def sample_detections(markers: int = 6) -> MarkerDetections:
+def sample_detections(markers: int = 6, rivals: Float | None = None) -> MarkerDetections:
     uv = np.arange(2.0 * markers).reshape(markers, 2)
     uv[1:2] = np.nan
-    return MarkerDetections("left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers))
+    sigma = np.where(np.isnan(uv[:, 0]), np.nan, 0.1)
+    rival = np.full((markers, 2), np.nan) if rivals is None else rivals
+    return MarkerDetections("left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, rival)
 
 
 SAMPLES: tuple[Message, ...] = (
@@ -155,22 +168,58 @@ def test_decoded_arrays_cannot_be_written(message: Message) -> None:
 
 def test_a_message_does_not_follow_the_array_it_was_made_of() -> None:
     uv = np.zeros((6, 2))
-    message = MarkerDetections("left", 1, 2, 3, 4, uv, np.zeros(6), np.zeros(6))
+    message = msgspec.structs.replace(sample_detections(), uv=uv, sigma_px=np.ones(6))
     uv[0] = 7.0
     assert not message.uv.any()
 
 
 def test_a_marker_frame_fits_one_datagram_and_its_size_is_known() -> None:
-    # 6 markers: 6 * (2 + 1 + 1) * 8 bytes of numbers; names and keys come on top.
-    assert 192 < len(encode(sample_detections())) < 320
-    assert len(encode(sample_detections(MAX_MARKERS))) < 1700
+    # 6 markers: 6 * (2 + 1 + 1 + 1) * 8 bytes of numbers; names and keys come on top.
+    assert 240 < len(encode(sample_detections())) < 390
+    largest = sample_detections(
+        MAX_MARKERS, np.where(np.arange(MAX_MARKERS)[:, None] == 1, np.nan, [1.0, 2.0])
+    )
+    assert len(encode(sample_detections(MAX_MARKERS))) < 2100
+    assert len(encode(largest)) + OVERHEAD < 2950 < MAX_DATAGRAM
+
+
+def longest(markers: int) -> MarkerDetections:
+    """Detections whose camera name and numbers take the most bytes."""
+    return msgspec.structs.replace(
+        sample_detections(markers),
+        camera="x" * 64,
+        session=2**63 - 1,
+        seq=2**63 - 1,
+        t_ns=-(2**63),
+        ready_t_ns=-(2**63),
+    )
+
+
+def test_the_detections_of_24_markers_are_one_ethernet_packet_while_none_has_a_rival() -> None:
+    payload = 1500 - 20 - 8  # MTU less the IPv4 and UDP headers: nothing is split into fragments
+    assert len(encode(longest(24))) + OVERHEAD <= payload
+    assert len(encode(longest(30))) + OVERHEAD <= payload
+    assert len(encode(longest(31))) + OVERHEAD > payload
+
+
+def test_no_rival_travels_as_no_bytes_and_one_rival_with_its_row() -> None:
+    assert as_map(sample_detections())["rival_uv"] == b""
+    decoded = decode(encode(sample_detections()))
+    assert isinstance(decoded, MarkerDetections)
+    assert decoded.rival_uv.shape == (6, 2)
+    assert np.isnan(decoded.rival_uv).all()
+    rivals = np.full((6, 2), np.nan)
+    rivals[3] = 7.0, 8.0
+    decoded = decode(encode(sample_detections(6, rivals)))
+    assert isinstance(decoded, MarkerDetections)
+    np.testing.assert_array_equal(decoded.rival_uv, rivals)
 
 
 @pytest.mark.parametrize("value", [np.inf, -np.inf])
 def test_infinity_is_refused_on_both_sides(value: float) -> None:
     area = np.array([1.0, value])
     with pytest.raises(ValueError, match="area: infinite"):
-        MarkerDetections("left", 1, 2, 3, 4, np.zeros((2, 2)), area, np.zeros(2))
+        MarkerDetections("left", 1, 2, 3, 4, np.zeros((2, 2)), area, np.ones(2), np.ones(2), np.zeros((2, 2)))
     wire = msgspec.msgpack.encode(as_map(sample_detections(2)) | {"area": area.tobytes()})
     with pytest.raises(MessageError, match="infinite"):
         decode(wire)
@@ -193,6 +242,18 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (0, {"uv": [0.0] * 12}),
         (0, {"area": b""}),
         (0, {"area": b"\0" * 8 * (MAX_MARKERS + 1)}),
+        (0, {"quality": b"\0" * 8}),
+        (0, {"sigma_px": b"\0" * 8}),
+        (0, {"sigma_px": b""}),
+        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, 0.0, 0.1, 0.1]).tobytes()}),
+        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, -0.1, 0.1, 0.1]).tobytes()}),
+        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
+        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
+        (0, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
+        (0, {"rival_uv": b"\0" * 8}),
+        (0, {"rival_uv": np.zeros((5, 2)).tobytes()}),
+        (0, {"rival_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
+        (0, {"rival_uv": np.full((6, 2), -np.inf).tobytes()}),
         (0, {"surplus": 1}),
         (0, {"type": "HandPose"}),
         (0, {"type": "Pickle"}),
@@ -322,7 +383,11 @@ def test_the_largest_preview_travels_and_one_byte_more_does_not() -> None:
 
 def test_constructors_refuse_what_does_not_fit() -> None:
     with pytest.raises(ValueError, match="uv: shape"):
-        MarkerDetections("left", 1, 2, 3, 4, np.zeros((6, 3)), np.zeros(6), np.zeros(6))
+        msgspec.structs.replace(sample_detections(), uv=np.zeros((6, 3)))
+    with pytest.raises(ValueError, match="sigma_px: must be positive"):
+        msgspec.structs.replace(sample_detections(), sigma_px=np.zeros(6))
+    with pytest.raises(ValueError, match="rival_uv: a rival of a marker that is not seen"):
+        msgspec.structs.replace(sample_detections(), rival_uv=np.ones((6, 2)))
     with pytest.raises(ValueError, match="at most 48"):
         sample_detections(MAX_MARKERS + 1)
     with pytest.raises(ValueError, match="at most 48"):

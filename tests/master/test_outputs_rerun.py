@@ -16,13 +16,14 @@ from common.errors import PhalanxError, RecordingError
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import JOINTS, TIPS, HandModel
 from common.hand_profiles import generated_profile
-from common.messages import Command, HandPose, Health, MarkerDetections, Preview, Source
+from common.messages import Command, HandPose, Health, Preview, Source
 from master.outputs.bus import BusSink
 from master.outputs.poses import Poses
 from master.outputs.rerun import run_viewer, write_rrd
 from master.outputs.rerun_process import ViewerProcess, viewer_arguments
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
+from tests.hand_helpers import detections
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
 EYE = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
@@ -121,10 +122,7 @@ def column(path: Path, entity: str, component: str) -> tuple[list[int], list[lis
 def test_a_run_written_as_rrd_is_all_there(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     poses = Poses.of(moving_hand(6))
-    seen = [
-        MarkerDetections("left", 1, i, int(t), 0, np.full((6, 2), 100.0 + i), np.ones(6), np.ones(6))
-        for i, t in enumerate(poses.t_ns)
-    ]
+    seen = [detections("left", i, int(t), np.full((6, 2), 100.0 + i)) for i, t in enumerate(poses.t_ns)]
     frames = [("right", int(t), np.full((48, 64, 3), 90, np.uint8)) for t in poses.t_ns]
     write_rrd(path, poses, RIG, CAMERAS, MODEL, {"left": seen}, truth_of(poses, 0.004), frames)
     rows = rows_of(path)

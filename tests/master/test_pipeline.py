@@ -11,7 +11,7 @@ from common.messages import HandPose, MarkerDetections, Source
 from master.rig import build_pipeline
 from master.stages import StageTimes
 from master.stereo.pipeline import MarkerPipeline
-from tests.hand_helpers import MARKERS, RIGHT
+from tests.hand_helpers import MARKERS, RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
 
 
@@ -35,9 +35,10 @@ def joint_mm(pose: HandPose) -> Float:
 
 
 def changed(message: MarkerDetections, marker: int, uv: Float) -> MarkerDetections:
-    new = message.uv.copy()
+    new, sigma = message.uv.copy(), message.sigma_px.copy()
     new[marker] = uv
-    return msgspec.structs.replace(message, uv=new)
+    sigma[marker] += 0.0 * uv[0]  # NaN where it is not seen
+    return msgspec.structs.replace(message, uv=new, sigma_px=sigma)
 
 
 def test_exact_detections_give_the_hand_back(exact_run: SyntheticRun) -> None:
@@ -121,12 +122,7 @@ def test_a_silent_camera_leaves_poses_and_is_counted(exact_run: SyntheticRun) ->
 
 
 def test_nothing_seen_at_all_is_a_pose_that_is_not_valid(exact_run: SyntheticRun) -> None:
-    blind = [
-        msgspec.structs.replace(
-            m, uv=np.full((6, 2), np.nan), area=np.full(6, np.nan), quality=np.full(6, np.nan)
-        )
-        for m in exact_run.messages[:10]
-    ]
+    blind = [detections(m.camera, m.seq, m.t_ns, np.full((6, 2), np.nan)) for m in exact_run.messages[:10]]
     poses = solve_all(build_pipeline(exact_run.setup, StageTimes()), blind)
     assert len(poses) == 5
     assert not any(p.valid.any() for p in poses)

@@ -10,12 +10,11 @@ import pytest
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Manifest
 from master.outputs.files import load_poses
+from master.outputs.poses import Poses
 from master.solve import fingers_of, solve
 from master.summary import read_summary, write_summary
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, hand_at, synthetic_run
-
-ARRAYS = ("t_ns", "seq", "uv", "area_px2", "quality")
 
 
 @pytest.fixture(scope="module")
@@ -32,6 +31,8 @@ def write_detections(folder: Path, run: SyntheticRun, **changes: object) -> None
             "uv": np.array([m.uv for m in own]),
             "area_px2": np.array([m.area for m in own]),
             "quality": np.array([m.quality for m in own]),
+            "sigma_px": np.array([m.sigma_px for m in own]),
+            "rival_uv": np.array([m.rival_uv for m in own]),
         } | changes
         np.savez(folder / f"detections_{camera}.npz", **{k: v for k, v in data.items() if v is not None})  # pyright: ignore[reportArgumentType]
 
@@ -95,6 +96,25 @@ def test_without_a_truth_there_are_no_scores(tmp_path: Path, short_run: Syntheti
     assert "marker_mm" not in summary
 
 
+def test_files_without_sigma_and_rivals_are_solved_with_a_sigma_from_their_quality(
+    tmp_path: Path, short_run: SyntheticRun
+) -> None:
+    clear, old = tmp_path / "clear", tmp_path / "old"
+    poses: list[Poses] = []
+    for folder in (clear, old):
+        folder.mkdir()
+        left_out = {"sigma_px": None, "rival_uv": None} if folder is old else {}
+        write_detections(folder, short_run, **left_out)
+        solve(recording(folder, short_run), short_run.setup, folder, folder)
+        poses.append(load_poses(folder / "poses.npz"))
+    # The run's markers are of full quality and state the 0.1 px that is the default for those.
+    np.testing.assert_array_equal(poses[0].cov_m2, poses[1].cov_m2)
+    write_detections(old, short_run, sigma_px=None, rival_uv=None, quality=np.full((10, 6), np.nan))
+    solve(recording(old, short_run), short_run.setup, old, old)
+    unknown = load_poses(old / "poses.npz")
+    assert np.trace(unknown.cov_m2[5, 10]) > 2.0 * np.trace(poses[0].cov_m2[5, 10])  # the index's tip
+
+
 def test_no_detections_at_all_are_no_poses(tmp_path: Path, short_run: SyntheticRun) -> None:
     empty = {
         "t_ns": np.zeros(0, np.int64),
@@ -102,6 +122,8 @@ def test_no_detections_at_all_are_no_poses(tmp_path: Path, short_run: SyntheticR
         "uv": np.zeros((0, 6, 2)),
         "area_px2": np.zeros((0, 6)),
         "quality": np.zeros((0, 6)),
+        "sigma_px": np.zeros((0, 6)),
+        "rival_uv": np.zeros((0, 6, 2)),
     }
     write_detections(tmp_path, short_run, **empty)
     summary = solve(recording(tmp_path, short_run), short_run.setup, tmp_path, tmp_path)
@@ -134,6 +156,14 @@ BROKEN: dict[str, tuple[dict[str, object], str]] = {
     "text": ({"uv": np.full((10, 6, 2), "x")}, "detections_left"),
     "times of two axes": ({"t_ns": np.zeros((10, 2), np.int64)}, "t_ns and seq"),
     "times in seconds": ({"t_ns": np.zeros(10)}, "detections_left"),
+    "too few sigmas": ({"sigma_px": np.ones((10, 5))}, r"sigma_px and rival_uv have shapes \(10, 5\)"),
+    "no sigma where one is seen": (
+        {"sigma_px": np.full((10, 6), np.nan)},
+        "row 0: sigma_px: must be positive",
+    ),
+    "a sigma of zero": ({"sigma_px": np.zeros((10, 6))}, "row 0: sigma_px: must be positive"),
+    "rivals of five": ({"rival_uv": np.zeros((10, 5, 2))}, r"\(10, 5, 2\), expected \(10, 6\) and"),
+    "infinitely far": ({"uv": np.full((10, 6, 2), np.inf)}, "row 0: uv: infinite"),
     "fewer numbers than times": ({"seq": np.zeros(3, np.int64)}, "t_ns and seq"),
 }
 

@@ -70,6 +70,8 @@ def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:
     ]
     np.testing.assert_allclose(wire.sent[0].uv, CENTRES + np.array([300.0, 200.0]), atol=0.3)
     assert np.isnan(wire.sent[1].uv).all()
+    assert (wire.sent[0].sigma_px > 0.0).all()
+    assert np.isnan(wire.sent[1].sigma_px).all()
     counts = tally.counts()
     assert (counts["frames"], counts["dropped"], counts["empty"], counts["seen.back"]) == (3, 2, 1, 2)
 

@@ -89,5 +89,6 @@ def test_a_wrong_key_is_refused_at_start(port: int) -> None:
 def test_messages_of_any_type_may_be_sent(uplink: Uplink) -> None:
     uplink.send(Health("left", 1, 0, {}, {}))
     empty = np.zeros(0)
-    uplink.send(MarkerDetections("left", 1, 0, 0, 0, empty.reshape(0, 2), empty, empty))
+    uv = empty.reshape(0, 2)
+    uplink.send(MarkerDetections("left", 1, 0, 0, 0, uv, empty, empty, empty, uv))
     assert uplink.counts["unsent"] == 2
