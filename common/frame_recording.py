@@ -1,9 +1,13 @@
 """A recording of raw frames: a folder with recording.json, frames.csv and PNG files.
 
-The slave's recorder writes it, the replay camera and the offline solver read it.
+The replay camera and the offline solver read it; `common.frame_writing` writes it. Whatever ended the recording,
+what is there can be read: the manifest comes first, and a frame's row after its file. So only the last row can be
+cut, and a cut last row is left out with a warning; every other broken row is an error.
 """
 
 import csv
+import io
+import logging
 import re
 from dataclasses import dataclass
 from enum import StrEnum
@@ -14,11 +18,13 @@ from msgspec import Struct
 
 from common.calibration import CameraCalibration, RigCalibration, check, load
 from common.errors import CalibrationError, RecordingError
+from common.messages import TimeNs
 
 MANIFEST = "recording.json"
 FRAMES = "frames.csv"
-_INTEGER = re.compile(r"-?[0-9]{1,19}")
 COLUMNS = ("camera", "seq", "t_ns", "illumination", "file")
+_INTEGER = re.compile(r"-?[0-9]{1,19}")
+_LOG = logging.getLogger(__name__)
 
 
 class Illumination(StrEnum):
@@ -30,6 +36,18 @@ class Illumination(StrEnum):
     LED = "led"
 
 
+class RecordedClock(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The clock of `t_ns`.
+
+    Attributes:
+        id: One monotonic clock: one start of one machine. Times of equal ids can be compared as they are.
+        wall_ahead_ns: The machine's wall clock minus this clock when the recording began [ns].
+    """
+
+    id: str
+    wall_ahead_ns: TimeNs
+
+
 class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """recording.json: the calibration a recording was made with, and how to read it.
 
@@ -38,6 +56,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         rig: The rig file's content; `rigs` where there are several.
         clicks: Camera -> marker -> (u, v) [px] of a pixel on that marker in the first frame.
         continuous: False: frames are unrelated poses, each solved afresh.
+        clock: The clock of all `t_ns`; None: not known.
     """
 
     version: Literal[1]
@@ -48,6 +67,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     clicks: dict[str, dict[str, tuple[float, float]]] = {}
     continuous: bool = True
     note: str = ""
+    clock: RecordedClock | None = None
 
     def marker_rig(self) -> RigCalibration:
         """The marker rig of this recording.
@@ -100,16 +120,12 @@ def open_recording(folder: Path) -> FrameRecording:
     """
     try:
         manifest = load(folder / MANIFEST, Manifest)
-        _check(manifest, str(folder / MANIFEST))
+        check_manifest(manifest, str(folder / MANIFEST))
     except CalibrationError as error:
         raise RecordingError(str(error)) from error
     path = folder / FRAMES
     try:
-        with path.open(newline="") as file:
-            reader = csv.reader(file)
-            if tuple(next(reader, ())) != COLUMNS:
-                raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")
-            rows = tuple(_row(path, reader.line_num, line) for line in reader if line)
+        rows = _rows(path, path.read_bytes().decode())
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -120,8 +136,12 @@ def open_recording(folder: Path) -> FrameRecording:
     return FrameRecording(folder, manifest, rows)
 
 
-def _check(manifest: Manifest, where: str) -> None:
-    """What `load` cannot know: the files inside the manifest, and that they fit together."""
+def check_manifest(manifest: Manifest, where: str) -> None:
+    """Refuse what `load` cannot see: the files inside the manifest, and whether they fit together.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
     for name, camera in manifest.cameras.items():
         check(camera, f"{where}: cameras.{name}")
     for rig in (manifest.rig, *manifest.rigs):
@@ -130,6 +150,28 @@ def _check(manifest: Manifest, where: str) -> None:
         check(rig, f"{where}: rig {rig.name!r}")
         if missing := set(rig.cameras) - manifest.cameras.keys():
             raise CalibrationError(f"{where}: cameras: {min(missing)!r} of rig {rig.name!r} is missing")
+
+
+def _rows(path: Path, text: str) -> tuple[FrameRow, ...]:
+    """All rows of frames.csv; the last one is left out, with a warning, where the end of the recording cut it."""
+    reader = csv.reader(io.StringIO(text, newline=""))
+    if tuple(next(reader, ())) != COLUMNS:
+        raise RecordingError(f"{path}: header must be {','.join(COLUMNS)}")
+    lines = [(reader.line_num, line) for line in reader if line]
+    if not lines or text.endswith("\n"):
+        return tuple(_row(path, number, line) for number, line in lines)
+    rows = [_row(path, number, line) for number, line in lines[:-1]]
+    number, line = lines[-1]
+    try:
+        last = _row(path, number, line)
+    except RecordingError:
+        last = None
+    # Five columns may still be a name cut short; a table written by hand may just lack its last line feed.
+    if last is not None and (path.parent / last.file).is_file():
+        rows.append(last)
+    else:
+        _LOG.warning("%s: line %d is cut, left out: the recording was not ended, but broke off", path, number)
+    return tuple(rows)
 
 
 def _row(path: Path, number: int, line: list[str]) -> FrameRow:

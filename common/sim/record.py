@@ -4,17 +4,16 @@ The form is that of every recording (recording.json, frames.csv, PNG files); the
 of rendered recordings: truth.npz, truth_meta.json.
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Float
 from common.errors import RecordingError
-from common.frame_recording import COLUMNS, FRAMES, MANIFEST, Illumination, Manifest
+from common.frame_recording import Illumination, Manifest
+from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.sim.light import PAINT_LINEAR_RGB
 from common.sim.paint import MarkerView
@@ -48,66 +47,61 @@ def record_scene(
     of the exposure of the centre row of the rig's first camera.
 
     Args:
-        folder: Made if missing; must hold no recording yet.
+        folder: New or empty.
         scene: What to render.
         seconds: How long [s]; at least one frame is written.
         start_s: Scene time of the first frame [s].
         continuous: False tells readers that every frame is a pose of its own.
 
     Raises:
-        RecordingError: The folder holds a recording already, or cannot be written.
+        RecordingError: The folder holds something already, or cannot be written.
         ValueError: The cameras differ in frame rate.
     """
     names = scene.rig.cameras
     rates = {scene.cameras[name].frame_rate_hz for name in names}
     if len(rates) != 1:
         raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
-    if (folder / MANIFEST).exists():
-        raise RecordingError(f"{folder}: holds a recording already; give an empty folder")
     period = 1.0 / rates.pop()
     count = max(round(seconds / period), 1)
     renderers = [Renderer(scene, name) for name in names]
     offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
     lead = scene.cameras[names[0]]
     centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
+    first = [
+        renderer.observe(start_s + offset)[1] for renderer, offset in zip(renderers, offsets, strict=True)
+    ]
+    writer = RecordingWriter(folder, _manifest(scene, first, continuous))
     rows: list[_Row] = []
-    lines: list[tuple[object, ...]] = []
     try:
-        for name in names:
-            (folder / name).mkdir(parents=True, exist_ok=True)
         for k in range(count):
             times = tuple(start_s + k * period + offset for offset in offsets)
             views: list[MarkerView] = []
             for name, renderer, t in zip(names, renderers, times, strict=True):
                 image, view = renderer.observe(t)
-                file = f"{name}/{k:06d}.png"
-                _write_png(folder / file, image)
-                lines.append((name, k, FIRST_NS + round(t * 1e9), Illumination.NONE.value, file))
+                t_ns = FIRST_NS + round(t * 1e9)
+                writer.add(name, k, t_ns, Illumination.NONE, encode_png(image))
                 views.append(view)
             rows.append(_Row(tuple(views), times, scene.truth(times[0] + centre_s)))
-        _write_tables(folder, scene, rows, lines, continuous)
+    finally:
+        writer.close()
+    try:
+        _write_truth(folder, scene, rows)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
     return count
 
 
-def _write_png(path: Path, image: Image) -> None:
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1]):
-        raise RecordingError(f"{path}: cannot write")
-
-
-def _write_tables(
-    folder: Path, scene: Scene, rows: list[_Row], lines: list[tuple[object, ...]], continuous: bool
-) -> None:
+def _manifest(scene: Scene, first: list[MarkerView], continuous: bool) -> Manifest:
+    """What was rendered; the clicks are the exact centroids in the first frame of each camera."""
     clicks = {
         name: {
             marker: (float(uv[0]), float(uv[1]))
             for marker, uv in zip(scene.rig.markers, view.uv, strict=True)
             if np.isfinite(uv).all()
         }
-        for name, view in zip(scene.rig.cameras, rows[0].views, strict=True)
+        for name, view in zip(scene.rig.cameras, first, strict=True)
     }
-    manifest = Manifest(
+    return Manifest(
         version=1,
         kind="markers",
         cameras={name: scene.cameras[name] for name in scene.rig.cameras},
@@ -116,11 +110,9 @@ def _write_tables(
         continuous=continuous,
         note=f"rendered scene, seed {scene.seed}",
     )
-    (folder / MANIFEST).write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1))
-    with (folder / FRAMES).open("w", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(COLUMNS)
-        writer.writerows(lines)
+
+
+def _write_truth(folder: Path, scene: Scene, rows: list[_Row]) -> None:
     truths = [row.reference for row in rows]
     np.savez(
         folder / TRUTH,

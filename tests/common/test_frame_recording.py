@@ -131,6 +131,33 @@ def test_a_broken_manifest_is_named_by_file_and_key(
         open_recording(write(tmp_path, **manifest))
 
 
+@pytest.mark.parametrize("length", range(len(HEADER) + 1, len("\n".join((HEADER, *ROWS)))))
+def test_a_table_cut_anywhere_opens_up_to_the_cut(
+    length: int, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write(tmp_path)
+    table = tmp_path / "frames.csv"
+    text = table.read_text()[:length]
+    table.write_text(text)
+    (tmp_path / "right").mkdir()
+    (tmp_path / "right/0.png").write_bytes(b"")
+    recording = open_recording(tmp_path)
+    whole = text.count("\n") - 1
+    assert len(recording.rows) == whole + text.endswith(
+        ROWS[0]
+    )  # its line feed is missing, but its file is there
+    assert ("is cut, left out" in caplog.text) == (len(recording.rows) < len(text.splitlines()) - 1)
+
+
+def test_a_cut_header_or_a_cut_line_with_others_behind_it_is_no_cut_recording(tmp_path: Path) -> None:
+    write(tmp_path, rows=(ROWS[0], ROWS[1][:-12], ROWS[2]))
+    with pytest.raises(RecordingError, match="line 3: expected the 5 columns"):
+        open_recording(tmp_path)
+    (tmp_path / "frames.csv").write_text(HEADER[:-3])
+    with pytest.raises(RecordingError, match="header must be"):
+        open_recording(tmp_path)
+
+
 def test_a_frame_of_an_unknown_camera_is_named(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=r"frames\.csv: camera 'top' is not in recording\.json"):
         open_recording(write(tmp_path, rows=("top,0,5,none,x.png",)))
