@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.errors import CalibrationError
+from common.srgb import to_linear, to_srgb
 
 Float32 = npt.NDArray[np.float32]
 
@@ -58,17 +59,6 @@ class SrgbTables:
         """sRGB bytes of linear light (H, W, 3), clipped to 0..1."""
         steps = np.clip(light * np.float32(_ENCODE_STEPS - 1) + np.float32(0.5), 0, _ENCODE_STEPS - 1)
         return self.byte[steps.astype(np.uint16)]
-
-
-def to_srgb(linear: Float) -> Float:
-    """sRGB transfer curve of linear values 0..1 (IEC 61966-2-1)."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def to_linear(srgb: Float) -> Float:
-    """Inverse of `to_srgb`."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
 def bgr_bytes(linear_rgb: Float) -> tuple[int, int, int]:

@@ -1,7 +1,10 @@
 """Scene -> camera image: hand, paint, desk, card, blur and noise, with the truth of what each marker shows.
 
 Order of drawing: desk; finger parts and palm from far to near, each as nested discs that make it look round;
-sleeve; motion blur; card; markers (see `paint`); lens blur; noise.
+sleeve; motion blur; card; markers (see `paint`); lens blur; the light, where it is not the calibrated one; noise.
+
+Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
+there stays as bright as white paint under the new light, also where a real one would outshine it.
 """
 
 import cv2
@@ -15,6 +18,7 @@ from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
 from common.sim.surface import CAPSULES, PALM_HULL, SLEEVE_SPHERES, WEB_HULL
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
+from common.srgb import relit_bytes
 
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
 ROUND_LAYER = 2
@@ -39,6 +43,7 @@ class Renderer:
         self._painter = Painter(self._view)
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
+        self._light = scene.light
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
 
     def render(self, t_s: float) -> Image:
@@ -70,6 +75,9 @@ class Renderer:
         cv2.GaussianBlur(roi, (3, 3), LENS_SIGMA_PX, dst=roi)
         for x, y, patch in windows:
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
+        if self._light is not None:
+            tables = relit_bytes(self._light.gains_bgr(max(t_s, 0.0) % self._view.scene.period_s))
+            image = np.asarray(cv2.LUT(image, tables.T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
         return image, self._painter.truth(painted)
 

@@ -13,6 +13,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.hand_model import HandJoints, HandModel
+from common.sim.illuminant import LightCourse
 from common.sim.motion import HandMotion, ScriptedMotion
 
 STANDARD_SEED = 7
@@ -104,6 +105,7 @@ class Scene:
         cards: Occluders.
         seed: Of textures and noise.
         centre_m: Middle of the volume (3,), rig frame [m].
+        light: How the light changes; None: as it was when the colours were calibrated.
     """
 
     rig: RigCalibration
@@ -113,6 +115,7 @@ class Scene:
     centre_m: Float
     cards: tuple[Card, ...] = ()
     seed: int = STANDARD_SEED
+    light: LightCourse | None = None
     optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
 
     def __post_init__(self) -> None:

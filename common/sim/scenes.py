@@ -1,28 +1,32 @@
 """Scenes by name, so that every process of a simulated rig renders the same one."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.errors import PhalanxError
 from common.hand_model import HandModel
+from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
 from common.sim.scene import Scene, view_centre
 
-NAMES = "standard | leap:FILE.npz"
+NAMES = "standard | lights | leap:FILE.npz"
 _LEAP = "leap:"
 
 
 def scene_by_name(
     name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
 ) -> Scene:
-    """The scene called `standard`, or one that follows a recorded motion, `leap:FILE.npz`.
+    """The scene called `standard`, the same under light that changes, `lights`, or one that follows a recorded motion.
 
     Raises:
         PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
     """
     if name == "standard":
         return Scene.standard(rig, cameras, hand, seed)
+    if name == "lights":
+        return replace(Scene.standard(rig, cameras, hand, seed), light=ROOM)
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
         return Scene.of_motion(rig, cameras, hand, motion, seed)
