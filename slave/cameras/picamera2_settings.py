@@ -1,0 +1,165 @@
+"""What a camera file means for libcamera: the controls to write, and the values that must be read back.
+
+Tolerances. libcamera programs exposure and frame duration in whole rows, rounding down, so one row is allowed. It
+programs the analogue gain in codes of the sensor: OV5647 has steps of 1/16, IMX219 has 256 / (256 - code), that is
+steps of gain² / 256, the others are finer (libcamera, src/ipa/rpi/cam_helper). What rounding takes away it gives back
+as digital gain behind the sensor, which may therefore exceed 1 by as much, and not by more. Colour gains come back as
+they were written, but for the fixed point of the image processor. A lens moves in steps of about 0.03 dioptres
+(IMX708: 480 steps for 15 dioptres).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from common.calibration import CameraCalibration
+from common.errors import CameraError
+from slave.cameras.picamera2_library import Enums
+from slave.cameras.settings import Setting, as_values
+
+Sync = Literal["off", "server", "client"]
+
+GLOBAL_SHUTTER_ROW_US = (
+    30.0  # where the camera file says 0: no official sensor needs longer for a row at video rates
+)
+EXPOSURE_SHARE = 0.01  # a hundredth of the exposure is below the noise of an 8-bit pixel
+COLOUR_GAIN = 0.01
+DIOPTRES = 0.05
+SYNC_FRAMES = (
+    100  # libcamera's default: the server tells the clients every 30 frames, so each hears it three times
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Picamera2Options:
+    """What is not in the camera file.
+
+    Attributes:
+        index: Number of the camera on this Pi.
+        sync: Whether frames follow another camera's ("client"), lead ("server") or run free.
+        sync_timeout_s: How long to wait for the others [s].
+        focus_m: Distance in focus [m]; needed by a camera with a focus motor, refused by any other.
+        lores: Width and height of a second, small YUV420 image of each frame [px], or None.
+    """
+
+    index: int = 0
+    sync: Sync = "off"
+    sync_timeout_s: float = 60.0
+    focus_m: float | None = None
+    lores: tuple[int, int] | None = None
+
+
+def controls(
+    camera: CameraCalibration, options: Picamera2Options, enums: Enums, available: Mapping[str, object]
+) -> dict[str, Any]:
+    """Controls of the configuration, by libcamera's names.
+
+    Args:
+        camera: Exposure, gains and rate.
+        options: Focus and synchronisation.
+        enums: Values of libcamera's enumerations.
+        available: Controls that this camera has.
+
+    Raises:
+        CameraError: The camera lacks a control that is needed, or the options do not fit the camera.
+    """
+    period_us = round(1e6 / camera.frame_rate_hz)
+    if camera.exposure_us >= period_us:
+        raise CameraError(
+            f"exposure_us {camera.exposure_us:g} does not fit into a frame of {period_us} us (frame_rate_hz "
+            f"{camera.frame_rate_hz:g}); lower one of them in the camera file"
+        )
+    asked: dict[str, Any] = {
+        "AeEnable": False,
+        "AwbEnable": False,
+        "ExposureTime": round(camera.exposure_us),
+        "AnalogueGain": camera.analogue_gain,
+        "ColourGains": camera.colour_gains,
+        "FrameDurationLimits": (period_us, period_us),
+    }
+    if "NoiseReductionMode" in available:  # a camera without it has none to switch off
+        asked["NoiseReductionMode"] = enums.noise_reduction_off
+    asked |= _focus(options, enums, available) | _sync(options, enums, available)
+    missing = [name for name in asked if name not in available]
+    if missing:
+        raise CameraError(
+            f"it has no control {', '.join(missing)}, which the camera file needs (a monochrome camera has no colour "
+            "gains, and sees no coloured markers); use another camera, or update libcamera"
+        )
+    return asked
+
+
+def _focus(options: Picamera2Options, enums: Enums, available: Mapping[str, object]) -> dict[str, Any]:
+    if "AfMode" not in available:
+        if options.focus_m is not None:
+            raise CameraError(
+                f"--focus {options.focus_m:g}: it has no focus motor; turn its lens, and leave --focus away"
+            )
+        return {}
+    if options.focus_m is None:
+        raise CameraError(
+            "it has a focus motor, which would move: give the distance in focus, for example --focus 0.6"
+        )
+    if not options.focus_m > 0.0:
+        raise CameraError(f"--focus {options.focus_m:g}: must be a distance above 0 m")
+    return {"AfMode": enums.af_manual, "LensPosition": 1.0 / options.focus_m}  # dioptres
+
+
+def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, object]) -> dict[str, Any]:
+    if options.sync == "off":
+        return {}
+    mode = enums.sync_server if options.sync == "server" else enums.sync_client
+    if mode is None or "SyncMode" not in available:
+        raise CameraError(
+            f"--sync {options.sync}: this libcamera cannot synchronise cameras; update the system "
+            "(`sudo apt full-upgrade`), or leave --sync away: the master brings free-running cameras to one instant"
+        )
+    # The number of frames until "ready" is the server's to say (control_ids_rpi.yaml, SyncFrames).
+    return {"SyncMode": mode} | ({"SyncFrames": SYNC_FRAMES} if options.sync == "server" else {})
+
+
+def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, Any, Any]]) -> None:
+    """Refuse what libcamera would clip.
+
+    Args:
+        asked: Control -> value.
+        available: Control -> (lowest, highest, default) in the mode that is configured.
+
+    Raises:
+        CameraError: A value is out of range; every such control is named with its range.
+    """
+    wrong: list[str] = []
+    for name in ("ExposureTime", "AnalogueGain", "ColourGains", "FrameDurationLimits", "LensPosition"):
+        if name not in asked:
+            continue
+        low, high = (as_values(bound) for bound in available[name][:2])
+        values = as_values(asked[name])
+        if not (low and high and values):  # a range without numbers says nothing; reading back will
+            continue
+        if not all(low[0] <= value <= high[0] for value in values):
+            wrong.append(
+                f"{name} {', '.join(f'{v:g}' for v in values)} is not within {low[0]:g} to {high[0]:g}"
+            )
+    if wrong:
+        raise CameraError(f"in this mode {'; '.join(wrong)}: change the camera file (or --focus)")
+
+
+def wanted_settings(
+    camera: CameraCalibration, options: Picamera2Options, available: Mapping[str, object]
+) -> tuple[Setting, ...]:
+    """What the metadata of a captured frame must say; tolerances as in the text above."""
+    row_us = camera.row_time_us if camera.row_time_us > 0.0 else GLOBAL_SHUTTER_ROW_US
+    exposure = row_us + EXPOSURE_SHARE * camera.exposure_us
+    gain = max(1.0 / 16.0, camera.analogue_gain**2 / 256.0)
+    digital = exposure / camera.exposure_us + gain / camera.analogue_gain
+    rate = f"frame_rate_hz {camera.frame_rate_hz:g}"
+    wanted = [
+        Setting("ExposureTime", (camera.exposure_us,), exposure, "us", "exposure_us"),
+        Setting("AnalogueGain", (camera.analogue_gain,), gain, "", "analogue_gain"),
+        Setting("DigitalGain", (1.0,), digital, "", "no brightening behind the sensor"),
+        Setting("ColourGains", camera.colour_gains, COLOUR_GAIN, "", "colour_gains"),
+        Setting("FrameDuration", (1e6 / camera.frame_rate_hz,), row_us + 1.0, "us", rate),
+    ]
+    if "AfMode" in available and options.focus_m is not None:
+        wanted.append(Setting("LensPosition", (1.0 / options.focus_m,), DIOPTRES, "dioptres", "--focus"))
+    return tuple(wanted)

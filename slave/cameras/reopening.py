@@ -1,0 +1,123 @@
+"""A real camera that is unplugged and comes back: opened anew without restarting the slave.
+
+An error while the camera is opened for the first time is an error. Once it has run, losing it is an event: it is
+given back, and opened again after 0.2 s, 0.4 s … at most 2 s, until it is there or the slave is told to stop. Every
+opening writes and checks all settings again. `seq` keeps rising, by as many frames as fit into the absence, so that
+those count as dropped.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+
+from common.clock import Clock
+from common.errors import CameraError
+from slave.cameras.source import Frame, FrameSource
+
+FIRST_WAIT_S = 0.2
+LONGEST_WAIT_S = 2.0
+LOG_EVERY_NS = 10_000_000_000
+_LOG = logging.getLogger(__name__)
+
+
+class ReopeningCamera:
+    """A `FrameSource` around one that can be lost.
+
+    Holds the open camera, if there is one, the number and time of the last frame, and in `lost` how often the
+    camera went away.
+    """
+
+    def __init__(
+        self,
+        opener: Callable[[], FrameSource],
+        frame_rate_hz: float,
+        clock: Clock,
+        stop: threading.Event,
+    ) -> None:
+        """Open the camera.
+
+        Args:
+            opener: Opens the camera; called again after each loss.
+            frame_rate_hz: Its nominal rate [Hz], to count the frames of an absence.
+            clock: The clock of the frames' times.
+            stop: Set when the slave is to end; `read` then gives up waiting for a camera.
+
+        Raises:
+            CameraError: The camera is not there or refused a setting.
+        """
+        self._open = opener
+        self._rate_hz = frame_rate_hz
+        self._clock = clock
+        self._stop = stop
+        self._closed = threading.Event()
+        self._source: FrameSource | None = opener()
+        self._base = 0  # added to the camera's own numbers
+        self._fresh = False  # the next frame is the first one after a loss
+        self._last: tuple[int, int] | None = None  # seq, t_ns
+        self._wait_s = FIRST_WAIT_S
+        self._said_ns: int | None = None
+        self.lost = 0
+
+    def read(self) -> Frame | None:
+        """Next frame; waits for a lost camera. None at the end of the stream, when stopped, or once closed."""
+        while True:
+            source = self._source if self._source is not None else self._return()
+            if source is None or self._closed.is_set():
+                return None
+            try:
+                frame = source.read()
+            except CameraError as error:
+                self.lost += 1
+                self._say(f"lost: {error}")
+                self._drop()
+                continue
+            return None if frame is None else self._number(frame)
+
+    def close(self) -> None:
+        """Give the camera back. Safe to call twice, and from another thread that ends a wait."""
+        self._closed.set()
+        self._drop()
+
+    def _drop(self) -> None:
+        source, self._source = self._source, None
+        if source is None:
+            return
+        try:
+            source.close()
+        except CameraError as error:
+            self._say(f"could not be given back: {error}")
+
+    def _return(self) -> FrameSource | None:
+        """Open until it works; None when told to stop."""
+        while not (self._stop.wait(self._wait_s) or self._closed.is_set()):
+            self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a frame has come
+            try:
+                self._source, self._fresh = self._open(), True
+            except CameraError as error:
+                self._say(f"still away: {error}")
+                continue
+            if self._closed.is_set():  # while it was being opened
+                self._drop()
+            return self._source
+        return None
+
+    def _number(self, frame: Frame) -> Frame:
+        """The frame with a number that goes on where the last camera ended."""
+        if self._fresh:
+            _LOG.warning("camera: back after loss number %d", self.lost)
+            self._said_ns, self._wait_s, self._fresh = None, FIRST_WAIT_S, False
+            if self._last is not None:
+                seq, t_ns = self._last
+                self._base = seq + max(1, round((frame.t_ns - t_ns) * 1e-9 * self._rate_hz)) - frame.seq
+        seq = frame.seq + self._base
+        self._last = (seq, frame.t_ns)
+        if self._base == 0:
+            return frame
+        return Frame(seq, frame.t_ns, frame.ready_t_ns, frame.image, frame.illumination)
+
+    def _say(self, text: str) -> None:
+        """Log the first event of an absence at once, further ones every ten seconds."""
+        now_ns = self._clock.now_ns()
+        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
+            self._said_ns = now_ns
+            _LOG.warning("camera: %s", text)

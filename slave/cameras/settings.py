@@ -1,0 +1,85 @@
+"""Camera settings: what was asked for, what the camera says it has, and whether that is the same.
+
+A camera rounds: exposure to whole rows, gain to whole register codes. So every setting carries how far the value
+read back may be from the value wanted, and why. Whatever is further off is an error that names setting, wanted,
+got and what to do; nothing is taken on trust.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from common.errors import CameraError
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One quantity that the camera must have.
+
+    Attributes:
+        name: As the camera calls it.
+        wanted: Values, one or several (a pair of colour gains).
+        tolerance: Largest allowed distance of each value, in its unit.
+        unit: For the text of errors; may be empty.
+        source: Where the wanted value comes from, for the text of errors.
+    """
+
+    name: str
+    wanted: tuple[float, ...]
+    tolerance: float
+    unit: str
+    source: str
+
+
+def as_values(value: object) -> tuple[float, ...] | None:
+    """Numbers of a scalar or a sequence; None where it holds anything else."""
+    items: Sequence[object] = list(value) if isinstance(value, (list, tuple)) else [value]  # pyright: ignore[reportUnknownArgumentType]
+    numbers = [float(item) for item in items if isinstance(item, (int, float))]
+    return tuple(numbers) if len(numbers) == len(items) else None
+
+
+def differences(wanted: Iterable[Setting], got: Mapping[str, object]) -> list[str]:
+    """What is not as wanted, one sentence each; empty if all is well.
+
+    A setting that was not read back at all is a difference: nothing is known about it.
+    """
+    found: list[str] = []
+    for setting in wanted:
+        if setting.name not in got:
+            found.append(f"{setting.name}: wanted {_say(setting.wanted, setting.unit)}, not read back at all")
+            continue
+        values = as_values(got[setting.name])
+        near = (
+            values is not None
+            and len(values) == len(setting.wanted)
+            and all(abs(a - b) <= setting.tolerance for a, b in zip(values, setting.wanted, strict=True))
+        )
+        if not near:
+            say = got[setting.name] if values is None else _say(values, setting.unit)
+            found.append(
+                f"{setting.name}: wanted {_say(setting.wanted, setting.unit)} ({setting.source}), got {say}, "
+                f"allowed are {_number(setting.tolerance)}{_space(setting.unit)} off"
+            )
+    return found
+
+
+def demand(where: str, wanted: Iterable[Setting], got: Mapping[str, object], fix: str) -> None:
+    """Raise unless the camera has everything.
+
+    Raises:
+        CameraError: With `where`, every setting that differs, and `fix`.
+    """
+    found = differences(wanted, got)
+    if found:
+        raise CameraError(f"{where} did not take its settings: {'; '.join(found)}. {fix}")
+
+
+def _say(values: Sequence[float], unit: str) -> str:
+    return ", ".join(_number(value) for value in values) + _space(unit)
+
+
+def _number(value: float) -> str:
+    return f"{value:.6g}"
+
+
+def _space(unit: str) -> str:
+    return f" {unit}" if unit else ""
