@@ -28,6 +28,7 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
+LinearLight = Annotated[float, Meta(gt=0.0, le=1.0)]
 Json = Annotated[object, Meta(extra_json_schema={"description": "any JSON value"})]
 Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
 
@@ -50,10 +51,15 @@ class Intrinsics(_File, frozen=True):
 
 
 class HsvRange(_File, frozen=True):
-    """Colour of one marker in OpenCV's HSV (H 0-179); hsv_low[0] > hsv_high[0] wraps through 0."""
+    """Colour of one marker in OpenCV's HSV (H 0-179); hsv_low[0] > hsv_high[0] wraps through 0.
+
+    `reference_bgr_linear` is the mean colour of the paint in linear light, blue first, 1 = white, at calibration; with
+    it a slave follows changes of the light.
+    """
 
     hsv_low: Hsv
     hsv_high: Hsv
+    reference_bgr_linear: tuple[LinearLight, LinearLight, LinearLight] | None = None
 
 
 class CameraCalibration(_File, frozen=True):
