@@ -7,9 +7,8 @@ is emitted then, or when the message time has passed its deadline, with whatever
 newest capture time seen: no clock is read here, so a replay pairs exactly as the live run did.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
-than the back of the hand. A track is carried to the instant by the polynomial through up to three neighbouring
-sightings. The error this leaves is added to the sigma that the slave gave; sideways error Dt v turns into a depth
-error D v Dt / B, the largest error of an unsynchronised rig.
+than the back of the hand. `master.stereo.tracks` carries each to the instant; a sideways error Dt v would turn into a
+depth error D v Dt / B, the largest of an unsynchronised rig.
 """
 
 from collections import deque
@@ -21,13 +20,10 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
+from master.stereo.tracks import Carried, Sighting, carry
 
 HISTORY = 8
 SILENT_FRAMES = 12
-# What a hand can do that a polynomial does not know, at half a metre from a 500 px lens.
-_SPEED_PX_S = 500.0
-_ACCELERATION_PX_S2 = 1.0e4
-_JERK_PX_S3 = 2.0e5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +37,7 @@ class Instant:
         area: (C, M) [px^2] of the nearest sighting.
         ready_t_ns: When the last contributing frame was handed to its slave.
         missing: (C,) cameras that had no frame in time.
+        rival_uv, rival_sigma_px: As `uv` and `sigma_px` of the second places that slaves named; None: none at all.
     """
 
     t_ns: int
@@ -49,16 +46,8 @@ class Instant:
     area: Float
     ready_t_ns: int
     missing: Bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Sighting:
-    centre_ns: int
-    t_ns: Float  # (M,) capture time of each marker's row, since the first frame of all: float64 is exact to 1 ns
-    uv: Float
-    sigma_px: Float
-    area: Float
-    ready_t_ns: int
+    rival_uv: Float | None = None
+    rival_sigma_px: Float | None = None
 
 
 class Pairing:
@@ -87,7 +76,7 @@ class Pairing:
         self._gap_ns = int(2.5 * period_ns)
         self._patience = SILENT_FRAMES * len(cameras)
         self._policy, self._continuous = policy, continuous
-        self._seen: tuple[deque[_Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
+        self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
         self._waiting = [0] * len(self._names)  # frames of other cameras since this one's last
         self._pending: deque[int] = deque()
         self._origin_ns: int | None = None
@@ -110,17 +99,19 @@ class Pairing:
             self._origin_ns = message.t_ns
         half = 0.5 * (camera.height_px - 1) * camera.row_time_ns
         centre_ns = message.t_ns + round(half)
-        rows = np.where(np.isnan(message.uv[:, 1]), 0.5 * (camera.height_px - 1), message.uv[:, 1])
         if self._seen[index] and centre_ns <= self._seen[index][-1].centre_ns:
             return []  # a restarted slave's first clock estimate may step back: wait until time goes on
+        rivals = not np.isnan(message.rival_uv).all()
         self._seen[index].append(
-            _Sighting(
+            Sighting(
                 centre_ns=centre_ns,
-                t_ns=(message.t_ns - self._origin_ns) + camera.row_time_ns * rows,
+                t_ns=self._row_times(message.t_ns, camera, message.uv),
                 uv=message.uv,
                 sigma_px=message.sigma_px,
                 area=message.area,
                 ready_t_ns=message.ready_t_ns,
+                rival_uv=message.rival_uv if rivals else None,
+                rival_t_ns=self._row_times(message.t_ns, camera, message.rival_uv) if rivals else None,
             )
         )
         self._newest_ns = max(self._newest_ns, centre_ns)
@@ -133,6 +124,12 @@ class Pairing:
     def flush(self) -> list[Instant]:
         """At the end of a recording: emit what is still waiting."""
         return self._emit(flush=True)
+
+    def _row_times(self, t_ns: int, camera: CameraModel, uv: Float) -> Float:
+        """When the rows of places (M, 2) were exposed (M,) [ns since the first frame of all]."""
+        assert self._origin_ns is not None
+        rows = np.where(np.isnan(uv[:, 1]), 0.5 * (camera.height_px - 1), uv[:, 1])
+        return (t_ns - self._origin_ns) + camera.row_time_ns * rows
 
     def _leader(self) -> int:
         speaking = (c for c, seen in enumerate(self._seen) if seen and self._waiting[c] < self._patience)
@@ -171,6 +168,7 @@ class Pairing:
         uv = np.full((count, markers, 2), np.nan)
         sigma = np.full((count, markers), np.nan)
         area = np.full((count, markers), np.nan)
+        rivals: list[tuple[int, Carried]] = []
         missing = np.ones(count, dtype=bool)
         ready = 0
         assert self._origin_ns is not None
@@ -178,11 +176,19 @@ class Pairing:
             near = self._neighbours(c, t_ns)
             if near:
                 missing[c] = False
-                uv[c], sigma[c], area[c] = _carry(near, float(t_ns - self._origin_ns))
+                carried = carry(near, float(t_ns - self._origin_ns))
+                uv[c], sigma[c], area[c] = carried.uv, carried.sigma_px, near[0].area
                 ready = max(ready, *(s.ready_t_ns for s in near))
-        return Instant(t_ns, uv, sigma, area, ready, missing)
+                if carried.rival_uv is not None:
+                    rivals.append((c, carried))
+        if not rivals:
+            return Instant(t_ns, uv, sigma, area, ready, missing)
+        rival_uv, rival_sigma = np.full_like(uv, np.nan), np.full_like(sigma, np.nan)
+        for c, carried in rivals:
+            rival_uv[c], rival_sigma[c] = carried.rival_uv, carried.rival_sigma_px
+        return Instant(t_ns, uv, sigma, area, ready, missing, rival_uv, rival_sigma)
 
-    def _neighbours(self, camera: int, t_ns: int) -> list[_Sighting]:
+    def _neighbours(self, camera: int, t_ns: int) -> list[Sighting]:
         """Up to three sightings around the instant, nearest first, none farther away than a gap.
 
         None at all where even the nearest is farther than the deadline: a track carried over two frames into
@@ -198,32 +204,3 @@ class Pairing:
         if near and abs(near[0].centre_ns - t_ns) > self._deadline_ns:
             return []
         return near[:3] if self._continuous else near[:1]
-
-
-def _carry(near: list[_Sighting], t: float) -> tuple[Float, Float, Float]:
-    """Position (M, 2), sigma (M,) and area (M,) at time `t` [ns since the origin], nearest sighting first.
-
-    A marker the nearest sighting does not hold is not seen. Lagrange's weights through the sightings that do:
-    three -> parabola, two -> line, one -> held where it was.
-    """
-    uv = np.full_like(near[0].uv, np.nan)
-    sigma = np.full_like(near[0].area, np.nan)
-    times = np.stack([s.t_ns for s in near])
-    seen = np.stack([np.isfinite(s.uv).all(axis=1) for s in near])
-    order = np.cumprod(seen, axis=0).sum(axis=0)  # sightings in a row, from the nearest on
-    for n in range(1, len(near) + 1):
-        use = order == n
-        if not use.any():
-            continue
-        tn = times[:n, use]
-        away = np.abs(t - tn) * 1e-9
-        weights = np.ones_like(tn)
-        for i in range(n):
-            for j in range(n):
-                if i != j:
-                    weights[i] *= (t - tn[j]) / (tn[i] - tn[j])
-        uv[use] = sum(weights[i][:, None] * near[i].uv[use] for i in range(n))
-        noise = sum((weights[i] * near[i].sigma_px[use]) ** 2 for i in range(n))
-        unknown = (_SPEED_PX_S, _ACCELERATION_PX_S2 / 2, _JERK_PX_S3 / 6)[n - 1] * np.prod(away, axis=0)
-        sigma[use] = np.sqrt(noise + unknown**2)
-    return uv, sigma, near[0].area

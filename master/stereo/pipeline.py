@@ -7,11 +7,11 @@ and get the same poses. It is built from calibration by `master.rig`.
 from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
@@ -19,12 +19,13 @@ from master.filters import OneEuro
 from master.ik.hand import HandSolution
 from master.ik.tracker import HandTracker, pose_of
 from master.stereo.caps import CapModel
-from master.stereo.depth import DepthLaw, position_at_depth
+from master.stereo.depth import DepthLaw
 from master.stereo.pairing import Instant, Pairing
-from master.stereo.triangulate import Triangulator
+from master.stereo.place import Placed, Placement, ray_covariance
+from master.stereo.rivals import RivalChooser
+from master.stereo.whereabouts import Whereabouts
 
 Stage = Callable[[str], AbstractContextManager[None]]
-_MISFIT_PX, _MISFIT_SIGMAS = 3.0, 5.0  # residual above the larger of the two: not rays of one cap
 _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
 # Where one camera sees all there is, its depth is held: perspective alone lets it drift.
 _HELD_DEPTH_M = 0.004
@@ -68,8 +69,10 @@ class MarkerPipeline:
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter()
         self._cameras = tuple(cameras.values())
-        self._pairing, self._law, self._smooth, self._tracker = pairing, law, smooth, tracker
-        self._triangulator = Triangulator.of(self._cameras)
+        self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
+        self._place = Placement(self._cameras, law)
+        self._choose = RivalChooser(self._cameras, self._place)
+        self._whereabouts = Whereabouts(np.ones(len(markers), dtype=bool))
         self._caps = CapModel(model, markers)
         self._stage = stage
         self._centres = np.array([camera.centre for camera in self._cameras])
@@ -91,14 +94,15 @@ class MarkerPipeline:
     def _solve(self, instant: Instant) -> SolvedPose:
         last = self._tracker.last if self._smooth is not None else None
         with self._stage("triangulate"):
-            raw, cov = self._locate(instant, last)
+            instant = self._without_rivals(instant, last)
+            raw, cov, apart = self._locate(instant, last)
         if last is None:
             # The caps' tilt is not known yet: a first solution without correction tells it.
             with self._stage("hand"):
                 first = self._tracker.peek(*self._with_rays(instant, raw, cov, None), self._towards(raw))
             if first is not None:
                 with self._stage("triangulate"):
-                    raw, cov = self._locate(instant, first)
+                    raw, cov, apart = self._locate(instant, first)
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
         with self._stage("hand"):
@@ -106,25 +110,56 @@ class MarkerPipeline:
             measured = np.isfinite(markers[:, 0])
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
+        if self._smooth is not None:
+            self._whereabouts.saw(instant.t_ns, raw)
+        self._count("apart", apart)
+        self.counts["epipolar_misfits"] += int(apart.sum())
         self.counts["poses"] += 1
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
         return SolvedPose(pose, instant.ready_t_ns)
 
-    def _locate(self, instant: Instant, hand: HandSolution | None) -> tuple[Float, Float]:
-        """Cap centroids (M, 3) [m] and covariances (M, 3, 3) at the instant, given the hand known so far."""
+    def _without_rivals(self, instant: Instant, last: HandSolution | None) -> Instant:
+        """The instant with one place for each marker; the usual one has no rival and is passed on."""
+        if instant.rival_uv is None or instant.rival_sigma_px is None:
+            return instant
+        in_doubt = np.isfinite(instant.rival_uv[..., 0]).any(axis=0)
+        first = self._place(instant.uv, instant.sigma_px)
+        clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
+        of_hand = None if last is None else self._caps_of(last)
+        expected = self._whereabouts.expected(instant.t_ns, of_hand, clear)
+        chosen = self._choose(
+            instant.uv, instant.sigma_px, instant.rival_uv, instant.rival_sigma_px, expected
+        )
+        self._count("rival", chosen.taken)
+        self._count("unclear", chosen.dropped)
+        area = np.where(chosen.taken | chosen.dropped, np.nan, instant.area)  # that of the first place
+        return replace(instant, uv=chosen.uv, sigma_px=chosen.sigma_px, area=area, rival_uv=None)
+
+    def _apart(self, uv: Float, placed: Placed) -> Bool:
+        """(M,) markers that two cameras see, but whose rays do not meet: one camera saw something else."""
+        met = np.isfinite(placed.points[:, 0]) & (placed.misfit <= placed.limit)
+        return (np.isfinite(uv[..., 0]).sum(axis=0) >= 2) & ~met
+
+    def _count(self, event: str, markers: Bool) -> None:
+        """Count an event of each of the markers (M,) by name."""
+        for m in np.flatnonzero(markers):
+            self.counts[f"{event}.{self.markers[m]}"] += 1
+
+    def _locate(self, instant: Instant, hand: HandSolution | None) -> tuple[Float, Float, Bool]:
+        """Cap centroids (M, 3) [m] and covariances (M, 3, 3) at the instant, given the hand known so far.
+
+        Those whose rays do not meet are NaN, and told by the third array (M,).
+        """
         uv, sigma = instant.uv, instant.sigma_px
-        points, cov, residual = self._triangulate(uv, sigma)
+        points = self._place(uv, sigma).points
         sigma = np.hypot(sigma, self._caps.doubt_px(instant.area, points, self._cameras))
         if hand is not None:
             uv = uv - self._caps.bias_px(hand.joints, points, self._cameras)
-        points, cov, residual = self._triangulate(uv, sigma)
-        limit = np.maximum(_MISFIT_PX, _MISFIT_SIGMAS * np.nan_to_num(sigma).max(axis=0))
-        misfit = residual > limit
-        if misfit.any():
-            # Rays that pass each other: one camera saw something else of that colour.
-            self.counts["epipolar_misfits"] += int(misfit.sum())
-            points[misfit], cov[misfit] = np.nan, np.nan
-        return points, cov
+        placed = self._place(uv, sigma)
+        apart = self._apart(uv, placed)
+        if apart.any():
+            placed.points[apart], placed.cov[apart] = np.nan, np.nan
+        return placed.points, placed.cov, apart
 
     def _with_rays(
         self, instant: Instant, points: Float, cov: Float, last: HandSolution | None
@@ -144,42 +179,20 @@ class MarkerPipeline:
         near = np.broadcast_to(found.mean(axis=0), points.shape) if last is None else self._caps_of(last)
         view = np.argmax(seen[:, lone], axis=0)
         uv = instant.uv[view, lone]
-        self._place(points, lone, view, uv, near)
+        self._place.put(points, lone, view, uv, near)
         doubt = self._caps.doubt_px(instant.area, points, self._cameras)[view, lone]
         if last is not None:
             bias = self._caps.bias_px(last.joints, points, self._cameras)[view, lone]
-            self._place(points, lone, view, uv - bias, near)
+            self._place.put(points, lone, view, uv - bias, near)
         sight = points[lone] - self._centres[view]
         across = np.hypot(instant.sigma_px[view, lone], doubt) / self._focal_px[view]
         across = across * np.linalg.norm(sight, axis=1)
         depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
-        cov[lone] = _ray_covariance(sight, across, np.full(len(lone), depth_m))
+        cov[lone] = ray_covariance(sight, across, np.full(len(lone), depth_m))
         return points, cov
 
     def _caps_of(self, hand: HandSolution) -> Float:
         return self.model.marker_points(hand.joints, self.markers)
-
-    def _place(self, points: Float, markers: Int, view: Int, uv: Float, near: Float) -> None:
-        """Put each marker on the ray of its camera, as far away as its point of `near` (M, 3) is."""
-        for k, marker in enumerate(markers):
-            camera = self._cameras[int(view[k])]
-            points[marker] = camera.centre + np.linalg.norm(near[marker] - camera.centre) * camera.ray(uv[k])
-
-    def _triangulate(self, uv: Float, sigma_px: Float) -> tuple[Float, Float, Float]:
-        """Points (M, 3) [m], covariances (M, 3, 3) and reprojection residuals (M,) [px] by the rig's depth model."""
-        if self._law is None:
-            found = self._triangulator.triangulate(uv, sigma_px)
-            return found.points.copy(), found.covariance.copy(), found.residual_px
-        points, cov = self._by_law(self._law, uv, sigma_px)
-        return points, cov, np.zeros(len(points))
-
-    def _by_law(self, law: DepthLaw, uv: Float, sigma_px: Float) -> tuple[Float, Float]:
-        camera = self._cameras[0]
-        depth = law.depth(uv[0, :, 0] - uv[1, :, 0])
-        points = position_at_depth(camera, uv[0], depth)
-        along = law.metres_per_pixel(depth) * np.hypot(sigma_px[0], sigma_px[1])
-        across = depth / camera.matrix[0, 0] * sigma_px[0]
-        return points, _ray_covariance(points - camera.centre, across, along)
 
     def _towards(self, points: Float) -> Float:
         """Unit vector (3,) from what is seen of the hand to the cameras."""
@@ -188,10 +201,3 @@ class MarkerPipeline:
             return -self._ahead
         back = self._eye - seen.mean(axis=0)
         return back / np.linalg.norm(back)
-
-
-def _ray_covariance(sight: Float, across: Float, along: Float) -> Float:
-    """Covariances (N, 3, 3) [m^2] of points seen along `sight` (N, 3), from two standard deviations (N,) [m]."""
-    direction = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-    outer = direction[:, :, None] * direction[:, None, :]
-    return across[:, None, None] ** 2 * (np.eye(3) - outer) + along[:, None, None] ** 2 * outer

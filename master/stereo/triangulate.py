@@ -45,12 +45,14 @@ class Triangulation:
         points: (M, 3) [m], rig frame. NaN: not determined.
         covariance: (M, 3, 3) [m^2].
         residual_px: (M,) reprojection error, RMS over the cameras that saw the marker [px].
+        error_px2: (M, C) squared reprojection error in each camera [px^2]; 0: not seen.
         views: (M,) cameras that saw the marker.
     """
 
     points: Float
     covariance: Float
     residual_px: Float
+    error_px2: Float
     views: Int
 
 
@@ -167,7 +169,7 @@ def _judge(points: Float, covariance: Float, z: Float, error: Float, weight: Flo
     points[nan] = np.nan
     covariance[nan] = np.nan
     residual[nan] = np.nan
-    return Triangulation(points, covariance, residual, views.astype(np.int64))
+    return Triangulation(points, covariance, residual, squared, views.astype(np.int64))
 
 
 def _inverse(matrix: Float) -> Float:

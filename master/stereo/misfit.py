@@ -1,0 +1,87 @@
+"""Do the rays of one marker meet? How far they miss each other, against how well they are known.
+
+Rays of one point meet but for noise, so the squared miss in units of its standard deviation is chi square
+distributed: 2 C numbers of C cameras less the 3 of the point. For two cameras it is the distance from the epipolar
+line. What exceeds the quantile that noise exceeds once in a million is not one point (`LIMIT`: 4.9 standard
+deviations for two cameras).
+
+A rig whose depth comes from a law on raw disparities has no epipolar geometry to trust: its law contains how the
+cameras are misaligned, its poses do not. Where its cameras are nearly parallel, side by side and alike, rows are still
+epipolar lines but for that misalignment, and the difference of rows is tested. Other such rigs have no test.
+"""
+
+from math import erfc, exp, gamma, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+from common.camera_model import CameraModel
+
+RIG_PX = 0.5
+"""Standard deviation per axis of what lens and place of a calibrated camera leave at one marker."""
+_ONE_IN = 1e-6
+_MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
+_PARALLEL_RAD = np.radians(3.0)
+_ALIKE = 0.05  # largest relative difference of focal lengths, and slope of the baseline
+
+
+def chi_square_survival(x: float, degrees: int) -> float:
+    """Probability that chi square exceeds `x` (Abramowitz & Stegun, 26.4.4 and 26.4.5)."""
+    if degrees % 2:
+        tail, first = erfc(sqrt(x / 2)), 1.5
+        count = (degrees - 1) // 2
+    else:
+        tail, first = 0.0, 1.0
+        count = degrees // 2
+    terms = ((x / 2) ** (first - 1 + i) / gamma(first + i) for i in range(count))
+    return tail + exp(-x / 2) * sum(terms)
+
+
+def chi_square_quantile(exceeded: float, degrees: int) -> float:
+    """The value that chi square exceeds with probability `exceeded`, to 1e-9."""
+    low, high = 0.0, 1.0
+    while chi_square_survival(high, degrees) > exceeded:
+        high *= 2.0
+    while high - low > 1e-9:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if chi_square_survival(middle, degrees) > exceeded else (low, middle)
+    return high
+
+
+def limits(cameras: int) -> Float:
+    """Largest misfit of one point by the number of cameras that see it, (cameras + 1,) ; inf below two."""
+    return np.array([np.inf] * 2 + [chi_square_quantile(_ONE_IN, 2 * n - 3) for n in range(2, cameras + 1)])
+
+
+def misfit_of_rays(error_px2: Float, sigma_px: Float) -> Float:
+    """Chi square (M,) of reprojection errors; NaN where there is no point.
+
+    Args:
+        error_px2: (M, C) squared distance of each observation from the projected point [px^2]; 0: not seen.
+        sigma_px: (C, M) standard deviations per axis; NaN where not seen.
+    """
+    return (error_px2 / (np.nan_to_num(sigma_px.T, nan=1.0) ** 2 + RIG_PX**2)).sum(axis=1)
+
+
+def misfit_of_rows(uv: Float, sigma_px: Float, row_sigma_px: float) -> Float:
+    """Chi square (M,) of the difference of rows of two cameras; NaN where one does not see the marker.
+
+    Args:
+        uv: (2, M, 2) [px].
+        sigma_px: (2, M).
+        row_sigma_px: What `row_sigma` gave.
+    """
+    return (uv[0, :, 1] - uv[1, :, 1]) ** 2 / (sigma_px[0] ** 2 + sigma_px[1] ** 2 + row_sigma_px**2)
+
+
+def row_sigma(cameras: tuple[CameraModel, ...]) -> float:
+    """Standard deviation [px] of the difference of rows of one point in two cameras; inf where rows tell nothing."""
+    one, other = cameras[:2]
+    turn = one.T_rig_camera[:3, :3].T @ other.T_rig_camera[:3, :3]
+    x, y, z = np.abs(one.T_rig_camera[:3, :3].T @ (other.centre - one.centre))
+    turned = np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))
+    focal = one.matrix[1, 1], other.matrix[1, 1]
+    alike = abs(focal[0] / focal[1] - 1.0) <= _ALIKE and one.height_px == other.height_px
+    if turned > _PARALLEL_RAD or max(y, z) > _ALIKE * x or not alike:
+        return float(np.inf)
+    return float(np.hypot(sqrt(2.0) * RIG_PX, focal[0] * _MOUNTED_RAD))

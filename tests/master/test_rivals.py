@@ -1,0 +1,168 @@
+"""Tests of the choice between a marker and a thing of its colour, on exact geometry with noise."""
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.camera_model import CameraModel
+from master.stereo.place import Placement
+from master.stereo.rivals import Chosen, Expected, RivalChooser
+from master.stereo.whereabouts import Whereabouts
+from tests.hand_helpers import camera_models, rig_file
+
+PAIR = tuple(camera_models(rig_file()).values())
+THREE = tuple(camera_models(rig_file(("left", "right", "top"))).values())
+SIGMA_PX = 0.1
+MARKER = np.array([0.02, 0.01, 0.5])
+MUG = np.array([0.12, -0.06, 0.6])  # seen at another row
+IN_ROW = np.array([-0.05, 0.012, 0.6])  # seen at the rows of the marker: on its epipolar line
+NO_IDEA = Expected(np.full((1, 3), np.nan), np.full(1, np.nan))
+NOWHERE = np.array([np.nan, np.nan])
+
+
+def seen(cameras: tuple[CameraModel, ...], *points: Float | None, seed: int = 0) -> Float:
+    """What each camera takes for the one marker (C, 1, 2): the image of its point, with noise; None: nothing."""
+    noise = np.random.default_rng(seed).normal(0.0, SIGMA_PX, (len(points), 2))
+    places = [NOWHERE if p is None else c.project(p) for c, p in zip(cameras, points, strict=True)]
+    return (np.array(places) + noise)[:, None]
+
+
+def choose(
+    cameras: tuple[CameraModel, ...], first: Float, second: Float, expected: Expected = NO_IDEA
+) -> Chosen:
+    sigmas = [np.where(np.isnan(uv[..., 0]), np.nan, SIGMA_PX) for uv in (first, second)]
+    return RivalChooser(cameras, Placement(cameras, None))(first, sigmas[0], second, sigmas[1], expected)
+
+
+def near(point: Float, spread_m: float = 0.02) -> Expected:
+    return Expected(point[None], np.array([spread_m]))
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_other_camera_tells_a_thing_from_the_marker(seed: int) -> None:
+    """The left slave takes the mug, the right one is sure: the mug is not on the marker's epipolar line."""
+    first, second = seen(PAIR, MUG, MARKER, seed=seed), seen(PAIR, MARKER, None, seed=seed + 100)
+    chosen = choose(PAIR, first, second)
+    np.testing.assert_array_equal(chosen.uv[0], second[0])
+    np.testing.assert_array_equal(chosen.uv[1], first[1])
+    assert chosen.taken.all()
+    assert not chosen.dropped.any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_the_slaves_are_believed_where_their_choice_fits(seed: int) -> None:
+    first, second = seen(PAIR, MARKER, MARKER, seed=seed), seen(PAIR, MUG, MUG, seed=seed + 100)
+    for rivals in (second, seen(PAIR, None, MUG), seen(PAIR, IN_ROW, None), seen(PAIR, IN_ROW, IN_ROW)):
+        chosen = choose(PAIR, first, rivals)
+        np.testing.assert_array_equal(chosen.uv, first)
+        assert not chosen.taken.any()
+
+
+def test_a_little_better_is_not_clearly_better() -> None:
+    """A fragment of the marker itself, 1.2 px nearer to the epipolar line: the slave knows best which to take."""
+    first = seen(PAIR, MARKER, MARKER)
+    first[0, 0, 1] += 1.2
+    fragment = seen(PAIR, MARKER, None)
+    assert not choose(PAIR, first, fragment).taken.any()
+    first[0, 0, 1] += 2.0
+    assert choose(PAIR, first, fragment).taken.all()
+
+
+def test_on_one_epipolar_line_the_last_place_decides() -> None:
+    first, second = seen(PAIR, IN_ROW, MARKER), seen(PAIR, MARKER, None)
+    assert not choose(PAIR, first, second).taken.any()  # it cannot be told: the slave's choice stands
+    chosen = choose(PAIR, first, second, near(MARKER))
+    np.testing.assert_array_equal(chosen.uv[0], second[0])
+    assert not choose(PAIR, first, second, near(IN_ROW, 2.0)).taken.any()
+
+
+def test_a_thing_seen_by_both_cameras_is_left_where_the_marker_was_elsewhere() -> None:
+    first, second = seen(PAIR, MUG, MUG), seen(PAIR, MARKER, MARKER)
+    chosen = choose(PAIR, first, second, near(MARKER))
+    np.testing.assert_array_equal(chosen.uv, second)
+
+
+def test_each_slave_took_another_thing_and_nobody_knows_better() -> None:
+    """Both the marker and the mug are consistent, neither is what the slaves chose: dropped, unless expected."""
+    first, second = seen(PAIR, MUG, MARKER), seen(PAIR, MARKER, MUG)
+    chosen = choose(PAIR, first, second)
+    assert chosen.dropped.all()
+    assert np.isnan(chosen.uv).all()
+    assert np.isnan(chosen.sigma_px).all()
+    np.testing.assert_array_equal(
+        choose(PAIR, first, second, near(MARKER)).uv[:, 0], [second[0, 0], first[1, 0]]
+    )
+
+
+def test_a_marker_that_only_one_camera_shows_is_not_made_of_two_things() -> None:
+    """The right camera sees the mug alone. Mug and mug meet, but far from where the marker was a frame ago."""
+    first, second = seen(PAIR, MARKER, MUG), seen(PAIR, MUG, None)
+    assert choose(PAIR, first, second, near(MARKER)).dropped.all()
+
+
+def test_what_fits_nowhere_is_dropped() -> None:
+    elsewhere = np.array([0.0, 0.09, 0.5])
+    assert choose(PAIR, seen(PAIR, MARKER, MUG), seen(PAIR, None, elsewhere)).dropped.all()
+
+
+def test_a_third_camera_needs_no_past() -> None:
+    first, second = seen(THREE, IN_ROW, MARKER, MARKER), seen(THREE, MARKER, None, None)
+    chosen = choose(THREE, first, second)  # cameras in one row, but the depths of the pairs differ
+    np.testing.assert_array_equal(chosen.uv[0], second[0])
+
+
+def test_one_camera_alone_goes_by_the_expected_place() -> None:
+    first, second = seen(PAIR, MUG, None), seen(PAIR, MARKER, None)
+    np.testing.assert_array_equal(choose(PAIR, first, second).uv, first)  # no idea: the slave's choice
+    np.testing.assert_array_equal(choose(PAIR, first, second, near(MARKER)).uv, second)
+    np.testing.assert_array_equal(choose(PAIR, second, first, near(MARKER)).uv, second)
+    assert choose(PAIR, first, second, near(np.array([-0.15, 0.1, 0.5]))).dropped.all()
+
+
+def test_other_markers_are_passed_on_untouched() -> None:
+    first = np.concatenate([seen(PAIR, MUG, MARKER), seen(PAIR, MARKER, MUG), seen(PAIR, None, MUG)], axis=1)
+    second = np.concatenate([seen(PAIR, MARKER, None), *[np.full((2, 1, 2), np.nan)] * 2], axis=1)
+    expected = Expected(np.full((3, 3), np.nan), np.full(3, np.nan))
+    chosen = choose(PAIR, first, second, expected)
+    np.testing.assert_array_equal(chosen.uv[:, 1:], first[:, 1:])
+    assert chosen.taken.tolist() == [True, False, False]
+
+
+def test_many_cameras_in_doubt_are_chosen_from_the_first_five_and_the_rest() -> None:
+    names = tuple(f"c{k}" for k in range(9))
+    cameras = tuple(camera_models(rig_file(names)).values())
+    first = seen(cameras, *[MUG] * 7, MARKER, MARKER)
+    second = seen(cameras, *[MARKER] * 7, None, None)
+    chosen = choose(cameras, first, second)
+    np.testing.assert_array_equal(chosen.uv[:5], second[:5])
+    assert np.isnan(chosen.uv[5:7]).all()
+    np.testing.assert_array_equal(chosen.uv[7:], first[7:])
+
+
+# -- where a marker is expected -------------------------------------------------------------------------------------
+
+
+def points(*rows: Float | None) -> Float:
+    return np.array([np.full(3, np.nan) if row is None else row for row in rows])
+
+
+def test_a_marker_of_the_hand_is_expected_on_the_hand_and_another_where_it_was() -> None:
+    whereabouts = Whereabouts(np.array([True, False, True]))
+    whereabouts.saw(0, points(MUG, IN_ROW, None))
+    expected = whereabouts.expected(20_000_000, points(MARKER, MARKER, MUG), points(None, None, None))
+    np.testing.assert_array_equal(expected.points, [MARKER, IN_ROW, MUG])
+    # 1 cm, and 1 m/s for 20 ms; a finger that was never seen is within its reach of 10 cm
+    np.testing.assert_allclose(expected.spread_m, [0.03, 0.03, 0.1])
+
+
+def test_without_a_hand_its_markers_are_expected_together_and_what_is_old_is_forgotten() -> None:
+    whereabouts = Whereabouts(np.array([True, True, True, False]))
+    nothing = points(None, None, None, None)
+    assert np.isnan(whereabouts.expected(0, None, nothing).points).all()
+    expected = whereabouts.expected(0, None, points(MARKER, None, None, MUG))
+    np.testing.assert_array_equal(expected.points, points(MARKER, MARKER, MARKER, None))
+    whereabouts.saw(0, points(MARKER, MUG, None, MUG))
+    soon = whereabouts.expected(400_000_000, None, nothing)
+    np.testing.assert_array_equal(soon.points, points(MARKER, MUG, None, MUG))
+    late = whereabouts.expected(600_000_000, points(MARKER, MARKER, MARKER, MARKER), nothing)
+    assert np.isnan(late.points).all()  # the hand is as old as its markers
