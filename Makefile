@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format bench schema clean
+.PHONY: help install demo test check format bench instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -8,6 +8,7 @@ DEMO_SECONDS ?= 30
 DEMO_ARGS ?=
 TEST_ARGS ?=
 BENCH_ARGS ?=
+INSTRUCTIONS_ARGS ?=
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -15,7 +16,7 @@ STAMP := .venv/.installed
 FITS := import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
 help: ## list the targets
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS="$$(printf '\t')" read -r target text; do printf '  make %-9s %s\n' "$$target" "$$text"; done
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS="$$(printf '\t')" read -r target text; do printf '  make %-12s %s\n' "$$target" "$$text"; done
 	@echo "  variables: PYTHON=python3.12  DEMO_SECONDS=30  DEMO_ARGS='--headless'  TEST_ARGS='-k geometry'  BENCH_ARGS=..."
 
 install: $(STAMP) ## make .venv with everything in it, in the locked versions
@@ -40,6 +41,9 @@ format: $(STAMP) ## rewrite the layout of all files, and mend what lint can mend
 
 bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
 	@$(BIN)/python -m bench $(BENCH_ARGS)
+
+instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs qemu-user, mmdebstrap, gcc
+	@$(BIN)/python -m bench.aarch64 count $(INSTRUCTIONS_ARGS)
 
 schema: $(STAMP) ## write docs/schema/*.json afresh from the types
 	@$(BIN)/python -m tests.test_schemas

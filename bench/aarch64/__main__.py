@@ -1,0 +1,124 @@
+"""`make instructions`: aarch64 instructions of the slave per frame, held against the recorded baseline.
+
+    python -m bench.aarch64 count                 every case
+    python -m bench.aarch64 count six lost        some of: step six twelve lost seed
+    python -m bench.aarch64 count six --parts     and the parts of the detector, six markers
+    python -m bench.aarch64 count --record        every case, and what was counted is the new baseline
+
+Exit code: 0 within the gate, 1 outside it or detected otherwise than on this machine, 2 cannot be counted here.
+"""
+
+import argparse
+import platform
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import cast
+
+from bench.aarch64 import baseline, frames, scene
+from bench.aarch64.count import CPU, Counted, counted, native
+from bench.aarch64.sysroot import CACHE, PYTHON, NotPossibleError, prepare
+
+CASES = {
+    "step": "whole step, six markers: detect, message, encode, seal",
+    "six": "detection, six markers",
+    "twelve": "detection, twelve markers",
+    "lost": "detection, six markers, all sought anew in every frame",
+    "seed": "published pipeline rebuilt, six markers",
+}
+LONGEST = 30  # parts shown
+RATIOS = (
+    ("seed", "six", "published / ours"),
+    ("twelve", "six", "12 markers / 6 markers"),
+    ("lost", "six", "every marker sought anew / tracked"),
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Count, compare, record if wanted; return the exit code."""
+    keep = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python -m bench.aarch64", description=__doc__, formatter_class=keep)
+    count = parser.add_subparsers(dest="command", required=True).add_parser("count")
+    count.add_argument("cases", nargs="*", metavar="CASE", help=f"{' '.join(CASES)} (default: all)")
+    count.add_argument("--parts", action="store_true", help="count the parts of the detector as well")
+    count.add_argument("--record", action="store_true", help="write the baseline")
+    count.add_argument("--cpu", default=CPU, help="QEMU's name of the processor (default: %(default)s)")
+    options = parser.parse_args(arguments)
+    cases = cast(list[str], options.cases) or list(CASES)
+    if unknown := sorted(set(cases) - CASES.keys()):
+        parser.error(f"no case {unknown[0]!r}; there are {', '.join(CASES)}")
+    if options.record and (options.cpu != CPU or set(cases) != CASES.keys()):
+        parser.error(f"the baseline holds every case on {CPU}: --record goes with no CASE and no --cpu")
+    try:
+        return _count(cases, parts=options.parts, record=options.record, cpu=options.cpu)
+    except (NotPossibleError, baseline.BaselineError) as error:
+        print(f"instructions: {error}", file=sys.stderr)
+        return 2
+
+
+def _count(cases: list[str], *, parts: bool, record: bool, cpu: str) -> int:
+    old = baseline.read() if cpu == CPU and not record else None
+    sysroot = prepare(lambda line: print(line, file=sys.stderr, flush=True))
+    with tempfile.TemporaryDirectory(dir=CACHE, prefix="frames-") as folder:
+        for name, marked in scene.rendered().items():
+            frames.write(Path(folder) / name, marked)
+        here = native(Path(folder), cases)
+        found = counted(sysroot, Path(folder), [*cases, "parts"] if parts else cases, cpu)
+    print(f"aarch64 instructions per frame, 640x480, {cpu}, QEMU {sysroot.versions['qemu']}")
+    _print_table(cases, found, old)
+    new = baseline.Baseline(cpu, {case: round(found.per_frame[case]) for case in cases}, sysroot.versions)
+    good = _same_everywhere(cases, found.hashes, here)
+    if record:
+        baseline.write(new)
+        print(f"  recorded in {baseline.FILE}")
+    elif old is not None:
+        good &= _within_gate(new, old)
+    return 0 if good else 1
+
+
+def _print_table(cases: list[str], found: Counted, old: baseline.Baseline | None) -> None:
+    for case in cases:
+        value = found.per_frame[case]
+        note = "" if old is None else baseline.compared(value, old.instructions.get(case))
+        print(f"  {case:7s} {value * 1e-6:9.3f} Minstr  {CASES[case]:56s} {note}")
+    for top, bottom, text in RATIOS:
+        if {top, bottom} <= set(cases):
+            print(f"  {'':7s} {found.per_frame[top] / found.per_frame[bottom]:9.2f} x       {text}")
+    for name, (calls, spent) in sorted(found.parts.items(), key=lambda item: -item[1][1])[:LONGEST]:
+        print(f"    {name:32s} {spent * 1e-6:8.3f} Minstr in {calls:6.2f} calls")
+
+
+def _same_everywhere(cases: list[str], there: dict[str, str], here: dict[str, str]) -> bool:
+    """Print whether both architectures detected the same bits; False if they did not, though they should."""
+    other = [case for case in cases if there[case] != here[case]]
+    for case in cases:
+        verdict = "NOT EQUAL" if case in other else "equal"
+        print(
+            f"  {case:7s} sha256 {there[case][:16]} on aarch64, {here[case][:16]} on {platform.machine()}: {verdict}"
+        )
+    if other and not platform.python_version().startswith(f"{PYTHON}."):
+        print(
+            f"  not judged: Python {platform.python_version()} here, {PYTHON} there; 3.12 adds floats otherwise"
+        )
+        return True
+    return not other
+
+
+def _within_gate(new: baseline.Baseline, old: baseline.Baseline) -> bool:
+    for line in baseline.other_versions(new.versions, old.versions):
+        print(f"  note: {line}")
+    outside = [
+        case
+        for case, value in new.instructions.items()
+        if not baseline.within(value, old.instructions.get(case))
+    ]
+    if outside:
+        print(
+            f"  outside the gate of ±{100 * baseline.GATE:g} %: {', '.join(outside)}; if that is meant: count --record"
+        )
+    return not outside
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,129 @@
+"""Runs the program under the counting QEMU and natively, and makes numbers of the marks."""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+from bench.aarch64.guest import FIRST, LAST
+from bench.aarch64.sysroot import CACHE, PYTHON, ROOT, NotPossibleError, Sysroot
+
+CPU = "cortex-a53"  # Raspberry Pi 3 and Zero 2 W: the slowest that is meant
+AT_ONCE = 2  # runs side by side
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
+
+
+class Counted(NamedTuple):
+    """Case -> instructions per frame; part -> (calls, instructions) per frame; case -> hash of what was detected."""
+
+    per_frame: dict[str, float]
+    parts: dict[str, tuple[float, float]]
+    hashes: dict[str, str]
+
+
+class _Run(NamedTuple):
+    """One run of the program: labels of its marks, the count at each, hash of what was detected."""
+
+    labels: list[str]
+    counts: list[int]
+    digest: str
+
+
+def counted(sysroot: Sysroot, frames: Path, cases: Sequence[str], cpu: str = CPU) -> Counted:
+    """Run `cases` under emulation, each in a process of its own: what ran before moves a count by some 1e-3.
+
+    Raises:
+        NotPossibleError: The emulated program failed.
+    """
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        running = {case: pool.submit(_emulated, sysroot, frames, case, cpu) for case in cases}
+        answers = {case: run.result() for case, run in running.items()}
+    slopes: dict[str, float] = {}
+    for case, (labels, counts, _) in answers.items():
+        at = dict(zip(labels, counts, strict=True))
+        slopes[case] = slope(at[f"{case} {FIRST}"], at[f"{case} {LAST}"])
+    parts = spans(answers["parts"].labels, answers["parts"].counts) if "parts" in answers else {}
+    return Counted(slopes, parts, {case: one.digest for case, one in answers.items()})
+
+
+def native(frames: Path, cases: Sequence[str]) -> dict[str, str]:
+    """Run `cases` on this machine; case -> hash of what was detected."""
+    return {
+        case: _ask([sys.executable], frames, case, os.environ | {"PYTHONPATH": str(ROOT)})[1]
+        for case in cases
+    }
+
+
+def _emulated(sysroot: Sysroot, frames: Path, case: str, cpu: str) -> _Run:
+    with tempfile.TemporaryDirectory() as folder:
+        marks = Path(folder) / "marks"
+        qemu = ["qemu-aarch64", "-cpu", cpu, "-L", str(sysroot.root)]
+        plugin = ["-plugin", f"file={sysroot.plugin},to={marks}"]
+        python = [str(sysroot.root / f"usr/bin/python{PYTHON}"), "-s", "-S"]
+        # Compiled modules go to a place of their own: the emulated Python's own path may be the machine's as well.
+        environment = {
+            "PATH": os.defpath,
+            "PYTHONPATH": f"{sysroot.wheels}:{ROOT}",
+            "PYTHONPYCACHEPREFIX": str(CACHE / "pyc"),
+        }
+        # Nothing else of this machine's environment: its size alone moves the count.
+        labels, digest = _ask([*qemu, *plugin, *python], frames, case, environment)
+        counts = [int(line) for line in marks.read_text().split()]
+    if len(counts) != len(labels):
+        raise NotPossibleError(f"{case}: the plugin saw {len(counts)} marks, the program made {len(labels)}")
+    return _Run(labels, counts, digest)
+
+
+def slope(first: int, last: int) -> float:
+    """Instructions per frame between two counts; what happens before the first does not enter."""
+    return (last - first) / (LAST - FIRST)
+
+
+def spans(labels: Sequence[str], counts: Sequence[int]) -> dict[str, tuple[float, float]]:
+    """Part -> (calls, instructions) per frame between the frames FIRST and LAST, what the marks cost taken off.
+
+    Args:
+        labels: `+name` at the begin of a call, `-name` at its end, properly nested; `parts N` at frame N.
+        counts: Instructions executed at each.
+    """
+    own = _cost_of_marks(labels, counts)
+    begin, end = labels.index(f"parts {FIRST}"), labels.index(f"parts {LAST}")
+    calls: defaultdict[str, int] = defaultdict(int)
+    spent: defaultdict[str, float] = defaultdict(float)
+    open_calls: list[tuple[str, int, int]] = []  # name, count at begin, marks before
+    for k in range(begin + 1, end):
+        sign, name = labels[k][0], labels[k][1:]
+        if sign == "+":
+            open_calls.append((name, counts[k], k))
+            continue
+        expected, began, at = open_calls.pop()
+        if expected != name:
+            raise ValueError(f"mark {k}: {name} ends inside {expected}")
+        calls[name] += 1
+        spent[name] += counts[k] - began - own * (k - at)
+    frames = LAST - FIRST
+    return {name: (calls[name] / frames, spent[name] / frames) for name in spent}
+
+
+def _cost_of_marks(labels: Sequence[str], counts: Sequence[int]) -> float:
+    """Instructions from one mark to the next around a part that does nothing."""
+    places = [k for k, label in enumerate(labels) if label in ("+nothing", "-nothing")]
+    return (counts[places[-1]] - counts[places[0]]) / (len(places) - 1)
+
+
+def _ask(
+    command: Sequence[str], frames: Path, case: str, environment: Mapping[str, str]
+) -> tuple[list[str], str]:
+    """Labels of the marks that the program made, and the hash of what it detected."""
+    line = [*command, "-m", "bench.aarch64.guest", str(frames), case]
+    result = subprocess.run(line, capture_output=True, text=True, env={**environment, **ONE_THREAD}, cwd=ROOT)
+    if result.returncode != 0:
+        raise NotPossibleError(f"{' '.join(line)} failed:\n{result.stderr.strip()}")
+    said = json.loads(result.stdout)
+    return said["labels"], said["hash"]

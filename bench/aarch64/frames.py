@@ -1,0 +1,60 @@
+"""The frames that are counted on, as files: written once by `bench.aarch64.scene`, read on both architectures."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import msgspec
+import numpy as np
+
+from common.arrays import Image
+from common.calibration import CameraCalibration, load
+
+FRAME_NS = 16_666_667
+SIX, TWELVE = "six", "twelve"
+
+
+class MarkedFrames(NamedTuple):
+    """Frames (H, W, 3) BGR of one camera, its calibration, and its markers in the order of the rig."""
+
+    camera: CameraCalibration
+    names: tuple[str, ...]
+    images: list[Image]
+
+    def image(self, k: int) -> Image:
+        """Frame `k` of the endless sequence forth and back, in which no marker ever jumps."""
+        return self.images[forth_and_back(k, len(self.images))]
+
+
+def forth_and_back(k: int, count: int) -> int:
+    """Index of step `k` along `count` >= 2 items that are walked forth and back; the period is 2 (count - 1)."""
+    period = 2 * (count - 1)
+    return min(k % period, period - k % period)
+
+
+def write(place: Path, frames: MarkedFrames) -> None:
+    """Write to the folder `place`: camera.json, names.json, and the frames as PNG.
+
+    Raises:
+        OSError: A file cannot be written.
+    """
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "camera.json").write_bytes(msgspec.json.encode(frames.camera))
+    (place / "names.json").write_bytes(msgspec.json.encode(frames.names))
+    for k, image in enumerate(frames.images):
+        if not cv2.imwrite(str(place / f"{k:02d}.png"), image):
+            raise OSError(f"{place}: cannot write frame {k}")
+
+
+def read(place: Path) -> MarkedFrames:
+    """What `write` left in the folder `place`.
+
+    Raises:
+        FileNotFoundError: There are no frames.
+    """
+    files = sorted(place.glob("*.png"))
+    if not files:
+        raise FileNotFoundError(f"{place}: no frames")
+    images = [np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR), np.uint8) for file in files]
+    names = msgspec.json.decode((place / "names.json").read_bytes(), type=tuple[str, ...])
+    return MarkedFrames(load(place / "camera.json", CameraCalibration), names, images)

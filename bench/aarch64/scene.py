@@ -1,0 +1,58 @@
+"""Renders what is counted on: six markers of an open hand, and twelve of two; on the host, uncounted."""
+
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from bench.aarch64.frames import SIX, TWELVE, MarkedFrames
+from common.arrays import Image
+from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCalibration, load
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+
+CALIBRATION = Path(__file__).resolve().parents[2] / "calib_json"
+OPEN_S = 20.0  # an open hand: all six markers in view
+FRAME_S = 1.0 / 60.0
+COUNT = 11  # forth and back a period of twenty frames
+SECOND_VALUE = 236  # HSV value from which a colour is the second hand's
+
+
+def rendered() -> dict[str, MarkedFrames]:
+    """The sets SIX and TWELVE, from the standard scene and the rig `desk`."""
+    rig = load(CALIBRATION / "rigs/desk.json", RigCalibration)
+    cameras = {name: load(CALIBRATION / f"cameras/{name}.json", CameraCalibration) for name in rig.cameras}
+    hand = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
+    name = rig.cameras[0]
+    renderer = Renderer(Scene.standard(rig, cameras, hand), name)
+    images = [renderer.render(OPEN_S + FRAME_S * k) for k in range(COUNT)]
+    six = MarkedFrames(cameras[name], rig.markers, images)
+    return {SIX: six, TWELVE: with_second_hand(six)}
+
+
+def with_second_hand(six: MarkedFrames) -> MarkedFrames:
+    """Twice the markers: the same hues, brighter, as caps on skin in a row on the other side of the picture."""
+    ranges: dict[str, HsvRange] = dict(six.camera.markers or {})
+    second: dict[str, tuple[int, int, int]] = {}
+    for name in six.names:
+        low, high = ranges[name].hsv_low, ranges[name].hsv_high
+        hue = (low[0] + high[0]) // 2 if low[0] <= high[0] else 0
+        second[f"{name}2"] = (hue, 200, 250)
+        first_high = (high[0], 255, SECOND_VALUE - 1)
+        second_low = (low[0], low[1], SECOND_VALUE)
+        ranges[f"{name}2"] = msgspec.structs.replace(ranges[name], hsv_low=second_low, hsv_high=high)
+        ranges[name] = msgspec.structs.replace(ranges[name], hsv_high=first_high)
+    camera = msgspec.structs.replace(six.camera, markers=ranges)
+    images = [_painted(image, list(second.values())) for image in six.images]
+    return MarkedFrames(camera, (*six.names, *second), images)
+
+
+def _painted(image: Image, colours: list[tuple[int, int, int]]) -> Image:
+    image = image.copy()
+    for k, hsv in enumerate(colours):
+        pixel = np.asarray(cv2.cvtColor(np.array([[hsv]], np.uint8), cv2.COLOR_HSV2BGR))[0, 0]
+        u, v = 60 + 28 * k, 60 + 11 * (k % 2)
+        cv2.circle(image, (u, v + 14), 12, (140, 165, 215), -1, cv2.LINE_AA)  # skin
+        cv2.circle(image, (u, v), 8, [int(c) for c in pixel], -1, cv2.LINE_AA)
+    return image

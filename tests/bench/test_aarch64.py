@@ -1,0 +1,282 @@
+"""Instructions per frame: the arithmetic of the marks, the gate, the frames, what is said where a tool is missing.
+
+What needs emulation runs where `make instructions` has been run before, and says so where not.
+"""
+
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.aarch64 import baseline, scene, sysroot
+from bench.aarch64.__main__ import CASES, main
+from bench.aarch64.baseline import Baseline, BaselineError
+from bench.aarch64.count import FIRST, LAST, counted, native, slope, spans
+from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, write
+from bench.aarch64.guest import Digest, Marks, run_case
+from bench.aarch64.parts import counted_parts
+from bench.aarch64.sysroot import NotPossibleError, plugin_interface, prepare, qemu_version
+from slave.markers import detector
+
+RECORD = Baseline("cortex-a53", {"six": 4_000_000}, {"numpy": "2.4.6", "qemu": "7.2"})
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("frames")
+    for name, marked in scene.rendered().items():
+        write(place / name, marked)
+    return place
+
+
+# The arithmetic of the marks
+
+
+def test_the_slope_is_per_frame_and_blind_to_what_came_before() -> None:
+    assert slope(10**9, 10**9 + 40 * 7_731_615) == 7_731_615 == slope(0, 40 * 7_731_615)
+
+
+def marked(own: int, *steps: tuple[str, int]) -> tuple[list[str], list[int]]:
+    """Labels and counts of a program whose marks cost `own` each: (label, work before it)."""
+    empty = [(f"{sign}nothing", 0) for _ in range(10) for sign in "+-"]
+    labels, counts, at = [], [], 5000
+    for label, work in (*empty, (f"parts {FIRST}", 900), *steps, (f"parts {LAST}", 300)):
+        at += work + own
+        labels.append(label)
+        counts.append(at)
+    return labels, counts
+
+
+@pytest.mark.parametrize("own", [0, 1152])
+def test_a_part_is_counted_with_what_it_calls_and_without_what_the_marks_cost(own: int) -> None:
+    frames = LAST - FIRST
+    steps = [("+scan", 70), ("+label", 100), ("-label", 40), ("+label", 10), ("-label", 60), ("-scan", 5)]
+    found = spans(*marked(own, *(steps * frames)))
+    assert found == {"label": (2.0, 100.0), "scan": (1.0, 215.0)}
+
+
+def test_parts_before_the_first_frame_and_calls_that_do_nothing_do_not_count() -> None:
+    labels, counts = marked(10, ("+scan", 1), ("-scan", 400))
+    early = labels.index(f"parts {FIRST}")
+    labels[early:early] = ["+scan", "-scan"]
+    counts[early:early] = [counts[early - 1] + 10, counts[early - 1] + 20]
+    assert spans(labels, counts) == {"scan": (1 / (LAST - FIRST), 400 / (LAST - FIRST))}
+
+
+def test_parts_that_are_not_nested_are_refused() -> None:
+    with pytest.raises(ValueError, match="scan ends inside label"):
+        spans(*marked(10, ("+scan", 1), ("+label", 1), ("-scan", 1), ("-label", 1)))
+
+
+# The record and its gate
+
+
+@pytest.mark.parametrize(
+    ("value", "inside"),
+    [(4_000_000, True), (4_039_000, True), (3_961_000, True), (4_041_000, False), (3_959_000, False)],
+)
+def test_the_gate_is_one_percent_to_either_side(value: int, inside: bool) -> None:
+    assert baseline.within(value, RECORD.instructions["six"]) is inside
+
+
+def test_a_case_without_record_is_outside() -> None:
+    assert not baseline.within(4_000_000, RECORD.instructions.get("twelve"))
+    assert baseline.compared(4_000_000, None) == "not recorded"
+
+
+def test_a_record_comes_back_as_written(tmp_path: Path) -> None:
+    file = tmp_path / "baseline.json"
+    assert baseline.read(file) is None
+    baseline.write(RECORD, file)
+    assert baseline.read(file) == RECORD
+
+
+@pytest.mark.parametrize("text", ["", "{}", '{"cpu": "x", "instructions": {"six": "many"}, "versions": {}}'])
+def test_a_record_that_is_none_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "baseline.json"
+    file.write_text(text)
+    with pytest.raises(BaselineError, match=r"baseline\.json.*--record"):
+        baseline.read(file)
+
+
+def test_the_record_of_the_project_holds_every_case() -> None:
+    record = baseline.read()
+    assert record is not None
+    assert record.instructions.keys() == CASES.keys()
+
+
+def test_other_versions_are_named() -> None:
+    lines = baseline.other_versions({"numpy": "2.5.0", "cffi": "2.1.1"}, RECORD.versions)
+    assert lines == [
+        "cffi is 2.1.1, recorded with absent",
+        "numpy is 2.5.0, recorded with 2.4.6",
+        "qemu is absent, recorded with 7.2",
+    ]
+
+
+# The frames
+
+
+def test_forth_and_back_never_jumps_and_repeats() -> None:
+    walk = [forth_and_back(k, 11) for k in range(41)]
+    assert set(walk) == set(range(11))
+    assert {abs(b - a) for a, b in pairwise(walk)} == {1}
+    assert walk[:20] == walk[20:40]
+
+
+def test_the_slope_is_taken_over_whole_periods() -> None:
+    assert (LAST - FIRST) % (2 * (scene.COUNT - 1)) == 0
+
+
+def test_frames_come_back_as_written(folder: Path) -> None:
+    sets = scene.rendered()
+    for name, one in sets.items():
+        back = read(folder / name)
+        assert (back.camera, back.names) == (one.camera, one.names)
+        np.testing.assert_array_equal(back.images, one.images)
+    assert len(sets[TWELVE].names) == 2 * len(sets[SIX].names) == 12
+
+
+def test_no_frames_are_an_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="no frames"):
+        read(tmp_path)
+
+
+@pytest.mark.parametrize("name", [SIX, TWELVE])
+def test_every_marker_is_there_to_be_detected(folder: Path, name: str) -> None:
+    frames = read(folder / name)
+    machine = detector.MarkerDetector(frames.camera, frames.names)
+    found = [machine.push(frames.image(k), k * FRAME_NS) for k in range(5)]
+    assert np.isfinite(found[-1].uv).all()
+
+
+# The program that is counted, natively
+
+
+def test_a_case_marks_twice_and_repeats_bit_by_bit(folder: Path) -> None:
+    marks = Marks()
+    assert run_case("step", folder, marks) == run_case("step", folder, Marks())
+    assert marks.labels == [f"step {FIRST}", f"step {LAST}"]
+
+
+def test_counting_parts_changes_no_result_and_is_undone(folder: Path) -> None:
+    before = vars(detector) | vars(detector.MarkerDetector)
+    marks = Marks()
+    assert run_case("parts", folder, marks) == run_case("six", folder, Marks())
+    assert vars(detector) | vars(detector.MarkerDetector) == before
+    parts = spans(marks.labels, range(len(marks.labels)))
+    assert 1.0 in [calls for calls, _ in parts.values()]  # something is done once in a frame
+    assert "MarkerDetector.push" not in parts
+
+
+def fail_while_counting() -> None:
+    before = dict(vars(detector))
+    with counted_parts(Marks()):
+        assert vars(detector) != before
+        raise KeyError
+
+
+def test_parts_are_given_back_after_an_error() -> None:
+    before = dict(vars(detector))
+    with pytest.raises(KeyError):
+        fail_while_counting()
+    assert vars(detector) == before
+
+
+def test_an_unknown_case_is_refused(folder: Path) -> None:
+    with pytest.raises(ValueError, match="no case 'seven'"):
+        run_case("seven", folder, Marks())
+
+
+def test_one_bit_changes_the_hash_and_the_kind_of_nan_does_not() -> None:
+    def digest(*values: float) -> str:
+        taken = Digest()
+        taken.add(np.array(values))
+        return taken.hex()
+
+    assert digest(1.0, np.nan) == digest(1.0, -np.nan)
+    assert digest(1.0, np.nan) != digest(np.nextafter(1.0, 2.0), np.nan)
+
+
+# Where a tool is missing, and the tools' versions
+
+
+def test_a_missing_tool_is_named_with_its_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert main(["count", "six"]) == 2
+    said = capsys.readouterr().err
+    assert "apt install" in said
+    for package in ("qemu-user", "mmdebstrap", "gcc"):
+        assert package in said
+
+
+@pytest.mark.parametrize(
+    "arguments", [["count", "seven"], ["count", "six", "--record"], ["count", "--record", "--cpu", "max"]]
+)
+def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(arguments)
+    assert refused.value.code == 2
+
+
+def test_the_plugin_interface_follows_the_version_of_qemu() -> None:
+    debian12 = qemu_version("qemu-aarch64 version 7.2.22 (Debian 1:7.2+dfsg-7+deb12u18+b3)\nCopyright")
+    assert (debian12, plugin_interface(debian12)) == ((7, 2), 1)
+    assert plugin_interface((8, 2)) == 1
+    assert plugin_interface(qemu_version("qemu-aarch64 version 10.0.2")) == 2
+    with pytest.raises(NotPossibleError, match="no version"):
+        qemu_version("busybox")
+
+
+def test_what_is_cached_is_made_once_and_anew_for_other_inputs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sysroot, "CACHE", tmp_path / "cache")
+    monkeypatch.setattr(sysroot, "ROOT", tmp_path)
+    made: list[str] = []
+
+    def make(content: str) -> Callable[[Path], None]:
+        def write_it(place: Path) -> None:
+            made.append(content)
+            (place / "it").write_text(content)
+
+        return write_it
+
+    first = sysroot._made("it", "inputs 1", make("a"), made.append)
+    assert sysroot._made("it", "inputs 1", make("b"), made.append) == first
+    other = sysroot._made("it", "inputs 2", make("c"), made.append)
+    assert ((first / "it").read_text(), (other / "it").read_text()) == ("a", "c")
+    assert [entry for entry in made if len(entry) == 1] == ["a", "c"]
+
+
+def test_what_failed_to_be_made_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sysroot, "CACHE", tmp_path)
+    monkeypatch.setattr(sysroot, "ROOT", tmp_path)
+
+    def fail(place: Path) -> None:
+        (place / "half").touch()
+        raise NotPossibleError("no network")
+
+    with pytest.raises(NotPossibleError, match="no network"):
+        sysroot._made("it", "inputs", fail, lambda line: None)
+    assert list(tmp_path.iterdir()) == []
+
+
+# Under emulation
+
+
+def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(folder: Path) -> None:
+    if absent := sysroot.missing():
+        pytest.skip(f"missing here: {', '.join(absent)}")
+    if not list(sysroot.CACHE.glob("wheels-*")):
+        pytest.skip("nothing to emulate with: run `make instructions` once")
+    if sys.version_info[:2] != (3, 11):
+        pytest.skip("Python 3.12 and later add floats otherwise than the emulated 3.11")
+    found = counted(prepare(lambda line: None), folder, ["six"])
+    assert found.hashes == native(folder, ["six"])
+    assert found.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
