@@ -1,0 +1,286 @@
+"""A USB camera, or any other single-planar V4L2 camera: controlled, stamped and counted by the kernel.
+
+Frames come in four mapped buffers. Each is decoded into an image of its own before its buffer goes back, so nobody
+ever writes to a frame that was handed over. A slave that is late takes the newest frame and leaves the others; one that
+did not read at all (while it waited for the master) finds all buffers full of old frames, which are thrown away.
+
+When a frame was taken. The kernel stamps each buffer and says on which clock and at which event: the start of the
+exposure (USB: reckoned from the camera's own clock where it has one), or the end of the frame, that is the last row's
+read-out. From there it is half an exposure forward, or all rows and half an exposure back. `sequence` counts every
+frame of the camera, so a gap in it is a dropped one; a frame that arrived damaged is one, too.
+"""
+
+import ctypes as c
+import errno
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+from common.arrays import Image
+from common.calibration import CameraCalibration
+from common.clock import Clock
+from common.errors import CameraError
+from slave.cameras import v4l2_abi as abi
+from slave.cameras.settings import demand, differences
+from slave.cameras.source import Frame
+from slave.cameras.stamps import ForeignClock, clock_of, system_clock
+from slave.cameras.v4l2_controls import plan, read_back, read_controls, write
+from slave.cameras.v4l2_formats import Offer, choose_offer, decode, read_offers
+
+BUFFERS = 4
+TIMEOUT_S = 2.0
+SETTLE_FRAMES = 12  # UVC cameras apply settings within a few frames; the rate is measured over as many
+RATE_SHARE = (
+    0.1  # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
+)
+NOT_INCREASING = 2**31  # steps of a 32-bit frame number beyond this run backwards
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class V4l2Options:
+    """What is not in the camera file.
+
+    Attributes:
+        path: Device; a path below /dev/v4l/by-id stays the same when the camera is plugged in anew.
+        controls: Control -> value, in codes of the maker.
+        allow_missing: Which of exposure, gain, white_balance the camera may lack.
+    """
+
+    path: Path = Path("/dev/video0")
+    controls: Mapping[str, int] = field(default_factory=dict[str, int])
+    allow_missing: tuple[str, ...] = ()
+
+
+class V4l2Camera:
+    """A `FrameSource`. Holds the device, its buffers and the last number; `broken` counts damaged frames."""
+
+    def __init__(
+        self,
+        calibration: CameraCalibration,
+        options: V4l2Options,
+        clock: Clock,
+        open_device: Callable[[Path], abi.Device] = abi.KernelDevice,
+    ) -> None:
+        """Open, set format, rate and controls, start, and check what the camera really does.
+
+        Args:
+            calibration: The camera file: size, rate, exposure.
+            options: The rest.
+            clock: The slave's clock.
+            open_device: Opens a path.
+
+        Raises:
+            CameraError: No such device, format or control, a setting was refused or not taken, or no frames come.
+        """
+        self._calibration, self._options, self._clock = calibration, options, clock
+        self._where = f"camera {calibration.name!r} (v4l2:{options.path})"
+        self._foreign: ForeignClock | None = None
+        self._buffers: list[memoryview] = []
+        self._seq = -1
+        self._sequence: int | None = None
+        self._pixel_format = self._stride = 0
+        self._streaming = False
+        self.broken = 0
+        self._device: abi.Device | None = self._open(open_device)
+        try:
+            self._start(self._device)
+        except CameraError as error:
+            self.close()
+            raise CameraError(f"{self._where}: {error}") from error
+        except OSError as error:
+            self.close()
+            raise CameraError(f"{self._where}: cannot be started: {error.strerror}") from error
+
+    def read(self) -> Frame | None:
+        """Wait for the newest frame; None once closed.
+
+        Raises:
+            CameraError: The device is gone, or no frame came for 2 s.
+        """
+        while self._device is not None:
+            try:
+                image, buffer = self._next(self._device)
+                t_ns = self._row_zero_ns(buffer)
+            except OSError as error:
+                raise CameraError(f"{self._where}: gone: {error.strerror}") from error
+            except CameraError as error:
+                raise CameraError(f"{self._where}: {error}") from error
+            self._count(int(buffer.sequence))
+            if image is None:
+                self.broken += 1
+                continue
+            return Frame(self._seq, t_ns, self._clock.now_ns(), image)
+        return None
+
+    def close(self) -> None:
+        """Stop and give the device back. Safe to call twice."""
+        device, self._device = self._device, None
+        if device is None:
+            return
+        try:
+            if self._streaming:
+                device.ioctl(abi.STREAMOFF, c.c_int(abi.CAPTURE))
+        except OSError as error:
+            _LOG.info("%s: was gone before it was stopped: %s", self._where, error.strerror)
+        self._buffers.clear()
+        device.close()
+
+    def _open(self, open_device: Callable[[Path], abi.Device]) -> abi.Device:
+        try:
+            return open_device(self._options.path)
+        except OSError as error:
+            there = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*"))) or "none"
+            fix = {
+                errno.ENOENT: f"is it plugged in? Devices here: {there}",
+                errno.EACCES: "add the user to group video (`sudo usermod -aG video $USER`, then log in again)",
+                errno.EBUSY: "another program has it",
+            }.get(error.errno or 0, f"devices here: {there}")
+            raise CameraError(f"{self._where}: cannot be opened: {error.strerror}; {fix}") from error
+
+    def _start(self, device: abi.Device) -> None:
+        camera, options = self._calibration, self._options
+        name = self._check_capabilities(device)
+        size = (camera.width_px, camera.height_px)
+        offer = choose_offer(read_offers(device, size), size, camera.frame_rate_hz)
+        self._set_format(device, offer)
+        controls = read_controls(device)
+        settings = plan(camera, controls, options.controls, options.allow_missing)
+        write(device, controls, settings)
+        self._stream(device)
+        self._settle(device)
+        if differences(settings, read_back(device, controls, settings)):
+            write(
+                device, controls, settings
+            )  # some cameras fall back to their own values when the stream starts
+            self._settle(device)
+        fix = "Take values that the camera keeps, and see that no other program controls it"
+        demand("it", settings, read_back(device, controls, settings), fix)
+        _LOG.info("%s: %s, %s, %d settings checked", self._where, name, offer.text(), len(settings))
+
+    def _check_capabilities(self, device: abi.Device) -> str:
+        found = abi.Capability()
+        device.ioctl(abi.QUERYCAP, found)
+        has = int(found.device_caps if found.capabilities & abi.CAP_DEVICE_CAPS else found.capabilities)
+        name = found.card.decode("utf-8", "replace")
+        if not (has & abi.CAP_CAPTURE and has & abi.CAP_STREAMING):
+            raise CameraError(
+                f"{name} is no single-planar capture device (a USB camera has a second device for metadata; a Pi "
+                "camera is opened with --camera picamera2)"
+            )
+        return name
+
+    def _set_format(self, device: abi.Device, offer: Offer) -> None:
+        """Set size, format and rate, and see what the driver made of them."""
+        asked = abi.Format(type=abi.CAPTURE)
+        pix = asked.fmt.pix
+        pix.width, pix.height = offer.size
+        pix.pixelformat, pix.field = offer.pixel_format, abi.FIELD_NONE
+        device.ioctl(abi.S_FMT, asked)
+        if (pix.width, pix.height, pix.pixelformat) != (*offer.size, offer.pixel_format):
+            got = abi.fourcc_text(pix.pixelformat)
+            raise CameraError(f"format: wanted {offer.text()}, got {got} {pix.width}x{pix.height}")
+        self._pixel_format, self._stride = offer.pixel_format, int(pix.bytesperline)
+        rate_hz = self._calibration.frame_rate_hz
+        parameters = abi.StreamParameters(type=abi.CAPTURE, numerator=1000, denominator=round(rate_hz * 1000))
+        try:
+            device.ioctl(abi.S_PARM, parameters)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTTY):
+                raise
+            return  # a fixed rate: it is measured below
+        got_hz = parameters.denominator / max(parameters.numerator, 1)
+        if not Offer(0, offer.size, (got_hz,)).reaches(rate_hz):
+            raise CameraError(f"frame_rate_hz: wanted {rate_hz:g}, the driver set {got_hz:.4g}")
+
+    def _stream(self, device: abi.Device) -> None:
+        """Map the buffers, hand them to the driver and start."""
+        request = abi.RequestBuffers(count=BUFFERS, type=abi.CAPTURE, memory=abi.MMAP)
+        device.ioctl(abi.REQBUFS, request)
+        for index in range(int(request.count)):
+            buffer = abi.Buffer(index=index, type=abi.CAPTURE, memory=abi.MMAP)
+            device.ioctl(abi.QUERYBUF, buffer)
+            self._buffers.append(device.map(int(buffer.length), int(buffer.offset)))
+            device.ioctl(abi.QBUF, buffer)
+        device.ioctl(abi.STREAMON, c.c_int(abi.CAPTURE))
+        self._streaming = True
+
+    def _settle(self, device: abi.Device) -> None:
+        """Take some frames, and see that they come at the rate that was asked for.
+
+        Raises:
+            CameraError: They come at another rate, or the driver stamps them on no known clock.
+        """
+        times: list[tuple[int, int]] = []
+        for _ in range(SETTLE_FRAMES):
+            _, buffer = self._next(device)
+            times.append((int(buffer.sequence), self._row_zero_ns(buffer)))
+        periods = [(b[1] - a[1]) / max(b[0] - a[0], 1) for a, b in pairwise(times) if b[1] > a[1]]
+        got_hz = 1e9 / median(periods) if periods else 0.0
+        rate_hz = self._calibration.frame_rate_hz
+        if abs(got_hz - rate_hz) > RATE_SHARE * rate_hz:
+            raise CameraError(
+                f"frame_rate_hz: wanted {rate_hz:g}, frames come at {got_hz:.4g} Hz; an exposure of "
+                f"{self._calibration.exposure_us:g} us may be too long, or the USB port too slow (two on one hub)"
+            )
+
+    def _next(self, device: abi.Device) -> tuple[Image | None, abi.Buffer]:
+        """Newest frame (None: damaged) and its buffer, which the driver has back already."""
+        size = (self._calibration.width_px, self._calibration.height_px)
+        while True:
+            if not device.wait(TIMEOUT_S):
+                raise CameraError(f"no frame for {TIMEOUT_S:g} s; check its cable")
+            newest, count = _take(device), 1
+            while newest is not None and (later := _take(device)) is not None:
+                device.ioctl(abi.QBUF, newest)
+                newest, count = later, count + 1
+            if newest is None:
+                continue
+            stale = count >= len(self._buffers)  # the driver had no buffer left: nobody read for a while
+            damaged = bool(newest.flags & abi.BUF_ERROR) or newest.bytesused == 0
+            image: Image | None = None
+            if not stale and not damaged:
+                data = self._buffers[int(newest.index)][: int(newest.bytesused)]
+                image = decode(data, self._pixel_format, size, self._stride)
+            done = abi.Buffer.from_buffer_copy(newest)
+            device.ioctl(abi.QBUF, newest)
+            if not stale:
+                return image, done
+
+    def _count(self, sequence: int) -> None:
+        """Number of the frame, from the driver's 32-bit number; a driver that does not count adds one."""
+        step = 1 if self._sequence is None else (sequence - self._sequence) % 2**32
+        self._seq += step if 0 < step < NOT_INCREASING else 1
+        self._sequence = sequence
+
+    def _row_zero_ns(self, buffer: abi.Buffer) -> int:
+        """Middle of the exposure of row 0 [ns], slave's clock.
+
+        Raises:
+            CameraError: The stamp is on no clock of this machine.
+        """
+        stamp_ns = int(buffer.tv_sec) * 10**9 + int(buffer.tv_usec) * 1000
+        if self._foreign is None:
+            monotonic = buffer.flags & abi.STAMP_CLOCK == abi.STAMP_MONOTONIC
+            name = "monotonic" if monotonic else clock_of(stamp_ns)
+            if name is None:
+                raise CameraError(f"its driver stamps frames with {stamp_ns} ns, on no known clock")
+            self._foreign = ForeignClock(self._clock, system_clock(name))
+        half_ns = round(self._calibration.exposure_us * 500.0)
+        t_ns = self._foreign.to_own(stamp_ns)
+        if buffer.flags & abi.STAMP_SOURCE == abi.STAMP_START_OF_EXPOSURE:
+            return t_ns + half_ns
+        return t_ns - round(self._calibration.height_px * self._calibration.row_time_us * 1e3) - half_ns
+
+
+def _take(device: abi.Device) -> abi.Buffer | None:
+    """Dequeue a filled buffer, or None if there is none."""
+    buffer = abi.Buffer(type=abi.CAPTURE, memory=abi.MMAP)
+    try:
+        device.ioctl(abi.DQBUF, buffer)
+    except BlockingIOError:
+        return None
+    return buffer

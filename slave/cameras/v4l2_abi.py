@@ -1,0 +1,309 @@
+"""The kernel's V4L2 interface as far as a camera needs it: structures, request numbers, and an open device.
+
+Layouts and numbers are those of linux/videodev2.h on 64-bit machines, where x86-64 and aarch64 agree; the tests hold
+them against sizes and numbers that a C compiler gave. Only single-planar memory-mapped capture is here. No library is
+used: OpenCV's own V4L2 capture hides the frame number, the source of the time stamp and whether a setting was taken.
+"""
+
+import ctypes as c
+import errno
+import fcntl
+import mmap
+import os
+import select
+from pathlib import Path
+from typing import Protocol
+
+CAPTURE = 1  # V4L2_BUF_TYPE_VIDEO_CAPTURE
+MMAP = 1  # V4L2_MEMORY_MMAP
+FIELD_ANY, FIELD_NONE = 0, 1
+CAP_CAPTURE, CAP_STREAMING, CAP_DEVICE_CAPS = 0x1, 0x0400_0000, 0x8000_0000
+DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
+BUF_ERROR = 0x40
+STAMP_CLOCK, STAMP_MONOTONIC = 0xE000, 0x2000
+STAMP_SOURCE, STAMP_START_OF_EXPOSURE = 0x7_0000, 0x1_0000
+CTRL_DISABLED, CTRL_GRABBED, CTRL_READ_ONLY, CTRL_INACTIVE, CTRL_WRITE_ONLY = 0x1, 0x2, 0x4, 0x10, 0x40
+CTRL_HAS_PAYLOAD, CTRL_NEXT = 0x100, 0x8000_0000
+TYPE_INTEGER, TYPE_BOOLEAN, TYPE_MENU, TYPE_INTEGER64, TYPE_BITMASK, TYPE_INTEGER_MENU = 1, 2, 3, 5, 8, 9
+
+
+class Capability(c.Structure):
+    """struct v4l2_capability."""
+
+    _fields_ = [
+        ("driver", c.c_char * 16),
+        ("card", c.c_char * 32),
+        ("bus_info", c.c_char * 32),
+        ("version", c.c_uint32),
+        ("capabilities", c.c_uint32),
+        ("device_caps", c.c_uint32),
+        ("reserved", c.c_uint32 * 3),
+    ]
+
+
+class FormatDescription(c.Structure):
+    """struct v4l2_fmtdesc."""
+
+    _fields_ = [
+        ("index", c.c_uint32),
+        ("type", c.c_uint32),
+        ("flags", c.c_uint32),
+        ("description", c.c_char * 32),
+        ("pixelformat", c.c_uint32),
+        ("mbus_code", c.c_uint32),
+        ("reserved", c.c_uint32 * 3),
+    ]
+
+
+class FrameSizes(c.Structure):
+    """struct v4l2_frmsizeenum; `size` is width, height, or min, max, step of width, then of height."""
+
+    _fields_ = [
+        ("index", c.c_uint32),
+        ("pixel_format", c.c_uint32),
+        ("type", c.c_uint32),
+        ("size", c.c_uint32 * 6),
+        ("reserved", c.c_uint32 * 2),
+    ]
+
+
+class FrameIntervals(c.Structure):
+    """struct v4l2_frmivalenum; `interval` is one fraction [s], or min, max and step."""
+
+    _fields_ = [
+        ("index", c.c_uint32),
+        ("pixel_format", c.c_uint32),
+        ("width", c.c_uint32),
+        ("height", c.c_uint32),
+        ("type", c.c_uint32),
+        ("interval", c.c_uint32 * 6),
+        ("reserved", c.c_uint32 * 2),
+    ]
+
+
+class PixelFormat(c.Structure):
+    """struct v4l2_pix_format."""
+
+    _fields_ = [
+        (name, c.c_uint32)
+        for name in (
+            *("width", "height", "pixelformat", "field", "bytesperline", "sizeimage"),
+            *("colorspace", "priv", "flags", "ycbcr_enc", "quantization", "xfer_func"),
+        )
+    ]
+
+
+class _FormatUnion(c.Union):
+    _fields_ = [("pix", PixelFormat), ("raw", c.c_uint8 * 200), ("pointer", c.c_void_p)]
+
+
+class Format(c.Structure):
+    """struct v4l2_format; the union holds pointers, so it begins at 8."""
+
+    _fields_ = [("type", c.c_uint32), ("fmt", _FormatUnion)]
+
+
+class StreamParameters(c.Structure):
+    """struct v4l2_streamparm with struct v4l2_captureparm."""
+
+    _fields_ = [
+        ("type", c.c_uint32),
+        ("capability", c.c_uint32),
+        ("capturemode", c.c_uint32),
+        ("numerator", c.c_uint32),
+        ("denominator", c.c_uint32),
+        ("rest", c.c_uint8 * 184),
+    ]
+
+
+class RequestBuffers(c.Structure):
+    """struct v4l2_requestbuffers."""
+
+    _fields_ = [
+        ("count", c.c_uint32),
+        ("type", c.c_uint32),
+        ("memory", c.c_uint32),
+        ("capabilities", c.c_uint32),
+        ("flags", c.c_uint8),
+        ("reserved", c.c_uint8 * 3),
+    ]
+
+
+class Buffer(c.Structure):
+    """struct v4l2_buffer; `offset` is the first member of the union m, which is a pointer wide."""
+
+    _fields_ = [
+        ("index", c.c_uint32),
+        ("type", c.c_uint32),
+        ("bytesused", c.c_uint32),
+        ("flags", c.c_uint32),
+        ("field", c.c_uint32),
+        ("tv_sec", c.c_int64),
+        ("tv_usec", c.c_int64),
+        ("timecode", c.c_uint8 * 16),
+        ("sequence", c.c_uint32),
+        ("memory", c.c_uint32),
+        ("offset", c.c_uint32),
+        ("m_rest", c.c_uint32),
+        ("length", c.c_uint32),
+        ("reserved2", c.c_uint32),
+        ("request_fd", c.c_int32),
+    ]
+
+
+class QueryControl(c.Structure):
+    """struct v4l2_query_ext_ctrl."""
+
+    _fields_ = [
+        ("id", c.c_uint32),
+        ("type", c.c_uint32),
+        ("name", c.c_char * 32),
+        ("minimum", c.c_int64),
+        ("maximum", c.c_int64),
+        ("step", c.c_uint64),
+        ("default_value", c.c_int64),
+        ("flags", c.c_uint32),
+        ("elem_size", c.c_uint32),
+        ("elems", c.c_uint32),
+        ("nr_of_dims", c.c_uint32),
+        ("dims", c.c_uint32 * 4),
+        ("reserved", c.c_uint32 * 32),
+    ]
+
+
+class QueryMenu(c.Structure):
+    """struct v4l2_querymenu, packed."""
+
+    _pack_ = 1
+    _fields_ = [
+        ("id", c.c_uint32),
+        ("index", c.c_uint32),
+        ("name", c.c_char * 32),
+        ("reserved", c.c_uint32),
+    ]
+
+
+class _ControlValue(c.Union):
+    _pack_ = 1
+    _fields_ = [("value", c.c_int32), ("value64", c.c_int64)]
+
+
+class ControlValue(c.Structure):
+    """struct v4l2_ext_control, packed."""
+
+    _pack_ = 1
+    _fields_ = [
+        ("id", c.c_uint32),
+        ("size", c.c_uint32),
+        ("reserved2", c.c_uint32),
+        ("of", _ControlValue),
+    ]
+
+
+class ControlValues(c.Structure):
+    """struct v4l2_ext_controls."""
+
+    _fields_ = [
+        ("which", c.c_uint32),
+        ("count", c.c_uint32),
+        ("error_idx", c.c_uint32),
+        ("request_fd", c.c_int32),
+        ("reserved", c.c_uint32),
+        ("controls", c.POINTER(ControlValue)),
+    ]
+
+
+_READ, _WRITE = 2, 1
+
+
+def _request(direction: int, number: int, size: int) -> int:
+    """_IOC of linux/ioctl.h with type 'V'."""
+    return direction << 30 | size << 16 | ord("V") << 8 | number
+
+
+QUERYCAP = _request(_READ, 0, c.sizeof(Capability))
+ENUM_FMT = _request(_READ | _WRITE, 2, c.sizeof(FormatDescription))
+S_FMT = _request(_READ | _WRITE, 5, c.sizeof(Format))
+REQBUFS = _request(_READ | _WRITE, 8, c.sizeof(RequestBuffers))
+QUERYBUF = _request(_READ | _WRITE, 9, c.sizeof(Buffer))
+QBUF = _request(_READ | _WRITE, 15, c.sizeof(Buffer))
+DQBUF = _request(_READ | _WRITE, 17, c.sizeof(Buffer))
+STREAMON = _request(_WRITE, 18, c.sizeof(c.c_int))
+STREAMOFF = _request(_WRITE, 19, c.sizeof(c.c_int))
+S_PARM = _request(_READ | _WRITE, 22, c.sizeof(StreamParameters))
+QUERYMENU = _request(_READ | _WRITE, 37, c.sizeof(QueryMenu))
+G_EXT_CTRLS = _request(_READ | _WRITE, 71, c.sizeof(ControlValues))
+S_EXT_CTRLS = _request(_READ | _WRITE, 72, c.sizeof(ControlValues))
+ENUM_FRAMESIZES = _request(_READ | _WRITE, 74, c.sizeof(FrameSizes))
+ENUM_FRAMEINTERVALS = _request(_READ | _WRITE, 75, c.sizeof(FrameIntervals))
+QUERY_EXT_CTRL = _request(_READ | _WRITE, 103, c.sizeof(QueryControl))
+
+
+class Device(Protocol):
+    """An open video device; all methods raise `OSError` as the kernel does."""
+
+    def ioctl(self, request: int, argument: c.Structure | c.c_int) -> None:
+        """Do one request; the kernel changes `argument` in place."""
+        ...
+
+    def map(self, length: int, offset: int) -> memoryview:
+        """Memory of one buffer."""
+        ...
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a frame (or an error) is there within the time."""
+        ...
+
+    def close(self) -> None:
+        """Unmap and close. Safe to call twice."""
+        ...
+
+
+class KernelDevice:
+    """A `Device` of the running kernel. Holds the file and the mapped buffers."""
+
+    def __init__(self, path: Path) -> None:
+        """Open without blocking.
+
+        Raises:
+            OSError: It is not there, busy, or not for this user.
+        """
+        self._file: int | None = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        self._maps: list[mmap.mmap] = []
+
+    def ioctl(self, request: int, argument: c.Structure | c.c_int) -> None:
+        """Do one request."""
+        fcntl.ioctl(self._open(), request, argument)  # Python repeats it after a signal (PEP 475)
+
+    def map(self, length: int, offset: int) -> memoryview:
+        """Memory of one buffer."""
+        self._maps.append(mmap.mmap(self._open(), length, mmap.MAP_SHARED, mmap.PROT_READ, offset=offset))
+        return memoryview(self._maps[-1])
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether a frame (or an error) is there within the time."""
+        poll = select.poll()
+        poll.register(self._open(), select.POLLIN)
+        return bool(poll.poll(timeout_s * 1e3))
+
+    def close(self) -> None:
+        """Close the file; a map goes when nobody looks at it any more."""
+        self._maps.clear()
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+    def _open(self) -> int:
+        if self._file is None:
+            raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+        return self._file
+
+
+def fourcc(text: str) -> int:
+    """Number of a pixel format such as "YUYV"."""
+    return int.from_bytes(text.encode("ascii"), "little")
+
+
+def fourcc_text(number: int) -> str:
+    """The four letters of a pixel format."""
+    return number.to_bytes(4, "little").decode("ascii", "replace").strip()

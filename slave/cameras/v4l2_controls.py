@@ -1,0 +1,298 @@
+"""Settings of a V4L2 camera by name: every automatic off, every value written, read back, compared.
+
+Names are those of v4l2-ctl and current kernels ("White Balance, Automatic" is `white_balance_automatic`); standard
+controls are recognised by their number, since kernels have renamed them. Only exposure has a physical unit (100 us).
+Gain, colour balance and focus are codes of the maker, which no camera file can hold for all cameras: where the camera
+has such a control its value must be given (`--control gain=32`), because whatever an automatic left there would
+otherwise be kept. Where it lacks a setting that the camera file names, that must be allowed (`--allow-missing gain`).
+Nothing is ignored silently.
+"""
+
+import ctypes as c
+import errno
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from common.calibration import CameraCalibration
+from common.errors import CameraError
+from slave.cameras.settings import Setting
+from slave.cameras.v4l2_abi import (
+    CTRL_DISABLED,
+    CTRL_HAS_PAYLOAD,
+    CTRL_NEXT,
+    CTRL_READ_ONLY,
+    CTRL_WRITE_ONLY,
+    G_EXT_CTRLS,
+    QUERY_EXT_CTRL,
+    QUERYMENU,
+    S_EXT_CTRLS,
+    TYPE_BITMASK,
+    TYPE_BOOLEAN,
+    TYPE_INTEGER,
+    TYPE_INTEGER64,
+    TYPE_INTEGER_MENU,
+    TYPE_MENU,
+    ControlValue,
+    ControlValues,
+    Device,
+    QueryControl,
+    QueryMenu,
+)
+
+EXPOSURE_UNIT_US = 100.0
+# Numbers of linux/v4l2-controls.h -> name in current kernels.
+NAMES = {
+    0x009A0901: "auto_exposure",
+    0x009A0902: "exposure_time_absolute",
+    0x009A0903: "exposure_dynamic_framerate",
+    0x009A090A: "focus_absolute",
+    0x009A090C: "focus_automatic_continuous",
+    0x009A0914: "white_balance_auto_preset",
+    0x009A0915: "wide_dynamic_range",
+    0x009A0916: "image_stabilization",
+    0x009A0918: "iso_sensitivity_auto",
+    0x0098090C: "white_balance_automatic",
+    0x0098090E: "red_balance",
+    0x0098090F: "blue_balance",
+    0x00980911: "exposure",
+    0x00980912: "gain_automatic",
+    0x00980913: "gain",
+    0x00980918: "power_line_frequency",
+    0x00980919: "hue_automatic",
+    0x0098091A: "white_balance_temperature",
+    0x00980920: "brightness_automatic",
+    0x009E0903: "analogue_gain",
+}
+# What thinks for itself, and the value that stops it: V4L2_EXPOSURE_MANUAL is 1, off is 0 everywhere else.
+AUTOMATICS = {
+    "auto_exposure": 1,
+    "exposure_dynamic_framerate": 0,
+    "white_balance_automatic": 0,
+    "white_balance_auto_preset": 0,
+    "gain_automatic": 0,
+    "focus_automatic_continuous": 0,
+    "hue_automatic": 0,
+    "brightness_automatic": 0,
+    "wide_dynamic_range": 0,
+    "image_stabilization": 0,
+    "iso_sensitivity_auto": 0,
+    "power_line_frequency": 0,
+}
+# What the camera file wants -> ways to have it, each a set of controls.
+NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
+    "exposure": (("exposure_time_absolute",), ("exposure",)),
+    "gain": (("gain",), ("analogue_gain",)),
+    "white_balance": (("white_balance_temperature",), ("red_balance", "blue_balance")),
+}
+FILE_KEYS = {"exposure": "exposure_us", "gain": "analogue_gain", "white_balance": "colour_gains"}
+NUMERIC = {TYPE_INTEGER, TYPE_BOOLEAN, TYPE_MENU, TYPE_INTEGER64, TYPE_BITMASK, TYPE_INTEGER_MENU}
+
+
+@dataclass(frozen=True, slots=True)
+class Control:
+    """One control of the camera.
+
+    Attributes:
+        number: Its id in the kernel.
+        name: As v4l2-ctl calls it.
+        type: One of `NUMERIC`.
+        low: Lowest value.
+        high: Highest value.
+        step: Distance of allowed values, at least 1.
+        menu: Value -> its name, for a menu; menus have holes.
+    """
+
+    number: int
+    name: str
+    type: int
+    low: int
+    high: int
+    step: int
+    menu: Mapping[int, str] | None = None
+
+    def text(self) -> str:
+        """Name and range in words."""
+        if self.menu is None:
+            return f"{self.name} ({self.low} to {self.high} step {self.step})"
+        return f"{self.name} ({', '.join(f'{value} = {name}' for value, name in self.menu.items())})"
+
+    def allows(self, value: int) -> bool:
+        """Whether the value is on the menu, or in range and on a step."""
+        if self.menu is not None:
+            return value in self.menu
+        return self.low <= value <= self.high and (value - self.low) % self.step == 0
+
+    def nearest(self, value: float) -> int:
+        """The allowed value nearest to `value`."""
+        steps = (min(max(value, self.low), self.high) - self.low) / self.step
+        return self.low + round(steps) * self.step
+
+
+def read_controls(device: Device) -> dict[str, Control]:
+    """All controls with a number as value that can be written and read back, by name."""
+    found: dict[str, Control] = {}
+    number = 0
+    while True:
+        query = QueryControl(id=number | CTRL_NEXT)
+        try:
+            device.ioctl(QUERY_EXT_CTRL, query)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOTTY):
+                return found
+            raise
+        number = int(query.id)
+        useless = CTRL_DISABLED | CTRL_READ_ONLY | CTRL_WRITE_ONLY | CTRL_HAS_PAYLOAD
+        if query.type in NUMERIC and not query.flags & useless:
+            name = NAMES.get(number) or plain_name(query.name.decode("ascii", "replace"))
+            menu = _menu(device, query) if query.type in (TYPE_MENU, TYPE_INTEGER_MENU) else None
+            low, high, step = int(query.minimum), int(query.maximum), max(int(query.step), 1)
+            found[name] = Control(number, name, int(query.type), low, high, step, menu)
+
+
+def _menu(device: Device, query: QueryControl) -> dict[int, str]:
+    found: dict[int, str] = {}
+    for index in range(int(query.minimum), int(query.maximum) + 1):
+        entry = QueryMenu(id=query.id, index=index)
+        try:
+            device.ioctl(QUERYMENU, entry)
+        except OSError as error:
+            if error.errno == errno.EINVAL:  # a hole
+                continue
+            raise
+        label = bytes(entry.name)
+        number = str(int.from_bytes(label[:8], "little", signed=True))
+        found[index] = (
+            number if query.type == TYPE_INTEGER_MENU else label.split(b"\0")[0].decode("ascii", "replace")
+        )
+    return found
+
+
+def plain_name(name: str) -> str:
+    """The kernel's name as v4l2-ctl writes it: lower case, everything else one underscore."""
+    return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+
+
+def plan(
+    camera: CameraCalibration,
+    controls: Mapping[str, Control],
+    given: Mapping[str, int],
+    missing: Iterable[str],
+) -> tuple[Setting, ...]:
+    """What to write, in this order, and to find again: automatics off, exposure, then what was given.
+
+    Args:
+        camera: The camera file; its exposure is used as it is.
+        controls: What the camera has.
+        given: Control -> value, from the command line.
+        missing: Which of exposure, gain, white_balance the camera may lack.
+
+    Raises:
+        CameraError: A control is unknown, out of range, or needed and not given. The text says what to write.
+    """
+    allowed = set(missing)
+    if wrong := sorted(allowed - set(NEEDS)):
+        raise CameraError(f"--allow-missing {wrong[0]}: there are {', '.join(NEEDS)}")
+    for name in given:
+        if name not in controls:
+            known = "; ".join(control.text() for control in controls.values()) or "none"
+            raise CameraError(f"--control {name}: it has no such control; it has {known}")
+    if "exposure_time_absolute" in given:
+        raise CameraError("--control exposure_time_absolute: the exposure is exposure_us of the camera file")
+    settings: dict[str, Setting] = {}
+    for name, off in AUTOMATICS.items():
+        if name in controls and name not in given and not controls[name].allows(off):
+            raise CameraError(
+                f"{name} cannot be switched off: give --control {name}=N, {controls[name].text()}"
+            )
+        if name in controls:
+            settings[name] = Setting(name, (float(off),), 0.0, "", "no automatic")
+    if "exposure_time_absolute" in controls:
+        settings["exposure_time_absolute"] = _exposure(camera, controls["exposure_time_absolute"])
+    for name, value in given.items():
+        if not controls[name].allows(value):
+            raise CameraError(f"--control {name}={value}: out of range; {controls[name].text()}")
+        settings[name] = Setting(name, (float(value),), 0.0, "", "--control")
+    _check_needs(camera, controls, given, allowed)
+    return tuple(settings.values())
+
+
+def _exposure(camera: CameraCalibration, control: Control) -> Setting:
+    """Exposure in units of 100 us, on the nearest step; half a step off the camera file is allowed."""
+    wanted = camera.exposure_us / EXPOSURE_UNIT_US
+    if not control.low - 0.5 <= wanted <= control.high + 0.5:
+        raise CameraError(
+            f"exposure_us {camera.exposure_us:g} is not within {control.low * EXPOSURE_UNIT_US:g} to "
+            f"{control.high * EXPOSURE_UNIT_US:g}: change the camera file"
+        )
+    return Setting(control.name, (wanted,), 0.5 * control.step, "x 100 us", "exposure_us")
+
+
+def _check_needs(
+    camera: CameraCalibration, controls: Mapping[str, Control], given: Mapping[str, int], allowed: set[str]
+) -> None:
+    """Every value that the image depends on is known, or its absence was allowed."""
+    say: list[str] = []
+    for need, ways in NEEDS.items():
+        have = [way for way in ways if all(name in controls for name in way)]
+        set_already = any(
+            all(name in given or name == "exposure_time_absolute" for name in way) for way in have
+        )
+        if not have and need not in allowed:
+            say.append(
+                f"it has no {need} control for {FILE_KEYS[need]} of the camera file: allow that with "
+                f"--allow-missing {need}"
+            )
+        elif have and not set_already:
+            choice = " and ".join(f"--control {name}=N" for name in have[0])
+            ranges = ", ".join(controls[name].text() for name in have[0])
+            say.append(f"its {need} is a code of its maker: give {choice}, {ranges}")
+    if "focus_absolute" in controls and "focus_absolute" not in given:
+        say.append(
+            f"it has a focus motor: give --control focus_absolute=N, {controls['focus_absolute'].text()}"
+        )
+    if say:
+        raise CameraError("; ".join(say))
+
+
+def write(device: Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> None:
+    """Write all settings, in order.
+
+    Raises:
+        CameraError: The camera refuses one; the text names it and says why.
+    """
+    for setting in settings:
+        control = controls[setting.name]
+        value = control.nearest(setting.wanted[0])
+        values, one = _one(control)
+        if control.type == TYPE_INTEGER64:
+            one.of.value64 = value
+        else:
+            one.of.value = value
+        try:
+            device.ioctl(S_EXT_CTRLS, values)
+        except OSError as error:
+            why = {
+                errno.EBUSY: "another program is using it",
+                errno.EACCES: "it is read-only now",
+                errno.ERANGE: "out of range",
+            }
+            raise CameraError(
+                f"{setting.name}={value} ({setting.source}) was refused: {why.get(error.errno or 0, error.strerror)}"
+            ) from error
+
+
+def read_back(device: Device, controls: Mapping[str, Control], settings: Iterable[Setting]) -> dict[str, int]:
+    """Present values of the controls of `settings`, by name."""
+    found: dict[str, int] = {}
+    for setting in settings:
+        control = controls[setting.name]
+        values, one = _one(control)
+        device.ioctl(G_EXT_CTRLS, values)
+        found[setting.name] = int(one.of.value64 if control.type == TYPE_INTEGER64 else one.of.value)
+    return found
+
+
+def _one(control: Control) -> tuple[ControlValues, ControlValue]:
+    one = ControlValue(id=control.number)
+    return ControlValues(which=0, count=1, controls=c.pointer(one)), one

@@ -1,0 +1,184 @@
+"""In which format a V4L2 camera delivers: what it offers, which offer is taken, and how its bytes become BGR.
+
+Uncompressed formats are preferred because JPEG moves colours at the edges of the markers; it is taken where only it
+reaches size and rate, as with most USB 2 cameras above 640x480 at 30 Hz. The size must be offered exactly and the rate
+to 1 %: a camera that rounds silently would deliver frames that were never calibrated.
+"""
+
+import errno
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.errors import CameraError
+from slave.cameras.v4l2_abi import (
+    CAPTURE,
+    DISCRETE,
+    ENUM_FMT,
+    ENUM_FRAMEINTERVALS,
+    ENUM_FRAMESIZES,
+    Device,
+    FormatDescription,
+    FrameIntervals,
+    FrameSizes,
+    fourcc,
+    fourcc_text,
+)
+
+RATE_SHARE = 0.01  # 59.94 Hz serves 60 Hz
+MOST = 256  # entries of an enumeration; a driver that never ends it is broken
+PREFERENCE = tuple(fourcc(text) for text in ("BGR3", "RGB3", "YUYV", "UYVY", "MJPG", "JPEG"))
+JPEG_END = b"\xff\xd9"
+
+EntryT = TypeVar("EntryT", FormatDescription, FrameSizes, FrameIntervals)
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """One format in one size.
+
+    Attributes:
+        pixel_format: Number of the format.
+        size: Width and height [px].
+        rates_hz: Frame rates [Hz], rising; of a camera with a continuous range its ends; empty where the driver does
+            not say.
+        continuous: Whether everything between the ends is offered, too.
+    """
+
+    pixel_format: int
+    size: tuple[int, int]
+    rates_hz: tuple[float, ...]
+    continuous: bool = False
+
+    def reaches(self, rate_hz: float) -> bool:
+        """Whether this rate [Hz] is offered; a driver that does not say is believed until it is read back."""
+        if not self.rates_hz:
+            return True
+        slack = RATE_SHARE * rate_hz
+        if self.continuous:
+            return self.rates_hz[0] - slack <= rate_hz <= self.rates_hz[-1] + slack
+        return any(abs(offered - rate_hz) <= slack for offered in self.rates_hz)
+
+    def text(self) -> str:
+        """The offer in words."""
+        join = " to " if self.continuous else ", "
+        rates = join.join(f"{rate:.4g}" for rate in self.rates_hz) or "unknown"
+        return f"{fourcc_text(self.pixel_format)} {self.size[0]}x{self.size[1]} at {rates} Hz"
+
+
+def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
+    """Everything the camera offers; of a continuous range of sizes its ends and, if within, the wanted size [px]."""
+    offers: list[Offer] = []
+    for description in _enumerate(device, ENUM_FMT, lambda i: FormatDescription(index=i, type=CAPTURE)):
+        pixel_format = int(description.pixelformat)
+        for size in _sizes(device, pixel_format, wanted):
+            offers.append(_with_rates(device, pixel_format, size))
+    return tuple(offers)
+
+
+def choose_offer(offers: Sequence[Offer], size: tuple[int, int], rate_hz: float) -> Offer:
+    """The best format that has exactly this size [px] and this rate [Hz].
+
+    Raises:
+        CameraError: There is none; the text lists what there is.
+    """
+    able = [o for o in offers if o.pixel_format in PREFERENCE and o.size == size and o.reaches(rate_hz)]
+    if not able:
+        listed = "; ".join(offer.text() for offer in offers) or "nothing"
+        known = ", ".join(fourcc_text(number) for number in PREFERENCE)
+        raise CameraError(
+            f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: {listed}. "
+            "Set width_px, height_px and frame_rate_hz of the camera file to one of these"
+        )
+    return min(able, key=lambda offer: PREFERENCE.index(offer.pixel_format))
+
+
+def decode(data: memoryview, pixel_format: int, size: tuple[int, int], stride: int) -> Image | None:
+    """New BGR image (H, W, 3) from the bytes of one frame; None for a frame that is cut or broken.
+
+    Args:
+        data: The bytes the driver filled.
+        pixel_format: Number of the format, one of `PREFERENCE`.
+        size: Width and height [px].
+        stride: Bytes from row to row; meaningless for JPEG.
+    """
+    width, height = size
+    raw = np.frombuffer(data, np.uint8)
+    name = fourcc_text(pixel_format)
+    if name in ("MJPG", "JPEG"):
+        # A JPEG whose end is missing decodes to an image with a grey rest, and no error.
+        if JPEG_END not in bytes(data[-64:]):
+            return None
+        image = cv2.imdecode(raw, cv2.IMREAD_COLOR)
+        whole = image is not None and image.shape == (height, width, 3)
+        return np.asarray(image, np.uint8) if whole else None
+    used = width * (3 if name in ("BGR3", "RGB3") else 2)
+    if raw.size < stride * (height - 1) + used or stride < used:
+        return None
+    rows = np.lib.stride_tricks.as_strided(raw, (height, used), (stride, 1), writeable=False)
+    if name == "BGR3":
+        return rows.reshape(height, width, 3).copy()
+    if name == "RGB3":
+        return np.ascontiguousarray(rows.reshape(height, width, 3)[..., ::-1])
+    code = cv2.COLOR_YUV2BGR_YUYV if name == "YUYV" else cv2.COLOR_YUV2BGR_UYVY
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(rows).reshape(height, width, 2), code), np.uint8)
+
+
+def _enumerate(device: Device, request: int, entry: Callable[[int], EntryT]) -> Iterator[EntryT]:
+    """Entries 0, 1, … until the driver says that there is no more."""
+    for index in range(MOST):
+        item = entry(index)
+        try:
+            device.ioctl(request, item)
+        except OSError as error:
+            if error.errno in (
+                errno.EINVAL,
+                errno.ENOTTY,
+            ):  # the end; or the driver does not enumerate this at all
+                return
+            raise
+        yield item
+
+
+def _sizes(device: Device, pixel_format: int, wanted: tuple[int, int]) -> list[tuple[int, int]]:
+    found: list[tuple[int, int]] = []
+    for entry in _enumerate(
+        device, ENUM_FRAMESIZES, lambda i: FrameSizes(index=i, pixel_format=pixel_format)
+    ):
+        if entry.type == DISCRETE:
+            found.append((int(entry.size[0]), int(entry.size[1])))
+            continue
+        low_w, high_w, step_w, low_h, high_h, step_h = (int(value) for value in entry.size)
+        fits = _on_grid(wanted[0], low_w, high_w, step_w) and _on_grid(wanted[1], low_h, high_h, step_h)
+        found += [(low_w, low_h), *([wanted] if fits else []), (high_w, high_h)]
+        break  # a range has one entry; some drivers repeat it for ever
+    return found
+
+
+def _on_grid(value: int, low: int, high: int, step: int) -> bool:
+    return low <= value <= high and (value - low) % max(step, 1) == 0
+
+
+def _with_rates(device: Device, pixel_format: int, size: tuple[int, int]) -> Offer:
+    rates: list[float] = []
+    width, height = size
+    for entry in _enumerate(
+        device,
+        ENUM_FRAMEINTERVALS,
+        lambda i: FrameIntervals(index=i, pixel_format=pixel_format, width=width, height=height),
+    ):
+        values = [int(value) for value in entry.interval]
+        if entry.type != DISCRETE:
+            slowest, fastest = _rate(values[2], values[3]), _rate(values[0], values[1])
+            return Offer(pixel_format, size, (slowest, fastest), continuous=True)
+        rates.append(_rate(values[0], values[1]))
+    return Offer(pixel_format, size, tuple(sorted(rates)))
+
+
+def _rate(numerator: int, denominator: int) -> float:
+    """Rate [Hz] of an interval [s]."""
+    return denominator / max(numerator, 1)

@@ -1,0 +1,340 @@
+"""A USB camera as the kernel shows it, answering ioctls from a list of controls and formats.
+
+It behaves as the kernel documents: enumerations end with EINVAL, S_FMT and S_PARM take the nearest they have, a value
+that an automatic owns cannot be kept, buffers go round between driver and program, DQBUF without a filled buffer
+is EAGAIN and without a device ENODEV.
+"""
+
+import ctypes as c
+import errno
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from slave.cameras import v4l2_abi as abi
+
+MANUAL = 1
+
+
+@dataclass
+class Knob:
+    """One control: its number, name, kind, range and present value."""
+
+    number: int
+    name: str
+    kind: int
+    low: int
+    high: int
+    step: int
+    value: int
+    menu: dict[int, str] = field(default_factory=dict[int, str])
+    flags: int = 0
+
+
+def webcam_knobs() -> list[Knob]:
+    """Controls of a common UVC camera, named as kernel 6 does; the last one is of a kernel before 5.10."""
+    off_on = (abi.TYPE_BOOLEAN, 0, 1, 1)
+    return [
+        Knob(0x00980001, "User Controls", 6, 0, 0, 0, 0, flags=abi.CTRL_READ_ONLY),
+        Knob(0x00980900, "Brightness", abi.TYPE_INTEGER, -64, 64, 1, 0),
+        Knob(0x0098090C, "White Balance, Automatic", *off_on, 1),
+        Knob(0x00980913, "Gain", abi.TYPE_INTEGER, 0, 100, 1, 17),
+        Knob(
+            0x00980918,
+            "Power Line Frequency",
+            abi.TYPE_MENU,
+            0,
+            2,
+            1,
+            1,
+            {0: "Disabled", 1: "50 Hz", 2: "60 Hz"},
+        ),
+        Knob(0x0098091A, "White Balance Temperature", abi.TYPE_INTEGER, 2800, 6500, 10, 4600),
+        Knob(
+            0x009A0901,
+            "Exposure, Auto",
+            abi.TYPE_MENU,
+            0,
+            3,
+            1,
+            3,
+            {1: "Manual Mode", 3: "Aperture Priority Mode"},
+        ),
+        Knob(0x009A0902, "Exposure Time, Absolute", abi.TYPE_INTEGER, 1, 5000, 1, 157),
+        Knob(0x009A0903, "Exposure, Dynamic Framerate", *off_on, 1),
+    ]
+
+
+@dataclass
+class Camera:
+    """The camera behind the device, and what goes wrong with it.
+
+    Attributes:
+        formats: Four letters -> size [px] -> rates [Hz].
+        keeps: What a written value becomes, by control name.
+        resets: Control name -> value it falls back to when the stream starts.
+        real_rate_hz: At which frames really come, if not as set.
+        queue: Frames ready at each wait (1: the program keeps up).
+        skip: Frame numbers the camera lost.
+        damaged: Frame numbers that arrive with the error flag.
+        cut: Frame numbers whose bytes end early.
+        gone_after: From this frame on the device is unplugged; `silent_after`: it just sends nothing.
+    """
+
+    knobs: list[Knob] = field(default_factory=webcam_knobs)
+    formats: dict[str, dict[tuple[int, int], tuple[float, ...]]] = field(
+        default_factory=lambda: {
+            "YUYV": {(640, 480): (30.0, 15.0), (1280, 720): (10.0,)},
+            "MJPG": {(640, 480): (60.0, 30.0), (1280, 720): (60.0, 30.0)},
+        }
+    )
+    keeps: Callable[[str, int], int] = lambda _name, value: value
+    resets: dict[str, int] = field(default_factory=dict[str, int])
+    refuses: dict[str, int] = field(default_factory=dict[str, int])
+    real_rate_hz: float | None = None
+    stepwise: tuple[int, int, int, int, int, int] | None = None
+    capabilities: int = abi.CAP_CAPTURE | abi.CAP_STREAMING
+    stamp_flags: int = abi.STAMP_MONOTONIC | abi.STAMP_START_OF_EXPOSURE
+    stamp_zero_ns: int = field(default_factory=lambda: time.monotonic_ns() - 2_000_000_000)
+    counts: bool = True
+    queue: int = 1
+    padding: int = 0
+    skip: frozenset[int] = frozenset()
+    damaged: frozenset[int] = frozenset()
+    cut: frozenset[int] = frozenset()
+    gone_after: int | None = None
+    silent_after: int | None = None
+    writes: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
+    closed: int = 0
+
+    def knob(self, name: str) -> Knob:
+        """The control whose kernel name begins so."""
+        return next(knob for knob in self.knobs if knob.name.startswith(name))
+
+
+def colour(number: int) -> tuple[int, int, int]:
+    """Blue, green and red of frame `number`: plain, so that it survives YUV and JPEG."""
+    return (40 + 8 * (number % 20), 90, 200)
+
+
+class FakeDevice:
+    """An `abi.Device`."""
+
+    def __init__(self, camera: Camera) -> None:
+        self.camera = camera
+        self.frame = 0
+        self._size, self._format, self._rate_hz, self._stride = (0, 0), "", 30.0, 0
+        self._memory: list[bytearray] = []
+        self._empty: list[int] = []
+        self._full: list[tuple[int, int, int]] = []  # index, frame, bytes
+        self._streaming = self._closed = False
+        self.mapped = 0
+
+    def ioctl(self, request: int, argument: c.Structure | c.c_int) -> None:
+        if self._gone():
+            raise _error(errno.ENODEV)
+        answers: dict[int, Callable[..., None]] = {
+            abi.QUERYCAP: self._querycap,
+            abi.ENUM_FMT: self._enum_fmt,
+            abi.ENUM_FRAMESIZES: self._enum_sizes,
+            abi.ENUM_FRAMEINTERVALS: self._enum_intervals,
+            abi.S_FMT: self._s_fmt,
+            abi.S_PARM: self._s_parm,
+            abi.QUERY_EXT_CTRL: self._query_control,
+            abi.QUERYMENU: self._query_menu,
+            abi.S_EXT_CTRLS: self._set_control,
+            abi.G_EXT_CTRLS: self._get_control,
+            abi.REQBUFS: self._reqbufs,
+            abi.QUERYBUF: self._querybuf,
+            abi.QBUF: self._qbuf,
+            abi.DQBUF: self._dqbuf,
+            abi.STREAMON: self._streamon,
+            abi.STREAMOFF: self._streamoff,
+        }
+        answers[request](argument)
+
+    def map(self, length: int, offset: int) -> memoryview:
+        index = offset // 0x100000
+        assert len(self._memory[index]) == length
+        self.mapped += 1
+        return memoryview(self._memory[index]).toreadonly()
+
+    def wait(self, timeout_s: float) -> bool:
+        assert timeout_s > 0.0
+        if self._gone():
+            return True  # POLLERR
+        if self.camera.silent_after is not None and self.frame >= self.camera.silent_after:
+            return False
+        for _ in range(self.camera.queue):
+            self._expose()
+        return bool(self._full)
+
+    def close(self) -> None:
+        assert not self._closed
+        self._closed = True
+        self.camera.closed += 1
+
+    def _gone(self) -> bool:
+        return self.camera.gone_after is not None and self.frame >= self.camera.gone_after
+
+    def _expose(self) -> None:
+        """The camera makes one frame; without an empty buffer it is lost."""
+        camera = self.camera
+        while self.frame in camera.skip:
+            self.frame += 1
+        number, self.frame = self.frame, self.frame + 1
+        if not self._empty or not self._streaming:
+            return
+        index = self._empty.pop(0)
+        data = encode(self._format, self._size, self._stride, number)
+        if number in camera.cut:
+            data = data[: len(data) // 2]
+        self._memory[index][: len(data)] = data
+        self._full.append((index, number, len(data)))
+
+    def _querycap(self, found: abi.Capability) -> None:
+        found.card, found.driver = b"Fake Cam", b"uvcvideo"
+        found.capabilities = abi.CAP_DEVICE_CAPS | abi.CAP_CAPTURE | abi.CAP_STREAMING
+        found.device_caps = self.camera.capabilities
+
+    def _enum_fmt(self, entry: abi.FormatDescription) -> None:
+        names = list(self.camera.formats)
+        entry.pixelformat = abi.fourcc(_nth(names, entry.index))
+
+    def _enum_sizes(self, entry: abi.FrameSizes) -> None:
+        if self.camera.stepwise is not None:
+            _nth([0], entry.index)
+            entry.type = 3
+            entry.size[:] = self.camera.stepwise
+            return
+        size = _nth(list(self.camera.formats[abi.fourcc_text(entry.pixel_format)]), entry.index)
+        entry.type = abi.DISCRETE
+        entry.size[0], entry.size[1] = size
+
+    def _enum_intervals(self, entry: abi.FrameIntervals) -> None:
+        sizes = self.camera.formats[abi.fourcc_text(entry.pixel_format)]
+        rates = next(iter(sizes.values())) if self.camera.stepwise else sizes[entry.width, entry.height]
+        if self.camera.stepwise is not None:
+            _nth([0], entry.index)
+            entry.type = 2
+            entry.interval[:] = (1, round(max(rates)), 1, round(min(rates)), 1, 1)
+            return
+        entry.type = abi.DISCRETE
+        entry.interval[0], entry.interval[1] = 1000, round(1000 * _nth(list(rates), entry.index))
+
+    def _s_fmt(self, asked: abi.Format) -> None:
+        pix = asked.fmt.pix
+        self._format, self._size = abi.fourcc_text(pix.pixelformat), (pix.width, pix.height)
+        width = {"MJPG": 0, "BGR3": 3, "RGB3": 3}.get(self._format, 2) * pix.width
+        self._stride = width + self.camera.padding if width else 0
+        pix.bytesperline = self._stride
+        pix.sizeimage = self._stride * pix.height or 500_000
+
+    def _s_parm(self, asked: abi.StreamParameters) -> None:
+        sizes = self.camera.formats[self._format]
+        wanted = asked.denominator / asked.numerator
+        rates = next(iter(sizes.values())) if self.camera.stepwise else sizes[self._size]
+        self._rate_hz = wanted if self.camera.stepwise else min(rates, key=lambda rate: abs(rate - wanted))
+        asked.numerator, asked.denominator = round(1e7 / self._rate_hz), 10_000_000  # UVC counts 100 ns
+
+    def _query_control(self, query: abi.QueryControl) -> None:
+        assert query.id & abi.CTRL_NEXT
+        after = query.id & ~abi.CTRL_NEXT
+        knob = _nth(
+            [knob for knob in sorted(self.camera.knobs, key=lambda k: k.number) if knob.number > after], 0
+        )
+        query.id, query.type, query.flags = knob.number, knob.kind, knob.flags
+        query.name = knob.name.encode()
+        query.minimum, query.maximum, query.step = knob.low, knob.high, knob.step
+
+    def _query_menu(self, query: abi.QueryMenu) -> None:
+        menu = self._knob(query.id).menu
+        if query.index not in menu:
+            raise _error(errno.EINVAL)
+        query.name = menu[query.index].encode()
+
+    def _set_control(self, values: abi.ControlValues) -> None:
+        assert (values.count, values.which) == (1, 0)
+        one = values.controls[0]
+        knob = self._knob(one.id)
+        if knob.name in self.camera.refuses:
+            raise _error(self.camera.refuses[knob.name])
+        if not knob.low <= one.of.value <= knob.high:
+            raise _error(errno.ERANGE)
+        self.camera.writes.append((knob.name, one.of.value))
+        automatic = self.camera.knob("Exposure, Auto").value != MANUAL
+        if not (knob.name.startswith("Exposure Time") and automatic):  # else the automatic owns it
+            knob.value = self.camera.keeps(knob.name, one.of.value)
+
+    def _get_control(self, values: abi.ControlValues) -> None:
+        one = values.controls[0]
+        one.of.value = self._knob(one.id).value
+
+    def _knob(self, number: int) -> Knob:
+        return next(knob for knob in self.camera.knobs if knob.number == number)
+
+    def _reqbufs(self, request: abi.RequestBuffers) -> None:
+        self._memory = [bytearray(self._stride * self._size[1] or 500_000) for _ in range(request.count)]
+
+    def _querybuf(self, buffer: abi.Buffer) -> None:
+        buffer.length, buffer.offset = len(self._memory[buffer.index]), buffer.index * 0x100000
+
+    def _qbuf(self, buffer: abi.Buffer) -> None:
+        assert buffer.index not in self._empty, "queued twice"
+        self._memory[buffer.index][:] = b"\x55" * len(self._memory[buffer.index])  # the driver may write now
+        self._empty.append(buffer.index)
+
+    def _dqbuf(self, buffer: abi.Buffer) -> None:
+        if not self._full:
+            raise _error(errno.EAGAIN)
+        index, number, used = self._full.pop(0)
+        rate_hz = self.camera.real_rate_hz or self._rate_hz
+        stamp_us = (self.camera.stamp_zero_ns + round(number * 1e9 / rate_hz)) // 1000
+        buffer.index, buffer.bytesused = index, used
+        buffer.sequence = number if self.camera.counts else 0
+        buffer.tv_sec, buffer.tv_usec = divmod(stamp_us, 1_000_000)
+        buffer.flags = self.camera.stamp_flags | (abi.BUF_ERROR if number in self.camera.damaged else 0)
+
+    def _streamon(self, _kind: c.c_int) -> None:
+        self._streaming = True
+        for name, value in self.camera.resets.items():
+            self.camera.knob(name).value = value
+
+    def _streamoff(self, _kind: c.c_int) -> None:
+        self._streaming = False
+
+
+def encode(name: str, size: tuple[int, int], stride: int, number: int) -> bytes:
+    """A plain frame in the camera's format, its rows padded to the stride."""
+    width, height = size
+    image = np.full((height, width, 3), colour(number), np.uint8)
+    if name == "MJPG":
+        return cv2.imencode(".jpg", image)[1].tobytes() + b"\0\0"  # cameras pad
+    if name == "RGB3":
+        image = image[..., ::-1]
+    if name == "YUYV":
+        y, cr, cb = cv2.split(cv2.cvtColor(image[:1, :1], cv2.COLOR_BGR2YCrCb))
+        luma, u, v = (round(16 + float(y[0, 0]) * 219 / 255), *_narrow(cb[0, 0], cr[0, 0]))
+        image = np.tile(np.array([luma, u, luma, v], np.uint8), (height, width // 2))
+    rows = np.zeros((height, stride), np.uint8)
+    rows[:, : image.reshape(height, -1).shape[1]] = image.reshape(height, -1)
+    return rows.tobytes()
+
+
+def _narrow(cb: int, cr: int) -> tuple[int, int]:
+    """Chroma of full range as studio range (BT.601)."""
+    return round(128 + (float(cb) - 128) * 224 / 255), round(128 + (float(cr) - 128) * 224 / 255)
+
+
+def _nth(items: list, index: int):  # pyright: ignore[reportMissingTypeArgument,reportUnknownParameterType]
+    if index >= len(items):
+        raise _error(errno.EINVAL)
+    return items[index]
+
+
+def _error(number: int) -> OSError:
+    return OSError(number, os.strerror(number))
