@@ -3,11 +3,13 @@
 import argparse
 import gc
 import logging
+import math
 import os
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -30,6 +32,10 @@ EXAMPLES = """examples:
         live: waits for the master's start, then sends one sealed datagram per frame
   phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
         live without hardware: renders the standard scene in real time
+  phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
+        raw frames to disk, without master or network; one folder per camera
+  phalanx-slave join recordings/wave-left recordings/wave-right -o recordings/wave
+        one recording of all cameras, for `phalanx replay` and the calibrations
 """
 CAMERAS = "synthetic | replay:FOLDER"
 PROGRESS_EVERY = 500  # frames
@@ -42,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
     try:
-        return {"run": _run, "detect": _detect, "colours": _colours}[options.command](options)
+        return COMMANDS[options.command](options)
     except PhalanxError as error:
         print(f"phalanx-slave: {error}", file=sys.stderr)
         return 1
@@ -133,6 +139,82 @@ def _source(
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 
+def _record(options: argparse.Namespace) -> int:
+    from common.frame_recording import Manifest
+    from common.frame_writing import refuse_occupied
+    from slave.progress import Length, ProgressDisplay
+    from slave.recorder import Recorder, clock_of, feed
+
+    rig, camera = _calibration(options)
+    files = {n: options.calibration / "cameras" / f"{n}.json" for n in rig.cameras}
+    true_clock = SystemClock()
+    clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
+    skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
+    skewed += f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else ""
+    manifest = Manifest(
+        version=1,
+        kind=rig.kind,
+        cameras={n: load(path, CameraCalibration) for n, path in files.items()},
+        rig=rig,
+        note=options.note,
+        clock=clock_of(clock, skewed),
+    )
+    refuse_occupied(options.output)  # before a camera is opened
+    display = ProgressDisplay(options.name, sys.stderr)
+    source = _source(options, rig, camera, clock, true_clock)
+    try:
+        recorder = Recorder(
+            options.output,
+            manifest,
+            options.name,
+            Length(options.seconds, options.frames),
+            display.show,
+            round(options.reserve_mb * 1e6),
+            round(options.queue_mb * 1e6),
+        )
+        try:
+            with _stop_by_signal() as stop:
+                feed(source, recorder, stop)
+        finally:
+            recorder.close()
+            done = recorder.progress()
+            display.end(done)
+    finally:
+        source.close()
+    os.sync()  # what was said to be recorded is there, also when the power goes now
+    if recorder.failure is not None:
+        raise recorder.failure
+    if not done.frames:
+        raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
+    print(f"{options.name}: recorded in {options.output}", flush=True)
+    return 0
+
+
+@contextmanager
+def _stop_by_signal() -> Generator[threading.Event, None, None]:
+    """An event that Ctrl-C and a stop by the system set, for as long as the block runs."""
+    stop = threading.Event()
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda _number, _frame: stop.set()) for number in numbers]
+    try:
+        yield stop
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+
+
+def _join(options: argparse.Namespace) -> int:
+    from slave.join import join_recordings
+
+    def progress(done: int, total: int) -> None:
+        if done % PROGRESS_EVERY == 0:
+            print(f"{done} of {total} frames", file=sys.stderr)
+
+    counts = join_recordings(options.recordings, options.output, options.by_wall_clock, progress)
+    print(f"{options.output}: " + ", ".join(f"{name} {count} frames" for name, count in counts.items()))
+    return 0
+
+
 def _detect(options: argparse.Namespace) -> int:
     from slave.offline import detect_recording, save_detections
 
@@ -153,6 +235,30 @@ def _colours(options: argparse.Namespace) -> int:
     return 0
 
 
+COMMANDS = {"run": _run, "record": _record, "join": _join, "detect": _detect, "colours": _colours}
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be positive")
+    return value
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least 1")
+    return value
+
+
+def _megabytes(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must not be negative")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     keep = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
@@ -161,10 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
     run = commands.add_parser("run", help="detect live and send", epilog=EXAMPLES, formatter_class=keep)
-    run.add_argument("--name", required=True, help="camera of this slave, a member of the rig")
-    run.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
-    run.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
-    run.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    _add_camera(run)
     run.add_argument(
         "--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
     )
@@ -174,17 +277,32 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
     )
-    sim = run.add_argument_group("synthetic camera")
-    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | leap:FILE.npz")
-    sim.add_argument("--seed", type=int, default=7)
-    sim.add_argument(
-        "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
+
+    record = commands.add_parser("record", help="raw frames to disk", epilog=EXAMPLES, formatter_class=keep)
+    _add_camera(record)
+    record.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty; one per camera"
     )
-    sim.add_argument(
-        "--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead"
+    record.add_argument("--seconds", type=_positive, metavar="S", help="default: until Ctrl-C")
+    record.add_argument("--frames", type=_count, metavar="N", help="end after so many recorded frames")
+    record.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
+    record.add_argument(
+        "--reserve-mb", type=_megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
     )
-    sim.add_argument("--clock-ppm", type=float, default=0.0, metavar="Y", help="and gains on the true one")
-    sim.add_argument("--start-offset-ms", type=float, default=0.0, metavar="Z", help="its frames come later")
+    record.add_argument(
+        "--queue-mb", type=_megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
+    )
+
+    join = commands.add_parser(
+        "join", help="one recording of several cameras", epilog=EXAMPLES, formatter_class=keep
+    )
+    join.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING", help="one folder per camera")
+    join.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty")
+    join.add_argument(
+        "--by-wall-clock",
+        action="store_true",
+        help="recorded on several machines: trust their wall clocks (keep them together by NTP or PTP)",
+    )
 
     detect = commands.add_parser(
         "detect", help="detect in a recording", epilog=EXAMPLES, formatter_class=keep
@@ -211,6 +329,25 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"
     )
     return parser
+
+
+def _add_camera(parser: argparse.ArgumentParser) -> None:
+    """All that `_calibration` and `_source` ask for."""
+    parser.add_argument("--name", required=True, help="camera of this slave, a member of the rig")
+    parser.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
+    parser.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+    parser.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    sim = parser.add_argument_group("synthetic camera")
+    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | leap:FILE.npz")
+    sim.add_argument("--seed", type=int, default=7)
+    sim.add_argument(
+        "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
+    )
+    sim.add_argument(
+        "--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead"
+    )
+    sim.add_argument("--clock-ppm", type=float, default=0.0, metavar="Y", help="and gains on the true one")
+    sim.add_argument("--start-offset-ms", type=float, default=0.0, metavar="Z", help="its frames come later")
 
 
 if __name__ == "__main__":

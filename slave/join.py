@@ -1,0 +1,167 @@
+"""Join recordings of single cameras, made side by side, into one recording of the rig.
+
+Every camera is recorded by a process of its own, into a folder of its own. Their times can be compared as they are
+when they are on one clock: one start of one machine. Between machines only the wall clocks say how the clocks lie
+to each other, as well as something (NTP, PTP) keeps those together; so that is done only on request.
+"""
+
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+
+from common.errors import RecordingError
+from common.frame_recording import FrameRecording, FrameRow, RecordedClock, open_recording
+from common.frame_writing import RecordingWriter, refuse_occupied
+from slave.progress import megabytes
+
+NOT_FRAMES = ("imu.csv", "truth.npz")
+
+
+def join_recordings(
+    folders: Sequence[Path],
+    output: Path,
+    by_wall_clock: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> dict[str, int]:
+    """Write one recording of all; return camera -> number of frames.
+
+    Times are on the clock of the first. The file of a camera is that of the recording which has its frames.
+
+    Args:
+        folders: Recordings of the same rig, each with frames of other cameras.
+        output: New or empty folder.
+        by_wall_clock: Trust the wall clocks where the clocks differ.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        RecordingError: One is broken, they do not belong together, or there is no room; the text names file and key.
+    """
+    refuse_occupied(output)
+    parts = [open_recording(folder) for folder in folders]
+    first = parts[0]
+    for part in parts:
+        _check_alike(first, part)
+    owners = _owners(parts)
+    shifts_ns = [_shift_ns(first, part, by_wall_clock) for part in parts]
+    _check_overlap(parts, shifts_ns)
+    manifest = msgspec.structs.replace(
+        first.manifest,
+        cameras={name: owners.get(name, first).manifest.cameras[name] for name in first.manifest.cameras},
+        clicks={
+            name: part.manifest.clicks[name] for name, part in owners.items() if name in part.manifest.clicks
+        },
+        note="; ".join(dict.fromkeys(part.manifest.note for part in parts if part.manifest.note)),
+    )
+    frames = sorted(
+        (
+            (row.t_ns + shift_ns, row, part.folder / row.file)
+            for part, shift_ns in zip(parts, shifts_ns, strict=True)
+            for row in part.rows
+        ),
+        key=lambda frame: (frame[0], frame[1].camera),
+    )
+    _check_room(output, [path for _, _, path in frames])
+    _write(RecordingWriter(output, manifest), frames, progress)
+    return {name: len(part.frames_of(name)) for name, part in owners.items()}
+
+
+def _write(
+    writer: RecordingWriter,
+    frames: Sequence[tuple[int, FrameRow, Path]],
+    progress: Callable[[int, int], None],
+) -> None:
+    try:
+        for done, (t_ns, row, path) in enumerate(frames, start=1):
+            try:
+                png = path.read_bytes()
+            except OSError as error:
+                raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+            writer.add(row.camera, row.seq, t_ns, row.illumination, png)
+            progress(done, len(frames))
+    finally:
+        writer.close()
+
+
+def _check_alike(first: FrameRecording, other: FrameRecording) -> None:
+    for name in NOT_FRAMES:
+        if (other.folder / name).exists():
+            raise RecordingError(f"{other.folder / name}: join takes frames only; move this file away")
+    if not other.rows:
+        raise RecordingError(f"{other.folder}/frames.csv: no frame in it")
+    ours, theirs = (msgspec.to_builtins(part.manifest) for part in (first, other))
+    for key in ("kind", "continuous", "rig", "rigs"):
+        if ours[key] == theirs[key]:
+            continue
+        inner = ""
+        if isinstance(ours[key], dict) and isinstance(theirs[key], dict):
+            inner = "." + next(k for k in ours[key] if ours[key][k] != theirs[key].get(k))
+        raise RecordingError(
+            f"{other.folder}/recording.json: {key}{inner} differs from that of {first.folder}: "
+            f"cameras of one recording must be recorded with one calibration"
+        )
+    if strange := other.manifest.cameras.keys() ^ first.manifest.cameras.keys():
+        raise RecordingError(
+            f"{other.folder}/recording.json: cameras: {min(strange)!r} is in only one of it and {first.folder}"
+        )
+
+
+def _owners(parts: Sequence[FrameRecording]) -> dict[str, FrameRecording]:
+    """Camera -> the recording with its frames, in the order of the first manifest."""
+    owners: dict[str, FrameRecording] = {}
+    for part in parts:
+        for camera in sorted({row.camera for row in part.rows}):
+            if camera in owners:
+                raise RecordingError(
+                    f"{part.folder}: frames of camera {camera!r} are in {owners[camera].folder} as well"
+                )
+            owners[camera] = part
+    return {name: owners[name] for name in parts[0].manifest.cameras if name in owners}
+
+
+def _shift_ns(first: FrameRecording, part: FrameRecording, by_wall_clock: bool) -> int:
+    """What to add to the times of `part` to have them on the clock of `first` [ns]."""
+    ours, theirs = _clock(first), _clock(part)
+    if ours.id == theirs.id:
+        return 0
+    if not by_wall_clock:
+        raise RecordingError(
+            f"{part.folder}: its clock is not that of {first.folder}: another machine, or a restart between them. "
+            f"With --by-wall-clock the wall clocks of the machines are trusted: 1 ms between them is 1 mm at 1 m/s"
+        )
+    return theirs.wall_ahead_ns - ours.wall_ahead_ns
+
+
+def _clock(part: FrameRecording) -> RecordedClock:
+    if part.manifest.clock is None:
+        raise RecordingError(f"{part.folder}/recording.json: clock: missing; nothing says how its times lie")
+    return part.manifest.clock
+
+
+def _check_overlap(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> None:
+    spans = [
+        (min(row.t_ns for row in part.rows) + shift, max(row.t_ns for row in part.rows) + shift, part.folder)
+        for part, shift in zip(parts, shifts_ns, strict=True)
+    ]
+    late, early = max(spans, key=lambda span: span[0]), min(spans, key=lambda span: span[1])
+    if late[0] > early[1]:
+        raise RecordingError(
+            f"{late[2]} begins {(late[0] - early[1]) * 1e-9:.3f} s after the end of {early[2]}: "
+            f"no moment is seen by all"
+        )
+
+
+def _check_room(output: Path, files: Sequence[Path]) -> None:
+    needed = 0
+    for path in files:
+        try:
+            needed += path.stat().st_size
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+    there = next(folder for folder in (output.absolute(), *output.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise RecordingError(
+            f"{output}: {megabytes(needed)} are needed, {megabytes(free)} are free on the disk"
+        )

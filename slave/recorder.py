@@ -1,0 +1,245 @@
+"""Record the raw frames of one camera to disk; the camera never waits for the disk.
+
+    camera loop ── offer ──▶ bounded queue ──▶ encoders (PNG) ──▶ one writer: the file, then its row
+                     │
+                     └ queue full: dropped, counted, a gap in `seq`
+
+A frame is encoded by any of several threads and written by one, in the order of the camera. The disk is looked at
+before every frame: where less than a reserve would be left, where it is full or gone, the recording ends with what
+was complete, and `failure` says why.
+"""
+
+import os
+import queue
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from common.calibration import CameraCalibration
+from common.clock import Clock
+from common.errors import RecordingError
+from common.frame_recording import Illumination, Manifest, RecordedClock
+from common.frame_writing import RecordingWriter, encode_png
+from slave.cameras.source import Frame, FrameSource
+from slave.progress import Length, Progress, megabytes
+
+RESERVE_BYTES = 200_000_000  # a system without any room left cannot even be logged in to
+QUEUE_BYTES = 128_000_000  # a quarter of the smallest slave's memory; at 640x480, 90 Hz it bridges 1.5 s
+ENCODERS = 4
+SHOW_S = 1.0
+BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # Linux: a new one at every start of the machine
+
+
+class _Waiting(NamedTuple):
+    """A frame on its way to the disk; its pixels are with the encoder."""
+
+    seq: int
+    t_ns: int
+    illumination: Illumination
+    png: Future[bytes]
+
+
+class Recorder:
+    """Writes what it is offered. Holds the queue, its threads, and the counts, each written by one thread alone.
+
+    Memory: the queue, and beyond it one PNG and what the camera holds.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        manifest: Manifest,
+        camera: str,
+        length: Length,
+        show: Callable[[Progress], None] = lambda _progress: None,
+        reserve_bytes: int = RESERVE_BYTES,
+        queue_bytes: int = QUEUE_BYTES,
+        free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
+    ) -> None:
+        """Make the recording and start the threads.
+
+        Args:
+            folder: New or empty.
+            manifest: What is recorded; `cameras` has `camera`.
+            camera: Name of the camera.
+            length: When to end.
+            show: Called once a second, on a thread of its own.
+            reserve_bytes: Stays free on the disk.
+            queue_bytes: Memory for frames that wait; two fit in any case.
+            free_bytes: What is free on the disk of a folder.
+
+        Raises:
+            RecordingError: The folder holds something, or cannot be written.
+        """
+        self._writer = RecordingWriter(folder, manifest)
+        self._folder, self._camera, self._length = folder, manifest.cameras[camera], length
+        self._name, self._show, self._reserve, self._free = camera, show, reserve_bytes, free_bytes
+        self._capacity = max(queue_bytes // _raw_bytes(self._camera), 2)
+        self._waiting: queue.Queue[_Waiting | None] = queue.Queue(self._capacity)
+        self._encoders = ThreadPoolExecutor(min(ENCODERS, os.cpu_count() or 1), f"{camera} png")
+        self._taken = self._refused = self._lost = 0  # by the camera's thread
+        self._first_ns = self._last_ns = 0
+        self._last_seq: int | None = None
+        self._frames = self._unwritten = self._bytes = 0  # by the writer
+        self._bytes_per_s = 0.0  # by the one that shows
+        self._closing = threading.Event()
+        self.failure: RecordingError | None = None
+        self._threads = [
+            threading.Thread(target=work, name=f"{camera} {work.__name__}", daemon=True)
+            for work in (self._write_all, self._show_all)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def wants_more(self) -> bool:
+        """Whether the length is not reached, and nothing has failed."""
+        return self.failure is None and self._left_s() != 0.0
+
+    def offer(self, frame: Frame) -> None:
+        """Take a frame, or count it as dropped; never waits. Whatever comes after the end is left out.
+
+        Raises:
+            RecordingError: The image is not of the size the camera file says.
+        """
+        size = (self._camera.height_px, self._camera.width_px)
+        if frame.image.shape[:2] != size or frame.image.dtype != np.uint8:
+            height, width = frame.image.shape[:2]
+            raise RecordingError(
+                f"camera {self._name!r} gives {width}x{height} px of {frame.image.dtype}, its file says "
+                f"{size[1]}x{size[0]} px of uint8; nobody could replay that"
+            )
+        if self._last_seq is None:
+            self._first_ns = frame.t_ns
+        else:
+            self._lost += max(frame.seq - self._last_seq - 1, 0)
+        self._last_seq, self._last_ns = frame.seq, frame.t_ns
+        if not self.wants_more:
+            return
+        if self._waiting.full():  # only this thread puts, so there is still room below
+            self._refused += 1
+            return
+        png = self._encoders.submit(encode_png, frame.image)
+        self._waiting.put_nowait(_Waiting(frame.seq, frame.t_ns, frame.illumination, png))
+        self._taken += 1
+
+    def progress(self) -> Progress:
+        """How it is now. Any thread may ask."""
+        try:
+            free = self._free(self._folder)
+        except OSError:
+            free = 0  # the disk is gone; the writer will say so
+        room = max(free - self._reserve, 0)
+        return Progress(
+            self._frames,
+            self._refused + self._unwritten,
+            self._lost,
+            self._waiting.qsize(),
+            self._capacity,
+            self._bytes,
+            self._bytes_per_s,
+            free,
+            (self._last_ns - self._first_ns) * 1e-9,
+            self._left_s(),
+            room / self._bytes_per_s if self._bytes_per_s > 0.0 else float("inf"),
+        )
+
+    def close(self) -> None:
+        """Write what waits and end the recording; one without any frame is taken away. Safe to call twice."""
+        if not self._closing.is_set():
+            self._closing.set()
+            self._waiting.put(None)
+        for thread in self._threads:
+            thread.join()
+        self._encoders.shutdown()
+        self._writer.discard()
+
+    def _left_s(self) -> float | None:
+        elapsed_s = (self._last_ns - self._first_ns) * 1e-9
+        return self._length.left_s(elapsed_s, self._taken, self._camera.frame_rate_hz)
+
+    def _write_all(self) -> None:
+        while (frame := self._waiting.get()) is not None:
+            if self.failure is not None:
+                frame.png.cancel()
+                self._unwritten += 1
+                continue
+            try:
+                self._write(frame, frame.png.result())
+            except RecordingError as error:
+                self.failure = error
+                self._unwritten += 1
+
+    def _write(self, frame: _Waiting, png: bytes) -> None:
+        """Write one frame.
+
+        Raises:
+            RecordingError: No room for it, or, with the first one, for all that was asked for.
+        """
+        try:
+            free = self._free(self._folder)
+        except OSError as error:
+            raise RecordingError(f"{self._folder}: the disk is gone: {error.strerror}") from error
+        expected = self._length.expected(self._camera.frame_rate_hz)
+        if self._frames == 0 and expected is not None and expected * len(png) > free - self._reserve:
+            fit = max(free - self._reserve, 0) // len(png)
+            raise RecordingError(
+                f"{self._folder}: {expected} frames of {megabytes(len(png))} need {megabytes(expected * len(png))}, "
+                f"{megabytes(free)} are free and {megabytes(self._reserve)} stay free (--reserve-mb): make room, or "
+                f"record at most {fit} frames ({fit / self._camera.frame_rate_hz:.1f} s)"
+            )
+        if free - len(png) < self._reserve:
+            raise RecordingError(
+                f"{self._folder}: ended after {self._frames} frames: {megabytes(free)} are free on the disk and "
+                f"{megabytes(self._reserve)} stay free (--reserve-mb)"
+            )
+        self._writer.add(self._name, frame.seq, frame.t_ns, frame.illumination, png)
+        self._frames += 1
+        self._bytes += len(png)
+
+    def _show_all(self) -> None:
+        since_ns, before = time.monotonic_ns(), 0
+        while not self._closing.wait(SHOW_S):
+            now_ns, written = time.monotonic_ns(), self._bytes
+            self._bytes_per_s = (written - before) * 1e9 / max(now_ns - since_ns, 1)
+            since_ns, before = now_ns, written
+            self._show(self.progress())
+
+
+def feed(source: FrameSource, recorder: Recorder, stop: threading.Event) -> None:
+    """Offer every frame until the length is reached, the source ends, the recorder fails or `stop` is set.
+
+    Raises:
+        CameraError: The camera is gone.
+        RecordingError: Its images are of another size than its file says.
+    """
+    while not stop.is_set() and recorder.wants_more and (frame := source.read()) is not None:
+        recorder.offer(frame)
+
+
+def clock_of(clock: Clock, simulated: str = "") -> RecordedClock | None:
+    """Which clock the times of a recording are on, for whoever joins it with others; None: this system cannot say.
+
+    Args:
+        clock: The slave's clock.
+        simulated: How it differs from the machine's; empty: it is the machine's.
+    """
+    try:
+        boot = BOOT_ID.read_text().strip()
+    except OSError:
+        return None
+    readings: list[tuple[int, int]] = []
+    for _ in range(8):
+        before_ns, wall_ns, after_ns = clock.now_ns(), time.time_ns(), clock.now_ns()
+        readings.append((after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2))
+    return RecordedClock(id=boot + simulated, wall_ahead_ns=min(readings)[1])  # of the shortest look
+
+
+def _raw_bytes(camera: CameraCalibration) -> int:
+    return camera.width_px * camera.height_px * 3
