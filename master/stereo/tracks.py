@@ -21,7 +21,7 @@ _SPEED_PX_S = 500.0
 _ACCELERATION_PX_S2 = 1.0e4
 _JERK_PX_S3 = 2.0e5
 _LEAP_PX_S, _LEAP_PX = 5000.0, 5.0  # 5 m/s there: what is farther away a frame later is another thing
-_LAST, _NEVER = 1e6, 1e9  # more than any distance in an image
+_SWAPPED = 3.0  # times nearer to the other track: a slave's names are contradicted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,37 +112,37 @@ def _sort(near: Sequence[Sighting], uv: Float, times: Float) -> tuple[Float, Flo
         places = np.stack([uv[:, m], rival_uv[:, m]], axis=1)  # (N, 2, 2): sighting, which of the two, u v
         moments = np.stack([times[:, m], rival_times[:, m]], axis=1)
         for n in range(1, len(near)):
-            follow = _followers(places[:n], moments[:n], places[n], moments[n])
-            none = [np.nan if k is None else 0.0 for k in follow]
-            order = [k or 0 for k in follow]
-            places[n] = places[n, order] + np.array(none)[:, None]
-            moments[n] = moments[n, order]
+            order = [1, 0] if _swapped(places[:n], moments[:n], places[n], moments[n]) else [0, 1]
+            places[n], moments[n] = places[n, order], moments[n, order]
+            for i in range(2):
+                if _away(places[:n, i], moments[:n, i], places[n, i], moments[n, i]) == np.inf:
+                    places[n, i] = np.nan  # another thing: the track ends
         uv[:, m], rival_uv[:, m] = places[:, 0], places[:, 1]
         times[:, m], rival_times[:, m] = moments[:, 0], moments[:, 1]
     return rival_uv, rival_times
 
 
-def _followers(tracks: Float, moments: Float, found: Float, found_ns: Float) -> tuple[int | None, int | None]:
-    """Which of two places `found` (2, 2) continues each of two tracks (n, 2, 2); None: neither.
+def _swapped(tracks: Float, moments: Float, found: Float, found_ns: Float) -> bool:
+    """Whether the slave called the marker and its rival by each other's name.
 
-    Each place is compared with the member of the track that is nearest in time; one place continues one track. A track
-    without a member takes what the other leaves.
+    It is contradicted only where the places are so much nearer to the other track: it has a track of its own.
+
+    Args:
+        tracks, moments: The marker's track and the rival's (n, 2, 2) [px], (n, 2) [ns].
+        found, found_ns: The two places of the next sighting (2, 2), (2,); NaN: there is none.
     """
-    away = np.full((2, 2), np.inf)  # of track i to place k
-    for i in range(2):
-        members = np.flatnonzero(np.isfinite(tracks[:, i, 0]))
-        for k in range(2):
-            if not np.isfinite(found[k, 0]):
-                continue
-            if not len(members):
-                away[i, k] = _LAST
-                continue
-            j = members[np.argmin(np.abs(moments[members, i] - found_ns[k]))]
-            leap_px = _LEAP_PX + _LEAP_PX_S * 1e-9 * abs(moments[j, i] - found_ns[k])
-            distance = float(np.hypot(*(tracks[j, i] - found[k])))
-            away[i, k] = distance if distance <= leap_px else np.inf
-    straight, crossed = np.isfinite(away[[0, 1], [0, 1]]), np.isfinite(away[[0, 1], [1, 0]])
-    both = np.where(np.isfinite(away), away, _NEVER)
-    if both[0, 0] + both[1, 1] <= both[0, 1] + both[1, 0]:
-        return (0 if straight[0] else None, 1 if straight[1] else None)
-    return (1 if crossed[0] else None, 0 if crossed[1] else None)
+    away = [[_away(tracks[:, i], moments[:, i], found[k], found_ns[k]) for k in range(2)] for i in range(2)]
+    straight = [x for x in (away[0][0], away[1][1]) if x is not None]
+    crossed = [x for x in (away[0][1], away[1][0]) if x is not None]
+    return bool(crossed) and _SWAPPED * sum(crossed) < sum(straight)
+
+
+def _away(track: Float, moments: Float, place: Float, place_ns: float) -> float | None:
+    """Distance [px] of a place from the member of a track that is nearest in time; inf: a leap; None: no such two."""
+    members = np.flatnonzero(np.isfinite(track[:, 0]))
+    if not len(members) or not np.isfinite(place[0]):
+        return None
+    j = members[np.argmin(np.abs(moments[members] - place_ns))]
+    distance = float(np.hypot(*(track[j] - place)))
+    leap_px = _LEAP_PX + _LEAP_PX_S * 1e-9 * float(abs(moments[j] - place_ns))
+    return distance if distance <= leap_px else np.inf
