@@ -1,0 +1,122 @@
+"""The real cameras behind `--camera`: their options on the command line, and how they are opened, and opened again."""
+
+import argparse
+import threading
+from pathlib import Path
+
+from common.calibration import CameraCalibration
+from common.clock import Clock
+from common.errors import CameraError
+from slave.cameras.picamera2 import Picamera2Camera
+from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.source import FrameSource
+from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+
+CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
+# Option -> its driver and the value that means "not given".
+OPTIONS: dict[str, tuple[str, object]] = {
+    "sync": ("picamera2", "off"),
+    "sync_timeout": ("picamera2", 60.0),
+    "focus": ("picamera2", None),
+    "control": ("v4l2", []),
+    "allow_missing": ("v4l2", []),
+}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the real cameras."""
+    pi = parser.add_argument_group("Pi camera (picamera2)")
+    pi.add_argument(
+        "--sync",
+        choices=("off", "server", "client"),
+        default="off",
+        help="frames in step with other Pi cameras: one leads, the others follow; start clients first",
+    )
+    pi.add_argument(
+        "--sync-timeout",
+        type=float,
+        default=60.0,
+        metavar="S",
+        help="how long to wait for them (default: %(default)s)",
+    )
+    pi.add_argument(
+        "--focus", type=float, metavar="M", help="distance in focus [m], for a camera with a focus motor"
+    )
+    usb = parser.add_argument_group("USB camera (v4l2)")
+    usb.add_argument(
+        "--control",
+        action="append",
+        default=[],
+        metavar="NAME=N",
+        help="fix a control in codes of its maker, for example gain=32; may be repeated",
+    )
+    usb.add_argument(
+        "--allow-missing",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="exposure | gain | white_balance: the camera lacks this control, and that is known; may be repeated",
+    )
+
+
+def open_real(
+    driver: str,
+    options: argparse.Namespace,
+    camera: CameraCalibration,
+    clock: Clock,
+    stop: threading.Event,
+) -> FrameSource | None:
+    """Open the camera that `--camera DRIVER[:PLACE]` names, to be opened again whenever it was lost.
+
+    Args:
+        driver: The value of `--camera`.
+        options: What `add_options` added.
+        camera: The camera file.
+        clock: The slave's clock.
+        stop: Set when the slave is to end, so that nobody waits for a lost camera any longer.
+
+    Returns:
+        The camera, or None if the driver is none of a real camera.
+
+    Raises:
+        CameraError: An option is of another driver or makes no sense, or the camera cannot be opened.
+    """
+    kind, _, place = driver.partition(":")
+    for name, (owner, unset) in OPTIONS.items():
+        if owner != kind and getattr(options, name) != unset:
+            flag = "--" + name.replace("_", "-")
+            raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
+    if kind == "picamera2":
+        pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, options.focus)
+        return ReopeningCamera(lambda: Picamera2Camera(camera, pi, clock), camera.frame_rate_hz, clock, stop)
+    if kind == "v4l2":
+        usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing))
+        return ReopeningCamera(lambda: V4l2Camera(camera, usb, clock), camera.frame_rate_hz, clock, stop)
+    return None
+
+
+def _index(place: str) -> int:
+    if place and not place.isdecimal():
+        raise CameraError(
+            f"--camera picamera2:{place}: the part behind the colon is a number, 0 for the first camera"
+        )
+    return int(place or "0")
+
+
+def _path(place: str) -> Path:
+    return Path(f"/dev/video{place or '0'}" if place.isdecimal() or not place else place)
+
+
+def _controls(texts: list[str]) -> dict[str, int]:
+    found: dict[str, int] = {}
+    for text in texts:
+        name, _, value = text.partition("=")
+        try:
+            number = int(value)
+        except ValueError as error:
+            raise CameraError(f"--control {text}: write NAME=NUMBER, for example gain=32") from error
+        if name in found:
+            raise CameraError(f"--control {name} is given twice")
+        found[name] = number
+    return found

@@ -1,0 +1,132 @@
+"""From `--camera` to an open camera: options, their owners, and a camera that comes back."""
+
+import argparse
+import sys
+import threading
+from typing import Any
+
+import pytest
+
+from common.calibration import CameraCalibration
+from common.clock import SystemClock
+from common.errors import CameraError
+from slave.cameras import real, reopening
+from slave.cameras.real import add_options, open_real
+from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.source import FrameSource
+from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from tests.slave.fake_picamera2 import Sensor, install
+from tests.slave.fake_v4l2 import Camera, FakeDevice
+
+CALIBRATION = CameraCalibration(
+    version=1,
+    name="left",
+    width_px=640,
+    height_px=480,
+    frame_rate_hz=30.0,
+    exposure_us=5000.0,
+    analogue_gain=1.25,
+    colour_gains=(0.83, 1.24),
+    row_time_us=33.6,
+)
+
+
+def opened(driver: str, *arguments: str) -> FrameSource | None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    return open_real(driver, parser.parse_args(arguments), CALIBRATION, SystemClock(), threading.Event())
+
+
+@pytest.fixture
+def seen(monkeypatch: pytest.MonkeyPatch) -> list[V4l2Options]:
+    """What the V4L2 driver is asked for; its devices are fakes."""
+    options: list[V4l2Options] = []
+
+    def make(calibration: CameraCalibration, asked: V4l2Options, clock: Any) -> V4l2Camera:
+        options.append(asked)
+        return V4l2Camera(calibration, asked, clock, lambda _path: FakeDevice(Camera()))
+
+    monkeypatch.setattr(real, "V4l2Camera", make)
+    return options
+
+
+@pytest.mark.parametrize(
+    ("driver", "path"),
+    [
+        ("v4l2", "/dev/video0"),
+        ("v4l2:2", "/dev/video2"),
+        ("v4l2:/dev/v4l/by-id/usb-cam:1", "/dev/v4l/by-id/usb-cam:1"),
+    ],
+)
+def test_a_usb_camera_is_named_by_number_or_path(seen: list[V4l2Options], driver: str, path: str) -> None:
+    source = opened(driver, "--control", "gain=32", "--control", "white_balance_temperature=4600")
+    assert isinstance(source, ReopeningCamera)
+    assert source.read() is not None
+    source.close()
+    assert str(seen[0].path) == path
+    assert seen[0].controls == {"gain": 32, "white_balance_temperature": 4600}
+
+
+def test_a_pi_camera_is_named_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = install(monkeypatch, Sensor())
+    source = opened("picamera2", "--sync", "client")
+    assert source is not None
+    assert source.read() is not None
+    source.close()
+    assert sensor.opened[0].config["controls"]["SyncMode"] == 2
+    with pytest.raises(CameraError, match="no such camera"):
+        opened("picamera2:1")
+    with pytest.raises(CameraError, match="the part behind the colon is a number"):
+        opened("picamera2:left")
+
+
+def test_other_drivers_are_not_its_business() -> None:
+    assert opened("synthetic") is None
+    assert opened("replay:folder") is None
+
+
+@pytest.mark.parametrize(
+    ("driver", "arguments", "says"),
+    [
+        ("v4l2", ("--sync", "server"), "--sync is an option of --camera picamera2"),
+        ("picamera2", ("--control", "gain=1"), "--control is an option of --camera v4l2"),
+        ("synthetic", ("--focus", "0.5"), "--focus is an option of --camera picamera2, not of synthetic"),
+        ("synthetic", ("--allow-missing", "gain"), "--allow-missing is an option of --camera v4l2"),
+        ("v4l2", ("--control", "gain"), "write NAME=NUMBER"),
+        ("v4l2", ("--control", "gain=1", "--control", "gain=2"), "--control gain is given twice"),
+    ],
+)
+def test_an_option_that_would_be_ignored_is_refused(
+    driver: str, arguments: tuple[str, ...], says: str
+) -> None:
+    with pytest.raises(CameraError, match=says):
+        opened(driver, *arguments)
+
+
+def test_a_missing_camera_at_the_start_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "picamera2", None)
+    with pytest.raises(CameraError, match="apt install python3-picamera2"):
+        opened("picamera2")
+    with pytest.raises(CameraError, match="cannot be opened"):
+        opened("v4l2:/dev/there-is-none")
+
+
+def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    first, second = Camera(gone_after=15), Camera()
+    plugged = [first, second]
+    asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600})
+    clock = SystemClock()
+    source = ReopeningCamera(
+        lambda: V4l2Camera(CALIBRATION, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
+        CALIBRATION.frame_rate_hz,
+        clock,
+        threading.Event(),
+    )
+    seqs = [frame.seq for _ in range(6) if (frame := source.read()) is not None]
+    assert len(seqs) == 6
+    assert seqs == sorted(set(seqs)), "the numbers keep rising"
+    assert source.lost == 1
+    assert (second.knob("Gain").value, second.knob("Exposure Time").value) == (32, 50)
+    source.close()
+    assert (first.closed, second.closed) == (1, 1)
