@@ -219,8 +219,9 @@ def _paint(cap: Cap, x: Light, y: Light, to_light: Float, fine: int) -> Light:
         _lay_support(out, cap.support, x, y, to_light)
     c, s = math.cos(cap.angle), math.sin(cap.angle)
     p, q = (c * x + s * y) / cap.a, (c * y - s * x) / cap.b
-    rho = np.hypot(p, q) + np.float32(1e-6)
-    slope = np.hypot(p / cap.a, q / cap.b) / rho
+    rho = np.sqrt(p * p + q * q) + np.float32(1e-6)
+    pa, qb = p / cap.a, q / cap.b
+    slope = np.sqrt(pa * pa + qb * qb) / rho
     cover = np.clip(0.5 - fine * (rho - 1.0) / slope, 0.0, 1.0)
     inside = cover > 0.0
     p_in, q_in = p[inside], q[inside]

@@ -17,7 +17,7 @@ from bench.marker_score import FLAG_SIGMA_PX, Measurements, honesty, measure, sc
 
 GOALS: Final = {"base": 0.07, "finger_end": 0.10, "blur6": 0.12}
 HIDDEN_GOAL: Final = 0.20
-SEQUENCES: Final = {"base": 40, "finger_end": 40, "blur3": 20, "blur6": 20, "occluded15": 20, "320x240": 20}
+SEQUENCES: Final = {"base": 30, "finger_end": 30, "blur3": 20, "blur6": 20, "occluded15": 20, "320x240": 20}
 LARGE: Final = 2  # sequences of the large sizes
 USUAL_SEQUENCES: Final = 8
 FLOOR_SEQUENCES: Final = 6
