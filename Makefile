@@ -42,7 +42,7 @@ format: $(STAMP) ## rewrite the layout of all files, and mend what lint can mend
 bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
 	@$(BIN)/python -m bench $(BENCH_ARGS)
 
-instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs qemu-user, mmdebstrap, gcc
+instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
 	@$(BIN)/python -m bench.aarch64 count $(INSTRUCTIONS_ARGS)
 
 schema: $(STAMP) ## write docs/schema/*.json afresh from the types

@@ -54,16 +54,13 @@ def counted(sysroot: Sysroot, frames: Path, cases: Sequence[str], cpu: str = CPU
 
 def native(frames: Path, cases: Sequence[str]) -> dict[str, str]:
     """Run `cases` on this machine; case -> hash of what was detected."""
-    return {
-        case: _ask([sys.executable], frames, case, os.environ | {"PYTHONPATH": str(ROOT)})[1]
-        for case in cases
-    }
+    return {case: _ask([sys.executable], frames, case, os.environ)[1] for case in cases}
 
 
 def _emulated(sysroot: Sysroot, frames: Path, case: str, cpu: str) -> _Run:
     with tempfile.TemporaryDirectory() as folder:
         marks = Path(folder) / "marks"
-        qemu = ["qemu-aarch64", "-cpu", cpu, "-L", str(sysroot.root)]
+        qemu = [*sysroot.qemu, "-cpu", cpu, "-L", str(sysroot.root)]
         plugin = ["-plugin", f"file={sysroot.plugin},to={marks}"]
         python = [str(sysroot.root / f"usr/bin/python{PYTHON}"), "-s", "-S"]
         # Compiled modules go to a place of their own: the emulated Python's own path may be the machine's as well.

@@ -1,11 +1,13 @@
-"""What the count needs, made once under out/aarch64: Debian's aarch64 Python, the pinned wheels, the QEMU plugin.
+"""What the count needs, made once under out/aarch64: Debian's aarch64 Python, the pinned wheels, QEMU and its plugin.
 
-Nothing is installed and nothing needs root: the Debian packages are unpacked, not set up.
+Nothing is installed and nothing needs root: Debian's packages are unpacked, not set up. QEMU comes from the same
+suite, whatever the machine has: one version counts for all, and since Debian 13 qemu-user loads no plugins.
 """
 
 import gzip
 import hashlib
 import importlib.util
+import platform
 import re
 import shutil
 import subprocess
@@ -17,11 +19,15 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "out" / "aarch64"
+PLUGIN = Path(__file__).with_name("count.c")
 SUITE, MIRROR, PYTHON = "bookworm", "http://deb.debian.org/debian", "3.11"  # Raspberry Pi OS 12
 PACKAGES = ("python3", "libgomp1", "libstdc++6")
 WHEELS = ("numpy", "opencv-python-headless", "msgspec", "cryptography")
+WHEELS_OF_WHEELS = ("cffi", "pycparser")
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
-TOOLS = {"qemu-aarch64": "qemu-user", "mmdebstrap": "mmdebstrap", "gcc": "gcc libc6-dev", "tar": "tar"}
+TOOLS = {"mmdebstrap": "mmdebstrap", "gcc": "gcc libc6-dev", "tar": "tar"}
+# Of this machine: Debian's name of the architecture, and the loader of programs.
+HOSTS = {"x86_64": ("amd64", "ld-linux-x86-64.so.2"), "aarch64": ("arm64", "ld-linux-aarch64.so.1")}
 
 
 class NotPossibleError(Exception):
@@ -29,10 +35,11 @@ class NotPossibleError(Exception):
 
 
 class Sysroot(NamedTuple):
-    """Folders and files of the emulated machine, and the versions that the count depends on."""
+    """Folders of the emulated machine, the command that is QEMU, its plugin, the versions that a count depends on."""
 
     root: Path
     wheels: Path
+    qemu: tuple[str, ...]
     plugin: Path
     versions: dict[str, str]
 
@@ -55,32 +62,29 @@ def prepare(say: Callable[[str], None]) -> Sysroot:
         raise NotPossibleError(
             f"missing here: {', '.join(absent)}; on Debian: apt install {' '.join(absent)}"
         )
-    constraints = (ROOT / "constraints.txt").read_text()
-    root = _made(f"root-{SUITE}", f"{SUITE} {PACKAGES}", _unpack_debian, say)
-    pins = "\n".join(_pins(constraints))
-    wheels = _made("wheels", f"{PYTHON} {WHEELS} {pins}", _download_wheels, say)
-    version = qemu_version(_output(["qemu-aarch64", "--version"]))
-    source = Path(__file__).with_name("count.c")
-    plugin = _made("plugin", f"{plugin_interface(version)} {source.read_text()}", _compile_plugin, say)
-    versions = {"qemu": ".".join(map(str, version)), **_debian_versions(root), **_wheel_versions(wheels)}
-    return Sysroot(root, wheels, plugin / "count.so", versions)
-
-
-def qemu_version(text: str) -> tuple[int, int]:
-    """(Major, minor) from what `qemu-aarch64 --version` prints.
-
-    Raises:
-        NotPossibleError: That is not QEMU's answer.
-    """
-    found = re.search(r"version (\d+)\.(\d+)", text)
-    if found is None:
-        raise NotPossibleError(f"qemu-aarch64 --version says {text.strip()!r}, and no version in it")
-    return int(found[1]), int(found[2])
-
-
-def plugin_interface(version: tuple[int, int]) -> int:
-    """Number of the plugin interface to declare: QEMU 9 refuses 1, QEMU 8 and before know nothing else."""
-    return 1 if version[0] < 9 else 2
+    if platform.machine() not in HOSTS:
+        raise NotPossibleError(
+            f"Debian has no QEMU for {platform.machine()}; there is one for {', '.join(HOSTS)}"
+        )
+    architecture, loader = HOSTS[platform.machine()]
+    root = _debian("arm64", PACKAGES, say)
+    tools = _debian(architecture, ("qemu-user",), say)
+    wheels = _made("wheels", f"{PYTHON} {WHEELS} {_pins()}", _download_wheels, say)
+    plugin = _made("plugin", PLUGIN.read_text(), _compile_plugin, say)
+    triplet = f"{platform.machine()}-linux-gnu"
+    # The loader by its real path: the usual one is a link to / and would be the machine's own, of another libc.
+    start = (
+        f"{tools}/lib/{triplet}/{loader}",
+        "--library-path",
+        f"{tools}/lib/{triplet}:{tools}/usr/lib/{triplet}",
+    )
+    qemu = (*start, f"{tools}/usr/bin/qemu-aarch64")
+    packages = {
+        "qemu": _version(tools, "qemu-user"),
+        "libc": _version(root, "libc6"),
+        "python": _version(root, f"python{PYTHON}-minimal"),
+    }
+    return Sysroot(root, wheels, qemu, plugin / "count.so", packages | _wheel_versions(wheels))
 
 
 def _made(name: str, inputs: str, make: Callable[[Path], None], say: Callable[[str], None]) -> Path:
@@ -103,20 +107,26 @@ def _made(name: str, inputs: str, make: Callable[[Path], None], say: Callable[[s
     return place
 
 
-def _unpack_debian(folder: Path) -> None:
-    archive = folder.with_name("root.tar")
-    command = ["mmdebstrap", "--quiet", "--variant=extract", "--arch=arm64", "--skip=check/qemu"]
-    _run([*command, f"--include={','.join(PACKAGES)}", SUITE, str(archive), MIRROR])
-    # A /tmp in here would hide the real one, a /dev the real devices.
-    leave_out = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
-    _run(["tar", "-x", "--no-same-owner", *leave_out, "-f", str(archive), "-C", str(folder)])
-    if not (folder / "lib").exists():
-        (folder / "lib").symlink_to("usr/lib")  # Debian 13 makes it only when the package is set up
+def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], None]) -> Path:
+    """A folder with `packages` and all that they need, unpacked."""
+
+    def unpack(folder: Path) -> None:
+        archive = folder.with_name("packages.tar")
+        # Without chroot there is nothing to be root for; the checks are of what would run in it.
+        modes = ["--mode=chrootless", "--skip=check/chrootless,check/qemu", "--variant=extract"]
+        what = [f"--arch={architecture}", f"--include={','.join(packages)}"]
+        _run(["mmdebstrap", "--quiet", *modes, *what, SUITE, str(archive), MIRROR])
+        # A /tmp in here would hide the real one from what is emulated, a /dev the real devices.
+        leave_out = [f"--exclude=./{name}" for name in ("dev", "tmp", "proc", "sys", "run")]
+        _run(["tar", "-x", "--no-same-owner", *leave_out, "-f", str(archive), "-C", str(folder)])
+
+    return _made(f"{SUITE}-{architecture}-{packages[0]}", f"{packages} {MIRROR}", unpack, say)
 
 
-def _pins(constraints: str) -> list[str]:
-    names = "|".join([*WHEELS, "cffi", "pycparser"])
-    return re.findall(rf"^(?:{names})==.*$", constraints, re.MULTILINE)
+def _pins() -> list[str]:
+    """The lines of constraints.txt that say which wheels."""
+    names = "|".join([*WHEELS, *WHEELS_OF_WHEELS])
+    return re.findall(rf"^(?:{names})==.*$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
 
 
 def _download_wheels(folder: Path) -> None:
@@ -134,31 +144,19 @@ def _download_wheels(folder: Path) -> None:
 
 
 def _compile_plugin(folder: Path) -> None:
-    interface = plugin_interface(qemu_version(_output(["qemu-aarch64", "--version"])))
-    source = str(Path(__file__).with_name("count.c"))
-    options = ["-O2", "-Wall", "-shared", "-fPIC", f"-DPLUGIN_VERSION={interface}"]
-    _run(["gcc", *options, "-o", str(folder / "count.so"), source])
+    _run(["gcc", "-O2", "-Wall", "-shared", "-fPIC", "-o", str(folder / "count.so"), str(PLUGIN)])
 
 
-def _debian_versions(root: Path) -> dict[str, str]:
-    """Versions of the unpacked packages that matter, of which dpkg knows nothing."""
-    versions: dict[str, str] = {}
-    for package in ("libc6", f"python{PYTHON}-minimal"):
-        with gzip.open(
-            root / f"usr/share/doc/{package}/changelog.Debian.gz", "rt", encoding="utf-8"
-        ) as changes:
-            versions[package] = changes.readline().split("(")[1].split(")")[0]
-    return versions
+def _version(root: Path, package: str) -> str:
+    """Version of an unpacked package, by its own change log: dpkg knows nothing of it."""
+    log = root / f"usr/share/doc/{package}/changelog.Debian.gz"
+    with gzip.open(log, "rt", encoding="utf-8") as changes:
+        return changes.readline().split("(")[1].split(")")[0]
 
 
 def _wheel_versions(wheels: Path) -> dict[str, str]:
-    return dict(
-        folder.name.removesuffix(".dist-info").split("-", 1) for folder in sorted(wheels.glob("*.dist-info"))
-    )
-
-
-def _output(command: Sequence[str]) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    names = sorted(folder.name.removesuffix(".dist-info") for folder in wheels.glob("*.dist-info"))
+    return dict(name.split("-", 1) for name in names)
 
 
 def _run(command: Sequence[str]) -> None:
