@@ -17,6 +17,7 @@ import cv2
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, PhalanxError
+from slave.cameras import real
 from slave.cameras.source import FrameSource
 
 ABOUT = (
@@ -32,12 +33,14 @@ EXAMPLES = """examples:
         live: waits for the master's start, then sends one sealed datagram per frame
   phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
         live without hardware: renders the standard scene in real time
+  phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
+        live with a USB camera; docs/cameras.md says which settings are fixed and checked
   phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
         raw frames to disk, without master or network; one folder per camera
   phalanx-slave join recordings/wave-left recordings/wave-right -o recordings/wave
         one recording of all cameras, for `phalanx replay` and the calibrations
 """
-CAMERAS = "synthetic | replay:FOLDER"
+CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
 PROGRESS_EVERY = 500  # frames
 BEACON_PORT = 47800
 
@@ -74,7 +77,7 @@ def _run(options: argparse.Namespace) -> int:
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
-    source = _source(options, rig, camera, clock, true_clock)
+    source = _source(options, rig, camera, clock, true_clock, stop)
     detector = MarkerDetector(camera, rig.markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
@@ -118,7 +121,11 @@ def _source(
     camera: CameraCalibration,
     clock: Clock,
     true_clock: Clock,
+    stop: threading.Event | None = None,
 ) -> FrameSource:
+    """Open the camera; with `stop`, a real one that is lost later is opened again until that is set."""
+    if (found := real.open_real(options.camera, options, camera, clock, stop)) is not None:
+        return found
     kind, _, folder = str(options.camera).partition(":")
     if kind == "replay" and folder:
         from slave.cameras.replay import ReplayCamera
@@ -337,6 +344,7 @@ def _add_camera(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
     parser.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
     parser.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    real.add_options(parser)
     sim = parser.add_argument_group("synthetic camera")
     sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | leap:FILE.npz")
     sim.add_argument("--seed", type=int, default=7)

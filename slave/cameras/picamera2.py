@@ -49,13 +49,20 @@ _LOG = logging.getLogger(__name__)
 class Picamera2Camera:
     """A `FrameSource`. Holds the open camera, the number and time of the last frame and its small image."""
 
-    def __init__(self, calibration: CameraCalibration, options: Picamera2Options, clock: Clock) -> None:
+    def __init__(
+        self,
+        calibration: CameraCalibration,
+        options: Picamera2Options,
+        clock: Clock,
+        stop: threading.Event | None = None,
+    ) -> None:
         """Open, configure, start, check what the camera really does and wait for synchronisation.
 
         Args:
             calibration: The camera file: mode, exposure, gains.
             options: The rest.
             clock: The slave's clock.
+            stop: Set when the slave is to end, which also ends the wait for synchronisation.
 
         Raises:
             CameraError: No picamera2, no such camera or mode, a setting was refused or not taken, no frames, or
@@ -72,7 +79,7 @@ class Picamera2Camera:
             self._start(enums)
             self._check_settings()
             if options.sync != "off":
-                self._synchronise()
+                self._synchronise(stop)
         except BaseException:
             with contextlib.suppress(CameraError):  # the first error is the one to read
                 self.close()
@@ -193,11 +200,11 @@ class Picamera2Camera:
             f"{self._where}: its settings do not stay: they were right, but not {GOOD_FRAMES} frames long"
         )
 
-    def _synchronise(self) -> None:
+    def _synchronise(self, stop: threading.Event | None) -> None:
         """Read frames until libcamera says that those of all cameras are in step.
 
         Raises:
-            CameraError: It did not within the time.
+            CameraError: It did not within the time, or before the slave was to stop.
         """
         role = self._options.sync
         other = "clients" if role == "server" else "the server"
@@ -212,6 +219,8 @@ class Picamera2Camera:
                 wall = metadata.get("FrameWallClock", "unknown")
                 _LOG.info("%s: in step, %s us off; first frame at wall clock %s ns", self._where, timer, wall)
                 return
+            if stop is not None and stop.is_set():
+                raise CameraError(f"{self._where}: stopped while it waited for {other}")
             if self._clock.now_ns() > end_ns:
                 heard = "no server was heard" if timer is None else f"{timer} us were left"
                 raise CameraError(

@@ -2,6 +2,7 @@
 
 import argparse
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 from common.calibration import CameraCalibration
@@ -65,16 +66,16 @@ def open_real(
     options: argparse.Namespace,
     camera: CameraCalibration,
     clock: Clock,
-    stop: threading.Event,
+    stop: threading.Event | None,
 ) -> FrameSource | None:
-    """Open the camera that `--camera DRIVER[:PLACE]` names, to be opened again whenever it was lost.
+    """Open the camera that `--camera DRIVER[:PLACE]` names.
 
     Args:
         driver: The value of `--camera`.
         options: What `add_options` added.
         camera: The camera file.
         clock: The slave's clock.
-        stop: Set when the slave is to end, so that nobody waits for a lost camera any longer.
+        stop: Set when the slave is to end; until then a lost camera is opened again. None: losing it is an error.
 
     Returns:
         The camera, or None if the driver is none of a real camera.
@@ -89,11 +90,17 @@ def open_real(
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     if kind == "picamera2":
         pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, options.focus)
-        return ReopeningCamera(lambda: Picamera2Camera(camera, pi, clock), camera.frame_rate_hz, clock, stop)
+        return _lasting(lambda: Picamera2Camera(camera, pi, clock, stop), camera, clock, stop)
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing))
-        return ReopeningCamera(lambda: V4l2Camera(camera, usb, clock), camera.frame_rate_hz, clock, stop)
+        return _lasting(lambda: V4l2Camera(camera, usb, clock), camera, clock, stop)
     return None
+
+
+def _lasting(
+    opener: Callable[[], FrameSource], camera: CameraCalibration, clock: Clock, stop: threading.Event | None
+) -> FrameSource:
+    return opener() if stop is None else ReopeningCamera(opener, camera.frame_rate_hz, clock, stop)
 
 
 def _index(place: str) -> int:

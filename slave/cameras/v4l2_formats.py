@@ -88,11 +88,13 @@ def choose_offer(offers: Sequence[Offer], size: tuple[int, int], rate_hz: float)
     """
     able = [o for o in offers if o.pixel_format in PREFERENCE and o.size == size and o.reaches(rate_hz)]
     if not able:
-        listed = "; ".join(offer.text() for offer in offers) or "nothing"
+        listed = "; ".join(offer.text() for offer in offers if offer.pixel_format in PREFERENCE) or "nothing"
         known = ", ".join(fourcc_text(number) for number in PREFERENCE)
+        foreign = sorted({fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in PREFERENCE})
+        unread = f" (and {', '.join(foreign)}, which Phalanx does not read)" if foreign else ""
         raise CameraError(
-            f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: {listed}. "
-            "Set width_px, height_px and frame_rate_hz of the camera file to one of these"
+            f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: "
+            f"{listed}{unread}. Set width_px, height_px and frame_rate_hz of the camera file to one of these"
         )
     return min(able, key=lambda offer: PREFERENCE.index(offer.pixel_format))
 

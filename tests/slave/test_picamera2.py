@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -244,6 +245,15 @@ def test_nobody_to_synchronise_with_is_an_error_after_the_time(monkeypatch: pyte
         opened(monkeypatch, Sensor(sync_ready_at=None), Picamera2Options(sync="client", sync_timeout_s=0.01))
     with pytest.raises(CameraError, match="--sync server: not in step"):
         opened(monkeypatch, Sensor(sync_ready_at=None), Picamera2Options(sync="server", sync_timeout_s=0.01))
+
+
+def test_a_stop_ends_the_wait_for_synchronisation(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = install(monkeypatch, Sensor(sync_ready_at=None))
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(CameraError, match="stopped while it waited for the server"):
+        Picamera2Camera(calibration(), Picamera2Options(sync="client"), SystemClock(), stop)
+    assert sensor.opened[0].closed
 
 
 def test_synchronisation_needs_a_libcamera_that_can_and_a_mode_with_room(

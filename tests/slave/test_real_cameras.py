@@ -67,6 +67,16 @@ def test_a_usb_camera_is_named_by_number_or_path(seen: list[V4l2Options], driver
     assert seen[0].controls == {"gain": 32, "white_balance_temperature": 4600}
 
 
+def test_without_a_stop_a_lost_camera_is_an_error(seen: list[V4l2Options]) -> None:
+    parser = argparse.ArgumentParser()
+    add_options(parser)
+    options = parser.parse_args(["--control", "gain=32", "--control", "white_balance_temperature=4600"])
+    source = open_real("v4l2", options, CALIBRATION, SystemClock(), None)
+    assert isinstance(source, V4l2Camera)
+    source.close()
+    assert len(seen) == 1
+
+
 def test_a_pi_camera_is_named_by_its_number(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = install(monkeypatch, Sensor())
     source = opened("picamera2", "--sync", "client")

@@ -263,6 +263,14 @@ def test_what_is_not_offered_is_refused_with_the_list(size: tuple[int, int], rat
     assert "YUYV 640x480 at 15, 30 Hz; YUYV 1280x720 at 10 Hz; MJPG 640x480 at 30, 60 Hz" in str(error.value)
 
 
+def test_formats_that_cannot_be_read_are_named_apart() -> None:
+    camera = Camera(formats={"YUYV": {(320, 240): (30.0,)}, "BA81": {(640, 480): (30.0,)}})
+    with pytest.raises(
+        CameraError, match=r"It offers: YUYV 320x240 at 30 Hz .and BA81, which Phalanx does not read"
+    ):
+        opened(camera)
+
+
 def test_a_range_of_sizes_and_rates_is_understood() -> None:
     camera = Camera(stepwise=(16, 1920, 2, 16, 1080, 2), formats={"BGR3": {(0, 0): (60.0, 1.0)}})
     offers = read_offers(FakeDevice(camera), (640, 480))
@@ -435,6 +443,10 @@ def test_a_real_camera_delivers_frames_with_all_settings_checked() -> None:
         for name in codes
         if name in controls
     }
+    if (
+        "timestamp_source" in controls
+    ):  # vivid: "end of frame" would be nine tenths of a frame after the hand-over
+        given["timestamp_source"] = 1  # start of exposure
     needs = ("exposure", "gain", "white_balance")
     clock = SystemClock()
     camera = V4l2Camera(
@@ -446,7 +458,9 @@ def test_a_real_camera_delivers_frames_with_all_settings_checked() -> None:
     assert frames[0].image.shape == (480, 640, 3)
     steps = np.diff([frame.t_ns for frame in frames]) / np.diff([frame.seq for frame in frames])
     assert abs(np.median(steps) * rate_hz * 1e-9 - 1.0) < 0.1
-    assert all(0 <= frame.ready_t_ns - frame.t_ns < 1_000_000_000 for frame in frames)
+    assert all(
+        -2_500_000 <= frame.ready_t_ns - frame.t_ns < 1_000_000_000 for frame in frames
+    )  # vivid exposes 0 us
     again = V4l2Camera(
         calibration(frame_rate_hz=rate_hz), V4l2Options(path, given, allow_missing=needs), clock
     )
