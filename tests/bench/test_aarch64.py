@@ -3,6 +3,8 @@
 What needs emulation runs where `make instructions` has been run before, and says so where not.
 """
 
+import struct
+import subprocess
 import sys
 from collections.abc import Callable
 from itertools import pairwise
@@ -18,7 +20,7 @@ from bench.aarch64.count import FIRST, LAST, counted, native, slope, spans
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, write
 from bench.aarch64.guest import Digest, Marks, run_case
 from bench.aarch64.parts import counted_parts
-from bench.aarch64.sysroot import NotPossibleError, prepare
+from bench.aarch64.sysroot import NotPossibleError, Sysroot, prepare
 from slave.markers import detector
 
 RECORD = Baseline("cortex-a53", {"six": 4_000_000}, {"numpy": "2.4.6", "qemu": "7.2"})
@@ -265,13 +267,63 @@ def test_what_failed_to_be_made_leaves_nothing(tmp_path: Path, monkeypatch: pyte
 # Under emulation
 
 
-def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(folder: Path) -> None:
+@pytest.fixture(scope="module")
+def emulated() -> Sysroot:
     if absent := sysroot.missing():
         pytest.skip(f"missing here: {', '.join(absent)}")
     if not list(sysroot.CACHE.glob("wheels-*")):
         pytest.skip("nothing to emulate with: run `make instructions` once")
+    return prepare(lambda line: None)
+
+
+LOOPS = 1000
+MACHINE_CODE = (
+    0xD2800009 | LOOPS << 5,  # mov x9, LOOPS
+    0xF1000529,  # subs x9, x9, 1
+    0x54FFFFE1,  # b.ne to the line before
+    0xD2800FA8,  # mov x8, 125: sched_get_priority_max
+    0xD2800020,  # mov x0, 1
+    0xD4000001,  # svc 0
+    0xD2800020,  # mov x0, 1
+    0xD4000001,  # svc 0
+    0xD2800BA8,  # mov x8, 93: exit
+    0xD2800000,  # mov x0, 0
+    0xD4000001,  # svc 0
+)
+
+
+def program(code: tuple[int, ...]) -> bytes:
+    """An ELF file of nothing but `code`, for aarch64 Linux."""
+    at, headers = 0x400000, 64 + 56
+    size = headers + 4 * len(code)
+    ident = b"\x7fELF\x02\x01\x01" + bytes(9)
+    header = struct.pack("<16sHHIQQQIHHHHHH", ident, 2, 183, 1, at + headers, 64, 0, 0, 64, 56, 1, 0, 0, 0)
+    segment = struct.pack("<IIQQQQQQ", 1, 5, 0, at, at, size, size, 0x1000)
+    return header + segment + struct.pack(f"<{len(code)}I", *code)
+
+
+def test_a_program_of_known_length_is_counted_to_the_instruction(emulated: Sysroot, tmp_path: Path) -> None:
+    file, marks = tmp_path / "program", tmp_path / "marks"
+    file.write_bytes(program(MACHINE_CODE))
+    file.chmod(0o755)
+    subprocess.run([*emulated.qemu, "-plugin", f"file={emulated.plugin},to={marks}", str(file)], check=True)
+    first = 1 + 2 * LOOPS + 3
+    assert [int(line) for line in marks.read_text().split()] == [first, first + 2]
+
+
+def test_the_plugin_says_what_it_needs(emulated: Sysroot, tmp_path: Path) -> None:
+    file = tmp_path / "program"
+    file.write_bytes(program(MACHINE_CODE))
+    file.chmod(0o755)
+    command = [*emulated.qemu, "-plugin", f"file={emulated.plugin}", str(file)]
+    said = subprocess.run(command, capture_output=True, text=True)
+    assert said.returncode != 0
+    assert "to=FILE" in said.stderr
+
+
+def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(emulated: Sysroot, folder: Path) -> None:
     if sys.version_info[:2] != (3, 11):
         pytest.skip("Python 3.12 and later add floats otherwise than the emulated 3.11")
-    found = counted(prepare(lambda line: None), folder, ["six"])
+    found = counted(emulated, folder, ["six"])
     assert found.hashes == native(folder, ["six"])
     assert found.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
