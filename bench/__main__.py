@@ -20,6 +20,7 @@ SECTIONS = {
     "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
+    "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "replay": "Recorded frames with exact truth (PHALANX_DATASETS); exact truth, no baseline",
     "live": "Two slaves and the master over real UDP, standard scene; baseline: an idle relay of datagrams",
 }
