@@ -188,8 +188,8 @@ def test_what_does_not_belong_together_is_named_and_nothing_is_written(
 
 def test_a_disk_too_small_is_said_before_the_work(tmp_path: Path) -> None:
     parts = [part(tmp_path, "left"), part(tmp_path, "right")]
-    with small_disk(tmp_path / "disk", "64k") as disk:
-        with pytest.raises(RecordingError, match=r"MB are needed, 0\.1 MB are free on the disk"):
+    with small_disk(tmp_path / "disk", "16k") as disk:
+        with pytest.raises(RecordingError, match=r"MB are needed, 0\.0 MB are free on the disk"):
             join_recordings(parts, disk / "deep/wave")
         assert not any(disk.iterdir())
 

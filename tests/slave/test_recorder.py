@@ -363,6 +363,16 @@ def test_the_command_records_what_the_camera_gives(
     assert "left: 30 frames in 0.03 s, 0 dropped, 0 lost by the camera" in told.err
 
 
+def test_the_command_records_the_simulated_camera(tmp_path: Path) -> None:
+    calibration = ["--rig", "desk", "--calibration", str(ROOT / "calib_json"), "--reserve-mb", "0"]
+    out = tmp_path / "wave"
+    arguments = ["record", "--name", "left", "--camera", "synthetic", "--frames", "3", "-o", str(out)]
+    assert main([*arguments, *calibration]) == 0
+    assert check_whole(out) == 3
+    assert set(open_recording(out).manifest.cameras) == {"left", "right"}
+    assert np.isfinite(detect_recording(out, "left").uv[..., 0]).any(axis=1).all()
+
+
 def test_the_command_refuses_what_it_should_not_touch(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -427,9 +437,10 @@ def test_stopped_by_hand_or_killed_there_is_a_recording(number: signal.Signals, 
     arguments = tree(tmp_path, rate_hz=5.0)
     out = tmp_path / "wave"
     process = start([*arguments, "-o", str(out), "--reserve-mb", "0"])
-    assert until(lambda: (out / "left/000002.png").exists(), 60.0)
+    begun = until(lambda: (out / "left/000002.png").exists(), 60.0)
     os.kill(process.pid, number)
     told_out, told = process.communicate(timeout=120.0)
+    assert begun, told
     if number == signal.SIGKILL:
         assert process.returncode == -9
         assert 2 <= same_images(out, tmp_path / "given")
