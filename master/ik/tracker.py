@@ -154,11 +154,19 @@ class HandTracker:
             self.last, self._last_ns = solution, t_ns
         return bits
 
-    def peek(self, points_m: Float, cov_m2: Float, towards_cameras: Float) -> HandSolution | None:
-        """Solve one instant afresh and remember nothing; arguments as `push`."""
+    def peek(
+        self, points_m: Float, cov_m2: Float, towards_cameras: Float, *, curled: bool = True
+    ) -> HandSolution | None:
+        """Solve one instant afresh and remember nothing; arguments as `push`.
+
+        Args:
+            points_m, cov_m2, towards_cameras: As in `push`.
+            curled: Whether a finger without a marker is believed curled out of sight; else anywhere natural.
+        """
         seen = seen_markers(points_m, cov_m2)
         facing = towards_cameras if (seen & self._on_palm).any() else None
-        return self._solver.solve(points_m, cov_m2, None, 0.0, None, facing)
+        hidden = None if curled else (np.zeros((5, 4)), np.full(5, np.inf))
+        return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
 
     def _bits(
         self, t_ns: int, solution: HandSolution | None, seen: Bool, placed: Bool, *, held: bool

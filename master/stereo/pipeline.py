@@ -23,7 +23,7 @@ from master.stereo.depth import DepthLaw
 from master.stereo.pairing import Instant, Pairing
 from master.stereo.place import Placed, Placement, ray_covariance
 from master.stereo.rivals import RivalChooser
-from master.stereo.whereabouts import Whereabouts
+from master.stereo.whereabouts import HandBelief, Past
 
 Stage = Callable[[str], AbstractContextManager[None]]
 _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
@@ -72,7 +72,7 @@ class MarkerPipeline:
         self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
         self._place = Placement(self._cameras, law)
         self._choose = RivalChooser(self._cameras, self._place)
-        self._whereabouts = Whereabouts(np.ones(len(markers), dtype=bool))
+        self._past, self._believe = Past(len(markers)), HandBelief(model, markers, np.arange(len(markers)))
         self._caps = CapModel(model, markers)
         self._stage = stage
         self._centres = np.array([camera.centre for camera in self._cameras])
@@ -94,7 +94,7 @@ class MarkerPipeline:
     def _solve(self, instant: Instant) -> SolvedPose:
         last = self._tracker.last if self._smooth is not None else None
         with self._stage("triangulate"):
-            instant = self._without_rivals(instant, last)
+            instant = self._without_rivals(instant)
             raw, cov, apart = self._locate(instant, last)
         if last is None:
             # The caps' tilt is not known yet: a first solution without correction tells it.
@@ -111,24 +111,28 @@ class MarkerPipeline:
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
         if self._smooth is not None:
-            self._whereabouts.saw(instant.t_ns, raw)
+            self._past.saw(instant.t_ns, raw)
         self._count("apart", apart)
         self.counts["epipolar_misfits"] += int(apart.sum())
         self.counts["poses"] += 1
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
         return SolvedPose(pose, instant.ready_t_ns)
 
-    def _without_rivals(self, instant: Instant, last: HandSolution | None) -> Instant:
+    def _without_rivals(self, instant: Instant) -> Instant:
         """The instant with one place for each marker; the usual one has no rival and is passed on."""
         if instant.rival_uv is None or instant.rival_sigma_px is None:
             return instant
         in_doubt = np.isfinite(instant.rival_uv[..., 0]).any(axis=0)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
-        of_hand = None if last is None else self._caps_of(last)
-        expected = self._whereabouts.expected(instant.t_ns, of_hand, clear)
+        others = self._tracker.peek(clear, first.cov, self._towards(clear), curled=False)
         chosen = self._choose(
-            instant.uv, instant.sigma_px, instant.rival_uv, instant.rival_sigma_px, expected
+            instant.uv,
+            instant.sigma_px,
+            instant.rival_uv,
+            instant.rival_sigma_px,
+            self._believe(others, clear),
+            self._past.at(instant.t_ns),
         )
         self._count("rival", chosen.taken)
         self._count("unclear", chosen.dropped)

@@ -1,29 +1,30 @@
-"""Where each marker is to be expected, from the hand and from its own past; asked only where a slave was in doubt.
+"""Where the markers are to be expected: by the hand that the others show, and by the past of each.
 
-A marker on a hand that was just seen is expected where that hand has it: the hand is held by all its markers, so a
-thing that one of them was once mistaken for does not become its past. Before there is a hand, its markers are expected
-near each other. A marker on no hand is expected where it was.
+Asked only where a slave was in doubt. A marker's own past may be a mistake that repeats itself, so what the hand says
+is made without the marker, and afresh: of the past it takes nothing.
 """
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
-from master.stereo.rivals import Expected
+from common.arrays import Float, Int
+from common.hand_model import HandModel
+from master.ik.hand import HandSolution
+from master.stereo.rivals import Belief
 
 _PLACE_M = 0.01  # a cap is expected no better than this
-_SPEED_M_S = 1.0  # standard deviation of a hand's speed
-_REACH_M = 0.1  # a finger's end is within about this of where its hand has it, and of the other markers
+_HAND_M = 0.015  # nor the place of a finger that others tell
+_SPEED_M_S = 1.0  # standard deviation of a marker's speed
+_TOGETHER_M = 0.1  # the markers of a hand lie about this far from its middle
 _FORGET_S = 0.5  # what is older says nothing
 
 
-class Whereabouts:
+class Past:
     """Push machine. Holds where and when each marker was last placed."""
 
-    def __init__(self, on_hand: Bool) -> None:
-        """Begin with nothing seen; `on_hand` (M,) tells the markers of the hand from the others."""
-        self._on_hand = on_hand
-        self._points = np.full((len(on_hand), 3), np.nan)
-        self._t_ns: Int = np.full(len(on_hand), -(2**62), np.int64)
+    def __init__(self, markers: int) -> None:
+        """Begin with nothing seen."""
+        self._points = np.full((markers, 3), np.nan)
+        self._t_ns: Int = np.full(markers, -(2**62), np.int64)
 
     def saw(self, t_ns: int, points: Float) -> None:
         """Remember points (M, 3) [m] of one instant; NaN: not placed."""
@@ -31,23 +32,38 @@ class Whereabouts:
         self._points[found] = points[found]
         self._t_ns[found] = t_ns
 
-    def expected(self, t_ns: int, of_hand: Float | None, clear: Float) -> Expected:
-        """Where the markers should be at `t_ns`.
-
-        Args:
-            t_ns: The instant.
-            of_hand: (M, 3) [m] where the last hand has its markers; None: there is none.
-            clear: (M, 3) [m] markers about which there is no doubt at this instant; NaN: the others.
-        """
+    def at(self, t_ns: int) -> Belief:
+        """Where the markers are at `t_ns` if they moved on like a hand."""
         age_s: Float = (t_ns - self._t_ns).astype(np.float64) * 1e-9
         points = np.where((age_s <= _FORGET_S)[:, None], self._points, np.nan)
         spread_m = _PLACE_M + _SPEED_M_S * age_s
-        hand = self._on_hand
-        if of_hand is not None and age_s[hand].min(initial=np.inf) <= _FORGET_S:
-            points[hand], spread_m[hand] = of_hand[hand], np.minimum(spread_m[hand], _REACH_M)
-            return Expected(points, spread_m)
-        lost = hand & np.isnan(points[:, 0])
-        others = clear[hand & np.isfinite(clear[:, 0])]
-        if len(others):
-            points[lost], spread_m[lost] = np.median(others, axis=0), _REACH_M
-        return Expected(points, spread_m)
+        return Belief(points, spread_m[:, None, None] ** 2 * np.eye(3))
+
+
+class HandBelief:
+    """Where a hand has its markers. Holds no state between calls."""
+
+    def __init__(self, model: HandModel, markers: tuple[str, ...], on_hand: Int) -> None:
+        """Of all markers of the rig, those `on_hand` (H,) are mounted on the hand."""
+        self._model, self._count, self._on_hand = model, len(markers), on_hand
+        self._names = tuple(markers[int(m)] for m in on_hand)
+        joints = [model.mount(name).joint for name in self._names]
+        self._joint = np.array([0 if joint is None else joint for joint in joints], np.int64)  # 0: the palm
+
+    def __call__(self, hand: HandSolution | None, clear: Float) -> Belief:
+        """Beliefs about all markers of the rig; NaN for those on no hand.
+
+        Args:
+            hand: Solved from the markers that nobody doubts; None: they are too few.
+            clear: Those markers (M, 3) [m]; NaN: the others.
+        """
+        points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
+        others = clear[self._on_hand]
+        others = others[np.isfinite(others[:, 0])]
+        if hand is not None:
+            points[self._on_hand] = self._model.marker_points(hand.joints, self._names)
+            cov[self._on_hand] = hand.cov_m2[self._joint] + _HAND_M**2 * np.eye(3)
+        elif len(others):
+            points[self._on_hand] = np.median(others, axis=0)
+            cov[self._on_hand] = _TOGETHER_M**2 * np.eye(3)
+        return Belief(points, cov)

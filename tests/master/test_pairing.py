@@ -187,6 +187,42 @@ def test_a_lost_marker_stays_lost_and_leaves_the_other_alone() -> None:
     assert [bool(np.isnan(i.uv[1, 0]).all()) for i in found] == [4 <= k < 7 for k in range(10)]
 
 
+def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
+    """The second marker's path is the rival of the first; the right slave names them crosswise now and then."""
+    alone = np.array([[0.0, 0.0], [np.nan, np.nan]])
+    streams: list[list[MarkerDetections]] = []
+    for camera, late in (("left", 0), ("right", 5 * MS)):
+        frames = stream(camera, 10, late, row_time_us=20.6)
+        crossed = [camera == "right" and k in (4, 7) for k in range(10)]
+        rivals = [np.where(np.isnan(alone), np.nan, m.uv[[1, 1]]) for m in frames]
+        streams.append(
+            [
+                msgspec.structs.replace(
+                    m,
+                    uv=np.where(alone[:, ::-1] == 0, rival, alone) if cross else m.uv + alone,
+                    rival_uv=m.uv + alone if cross else rival,
+                    sigma_px=np.array([0.1, np.nan]),
+                )
+                for m, rival, cross in zip(frames, rivals, crossed, strict=True)
+            ]
+        )
+    instants = push_all(pairing(20.6), interleaved(*streams))
+    for instant in instants[3:]:
+        assert instant.rival_uv is not None
+        truth = path(np.array(instant.t_ns * 1e-9))
+        for c in range(2):
+            places = np.stack([instant.uv[c, 0], instant.rival_uv[c, 0]])
+            if np.linalg.norm(places[0] - truth[0]) > 1.0:
+                places = places[::-1]
+            np.testing.assert_allclose(places, truth, atol=1e-4)
+        assert np.isnan(instant.rival_uv[:, 1]).all()
+
+
+def test_no_rival_costs_nothing_and_makes_none() -> None:
+    instants = push_all(pairing(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
+    assert all(instant.rival_uv is None and instant.rival_sigma_px is None for instant in instants)
+
+
 # -- cameras that come and go -------------------------------------------------------------------------------------
 
 

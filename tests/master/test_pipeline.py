@@ -92,6 +92,96 @@ def test_rays_that_pass_each_other_are_dropped_and_counted(exact_run: SyntheticR
     assert not any(p.tracked[CHAINS[1]].any() for p in poses[22:])
 
 
+def mistaken(
+    run: SyntheticRun, thing_m: Float, cameras: tuple[str, ...], *, doubt: bool
+) -> list[MarkerDetections]:
+    """From its 20th frame on these cameras take a thing at rest for the index marker; in `doubt` they name both."""
+    out: list[MarkerDetections] = []
+    for m in run.messages:
+        if m.camera not in cameras or m.seq < 20:
+            out.append(m)
+            continue
+        new = changed(m, 1, run.setup.models[m.camera].project(thing_m))
+        rivals = np.full((6, 2), np.nan)
+        rivals[1] = m.uv[1]
+        out.append(msgspec.structs.replace(new, rival_uv=rivals) if doubt else new)
+    return out
+
+
+THING = np.array([0.05, -0.05, 0.6])  # about 10 cm from the finger
+OUT_OF_REACH = np.array([0.25, -0.12, 0.6])
+
+
+def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
+    exact_run: SyntheticRun,
+) -> None:
+    clear = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages)
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, mistaken(exact_run, THING, ("right",), doubt=True))
+    for pose, true in zip(poses, clear, strict=True):
+        np.testing.assert_allclose(pose.markers_raw_m, true.markers_raw_m, atol=2e-3)
+        assert pose.tracked.all() or pose is poses[0]
+    assert pipeline.counts["rival.index"] >= 18
+    assert pipeline.counts["epipolar_misfits"] == pipeline.counts["unclear.index"] == 0
+    sure = build_pipeline(exact_run.setup, StageTimes())  # without the slave's doubt nothing can be chosen
+    lost = solve_all(sure, mistaken(exact_run, THING, ("right",), doubt=False))
+    assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])
+    assert sure.counts["apart.index"] >= 18
+
+
+def test_a_thing_that_both_slaves_take_for_a_marker_is_told_by_where_the_hand_is(
+    exact_run: SyntheticRun,
+) -> None:
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True))
+    assert all(marker_mm(p)[1] < 3.0 for p in poses[3:])
+    assert pipeline.counts["rival.index"] >= 18
+
+
+def test_what_was_mistaken_long_ago_is_not_the_past_of_a_marker(exact_run: SyntheticRun) -> None:
+    """Both slaves are sure of the thing for ten frames, then doubt: the hand says what is its finger."""
+    sure = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=False)
+    doubt = mistaken(exact_run, OUT_OF_REACH, ("left", "right"), doubt=True)
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, [d if d.seq >= 30 else s for s, d in zip(sure, doubt, strict=True)])
+    assert all(marker_mm(p)[1] > 50.0 for p in poses[22:28])
+    assert all(marker_mm(p)[1] < 5.0 for p in poses[33:])
+
+
+def test_what_fits_no_camera_is_dropped_with_its_rays_and_counted_by_name(exact_run: SyntheticRun) -> None:
+    other = np.array([-0.06, 0.12, 0.55])
+    false = mistaken(exact_run, THING, ("left",), doubt=True)
+    false = [
+        msgspec.structs.replace(
+            changed(m, 1, exact_run.setup.models["right"].project(other)), rival_uv=np.full((6, 2), np.nan)
+        )
+        if m.camera == "right" and m.seq >= 20
+        else m
+        for m in false
+    ]
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    poses = solve_all(pipeline, false)
+    assert all(np.isnan(p.markers_raw_m[1]).all() for p in poses[22:])
+    assert not any(p.tracked[CHAINS[1]].any() for p in poses[22:])
+    assert pipeline.counts["unclear.index"] >= 18
+    assert all(np.isfinite(np.delete(p.markers_raw_m, 1, axis=0)).all() for p in poses[22:])
+
+
+def test_sigma_reaches_the_covariance_of_the_hand(exact_run: SyntheticRun) -> None:
+    vague = [
+        msgspec.structs.replace(m, sigma_px=np.where(np.arange(6) == 1, 2.0, m.sigma_px))
+        for m in exact_run.messages[:24]
+    ]
+    sharp = solve_all(build_pipeline(exact_run.setup, StageTimes()), exact_run.messages[:24])[-1]
+    blunt = solve_all(build_pipeline(exact_run.setup, StageTimes()), vague)[-1]
+    tips = CHAINS[:, -1]
+    ratio = np.sqrt(
+        np.trace(blunt.cov_m2[tips], axis1=1, axis2=2) / np.trace(sharp.cov_m2[tips], axis1=1, axis2=2)
+    )
+    assert ratio[1] > 2.0
+    assert (np.delete(ratio, 1) < 1.3).all()
+
+
 def test_a_marker_one_camera_loses_is_kept_on_the_ray_of_the_other(exact_run: SyntheticRun) -> None:
     nowhere = np.array([np.nan, np.nan])
     half = [changed(m, 1, nowhere) if m.camera == "right" and m.seq >= 15 else m for m in exact_run.messages]
