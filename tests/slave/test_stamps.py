@@ -74,8 +74,10 @@ def test_an_interrupted_reading_is_made_again() -> None:
     clocks.stolen_ns = [8_000_000, 3_000_000, 50]
     taken_ns = clocks.t_ns
     assert abs(foreign.to_own(clocks.at(taken_ns)) - taken_ns) <= 1_000
-    clocks.stolen_ns = [2_000_000] * TRIES  # never undisturbed: half of the narrowest is the error
-    assert abs(foreign.to_own(clocks.at(taken_ns)) - taken_ns) <= 1_000_100
+    clocks.stolen_ns = [8_000_000, 300_000] + [8_000_000] * (
+        TRIES - 2
+    )  # never undisturbed: the narrowest counts
+    assert abs(foreign.to_own(clocks.at(taken_ns)) - taken_ns) <= 150_100
 
 
 def test_the_clock_of_a_stamp_is_found_on_this_machine() -> None:

@@ -372,6 +372,7 @@ def test_frames_that_waited_while_nobody_read_are_thrown_away() -> None:
     frame = source.read()
     assert frame is not None
     assert frame.seq > 990
+    assert source.broken == 0
 
 
 def test_a_camera_slower_than_asked_is_refused() -> None:
@@ -414,6 +415,8 @@ def test_a_frame_of_too_few_bytes_or_another_size_is_no_image() -> None:
     jpeg = memoryview(cv2.imencode(".jpg", np.zeros((48, 32, 3), np.uint8))[1].tobytes())
     assert decode(jpeg, abi.fourcc("MJPG"), (64, 48), 0) is None
     assert decode(jpeg, abi.fourcc("MJPG"), (32, 48), 0) is not None
+    for kept in (10, len(jpeg) // 2, len(jpeg) - 2):
+        assert decode(jpeg[:kept], abi.fourcc("MJPG"), (32, 48), 0) is None
 
 
 def real_devices() -> list[Path]:
