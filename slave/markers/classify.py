@@ -8,6 +8,7 @@ per axis; a packed table also carries ranges that are no boxes).
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import TypeAlias, cast
 
 import cv2
@@ -43,6 +44,24 @@ class ColourTable:
         self._table = _build(ranges)
         self._index = np.empty((0, 0), np.int64)
         self._codes: Codes = np.empty((0, 0), self._table.dtype)
+
+    def relit(self, tables: Image) -> "ColourTable":
+        """The table for pictures whose bytes must be mapped before these ranges hold, about 50 ms.
+
+        Colours that belong to one marker before belong to one marker after: no ranges can come to overlap.
+
+        Args:
+            tables: (3, 256) byte -> byte of blue, green and red.
+        """
+        blue, green, red = tables
+        cube = self._table.reshape(256, 256, 256)
+        made = np.empty_like(cube)
+        for plane, source in zip(made, red, strict=True):
+            cube[source].take(green, axis=0).take(blue, axis=1, out=plane)
+        other = copy(self)
+        other._table = made.reshape(-1)
+        other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), made.dtype)
+        return other
 
     @property
     def bits(self) -> tuple[int, ...]:

@@ -1,0 +1,152 @@
+"""Estimate how far the light has moved from that of calibration, from the colours of the markers themselves.
+
+Another light multiplies each channel in linear light by one gain that all surfaces share (von Kries). A marker shows,
+against its colour at calibration, the product of these gains and of its own shading s, which is the same in all three
+channels (a cap turned from the lamp):
+
+    log colour[m, k] - log reference[m, k] = x[k] + s[m] + e[m, k]
+
+x, the log gains, are solved from all markers of a frame together by weighted least squares. A channel weighs by
+what it can tell: paint is nearly black in one or two channels, and what is seen there is sheen and stray light, which
+come and go with the pose (`STRAY`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
+worse it fits (Cauchy weights, Holland and Welsch 1977). The estimate follows the solution slowly, and never leaves
+its bounds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+
+# Of red and blue against green: between any two lights of 3000-6500 K, and a little more.
+LIMIT_RED, LIMIT_BLUE = 2.2, 3.6
+LIMIT_EXPOSURE = 2.5  # of green
+RATE_PER_S = 0.5  # largest rate of each log gain: 3000 -> 6500 K within 10 s is at most 0.25
+TIME_S = 1.0  # time constant of following, when six markers are seen; longer with fewer
+EVERY_NS = 50_000_000  # colours are looked at so often; light has no need of more
+# What is known is trusted so little against one look (sd of each channel, and of all together): where a look tells
+# much it decides, and a lone marker, which tells of two channels at most, moves the third one slowly.
+WEAK, WEAK_TOGETHER = 0.3, 0.6
+KNOWN = np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2)
+STRAY = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
+UNEVEN = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
+SHADING = 0.35  # relative: the light on one marker against another's
+CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it tells no gain
+CAUCHY = 2.5  # standard deviations (of a triple, whose mean is 1.6) at which a marker has half its weight
+ROUNDS = 4
+GAP_NS = 500_000_000  # a step in time is taken as no longer than this
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GainFit:
+    """Gains of one look at the markers.
+
+    Attributes:
+        log_gains: (3,) natural logarithms, blue, green, red.
+        misfit: (M,) distance of each marker from them, in standard deviations; NaN: not seen.
+    """
+
+    log_gains: Float
+    misfit: Float
+
+
+def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> GainFit:
+    """Gains that best explain the colours of the markers.
+
+    Args:
+        colour: (M, 3) linear light of each marker's core, blue first; NaN or 0: not seen.
+        reference: (M, 3) the same at calibration, positive.
+        weight: (M,) 0..1, how far each sighting is trusted.
+        known: (3,) log gains known before; where the markers tell nothing, they stay.
+    """
+    misfit = np.full(len(colour), np.nan)
+    seen = np.flatnonzero((np.nan_to_num(colour) > 0.0).all(axis=1) & (np.nan_to_num(weight) > 0.0))
+    if not seen.size:
+        return GainFit(known, misfit)
+    now, then = colour[seen], reference[seen]
+    shift = np.log(now / then)
+    variance = UNEVEN**2 + (STRAY * np.exp(known) / now) ** 2 + (STRAY / then) ** 2
+    variance[now > CLIPPED] += 1.0
+    covariance = variance[:, :, None] * np.eye(3) + SHADING**2
+    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    trust, x = weight[seen], known
+    for _ in range(ROUNDS):
+        away = shift - x
+        distance = _distance(away, information)
+        heavy = (trust * (1.0 / (1.0 + (distance / CAUCHY) ** 2)))[:, None, None] * information
+        total = heavy.sum(axis=0) + KNOWN
+        told = (heavy @ shift[:, :, None]).sum(axis=0)[:, 0] + KNOWN @ known
+        x = np.asarray(np.linalg.solve(total, told), np.float64)
+    misfit[seen] = _distance(shift - x, information)
+    return GainFit(x, misfit)
+
+
+def _distance(away: Float, information: Float) -> Float:
+    """Mahalanobis distances (M,) of (M, 3) with the inverse covariances (M, 3, 3)."""
+    return np.sqrt((away[:, None] @ information @ away[:, :, None])[:, 0, 0])
+
+
+def bounded(log_gains: Float) -> Float:
+    """Log gains (3,) held within the bounds: green first, then red and blue against it."""
+    blue, green, red = log_gains
+    green = float(np.clip(green, -np.log(LIMIT_EXPOSURE), np.log(LIMIT_EXPOSURE)))
+    b = float(np.clip(blue - log_gains[1], -np.log(LIMIT_BLUE), np.log(LIMIT_BLUE)))
+    r = float(np.clip(red - log_gains[1], -np.log(LIMIT_RED), np.log(LIMIT_RED)))
+    return np.array([green + b, green, green + r])
+
+
+def at_bound(log_gains: Float) -> bool:
+    """Whether the light has reached a bound, so that it may be beyond."""
+    within = 0.98 * np.log([LIMIT_BLUE, LIMIT_EXPOSURE, LIMIT_RED])
+    blue, green, red = log_gains
+    return bool((np.abs([blue - green, green, red - green]) >= within).any())
+
+
+class ColourDrift:
+    """Follows the light of one camera. Holds the log gains and the time of the last look."""
+
+    def __init__(self, reference: Float) -> None:
+        """Begin at the light of calibration.
+
+        Args:
+            reference: (M, 3) linear light of each marker's core at calibration, blue first.
+
+        Raises:
+            ValueError: A reference is not three positive numbers.
+        """
+        if reference.ndim != 2 or reference.shape[1] != 3 or not (reference > 0.0).all():
+            raise ValueError(f"reference must be (M, 3) positive, got {reference.shape}")
+        self._reference = reference
+        self._x = np.zeros(3)
+        self._t_ns: int | None = None
+
+    @property
+    def log_gains(self) -> Float:
+        """Log gains (3,) of the light against calibration, blue, green, red."""
+        return self._x
+
+    def restart(self, log_gains: Float) -> None:
+        """Go on from a light that is known otherwise."""
+        self._x = bounded(log_gains)
+
+    def shift(self, change: Float) -> None:
+        """Add a change of the light that was seen elsewhere, on what stands still: (3,) log gains."""
+        self._x = bounded(self._x + change)
+
+    def push(self, colour: Float, quality: Float, t_ns: int) -> GainFit | None:
+        """Learn from the markers of one frame; None where the last look is too recent.
+
+        Args:
+            colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
+            quality: (M,) 0..1; NaN: not seen.
+            t_ns: Time of the frame [ns], rising.
+        """
+        if self._t_ns is not None and 0 <= t_ns - self._t_ns < EVERY_NS:
+            return None
+        dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), GAP_NS) * 1e-9
+        self._t_ns = t_ns
+        fit = fit_gains(colour, self._reference, np.nan_to_num(quality), self._x)
+        step = (1.0 - np.exp(-dt_s / TIME_S)) * (fit.log_gains - self._x)
+        self._x = bounded(self._x + np.clip(step, -RATE_PER_S * dt_s, RATE_PER_S * dt_s))
+        return fit

@@ -1,0 +1,153 @@
+"""Know the light of one camera at every frame, from three sources that differ in what they can tell.
+
+    first_light   the first picture: all colours together prove one light      at the start, and after doubt
+    light_meter   what stands still: how the light changes, at once             every frame
+    drift         the markers: where the light stands, slowly but for certain   20 times a second
+
+The light is *proven* when two or more markers of one picture agree on it and on no other. It is in doubt again when
+much of the picture changes at once and no marker vouches for the old light, or when the markers fit it badly. A light
+in doubt is used on only where nothing explains the picture better than the light of calibration.
+"""
+
+from concurrent.futures import Future
+from functools import partial
+
+import numpy as np
+
+from common.arrays import Float, Image
+from slave.markers.classify import ColourTable
+from slave.markers.colour_watch import ColourWarning
+from slave.markers.drift import ColourDrift, GainFit, at_bound
+from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, different, evidence, first_light
+from slave.markers.light_meter import Change, LightMeter
+from slave.markers.workers import Workers
+
+SUDDEN = (
+    0.2  # log gains of red or blue against green between two frames: a lamp was switched, or a hand came near
+)
+CLEAR = 0.75  # share of still points that must agree on a sudden change that the markers do not vouch for
+DIM = 0.25  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
+AGAIN_NS = 500_000_000  # between two attempts to prove the light
+MISFIT_NS = 500_000_000  # for which the markers may fit badly before the light is in doubt
+
+
+class CameraLight:
+    """The light of one camera. Holds its estimate, whether it is proven, and the proof under way."""
+
+    def __init__(self, table: ColourTable, reference: Float, size: tuple[int, int], workers: Workers) -> None:
+        """Begin with the light of calibration, not proven.
+
+        Args:
+            table: Colour table of the calibration.
+            reference: (M, 3) linear light of each marker's core at calibration, blue first.
+            size: Width and height of the picture [px].
+            workers: Where a first light is sought: it takes as long as some tens of frames.
+
+        Raises:
+            ValueError: A reference is not three positive numbers.
+        """
+        self._table, self._reference, self._workers = table, reference, workers
+        self._drift = ColourDrift(reference)
+        self._meter = LightMeter(*size)
+        self._provable = len(reference) >= PROOF
+        self.proven = not self._provable  # a rig of one marker can only be followed
+        self._plausible = False
+        self._fitted_ns = 0
+        self._tried_ns: int | None = None
+        self._proof: tuple[Float, Future[Evidence]] | None = None
+
+    @property
+    def log_gains(self) -> Float:
+        """Log gains (3,) of the light against calibration, blue, green, red."""
+        return self._drift.log_gains
+
+    @property
+    def trusted(self) -> bool:
+        """Whether markers may be told by their colours."""
+        return self.proven or self._plausible
+
+    def look(self, image: Image, t_ns: int) -> None:
+        """Take in a picture before its markers are sought.
+
+        Args:
+            image: (H, W, 3) BGR, C-contiguous.
+            t_ns: Time of the frame [ns], rising; only differences matter.
+        """
+        self._change(image, self._meter.push(image, t_ns))
+        if self._provable and not self.proven:
+            self._prove(image, t_ns)
+
+    def learn(self, colour: Float, quality: Float, t_ns: int) -> GainFit | None:
+        """Take in what the markers of that picture showed; None where the last look is too recent.
+
+        Args:
+            colour: (M, 3) linear light of each marker's core, blue first; NaN: not seen.
+            quality: (M,) 0..1; NaN: not seen.
+            t_ns: Time of the frame [ns].
+        """
+        fit = self._drift.push(colour, quality, t_ns)
+        if fit is not None:
+            seen = fit.misfit[np.isfinite(fit.misfit)]
+            if not seen.size or float(np.median(seen)) <= FITS:
+                self._fitted_ns = t_ns
+            elif t_ns - self._fitted_ns > MISFIT_NS:
+                self._doubt()
+        return fit
+
+    def warnings(self) -> list[ColourWarning]:
+        """What is wrong with the light of all markers."""
+        found: list[ColourWarning] = []
+        if at_bound(self.log_gains):
+            blue, green, red = np.exp(self.log_gains)
+            text = (
+                f"the light is at the bound of what is followed (red {red / green:.2f} and blue {blue / green:.2f} of "
+                f"green, brightness {green:.2f} of calibration): light the scene as at calibration, or calibrate the "
+                f"colours under this light"
+            )
+            found.append(ColourWarning(None, text))
+        if not self.proven:
+            text = f"the light is not known: show {PROOF} or more markers at once, so that it can be told from them"
+            found.append(ColourWarning(None, text))
+        return found
+
+    def _change(self, image: Image, change: Change) -> None:
+        """Add a change of the light, unless something in front of the camera only looks like one."""
+        if not change.sure:
+            return
+        sudden = apart(change.log_gains, np.zeros(3)) > SUDDEN
+        if sudden and change.agreeing < CLEAR:
+            half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
+            before, after = (
+                evidence(half, self._table, self._reference, light).score
+                for light in (self.log_gains, self.log_gains + change.log_gains)
+            )
+            if before + AHEAD > after:
+                if before < AHEAD:
+                    self._doubt()  # no marker says that the light stayed, either
+                return
+        self._drift.shift(change.log_gains)
+        if self._proof is not None:  # what is being proven is the light of an earlier frame
+            self._proof = self._proof[0] + change.log_gains, self._proof[1]
+
+    def _doubt(self) -> None:
+        if self._provable and self.proven:
+            self.proven, self._plausible, self._tried_ns = False, False, None
+
+    def _prove(self, image: Image, t_ns: int) -> None:
+        if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= AGAIN_NS):
+            self._tried_ns = t_ns
+            job = self._workers.submit(partial(first_light, image.copy(), self._table, self._reference))
+            self._proof = np.zeros(3), job
+        if self._proof is not None and self._proof[1].done():
+            (since, job), self._proof = self._proof, None
+            light = job.result()
+            self.proven, self._fitted_ns = light.proven, t_ns
+            self._plausible = light.matched > 0 and not different(light.log_gains, np.zeros(3))
+            if self.trusted:
+                self._drift.restart(light.log_gains + since)
+
+
+def apart(a: Float, b: Float) -> float:
+    """How different two lights (3,) look to the colour table, in log gains of red or blue against green."""
+    d = a - b
+    return float(max(abs(d[0] - d[1]), abs(d[2] - d[1]), DIM * abs(d[1])))

@@ -1,0 +1,85 @@
+"""See at once when the light changes, on what stands still: the same few hundred pixels of every frame.
+
+A camera of a rig does not move, so most of its picture is the same desk in every frame. The median over all
+points of the log ratio to what each point showed before is the change of the light; a hand in front of some of them
+does not move a median, and where a hand or a card covers too many, there is no answer. It says only how the
+light *changes*; where it stands against calibration only the paints know (`drift`).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Image
+from common.srgb import to_linear
+
+GRID = 16  # points along each side
+DARK, BRIGHT = 12, 250  # bytes beyond which a point tells nothing: noise, or clipped
+ALIKE = 0.25  # a point agrees when its log ratios are this near the median: three standard deviations of a dark desk
+AGREE = 0.55  # share of the points that must agree
+LEAST = 48  # points that tell something
+QUICK_S, SLOW_S = 2.0, 10.0  # a point that agrees is learnt quickly, one that shows something else slowly
+LOG_LIGHT = np.log(np.maximum(to_linear(np.arange(256) / 255.0), 1e-4))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """How the light changed since the frame before.
+
+    Attributes:
+        log_gains: (3,) natural logarithms, blue, green, red; 0 where nothing can be said.
+        sure: Enough points agree.
+        agreeing: Share of all points that agree, 0..1.
+    """
+
+    log_gains: Float
+    sure: bool
+    agreeing: float
+
+
+class LightMeter:
+    """Measures changes of the light on the still points of one camera.
+
+    Holds what each point shows under the light of the first frame, the light since then, and the last time.
+    """
+
+    def __init__(self, width: int, height: int) -> None:
+        """Place the points on a grid over a picture of this size [px]."""
+        u = ((np.arange(GRID) + 0.5) * width / GRID).astype(np.intp)
+        v = ((np.arange(GRID) + 0.5) * height / GRID).astype(np.intp)
+        self._pixel = (v[:, None] * width + u).reshape(-1)
+        self._still: Float | None = None
+        self._light = np.zeros(3)
+        self._t_ns = 0
+
+    def push(self, image: Image, t_ns: int) -> Change:
+        """The change since the frame before.
+
+        Args:
+            image: (H, W, 3) BGR, C-contiguous.
+            t_ns: Time of the frame [ns], rising.
+        """
+        bytes_ = image.reshape(-1, 3).take(self._pixel, axis=0)
+        seen = LOG_LIGHT.take(bytes_)
+        dt_s, self._t_ns = max(t_ns - self._t_ns, 0) * 1e-9, t_ns
+        if self._still is None:
+            self._still = seen
+            return Change(np.zeros(3), sure=True, agreeing=1.0)
+        usable = ((bytes_ >= DARK) & (bytes_ <= BRIGHT)).all(axis=1)
+        ratio = seen - self._still
+        count = int(np.count_nonzero(usable))
+        if count < LEAST:
+            return Change(np.zeros(3), sure=False, agreeing=0.0)
+        middle = np.median(ratio[usable], axis=0)
+        near = usable & (np.abs(ratio - middle) <= ALIKE).all(axis=1)
+        agreeing = float(np.count_nonzero(near)) / count
+        sure = agreeing >= AGREE
+        change = np.zeros(3)
+        if sure:
+            change, self._light = middle - self._light, middle
+        # Ratios are learnt relative to the light, so that the light itself is never learnt away.
+        rate = np.full(GRID * GRID, -np.expm1(-dt_s / SLOW_S))
+        rate[near] = -np.expm1(-dt_s / QUICK_S)
+        rate[~usable] = 0.0
+        self._still += rate[:, None] * (ratio - self._light)
+        return Change(change, sure=sure, agreeing=agreeing)
