@@ -26,7 +26,10 @@ ABOUT = (
 )
 EXAMPLES = """examples:
   phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
-        one click per marker in, HSV ranges out; prints what collides with what
+        HSV ranges from one click per marker, or, without clicks, from a few seconds of the moving hand;
+        prints what collides with what
+  phalanx-slave colours recordings/paints --camera right --like calib_json/cameras/left.json -o right.json
+        the same, the names taken from a camera file that has them
   phalanx-slave detect recordings/wave --camera left --calibration calib_json -o detections_left.npz
         offline: every frame of one camera, the same bytes on every run
   PHALANX_RIG_KEY=$(cat rig.key) phalanx-slave run --name left --rig desk --camera replay:recordings/wave
@@ -238,7 +241,16 @@ def _colours(options: argparse.Namespace) -> int:
     from slave.markers.colours import report
     from slave.offline import calibrate_colours
 
-    print(report(calibrate_colours(options.recording, options.camera, options.output)))
+    table = calibrate_colours(
+        options.recording,
+        options.camera,
+        options.output,
+        auto=options.auto,
+        like=options.like,
+        hand=options.hand,
+        say=lambda text: print(text, file=sys.stderr),
+    )
+    print(report(table))
     return 0
 
 
@@ -326,12 +338,33 @@ def _parser() -> argparse.ArgumentParser:
     )
 
     colours = commands.add_parser(
-        "colours", help="colours from clicks", epilog=EXAMPLES, formatter_class=keep
+        "colours", help="colours of the markers", epilog=EXAMPLES, formatter_class=keep
     )
     colours.add_argument(
-        "recording", type=Path, metavar="RECORDING", help="folder; recording.json has clicks"
+        "recording",
+        type=Path,
+        metavar="RECORDING",
+        help="folder; with clicks in recording.json, or a few seconds of the moving, open hand",
     )
     colours.add_argument("--camera", required=True, metavar="NAME")
+    colours.add_argument(
+        "--auto",
+        action="store_true",
+        help="from all frames though there are clicks, which then only name paints",
+    )
+    named = colours.add_mutually_exclusive_group()
+    named.add_argument(
+        "--like",
+        type=Path,
+        metavar="CAMERA.json",
+        help="from all frames; names by the hues of this camera file",
+    )
+    named.add_argument(
+        "--hand",
+        type=Path,
+        metavar="HAND.json",
+        help="from all frames; names by the shape of this hand (default: calib_json/hands/, the rig's hand)",
+    )
     colours.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"
     )

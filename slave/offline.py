@@ -8,11 +8,14 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float, Int
-from common.calibration import CameraCalibration, load, save
+from common.calibration import CameraCalibration, HandProfile, load, save
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording, open_recording
 from common.npz import write_npz
 from slave.cameras.replay import read_png
+from slave.markers.autocolour import calibrate_moving, frames_for
+from slave.markers.autocolour_blobs import spread
+from slave.markers.autocolour_names import by_clicks, by_hand, by_hues
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.detector import MarkerDetector
 
@@ -106,34 +109,67 @@ def detect_recording(
     return RecordedDetections(t_ns, seq, uv, area, quality, sigma_px, rival_uv)
 
 
-def calibrate_colours(folder: Path, camera: str, output: Path) -> list[ColourRow]:
-    """Make the colour ranges of one camera from the clicks of a recording and write its camera file.
+def calibrate_colours(
+    folder: Path,
+    camera: str,
+    output: Path,
+    *,
+    auto: bool = False,
+    like: Path | None = None,
+    hand: Path | None = None,
+    say: Callable[[str], None] = lambda _text: None,
+) -> list[ColourRow]:
+    """Make the colour ranges of one camera from a recording and write its camera file.
+
+    With clicks, from the clicked paints of the first frame. Without, or where `auto`, `like` or `hand` ask for it,
+    from what moves with the hand in all frames.
 
     Args:
-        folder: Recording whose `clicks` name one pixel per marker in the camera's first frame.
+        folder: Recording. Its `clicks` name one pixel per marker in the camera's first frame, or none.
         camera: Camera name.
         output: Camera file to write: the recording's, with `markers` filled.
+        auto: Use all frames though there are clicks; these then only name the paints.
+        like: Camera file whose hues name the paints.
+        hand: Hand profile whose shape names the paints. Where there are no clicks either, it is
+            calib_json/hands/<hand of the rig>.json.
+        say: Receives lines of progress.
 
     Raises:
-        RecordingError: The recording is broken or has no clicks for the camera.
-        FitError: A click is not on a paint, or two paints look the same.
-        CameraError, CalibrationError: The frame cannot be read, the file cannot be written.
+        RecordingError: The recording is broken, has no frame of the camera, or clicks for some markers only.
+        FitError: A click is not on a paint, two paints look the same, or the frames do not tell the paints or
+            their names for certain; the text says what to do.
+        CameraError, CalibrationError: A frame or file cannot be read, the file cannot be written.
     """
     recording = open_recording(folder)
     rows = recording.frames_of(camera)
+    if not rows:
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
     clicks = recording.manifest.clicks.get(camera, {})
-    names = recording.manifest.marker_rig().markers
-    missing = [name for name in names if name not in clicks]
-    if missing or not rows:
+    rig = recording.manifest.marker_rig()
+    missing = [name for name in rig.markers if name not in clicks]
+    moving = auto or like is not None or hand is not None or not clicks
+    if missing and not moving:
         raise RecordingError(
             f"{folder}/recording.json: clicks.{camera}: nothing for {', '.join(missing)}; give one pixel [u, v] on "
-            f"each marker in the first frame"
-            if missing
-            else f"{folder}/frames.csv: no frame of camera {camera!r}"
+            f"each marker in the first frame, or --auto"
         )
     own = recording.manifest.cameras[camera]
-    image = read_png(folder / rows[0].file, (own.height_px, own.width_px))
-    table = calibrate(image, {name: clicks[name] for name in names})
+    size = (own.height_px, own.width_px)
+    if not moving:
+        image = read_png(folder / rows[0].file, size)
+        table = calibrate(image, {name: clicks[name] for name in rig.markers})
+    else:
+        if like is not None:
+            namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), say)
+        elif hand is None and not missing:
+            namer = by_clicks(clicks, rig.markers, own.width_px)
+        else:
+            path = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
+            namer = by_hand(load(path, HandProfile), rig.markers, say)
+        chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
+        say(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
+        images = [read_png(folder / rows[k].file, size) for k in chosen]
+        table = calibrate_moving(images, rig.markers, namer, say)
     make_folder(output.parent)
     save(output, msgspec.structs.replace(own, markers={row.name: row.range for row in table}))
     return table

@@ -12,10 +12,12 @@ from typing import cast
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
-from common.arrays import Bool, Image
+from common.arrays import Bool, Float, Image
 from common.calibration import HsvRange
 from common.errors import FitError
+from common.srgb import to_linear
 from slave.markers.classify import HUES, in_range
 
 HUE_GROW = 10  # how far the hue of one paint wanders between its lit and its shadow side
@@ -29,6 +31,7 @@ PALE = 60  # saturation below which nothing is a paint that can be told from a g
 AROUND = 25  # px around the markers in which skin is sampled
 RIM = 4  # px around a marker that are partly paint
 SMALLEST = 6  # px of paint
+VISIBLE_PX = 24  # background pixels inside a range that may look like a marker; fewer are a speck
 BACKGROUND_TAIL = 99.9  # percentile of the background's saturation that a range stays above
 
 
@@ -44,6 +47,7 @@ class ColourRow:
         others: Other markers -> share of their paint inside the range; only those above zero.
         skin: Share of the skin pixels inside the range.
         background: Share of the background pixels inside the range.
+        background_px: How many that is in one frame.
     """
 
     name: str
@@ -53,6 +57,7 @@ class ColourRow:
     others: dict[str, float]
     skin: float
     background: float
+    background_px: float = 0.0
 
 
 def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[ColourRow]:
@@ -67,26 +72,42 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
     """
     hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
-    hue = {name: circular_median(hsv[..., 0][mask]) for name, mask in paint.items()}
-    _refuse_twins(hue)
     skin, background = _surroundings(hsv, paint)
-    skin_hue = circular_median(hsv[..., 0][skin]) if skin.any() else None
-    ranges = {
-        name: _range(hsv, hsv[mask], hue[name], _limits(name, hue, skin_hue), background)
-        for name, mask in paint.items()
-    }
-    return [
-        ColourRow(
-            name=name,
-            range=colour,
-            pixels=int(paint[name].sum()),
-            own=_share(hsv[paint[name]], colour),
-            others={o: s for o in paint if o != name and (s := _share(hsv[paint[o]], colour)) > 0.0},
-            skin=_share(hsv[skin], colour),
-            background=_share(hsv[background], colour),
+    return rows_of({name: hsv[mask] for name, mask in paint.items()}, hsv[skin], hsv[background])
+
+
+def rows_of(paint: Mapping[str, Image], skin: Image, background: Image, frames: int = 1) -> list[ColourRow]:
+    """Ranges and collisions of paints whose pixels are known, in the order of `paint`.
+
+    Args:
+        paint: Marker -> (N, 3) HSV of its pixels, of one frame or of many.
+        skin: (K, 3) HSV of skin pixels; may be empty.
+        background: (B, 3) HSV of all that is neither paint nor its rim.
+        frames: How many frames `background` was taken from.
+
+    Raises:
+        FitError: Two paints have the same hue.
+    """
+    hue = {name: circular_median(pixels[:, 0]) for name, pixels in paint.items()}
+    _refuse_twins(hue)
+    skin_hue = circular_median(skin[:, 0]) if len(skin) else None
+    rows: list[ColourRow] = []
+    for name, pixels in paint.items():
+        colour = _range(pixels, hue[name], _limits(name, hue, skin_hue), background, frames)
+        caught = _share(background, colour)
+        rows.append(
+            ColourRow(
+                name=name,
+                range=colour,
+                pixels=len(pixels),
+                own=_share(pixels, colour),
+                others={o: s for o in paint if o != name and (s := _share(paint[o], colour)) > 0.0},
+                skin=_share(skin, colour),
+                background=caught,
+                background_px=caught * len(background) / frames,
+            )
         )
-        for name, colour in ranges.items()
-    ]
+    return rows
 
 
 def report(rows: list[ColourRow]) -> str:
@@ -103,6 +124,11 @@ def report(rows: list[ColourRow]) -> str:
     bad = [r.name for r in rows if r.others or r.skin > 0.001 or r.background > 0.001]
     advice = "take another paint, or remove what has this colour from the picture"
     lines.append(f"collisions: {', '.join(bad)}: {advice}" if bad else "no collisions")
+    lines += [
+        f"warning: {r.name}: {r.background_px:.0f} background pixels per frame are inside its range"
+        for r in rows
+        if r.background_px >= VISIBLE_PX
+    ]
     return "\n".join(lines)
 
 
@@ -140,8 +166,13 @@ def circular_median(hues: Image) -> float:
     return float((mean + np.median(offset)) * HUES / (2.0 * np.pi) % HUES)
 
 
-def hue_distance(hues: Image, hue: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    """Distance on the hue circle of 180."""
+def hue_apart(a: float, b: float) -> float:
+    """Distance of two hues on the circle of 180."""
+    return min((a - b) % HUES, (b - a) % HUES)
+
+
+def hue_distance(hues: npt.NDArray[np.number], hue: float) -> Float:
+    """Distance on the hue circle of 180, of many hues from one."""
     d = np.abs(hues.astype(np.float64) - hue)
     return np.minimum(d, HUES - d)
 
@@ -149,8 +180,7 @@ def hue_distance(hues: Image, hue: float) -> np.ndarray[tuple[int, ...], np.dtyp
 def _refuse_twins(hue: Mapping[str, float]) -> None:
     names = sorted(hue, key=lambda name: hue[name])
     for a, b in zip(names, names[1:] + names[:1], strict=True):
-        apart = (hue[b] - hue[a]) % HUES
-        if a != b and min(apart, HUES - apart) < HUE_APART:
+        if a != b and hue_apart(hue[a], hue[b]) < HUE_APART:
             raise FitError(
                 f"markers {a} and {b} have nearly the same hue ({hue[a]:.0f}, {hue[b]:.0f}): repaint one"
             )
@@ -174,17 +204,28 @@ def _limits(name: str, hue: Mapping[str, float], skin_hue: float | None) -> tupl
     return int(min(HUE_MARGIN, below - 0.5)), int(min(HUE_MARGIN, above - 0.5))
 
 
-def _range(hsv: Image, paint: Image, hue: float, limits: tuple[int, int], background: Bool) -> HsvRange:
+def _range(paint: Image, hue: float, limits: tuple[int, int], background: Image, frames: int) -> HsvRange:
     middle = round(hue)
     low, high = (middle - limits[0]) % HUES, (middle + limits[1]) % HUES
     saturation = max(SATURATION_LEAST, SATURATION_SHARE * float(np.median(paint[:, 1])))
     value = max(VALUE_LEAST, VALUE_SHARE * float(np.median(paint[:, 2])))
-    same_hue = in_range(hsv[background], HsvRange(hsv_low=(low, 0, 0), hsv_high=(high, 255, 255)))
-    seen = hsv[background][same_hue][:, 1]
-    if seen.size > 1000:  # a desk of that tint, not an object
+    same_hue = in_range(background, HsvRange(hsv_low=(low, 0, 0), hsv_high=(high, 255, 255)))
+    seen = background[same_hue][:, 1]
+    if seen.size > 1000 * frames:  # a desk of that tint, not an object
         floor = float(np.percentile(seen, BACKGROUND_TAIL)) + 5.0
         saturation = max(saturation, min(floor, 0.7 * float(np.median(paint[:, 1]))))
-    return HsvRange(hsv_low=(low, round(saturation), round(value)), hsv_high=(high, 255, 255))
+    return HsvRange(
+        hsv_low=(low, round(saturation), round(value)),
+        hsv_high=(high, 255, 255),
+        reference_bgr_linear=_mean_light(paint),
+    )
+
+
+def _mean_light(paint: Image) -> tuple[float, float, float]:
+    """Mean colour in linear light, blue first, of (N, 3) HSV pixels: light adds linearly, bytes do not."""
+    bgr = np.asarray(cv2.cvtColor(paint[None], cv2.COLOR_HSV2BGR))[0]
+    blue, green, red = np.maximum(to_linear(bgr / 255.0).mean(axis=0), 1e-5).round(5).tolist()
+    return blue, green, red
 
 
 def _share(pixels: Image, colour: HsvRange) -> float:

@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.calibration import CameraCalibration, load
-from common.errors import FitError, RecordingError
+from common.errors import FitError
 from slave.markers.classify import HUES
 from slave.markers.colours import calibrate, circular_median, grow, report
 from slave.offline import calibrate_colours
-from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, paint, render
+from tests.slave.painted import CENTRES, HUE, NAMES, Disc, hand, linear, paint, render
 
 IMAGE = render(hand(), noise=2.0)
 CLICKS = {n: (300.0 + x, 200.0 + y) for n, (x, y) in zip(NAMES, CENTRES.tolist(), strict=True)}
@@ -110,6 +110,23 @@ def test_the_camera_file_is_the_recordings_with_markers(datasets: Path, tmp_path
     assert all(r.own == 1.0 and not r.others and r.skin == 0.0 and r.background < 1e-4 for r in rows)
 
 
-def test_a_recording_without_clicks_names_what_to_add(datasets: Path, tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match=r"clicks\.left: nothing for thumb, index"):
-        calibrate_colours(datasets / "stereo/sweep_paper", "left", tmp_path / "left.json")
+def test_a_recording_without_clicks_needs_a_moving_hand(datasets: Path, tmp_path: Path) -> None:
+    hand = datasets / "hands/webxr-right.json"
+    with pytest.raises(FitError, match=r"0 paints move with the hand .* the rig has 6 markers"):
+        calibrate_colours(datasets / "stereo/sweep_paper", "left", tmp_path / "left.json", hand=hand)
+    with pytest.raises(FitError, match="1 frames, at least 8 are needed"):
+        calibrate_colours(datasets / "stereo/calib_colors", "left", tmp_path / "left.json", auto=True)
+
+
+def test_the_reference_is_the_paints_colour_in_linear_light() -> None:
+    for row, hue in zip(calibrate(IMAGE, CLICKS), HUE, strict=True):
+        assert row.range.reference_bgr_linear is not None
+        np.testing.assert_allclose(row.range.reference_bgr_linear, linear((hue, 180, 150)), rtol=0.15)
+
+
+def test_background_that_may_look_like_a_marker_is_warned_of() -> None:
+    pen = Disc(paint(2), 560.0, 120.0, 5.0)  # 80 px: too few for a collision in share
+    text = report(calibrate(render([*hand(), pen]), CLICKS))
+    assert "no collisions" in text
+    assert "warning: middle: 8" in text or "warning: middle: 7" in text
+    assert "warning" not in report(calibrate(IMAGE, CLICKS))

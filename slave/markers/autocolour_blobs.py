@@ -1,0 +1,330 @@
+"""Coloured things in the frames of a moving hand: which of them move with it, and which stand on the desk.
+
+background   median over the frames: what stands still for most of the time
+skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
+mat          hues of which the background is full; no paint of such a hue can be seen anyway
+things       connected pixels that are saturated, and neither skin nor mat, cut where their hue jumps
+clutter      things of the background that stay whole in one place while the hand moves: a mug, a pen
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Bool, Float, Image, Int
+from common.errors import FitError
+from slave.markers.classify import HUES
+from slave.markers.colours import HUE_GROW, PALE, SMALLEST, circular_median, hue_apart, hue_distance
+
+MEDIAN_FRAMES = 25  # enough for a median; more only cost memory
+DIFFERENT = 25  # grey levels that no noise reaches, in any channel
+MOVING_LEAST = 0.002  # share of the image that must differ from the background in a typical frame
+SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
+SKIN_SATURATION = 30, 210
+SKIN_VALUE = 60
+SKIN_HALF_WIDTH = 12  # in hue; nearer than this no paint can be told from skin
+DARK = 40  # value below which hue is noise
+DESK_FRAMES = 3  # that tell how saturated the desk is, noise included
+TILES = 8  # the image in so many rows and columns:
+DESK_SHARE = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
+DESK_TILE = 100.0  # where one pixel in so many has it
+DESK_TAIL = 99.9  # percentile of the desk's saturation that paint must exceed
+HUE_NEAR = 3  # hues of one tint
+LARGEST = 0.05  # share of the image; a larger coloured thing is a sleeve
+RING = 2, 5  # px: skin is sought outside the mixed pixels of the rim, and near
+HUES_OF_ONE = 3  # pieces into which a thing of several hues is cut at most
+SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
+WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
+MOVED_FRAMES = 3
+COVERED = 0.3  # share of a thing that lies on clutter of its hue: it is that clutter, or hidden before it
+SKIN_BESIDE = 0.08  # share of skin around a paint in a typical frame; painted caps have 0.12 and more
+RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
+SKIN_DESK = 0.2  # share of the background that has the colour of skin, from which skin proves nothing: wood
+
+
+@dataclass(frozen=True, slots=True)
+class Skin:
+    """Measured skin: hue, and low and high saturation."""
+
+    hue: float
+    saturation: tuple[float, float]
+
+    def mask(self, hsv: Image) -> Bool:
+        """Skin pixels of (..., 3) HSV."""
+        low, high = self.saturation
+        near = hue_distance(hsv[..., 0], self.hue) <= SKIN_HALF_WIDTH
+        return near & (hsv[..., 1] >= low) & (hsv[..., 1] <= high) & (hsv[..., 2] >= SKIN_VALUE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Thing:
+    """A connected thing of one hue in one frame.
+
+    Attributes:
+        frame: Index of the frame.
+        u, v: Centroid [px].
+        hue: Median hue.
+        pixels: (N,) flat indices of its pixels.
+        hsv: (N, 3) their colours.
+        skin: Share of skin just around it.
+    """
+
+    frame: int
+    u: float
+    v: float
+    hue: float
+    pixels: Int
+    hsv: Image
+    skin: float
+
+    @property
+    def area(self) -> int:
+        """Pixels."""
+        return len(self.pixels)
+
+    @property
+    def size(self) -> float:
+        """Side of a square of the same area [px]."""
+        return float(np.sqrt(self.area))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surroundings:
+    """What all frames share.
+
+    Attributes:
+        skin: Its colour.
+        floor: (180,) saturation above which a pixel of that hue is coloured; 256: none is.
+        clutter: Coloured things that stand on the desk.
+        wooden: The desk has the colour of skin, so that skin beside a thing proves nothing.
+    """
+
+    skin: Skin
+    floor: Float
+    clutter: tuple[Thing, ...]
+    wooden: bool = False
+
+
+def background_of(images: Sequence[Image]) -> Image:
+    """Median over at most `MEDIAN_FRAMES` frames, evenly taken; (H, W, 3)."""
+    chosen = [images[k] for k in spread(len(images), MEDIAN_FRAMES)]
+    rows = [np.median([image[v] for image in chosen], axis=0) for v in range(chosen[0].shape[0])]
+    return np.stack(rows).astype(np.uint8)
+
+
+def spread(count: int, most: int) -> list[int]:
+    """At most `most` of the indices below `count`, evenly spread, first and last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist()
+
+
+def skin_of(images: Sequence[Image], background: Image) -> Skin:
+    """Skin, from what differs from the background and has a skin's hue.
+
+    Raises:
+        FitError: Nothing moves, or no skin moves.
+    """
+    samples: list[Image] = []
+    moving = 0.0
+    chosen = spread(len(images), MEDIAN_FRAMES)
+    for k in chosen:
+        differs = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) > DIFFERENT
+        moving += float(differs.mean()) / len(chosen)
+        hsv = hsv_of(images[k])[differs]
+        hue, saturation = hsv[:, 0], hsv[:, 1]
+        skin = (hue >= SKIN_HUES[0]) | (hue <= SKIN_HUES[1])
+        skin &= (saturation >= SKIN_SATURATION[0]) & (saturation <= SKIN_SATURATION[1])
+        samples.append(hsv[skin & (hsv[:, 2] >= SKIN_VALUE)])
+    if moving < MOVING_LEAST:
+        raise FitError(
+            f"nothing moves in these frames ({moving:.2%} of the image on average): record a few seconds of the open, "
+            f"painted hand, back to the camera, moving about by more than its width"
+        )
+    pixels = np.concatenate(samples)
+    if len(pixels) < MOVING_LEAST * moving * background.shape[0] * background.shape[1] * len(chosen):
+        raise FitError("what moves in these frames has no skin: record the bare, painted hand")
+    hue, saturation = circular_median(pixels[:, 0]), float(np.median(pixels[:, 1]))
+    return Skin(hue, (max(0.5 * saturation, SKIN_SATURATION[0] * 0.8), 1.6 * saturation))
+
+
+def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> Surroundings:
+    """Desk and clutter: what of the background is coloured."""
+    empty = Surroundings(skin, _floor(images, background, skin), ())
+    standing = things_of(background, 0, empty, border=True)
+    wooden = float(skin.mask(hsv_of(background)).mean()) > SKIN_DESK
+    clutter: list[Thing] = []
+    for thing in standing:
+        if _moved(thing, images):
+            continue
+        resting = thing.skin >= RESTING_SKIN or (
+            thing.skin >= SKIN_BESIDE and _uncovered(thing, images, background, skin)
+        )
+        if wooden or not resting:
+            clutter.append(thing)
+    return Surroundings(skin, empty.floor, tuple(clutter), wooden)
+
+
+def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = False) -> list[Thing]:
+    """Coloured things of one frame, without clutter; `border`: those cut by the image's border, too."""
+    hsv = hsv_of(image)
+    skin = around.skin.mask(hsv)
+    mask = coloured(hsv, around).astype(np.uint8)
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    height, width = mask.shape
+    found: list[Thing] = []
+    for label in range(1, count):
+        x, y, w, h, area = (int(value) for value in stats[label])
+        cut = x == 0 or y == 0 or x + w == width or y + h == height
+        if area < SMALLEST or area > LARGEST * mask.size or (cut and not border):
+            continue
+        piece = np.asarray(labels[y : y + h, x : x + w] == label)
+        for part in _cut_by_hue(hsv[y : y + h, x : x + w, 0], piece):
+            thing = _thing(hsv, skin, part, (x, y), frame)
+            if not any(hides(thing, clutter) for clutter in around.clutter):
+                found.append(thing)
+    return found
+
+
+def coloured(hsv: Image, around: Surroundings) -> Bool:
+    """Pixels (H, W) that may be paint: more saturated than the desk, not dark, and not of the skin's hue."""
+    return (hsv[..., 1] >= around.floor[hsv[..., 0]]) & (hsv[..., 2] >= DARK)
+
+
+def hides(thing: Thing, clutter: Thing) -> bool:
+    """Whether `thing` is the clutter, or a part of it."""
+    if hue_apart(thing.hue, clutter.hue) > HUE_GROW:
+        return False
+    inside = np.isin(thing.pixels, clutter.pixels, assume_unique=True)
+    return float(inside.mean()) > COVERED
+
+
+def hsv_of(image: Image) -> Image:
+    """OpenCV HSV of a BGR image."""
+    return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
+
+
+def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
+    """Saturation (180,) above which a pixel of that hue is coloured: more than what the whole desk shows of the hue."""
+    height, width = background.shape[:2]
+    samples: list[Image] = []
+    tiles = np.zeros((HUES, TILES * TILES))
+    row: Int = np.arange(height, dtype=np.int64) * TILES // height
+    column: Int = np.arange(width, dtype=np.int64) * TILES // width
+    tile: Int = row[:, None] * TILES + column
+    for k in spread(len(images), DESK_FRAMES):
+        hsv = hsv_of(images[k])
+        desk = np.asarray(cv2.absdiff(images[k], background)).max(axis=2) <= DIFFERENT
+        desk &= (hsv[..., 1] >= PALE) & (hsv[..., 2] >= DARK)
+        samples.append(hsv[desk])
+        np.add.at(tiles, (hsv[desk][:, 0], tile[desk]), DESK_TILE / DESK_FRAMES)
+    # A hue belongs to the desk where it and its neighbours are seen all over it.
+    around = np.stack(
+        [
+            tiles.take(range(h - HUE_NEAR, h + HUE_NEAR + 1), axis=0, mode="wrap").sum(axis=0)
+            for h in range(HUES)
+        ]
+    )
+    everywhere = (around >= height * width / TILES**2).mean(axis=1) >= DESK_SHARE
+    floor = np.full(HUES, float(PALE))
+    pixels = np.concatenate(samples)
+    for hue in np.flatnonzero(everywhere):
+        near = pixels[hue_distance(pixels[:, 0], float(hue)) <= HUE_NEAR, 1]
+        floor[hue] = float(np.percentile(near, DESK_TAIL))
+    floor[hue_distance(np.arange(HUES), skin.hue) <= SKIN_HALF_WIDTH] = 256.0
+    return floor
+
+
+def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
+    """Connected parts of one hue each, the most frequent hue first: paints that touch are cut apart."""
+    parts: list[Bool] = []
+    rest = piece.copy()
+    for _ in range(HUES_OF_ONE):
+        if int(rest.sum()) < SMALLEST:
+            break
+        counts = np.bincount(hue[rest], minlength=HUES)[:HUES]
+        kernel = np.ones(2 * HUE_GROW + 1)
+        around = np.convolve(np.concatenate([counts, counts, counts]), kernel, "same")[HUES : 2 * HUES]
+        same = rest & (hue_distance(hue, float(np.argmax(around))) <= HUE_GROW)
+        count, labels, stats, _ = cv2.connectedComponentsWithStats(same.astype(np.uint8), connectivity=4)
+        rest &= ~same
+        if count > 1:
+            largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
+            if int(stats[largest, cv2.CC_STAT_AREA]) >= SMALLEST:
+                parts.append(np.asarray(labels == largest))
+    return parts
+
+
+def _thing(hsv: Image, skin: Bool, part: Bool, corner: tuple[int, int], frame: int) -> Thing:
+    height, width = skin.shape
+    y, x = np.nonzero(part)
+    y, x = y + corner[1], x + corner[0]
+    top, left = max(int(y.min()) - RING[1], 0), max(int(x.min()) - RING[1], 0)
+    bottom, right = min(int(y.max()) + RING[1] + 1, height), min(int(x.max()) + RING[1] + 1, width)
+    own = np.zeros((bottom - top, right - left), np.uint8)
+    own[y - top, x - left] = 1
+    inner, outer = (cv2.dilate(own, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING)
+    ring = np.asarray(outer != inner)
+    share = float(skin[top:bottom, left:right][ring].mean()) if ring.any() else 0.0
+    colours = hsv[y, x]
+    hue = circular_median(colours[:, 0])
+    return Thing(frame, float(x.mean()), float(y.mean()), hue, y * width + x, colours, share)
+
+
+def _moved(thing: Thing, images: Sequence[Image]) -> bool:
+    """Whether a thing of the background is a paint of a hand that rested there: it is seen whole, but elsewhere.
+
+    Clutter only gets covered, and then it is smaller.
+    """
+    height, width = images[0].shape[:2]
+    rows, columns = np.divmod(thing.pixels, width)
+    reach = round(2.0 * thing.size) + 8  # it is searched for where it could still touch its place
+    top, bottom = max(int(rows.min()) - reach, 0), min(int(rows.max()) + reach + 1, height)
+    left, right = max(int(columns.min()) - reach, 0), min(int(columns.max()) + reach + 1, width)
+    place = np.zeros((bottom - top, right - left), np.bool_)
+    place[rows - top, columns - left] = True
+    saturation, value = np.median(thing.hsv[:, 1]), np.median(thing.hsv[:, 2])
+    seen: list[tuple[float, float, float]] = []  # area and centroid of what touches its place, per frame
+    for image in images:
+        hsv = hsv_of(image[top:bottom, left:right])
+        same = hue_distance(hsv[..., 0], thing.hue) <= HUE_GROW
+        same &= (hsv[..., 1] >= 0.55 * saturation) & (hsv[..., 2] >= 0.4 * value)
+        count, labels, stats, centres = cv2.connectedComponentsWithStats(
+            same.astype(np.uint8), connectivity=4
+        )
+        overlap = np.bincount(labels[place], minlength=count)
+        overlap[0] = 0
+        best = int(np.argmax(overlap))
+        if overlap[best]:
+            seen.append((float(stats[best, cv2.CC_STAT_AREA]), *centres[best].tolist()))
+    if len(seen) < MOVED_FRAMES:
+        return False
+    area, u, v = np.array(seen).T
+    whole = (area >= WHOLE * np.median(area)) & (area <= np.median(area) / WHOLE)
+    shift = np.hypot(u - np.median(u), v - np.median(v))
+    return int((whole & (shift > SHIFT_PX + SHIFT_SHARE * thing.size)).sum()) >= MOVED_FRAMES
+
+
+def _uncovered(thing: Thing, images: Sequence[Image], background: Image, skin: Skin) -> bool:
+    """Whether the desk came to light where a thing of the background was: a finger tip that was bent away.
+
+    The desk is what lies around the thing in the background and is not skin.
+    """
+    height, width = background.shape[:2]
+    place = np.zeros(height * width, np.uint8)
+    place[thing.pixels] = 1
+    inner, outer = (
+        cv2.dilate(place.reshape(height, width), np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING
+    )
+    ring = background[np.asarray(outer != inner)]
+    desk = ring[~skin.mask(hsv_of(ring[None]))[0]]
+    if len(desk) == 0:
+        return False
+    colour = np.median(desk, axis=0)
+    bare = 0
+    for image in images:
+        away = np.abs(image.reshape(-1, 3)[thing.pixels] - colour).max(axis=1) <= DIFFERENT
+        bare += bool(away.mean() > 0.5)
+    return bare >= MOVED_FRAMES
