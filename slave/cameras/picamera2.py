@@ -3,37 +3,26 @@
 Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
 those of the camera file. Image and metadata always come from the same captured request, which is released whatever
-happens.
-
-When a frame was taken. libcamera documents `SensorTimestamp` as the time at which row 0 is exposed, on the boot clock.
-The kernel's receivers (bcm2835-unicam, rp1-cfe) take it, with `ktime_get_ns`, the monotonic clock, when the first byte
-of the frame arrives: a row is read out when its exposure *ends* (picamera2 issue 821; picamera2's own `flush` subtracts
-the exposure). So the middle of the exposure of row 0 is `SensorTimestamp` - `ExposureTime` / 2. `FrameWallClock` is the
-same moment after a regression from the boot clock to the wall clock (libcamera's ClockRecovery); it follows a stepped
-wall clock only slowly. It is what two machines can compare, so it is reported when they run in step, and frames are
-stamped with it only where there is no `SensorTimestamp`.
+happens. When a frame was taken, and its number, are in `picamera2_frames`.
 """
 
 import contextlib
 import logging
-import math
 import threading
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.picamera2_frames import Timeline, without_padding
 from slave.cameras.picamera2_library import Enums, Request, open_library
 from slave.cameras.picamera2_modes import choose_mode, read_modes, view_text
 from slave.cameras.picamera2_settings import Picamera2Options, check_ranges, controls, wanted_settings
 from slave.cameras.settings import demand, differences
 from slave.cameras.source import Frame
-from slave.cameras.stamps import ForeignClock, clock_of, system_clock
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
@@ -42,12 +31,11 @@ GOOD_FRAMES = 3
 SYNC_MARGIN = 1.05  # a client catches up by shorter frames, so the mode must be faster than the rig
 PROGRESS_FRAMES = 120
 GIVE_BACK_S = 5.0
-MICROSECONDS_BELOW = 10**17  # wall clock: such a number of ns would be 1973, so it is in us
 _LOG = logging.getLogger(__name__)
 
 
 class Picamera2Camera:
-    """A `FrameSource`. Holds the open camera, the number and time of the last frame and its small image."""
+    """A `FrameSource`. Holds the open camera, the timeline of its frames, and the small image of the last one."""
 
     def __init__(
         self,
@@ -70,8 +58,7 @@ class Picamera2Camera:
         """
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (picamera2:{options.index})"
-        self._stamps: tuple[str, ForeignClock] | None = None
-        self._last: tuple[int, int] | None = None  # seq, t_ns
+        self._timeline = Timeline(calibration.frame_rate_hz, clock)
         self._lores: Image | None = None
         self._closed = self._lost = False
         self._library, enums = open_library(options.index)
@@ -98,13 +85,14 @@ class Picamera2Camera:
         """
         while not self._closed:
             metadata, image, lores = self._capture(with_image=True)
-            t_ns = self._row_zero_ns(metadata)
-            if t_ns is None:
+            try:
+                place = self._timeline.place(metadata)
+            except CameraError as error:
+                raise CameraError(f"{self._where}: {error}") from error
+            if place is None:
                 continue
             self._lores = lores
-            seq = self._number(t_ns, metadata)
-            self._last = (seq, t_ns)
-            return Frame(seq, t_ns, self._clock.now_ns(), image)
+            return Frame(*place, self._clock.now_ns(), image)
         return None
 
     def close(self) -> None:
@@ -268,51 +256,3 @@ class Picamera2Camera:
         if self._options.lores is None:
             return None
         return without_padding(request.make_array("lores"), *self._options.lores)
-
-    def _row_zero_ns(self, metadata: Mapping[str, object]) -> int | None:
-        """Middle of the exposure of row 0 [ns], slave's clock; None for a frame without a time.
-
-        Raises:
-            CameraError: Its time is on no known clock.
-        """
-        key = "SensorTimestamp" if "SensorTimestamp" in metadata else "FrameWallClock"
-        stamp, exposure = metadata.get(key), metadata.get("ExposureTime")
-        # Under load the receiver of Pi 4 and older can deliver a frame with time 0 (raspberrypi/linux 5118).
-        if not isinstance(stamp, int) or stamp <= 0 or not isinstance(exposure, (int, float)):
-            return None
-        if key == "FrameWallClock" and stamp < MICROSECONDS_BELOW:
-            stamp *= 1000
-        if self._stamps is None or self._stamps[0] != key:
-            name = clock_of(stamp)
-            if name is None:
-                raise CameraError(f"{self._where}: {key} {stamp} ns is on no clock of this machine")
-            self._stamps = (key, ForeignClock(self._clock, system_clock(name)))
-        return self._stamps[1].to_own(stamp) - round(exposure * 500.0)
-
-    def _number(self, t_ns: int, metadata: Mapping[str, object]) -> int:
-        """Number of the frame taken at `t_ns`: as many further as whole frame durations have passed."""
-        if self._last is None:
-            return 0
-        seq, before_ns = self._last
-        duration = metadata.get("FrameDuration")
-        nominal_us = 1e6 / self._calibration.frame_rate_hz
-        period_us = float(duration) if isinstance(duration, (int, float)) and duration > 0 else nominal_us
-        return seq + max(1, math.floor((t_ns - before_ns) / (period_us * 1e3) + 0.5))
-
-
-def without_padding(image: npt.NDArray[Any], width: int, height: int) -> Image:
-    """Planar YUV420 (3 height / 2, width) uint8 from an array whose rows are padded to the stride.
-
-    picamera2 hands out (3 height / 2, stride): rows of Y, then those of U and of V, two of which lie in one row of
-    the array, each half a stride long (`CompletedRequest.save` in picamera2 0.3.38).
-    """
-    stride = image.shape[1]
-    if image.shape[0] != height * 3 // 2 or stride < width or stride % 2:
-        raise RuntimeError(f"a small frame is {image.shape}, not ({height * 3 // 2}, at least {width})")
-    luma = image[:height, :width]
-    chroma = image[height:].reshape(height, stride // 2)[:, : width // 2]
-    return (
-        np.concatenate([luma.ravel(), chroma.ravel()])
-        .reshape(height * 3 // 2, width)
-        .astype(np.uint8, copy=False)
-    )

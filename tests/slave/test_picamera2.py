@@ -15,7 +15,8 @@ import pytest
 from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
-from slave.cameras.picamera2 import BUFFERS, Picamera2Camera, without_padding
+from slave.cameras.picamera2 import BUFFERS, Picamera2Camera
+from slave.cameras.picamera2_frames import without_padding
 from slave.cameras.picamera2_modes import choose_mode, read_modes
 from slave.cameras.picamera2_settings import Picamera2Options
 from tests.slave.fake_picamera2 import (
