@@ -118,7 +118,10 @@ class FilterCalibration(_File, frozen=True):
 
 
 class RigCalibration(_File, frozen=True):
-    """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand."""
+    """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
+
+    `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
+    """
 
     version: Literal[1]
     name: Name
@@ -126,6 +129,7 @@ class RigCalibration(_File, frozen=True):
     cameras: Annotated[tuple[Name, ...], Meta(min_length=1, max_length=32)]
     hand: Name
     markers: Markers = ("thumb", "index", "middle", "ring", "little", "back")
+    free_markers: tuple[Name, ...] = ()
     T_rig_camera: dict[Name, Matrix4] = {}
     depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
     power_law: PowerLawCalibration | None = None
@@ -250,6 +254,9 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         raise CalibrationError(f"{where}: cameras: a name stands twice")
     if len(set(rig.markers)) != len(rig.markers):
         raise CalibrationError(f"{where}: markers: a name stands twice")
+    for name in rig.free_markers:
+        if name not in rig.markers:
+            raise CalibrationError(f"{where}: free_markers: {name!r} is not one of markers")
     if rig.kind == "wrist":
         return
     for camera in rig.cameras:

@@ -31,13 +31,18 @@ class RigSetup:
     models: dict[str, CameraModel]
     hand: HandModel
 
+    @property
+    def hand_markers(self) -> tuple[str, ...]:
+        """The rig's markers that sit on the hand, in the rig's order."""
+        return tuple(name for name in self.rig.markers if name not in self.rig.free_markers)
+
     @classmethod
     def of(cls, rig: RigCalibration, cameras: dict[str, CameraCalibration], hand: HandModel) -> "RigSetup":
         """Join the files.
 
         Raises:
             CalibrationError: A camera of the rig is missing or has no intrinsics, fewer than two cameras, a
-                marker the hand does not mount, or a rig that is not of kind "markers".
+                marker the hand does not mount and that is not free, or a rig that is not of kind "markers".
         """
         if rig.kind != "markers":
             raise CalibrationError(f"rig {rig.name!r}: kind is {rig.kind!r}, this command needs 'markers'")
@@ -47,7 +52,8 @@ class RigSetup:
         if missing:
             raise CalibrationError(f"rig {rig.name!r}: no camera file for {missing[0]!r}")
         for name in rig.markers:
-            hand.mount(name)
+            if name not in rig.free_markers:
+                hand.mount(name)
         ordered = {name: cameras[name] for name in rig.cameras}
         models = {name: CameraModel.of(camera, rig.camera_pose(name)) for name, camera in ordered.items()}
         return cls(rig, ordered, models, hand)
@@ -108,6 +114,6 @@ def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = Tru
         pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
         law=depth_law(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
-        tracker=HandTracker(setup.hand, setup.rig.markers, continuous=continuous),
+        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
         stage=timed,
     )

@@ -84,8 +84,9 @@ def summarise(recording: FrameRecording, setup: RigSetup, poses: list[HandPose])
 
 def fingers_of(setup: RigSetup) -> tuple[int, ...]:
     """For each marker of the rig the finger it sits on, or -1."""
-    mounts = [setup.hand.mount(name) for name in setup.rig.markers]
-    return tuple(-1 if mount.finger is None else mount.finger for mount in mounts)
+    on_hand = {name: setup.hand.mount(name).finger for name in setup.hand_markers}
+    fingers = [on_hand.get(name) for name in setup.rig.markers]
+    return tuple(-1 if finger is None else finger for finger in fingers)
 
 
 def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:

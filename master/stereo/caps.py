@@ -21,7 +21,7 @@ class CapModel:
     """The painted caps of one hand as sampled surfaces. Holds no state between calls."""
 
     def __init__(self, model: HandModel, markers: tuple[str, ...]) -> None:
-        """Sample the cap of each marker that sits on a finger; a flat marker on the palm needs none."""
+        """Sample the cap of each marker on a finger; one on the palm, or on no hand, is flat and needs none."""
         self._joint: list[int] = []
         self._marker: list[int] = []
         points: list[Float] = []
@@ -29,6 +29,8 @@ class CapModel:
         areas: list[Float] = []
         self._offset = np.zeros((len(markers), 3))
         for index, name in enumerate(markers):
+            if name not in model.mounts:
+                continue
             mount = model.mount(name)
             self._offset[index] = mount.offset_m
             if mount.joint is None or mount.finger is None:

@@ -63,7 +63,7 @@ class MarkerPipeline:
             pairing: Brings cameras to one instant.
             law: Depth from disparity of the first two cameras; None: triangulate all cameras.
             smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
-            tracker: Solves the hand.
+            tracker: Solves the hand from its own markers, some or all of these.
             stage: Opens a timer by stage name.
         """
         self.model, self.markers = model, markers
@@ -72,7 +72,8 @@ class MarkerPipeline:
         self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
         self._place = Placement(self._cameras, law)
         self._choose = RivalChooser(self._cameras, self._place)
-        self._past, self._believe = Past(len(markers)), HandBelief(model, markers, np.arange(len(markers)))
+        self._on_hand = np.array([markers.index(name) for name in tracker.markers], np.int64)
+        self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
         self._stage = stage
         self._centres = np.array([camera.centre for camera in self._cameras])
@@ -107,7 +108,7 @@ class MarkerPipeline:
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
         with self._stage("hand"):
             aims = self._with_rays(instant, markers, cov, last)
-            measured = np.isfinite(markers[:, 0])
+            measured = np.isfinite(markers[self._on_hand, 0])
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
         if self._smooth is not None:
@@ -125,7 +126,8 @@ class MarkerPipeline:
         in_doubt = np.isfinite(instant.rival_uv[..., 0]).any(axis=0)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
-        others = self._tracker.peek(clear, first.cov, self._towards(clear), curled=False)
+        hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear)
+        others = self._tracker.peek(*hand, curled=False)
         chosen = self._choose(
             instant.uv,
             instant.sigma_px,
@@ -168,17 +170,18 @@ class MarkerPipeline:
     def _with_rays(
         self, instant: Instant, points: Float, cov: Float, last: HandSolution | None
     ) -> tuple[Float, Float]:
-        """Points and covariances with those markers added that only one camera sees.
+        """Points and covariances of the hand's markers, with those added that only one camera sees.
 
         Such a marker is somewhere on its ray. It is put there as far away as it was on the last hand, or as the
         other markers are, with a covariance as long as a hand along the ray and as thin as a centroid across:
         the fit takes the two numbers that were measured and no more. So tracking goes on while a camera is gone.
         """
         seen = np.isfinite(instant.uv[..., 0])
-        lone = np.flatnonzero((seen.sum(axis=0) == 1) & np.isnan(points[:, 0]))
-        found = points[np.isfinite(points[:, 0])]
+        lone = self._on_hand[(seen.sum(axis=0) == 1)[self._on_hand] & np.isnan(points[self._on_hand, 0])]
+        found = points[self._on_hand]
+        found = found[np.isfinite(found[:, 0])]
         if not len(lone) or (last is None and not len(found)):
-            return points, cov
+            return points[self._on_hand], cov[self._on_hand]
         points, cov = points.copy(), cov.copy()
         near = np.broadcast_to(found.mean(axis=0), points.shape) if last is None else self._caps_of(last)
         view = np.argmax(seen[:, lone], axis=0)
@@ -193,14 +196,18 @@ class MarkerPipeline:
         across = across * np.linalg.norm(sight, axis=1)
         depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
         cov[lone] = ray_covariance(sight, across, np.full(len(lone), depth_m))
-        return points, cov
+        return points[self._on_hand], cov[self._on_hand]
 
     def _caps_of(self, hand: HandSolution) -> Float:
-        return self.model.marker_points(hand.joints, self.markers)
+        """Where a hand has its markers (M, 3) [m]; NaN: those on no hand."""
+        points = np.full((len(self.markers), 3), np.nan)
+        points[self._on_hand] = self.model.marker_points(hand.joints, self._tracker.markers)
+        return points
 
     def _towards(self, points: Float) -> Float:
         """Unit vector (3,) from what is seen of the hand to the cameras."""
-        seen = points[np.isfinite(points).all(axis=1)]
+        seen = points[self._on_hand]
+        seen = seen[np.isfinite(seen[:, 0])]
         if not len(seen):
             return -self._ahead
         back = self._eye - seen.mean(axis=0)

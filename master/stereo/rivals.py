@@ -16,6 +16,7 @@ choice of the slaves fit alike at different places, the marker is dropped for th
 
 from dataclasses import dataclass
 from itertools import product
+from typing import cast
 
 import numpy as np
 
@@ -149,7 +150,7 @@ def _away(places: Float, cov: Float, believed: Float, believed_cov: Float) -> Fl
         return np.zeros(count)
     if cov.ndim == 1:
         cov = cov[:, None, None] ** 2 * np.eye(n)
-    off = np.where(np.isfinite(places), places - believed, 0.0)
+    off: Float = np.where(np.isfinite(places), places - believed, 0.0)
     both = np.where(np.isfinite(cov), cov, 0.0) + believed_cov
-    turned: Float = np.linalg.solve(both, off[..., None])[..., 0]
-    return (off * turned).sum(axis=1)
+    solved = cast(Float, np.linalg.solve(both, off[..., None]))
+    return cast(Float, np.einsum("ki,ki->k", off, solved[..., 0]))

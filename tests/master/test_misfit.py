@@ -48,7 +48,7 @@ def test_noise_gives_the_distribution_the_limit_is_made_of(
 def test_a_camera_that_sees_something_else_is_told_from_noise() -> None:
     points = np.tile([0.02, 0.01, 0.5], (3, 1))
     uv = np.stack([camera.project(points) for camera in PAIR])
-    uv[1, :, 1] += [0.0, 3.0, 6.0]  # limit: 4.9 sqrt(2 (0.1^2 + 0.5^2)) = 3.5 px
+    uv[1, :, 1] += [0.0, 5.0, 7.0]  # limit: 4.9 sqrt(2 (0.1^2 + 0.85^2)) = 5.9 px
     placed = Placement(PAIR, None)(uv, np.full((2, 3), 0.1))
     assert (placed.misfit <= placed.limit).tolist() == [True, True, False]
     doubtful = Placement(PAIR, None)(uv, np.full((2, 3), 2.0))
@@ -73,7 +73,7 @@ def turned(axis: str, degrees: float, at: tuple[float, float, float] = (0.075, 0
 
 def test_rows_of_a_parallel_pair_are_compared_as_far_as_half_a_degree_of_pitch_allows() -> None:
     sigma = row_sigma(PAIR)
-    assert sigma == pytest.approx(np.hypot(np.sqrt(2) * 0.5, 500.0 * np.radians(0.5)))
+    assert sigma == pytest.approx(np.hypot(np.sqrt(2) * 0.85, 500.0 * np.radians(0.5)))
     place = Placement(PAIR, PowerLaw(37.5, -1.0))
     uv = np.array([[[340.0, 240.0]] * 3, [[265.0, 240.0]] * 3])
     uv[1, :, 1] += [0.0, 15.0, 30.0]

@@ -73,12 +73,12 @@ def test_the_slaves_are_believed_where_their_choice_fits(seed: int) -> None:
 
 
 def test_a_little_better_is_not_clearly_better() -> None:
-    """A fragment of the marker itself, 1.2 px nearer to the epipolar line: the slave knows best which to take."""
+    """A fragment of the marker itself, 2 px nearer to the epipolar line: the slave knows best which to take."""
     first = seen(PAIR, MARKER, MARKER)
-    first[0, 0, 1] += 1.2
+    first[0, 0, 1] += 2.0
     fragment = seen(PAIR, MARKER, None)
     assert not choose(PAIR, first, fragment).taken.any()
-    first[0, 0, 1] += 2.0
+    first[0, 0, 1] += 3.0
     assert choose(PAIR, first, fragment).taken.all()
 
 
