@@ -117,8 +117,8 @@ def open_library(index: int) -> tuple[Library, Enums]:
         library = cast(Library, picamera2.Picamera2(index))
     except RuntimeError as error:
         raise CameraError(
-            f"--camera picamera2:{index}: cannot be opened ({error}); another program may have it: stop that, "
-            "or restart the Pi"
+            f"--camera picamera2:{index}: cannot be opened ({error.__cause__ or error}); another program may "
+            "have it: stop that, or restart the Pi"
         ) from error
     return library, _enums(controls)
 
