@@ -352,18 +352,18 @@ def _parser() -> argparse.ArgumentParser:
         action="store_true",
         help="from all frames though there are clicks, which then only name paints",
     )
-    named = colours.add_mutually_exclusive_group()
-    named.add_argument(
+    colours.add_argument(
         "--like",
         type=Path,
         metavar="CAMERA.json",
         help="from all frames; names by the hues of this camera file",
     )
-    named.add_argument(
+    colours.add_argument(
         "--hand",
         type=Path,
         metavar="HAND.json",
-        help="from all frames; names by the shape of this hand (default: calib_json/hands/, the rig's hand)",
+        help="from all frames; names by the shape of this hand, which checks those of --like "
+        "(default: calib_json/hands/, the rig's hand)",
     )
     colours.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"

@@ -15,7 +15,7 @@ from common.npz import write_npz
 from slave.cameras.replay import read_png
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_blobs import spread
-from slave.markers.autocolour_names import by_clicks, by_hand, by_hues
+from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.detector import MarkerDetector
 
@@ -129,8 +129,8 @@ def calibrate_colours(
         camera: Camera name.
         output: Camera file to write: the recording's, with `markers` filled.
         auto: Use all frames though there are clicks; these then only name the paints.
-        like: Camera file whose hues name the paints.
-        hand: Hand profile whose shape names the paints. Where there are no clicks either, it is
+        like: Camera file whose hues name the paints; the shape of the hand checks them where it can.
+        hand: Hand profile whose shape names the paints, or checks their names; by default
             calib_json/hands/<hand of the rig>.json.
         say: Receives lines of progress.
 
@@ -159,13 +159,17 @@ def calibrate_colours(
         image = read_png(folder / rows[0].file, size)
         table = calibrate(image, {name: clicks[name] for name in rig.markers})
     else:
+        profile = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
         if like is not None:
             namer = by_hues(load(like, CameraCalibration).markers, rig.markers, str(like), say)
+            if hand is not None or profile.exists():
+                shape = load(profile, HandProfile)
+                if hand is not None or shape.markers.keys() >= set(rig.markers):
+                    namer = checked(namer, by_hand(shape, rig.markers, say), say)
         elif hand is None and not missing:
             namer = by_clicks(clicks, rig.markers, own.width_px)
         else:
-            path = Path("calib_json/hands") / f"{rig.hand}.json" if hand is None else hand
-            namer = by_hand(load(path, HandProfile), rig.markers, say)
+            namer = by_hand(load(profile, HandProfile), rig.markers, say)
         chosen = spread(len(rows), frames_for(own.width_px * own.height_px))
         say(f"{camera}: reading {len(chosen)} of {len(rows)} frames")
         images = [read_png(folder / rows[k].file, size) for k in chosen]

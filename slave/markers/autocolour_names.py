@@ -45,19 +45,19 @@ def by_hand(profile: HandProfile, names: tuple[str, ...], say: Say = lambda _tex
 
     Raises:
         CalibrationError: The profile has no such marker.
-        FitError: Too few or too many markers for this.
+        FitError: When called: too few or too many markers, or the frames do not tell.
     """
     if len(names) == 1:
         return lambda paints, uv: names
-    if not LEAST <= len(names) <= MOST:
-        raise FitError(
-            f"{len(names)} markers cannot be named from the shape of the hand, only {LEAST} to {MOST}: give clicks, or "
-            f"--like with a camera file whose colours are named"
-        )
     pattern = pattern_of(profile, names)
-    orders = np.array(list(permutations(range(len(names)))))
 
     def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
+        if not LEAST <= len(names) <= MOST:
+            raise FitError(
+                f"{len(names)} markers cannot be named from the shape of the hand, only {LEAST} to {MOST}: give "
+                f"clicks, or --like with a camera file whose colours are named"
+            )
+        orders = np.array(list(permutations(range(len(names)))))
         votes, mirrored = votes_of(uv, pattern, orders)
         if mirrored > len(votes):
             raise FitError(
@@ -162,6 +162,35 @@ def by_hues(
         say(f"names by the hues of {where}: the farthest is {worst:.0f} away")
         named = dict(zip(order, np.roll(np.array(around), best).tolist(), strict=True))
         return tuple(str(named[k]) for k in range(len(paints)))
+
+    return name
+
+
+def checked(namer: Namer, shape: Namer, say: Say = lambda _text: None) -> Namer:
+    """Names of `namer`, refused where the shape of the hand is certain of others.
+
+    Raises:
+        FitError: When called: they disagree.
+    """
+
+    def name(paints: Sequence[Paint], uv: Float) -> tuple[str, ...]:
+        named = namer(paints, uv)
+        try:
+            shaped = shape(paints, uv)
+        except FitError as error:
+            say(f"names not checked by the shape of the hand: {error}")
+            return named
+        if named != shaped:
+            wrong = ", ".join(
+                f"hue {p.hue:.0f}: {a} or {b}"
+                for p, a, b in zip(paints, named, shaped, strict=True)
+                if a != b
+            )
+            raise FitError(
+                f"the names contradict the shape of the hand ({wrong}): another paint, clothing, or another hand? "
+                f"Give clicks, or the right --like or --hand"
+            )
+        return named
 
     return name
 

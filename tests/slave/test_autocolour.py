@@ -17,7 +17,7 @@ from common.errors import CalibrationError, FitError, RecordingError
 from common.sim.record import record_scene
 from slave.__main__ import main
 from slave.markers.autocolour import Namer, Paint, calibrate_moving
-from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, pattern_of, votes_of
+from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked, pattern_of, votes_of
 from slave.markers.colours import calibrate, report
 from slave.markers.detector import MarkerDetector
 from slave.offline import calibrate_colours, detect_recording
@@ -239,10 +239,27 @@ def test_clicks_name_what_they_hit() -> None:
         calibrate_moving(opening().images, NAMES, by_clicks({**uv, "ring": uv["index"]}, NAMES, 640))
 
 
-def test_too_few_or_too_many_markers_need_another_way_to_be_named() -> None:
-    for count in (4, 8):
-        with pytest.raises(FitError, match=f"{count} markers cannot be named from the shape"):
-            by_hand(HANDS["right"], NAMES[:1] * count)
+@pytest.mark.parametrize("names", [NAMES[:4], (*NAMES, "wrist", "knuckle")])
+def test_too_few_or_too_many_markers_need_another_way_to_be_named(names: tuple[str, ...]) -> None:
+    profile = HANDS["right"]
+    mounts = profile.markers | dict.fromkeys(names[6:], profile.markers["back"])
+    namer = by_hand(msgspec.structs.replace(profile, markers=mounts), names)
+    with pytest.raises(FitError, match=f"{len(names)} markers cannot be named from the shape"):
+        named(namer, [Paint(20.0 * k, ()) for k in range(len(names))])
+
+
+def test_names_that_the_shape_of_the_hand_contradicts_are_refused() -> None:
+    said: list[str] = []
+    unsure = by_hand(HANDS["right"], NAMES[:4])
+    paints = paints_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0)
+    hues = by_hues(ranges_at(92.0, 68.0, 113.0, 136.0, 172.0, 42.0), NAMES, "old.json")
+    assert named(checked(hues, lambda _paints, _uv: NAMES, said.append), paints) == NAMES
+    assert said == []
+    assert named(checked(hues, unsure, said.append), paints) == NAMES
+    assert "not checked" in said[0]
+    swapped = ("index", "thumb", *NAMES[2:])
+    with pytest.raises(FitError, match=r"hue 92: thumb or index, hue 68: index or thumb"):
+        named(checked(hues, lambda _paints, _uv: swapped, said.append), paints)
 
 
 @pytest.fixture(scope="module")
