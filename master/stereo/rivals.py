@@ -16,7 +16,6 @@ choice of the slaves fit alike at different places, the marker is dropped for th
 
 from dataclasses import dataclass
 from itertools import product
-from typing import cast
 
 import numpy as np
 
@@ -142,15 +141,13 @@ def _away(places: Float, cov: Float, believed: Float, believed_cov: Float) -> Fl
 
     Args:
         places: NaN: none; its distance is 0.
-        cov: Their covariances (K, n, n), or standard deviations (K,).
+        cov: Their covariances (K, n, n), or standard deviations per axis (K,) [px].
         believed, believed_cov: The belief.
     """
-    count, n = places.shape
     if not np.isfinite(believed).all():
-        return np.zeros(count)
+        return np.zeros(len(places))
     if cov.ndim == 1:
-        cov = cov[:, None, None] ** 2 * np.eye(n)
-    off: Float = np.where(np.isfinite(places), places - believed, 0.0)
+        cov = cov[:, None, None] ** 2 * np.eye(2)
+    off = np.where(np.isfinite(places), places - believed, 0.0)
     both = np.where(np.isfinite(cov), cov, 0.0) + believed_cov
-    solved = cast(Float, np.linalg.solve(both, off[..., None]))
-    return cast(Float, np.einsum("ki,ki->k", off, solved[..., 0]))
+    return (off * np.linalg.solve(both, off[..., None])[..., 0]).sum(axis=1)
