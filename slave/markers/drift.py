@@ -11,6 +11,9 @@ what it can tell: paint is nearly black in one or two channels, and what is seen
 come and go with the pose (`STRAY`). A marker that fits badly (half covered, in a coloured shadow) weighs less the
 worse it fits (Cauchy weights, Holland and Welsch 1977). The estimate follows the solution slowly, and never leaves
 its bounds.
+
+What a few markers cannot tell stays near an anchor: the light that many markers last agreed on. Without it, one
+marker whose paint differs a little from its reference would, look by look, carry the light away with it.
 """
 
 from dataclasses import dataclass
@@ -23,10 +26,11 @@ from common.arrays import Float
 LIMIT_RED, LIMIT_BLUE = 2.2, 3.6
 LIMIT_EXPOSURE = 2.5  # of green
 RATE_PER_S = 0.5  # largest rate of each log gain: 3000 -> 6500 K within 10 s is at most 0.25
-TIME_S = 1.0  # time constant of following, when six markers are seen; longer with fewer
+TIME_S = 1.0  # time constant of following
+ANCHOR_S, MANY = 5.0, 4  # time constant of the anchor, and how many markers move it
 EVERY_NS = 50_000_000  # colours are looked at so often; light has no need of more
-# What is known is trusted so little against one look (sd of each channel, and of all together): where a look tells
-# much it decides, and a lone marker, which tells of two channels at most, moves the third one slowly.
+# How far the light may be from the anchor (sd of each channel, and of all together): where a look tells much it
+# decides, and a lone marker, which tells of two channels at most, moves the third one little.
 WEAK, WEAK_TOGETHER = 0.3, 0.6
 KNOWN = np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2)
 STRAY = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
@@ -104,7 +108,7 @@ def at_bound(log_gains: Float) -> bool:
 
 
 class ColourDrift:
-    """Follows the light of one camera. Holds the log gains and the time of the last look."""
+    """Follows the light of one camera. Holds the log gains, their anchor, and the time of the last look."""
 
     def __init__(self, reference: Float) -> None:
         """Begin at the light of calibration.
@@ -118,7 +122,7 @@ class ColourDrift:
         if reference.ndim != 2 or reference.shape[1] != 3 or not (reference > 0.0).all():
             raise ValueError(f"reference must be (M, 3) positive, got {reference.shape}")
         self._reference = reference
-        self._x = np.zeros(3)
+        self._x = self._anchor = np.zeros(3)
         self._t_ns: int | None = None
 
     @property
@@ -128,11 +132,11 @@ class ColourDrift:
 
     def restart(self, log_gains: Float) -> None:
         """Go on from a light that is known otherwise."""
-        self._x = bounded(log_gains)
+        self._x = self._anchor = bounded(log_gains)
 
     def shift(self, change: Float) -> None:
         """Add a change of the light that was seen elsewhere, on what stands still: (3,) log gains."""
-        self._x = bounded(self._x + change)
+        self._x, self._anchor = bounded(self._x + change), bounded(self._anchor + change)
 
     def push(self, colour: Float, quality: Float, t_ns: int) -> GainFit | None:
         """Learn from the markers of one frame; None where the last look is too recent.
@@ -146,7 +150,9 @@ class ColourDrift:
             return None
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), GAP_NS) * 1e-9
         self._t_ns = t_ns
-        fit = fit_gains(colour, self._reference, np.nan_to_num(quality), self._x)
+        fit = fit_gains(colour, self._reference, np.nan_to_num(quality), self._anchor)
         step = (1.0 - np.exp(-dt_s / TIME_S)) * (fit.log_gains - self._x)
         self._x = bounded(self._x + np.clip(step, -RATE_PER_S * dt_s, RATE_PER_S * dt_s))
+        if np.count_nonzero(np.isfinite(fit.misfit)) >= MANY:
+            self._anchor = self._anchor + (1.0 - np.exp(-dt_s / ANCHOR_S)) * (self._x - self._anchor)
         return fit

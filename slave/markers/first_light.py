@@ -26,12 +26,13 @@ WAVELENGTHS_NM = np.array([460.0, 540.0, 605.0])  # middles of blue, green and r
 STEP, REACH = 15e-6, 210e-6  # reciprocal kelvin: 3000 to 6500 K is 180e-6
 STRIDE = 2  # pixels of every second row and column are plenty
 SPECK = 6  # of these pixels; smaller blobs prove nothing
-LARGEST = 0.02  # of the image; a larger blob is no marker
-FITS = 4.0  # standard deviations (of a triple, whose mean is 1.6) at which a blob proves nothing any more
+LARGEST = 0.1  # of the image; a larger blob is no marker
+FITS = 3.0  # standard deviations (of a triple, whose mean is 1.6) at which a blob proves nothing any more
+TINT = 0.25  # log gain of red against green by which lamps of rooms may lie off the line of black bodies
 PROOF = 2  # markers that must fit: one colour fits some light always
 AHEAD = 0.7  # markers by which the best light must lead every light that is clearly another
 OTHER = 0.2  # log gains of red or blue against green by which two lights are clearly different
-CALIBRATED_BONUS = 0.3  # markers: with equal evidence the light of calibration is the likelier one
+EXPECTED = 0.3  # markers that the expected light is worth by itself
 LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)
 BLOBS_EACH = 3  # of each colour, the largest
 
@@ -46,6 +47,7 @@ class Evidence:
         matched: How many of them.
         misfit: (M,) of each marker in standard deviations; NaN: none found.
         proven: At least `PROOF` markers fit, and no clearly different light comes near.
+        excluded: `PROOF` markers fit a light that leaves the expected one far behind.
     """
 
     log_gains: Float
@@ -53,26 +55,35 @@ class Evidence:
     matched: int
     misfit: Float
     proven: bool = False
+    excluded: bool = False
 
 
-def first_light(image: Image, table: ColourTable, reference: Float) -> Evidence:
+def first_light(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
     """The light that explains most of a picture, and whether the picture proves it.
 
     Args:
         image: (H, W, 3) BGR.
         table: Colour table of the calibration.
         reference: (M, 3) linear light of each marker's core at calibration, blue first.
+        expected: (3,) log gains of the light that is expected, blue, green, red; 0 at a start.
     """
+
+    def worth(item: Evidence) -> float:
+        return item.score + (0.0 if different(item.log_gains, expected) else EXPECTED)
+
     half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
-    tried = [evidence(half, table, reference, gains) for gains in lights()]
-    best = max(tried, key=lambda item: item.score)
+    tried = [evidence(half, table, reference, gains) for gains in (expected, *lights())]
+    best = max(tried, key=worth)
     for _ in range(2):  # the fit has moved it; what it finds there may be more
         again = evidence(half, table, reference, best.log_gains)
-        if again.score < best.score:
+        if worth(again) < worth(best):
             break
         best = again
-    others = [item.score for item in tried if different(item.log_gains, best.log_gains)]
-    return replace(best, proven=best.matched >= PROOF and best.score - max(others, default=0.0) >= AHEAD)
+    if best.matched < PROOF or off_line(best.log_gains) > TINT:
+        return best
+    other = max((worth(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
+    usual = max((worth(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
+    return replace(best, proven=worth(best) - other >= AHEAD, excluded=worth(best) - usual >= AHEAD)
 
 
 def lights() -> Float:
@@ -80,6 +91,13 @@ def lights() -> Float:
     steps = np.arange(-REACH, REACH + STEP / 2, STEP)
     gains = -WIEN_NM_K * steps[:, None] / WAVELENGTHS_NM
     return gains - gains[:, 1:2]
+
+
+def off_line(log_gains: Float) -> float:
+    """How far red against green lies off the line of black bodies, given blue against green."""
+    blue, green, red = log_gains
+    line = lights()[-1]
+    return float(abs((red - green) - line[2] / line[0] * (blue - green)))
 
 
 def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float) -> Evidence:
@@ -102,8 +120,6 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     fit = fit_gains(colour, reference, weight, log_gains)
     close = np.nan_to_num(1.0 - (fit.misfit / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
-    if not different(log_gains, np.zeros(3)):
-        score += CALIBRATED_BONUS
     return Evidence(bounded(fit.log_gains), score, int((close > 0.0).sum()), fit.misfit)
 
 

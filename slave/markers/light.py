@@ -6,7 +6,7 @@
 
 The light is *proven* when two or more markers of one picture agree on it and on no other. It is in doubt again when
 much of the picture changes at once and no marker vouches for the old light, or when the markers fit it badly. A light
-in doubt is used on only where nothing explains the picture better than the light of calibration.
+in doubt, the last one known is used on, but not where the picture excludes it.
 """
 
 from concurrent.futures import Future
@@ -18,7 +18,7 @@ from common.arrays import Float, Image
 from slave.markers.classify import ColourTable
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.drift import ColourDrift, GainFit, at_bound
-from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, different, evidence, first_light
+from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, evidence, first_light
 from slave.markers.light_meter import Change, LightMeter
 from slave.markers.workers import Workers
 
@@ -136,14 +136,16 @@ class CameraLight:
     def _prove(self, image: Image, t_ns: int) -> None:
         if self._proof is None and (self._tried_ns is None or t_ns - self._tried_ns >= AGAIN_NS):
             self._tried_ns = t_ns
-            job = self._workers.submit(partial(first_light, image.copy(), self._table, self._reference))
+            job = self._workers.submit(
+                partial(first_light, image.copy(), self._table, self._reference, self.log_gains)
+            )
             self._proof = np.zeros(3), job
         if self._proof is not None and self._proof[1].done():
             (since, job), self._proof = self._proof, None
             light = job.result()
             self.proven, self._fitted_ns = light.proven, t_ns
-            self._plausible = light.matched > 0 and not different(light.log_gains, np.zeros(3))
-            if self.trusted:
+            self._plausible = not light.excluded
+            if light.proven:
                 self._drift.restart(light.log_gains + since)
 
 

@@ -82,6 +82,15 @@ def test_nothing_seen_changes_nothing_and_one_marker_stays_alone() -> None:
     np.testing.assert_array_equal(np.isfinite(fit.misfit), [False, False, True, False, False, False])
 
 
+@pytest.mark.parametrize("lone", range(6))
+def test_a_lone_marker_of_another_shade_does_not_carry_the_light_away(lone: int) -> None:
+    drift, seen = ColourDrift(PAINTS), np.full((6, 3), np.nan)
+    seen[lone] = PAINTS[lone] * 1.4 + 0.02  # a flat, bright patch with a sheen
+    for k in range(600):
+        drift.push(seen, ONES, k * SECOND // 10)
+    assert np.abs(against_green(drift.log_gains)).max() < 0.2
+
+
 def test_a_clipped_channel_tells_no_gain() -> None:
     seen = np.minimum(PAINTS * [3.0, 1.0, 1.0], 1.0)
     assert (seen[:, 0] > 0.9).sum() >= 2

@@ -35,7 +35,7 @@ def hues_apart(a: Float, b: Float) -> float:
 @pytest.mark.parametrize("exposure", [0.7, 1.0, 1.3])
 def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
     gains = Light(kelvin, exposure).gains_bgr()
-    found = first_light(under(painted.render(painted.hand()), gains), TABLE, REFERENCE)
+    found = first_light(under(painted.render(painted.hand()), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
     assert found.matched == 6
     assert hues_apart(found.log_gains, np.log(gains)) < 0.06
@@ -49,7 +49,7 @@ def test_a_whole_hand_proves_its_light(kelvin: float, exposure: float) -> None:
 def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kelvin: float) -> None:
     discs = [d for k, m in enumerate(shown) for d in painted.finger(m, 200.0 + 50 * k, 200.0)]
     gains = Light(kelvin).gains_bgr()
-    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE)
+    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     if found.proven:
         assert hues_apart(found.log_gains, np.log(gains)) < OTHER
 
@@ -57,7 +57,7 @@ def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kel
 def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
     discs = [*painted.hand(), Disc(GREEN_MUG, 560.0, 380.0, 30.0), Disc((110, 200, 140), 80.0, 420.0, 5.0)]
     gains = Light(3200.0).gains_bgr()
-    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE)
+    found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     assert found.proven
     assert hues_apart(found.log_gains, np.log(gains)) < 0.1
 
@@ -74,7 +74,7 @@ def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
 @pytest.mark.parametrize("kelvin", [3000.0, 4300.0, 6500.0])
 def test_one_marker_proves_nothing(discs: list[Disc], kelvin: float) -> None:
     picture = under(painted.render(discs), Light(kelvin).gains_bgr())
-    assert not first_light(picture, TABLE, REFERENCE).proven
+    assert not first_light(picture, TABLE, REFERENCE, np.zeros(3)).proven
 
 
 def test_without_it_the_same_picture_is_misread() -> None:
@@ -106,3 +106,13 @@ def test_no_simulator_is_imported_to_know_the_light() -> None:
     folder = Path(first_light.__code__.co_filename).parent
     for name in ("first_light", "drift", "light_meter", "light", "colour_watch", "following"):
         assert "common.sim" not in (folder / f"{name}.py").read_text(), name
+
+
+@pytest.mark.parametrize("kelvin", [3000.0, 6500.0])
+def test_the_light_that_is_expected_is_kept_until_the_picture_excludes_it(kelvin: float) -> None:
+    there, elsewhere = np.log(Light(kelvin).gains_bgr()), np.zeros(3)
+    lone = under(painted.render(painted.finger(5, 300.0, 200.0)), np.exp(there))
+    assert not first_light(lone, TABLE, REFERENCE, there).excluded
+    whole = under(painted.render(painted.hand()), np.exp(there))
+    assert not first_light(whole, TABLE, REFERENCE, there).excluded
+    assert first_light(whole, TABLE, REFERENCE, elsewhere).excluded
