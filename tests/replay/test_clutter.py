@@ -1,0 +1,149 @@
+"""A thing of a marker's colour beside the hand, through the whole line: rendered frames, detection, solving by command.
+
+The same second of the standard scene is replayed as it is and with a disc of the marker's paint in one or both views.
+Where the disc does not touch the marker, as many caps must be placed rightly as without it, and no more wrongly.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from shutil import copytree
+
+import cv2
+import numpy as np
+import pytest
+
+from common.arrays import Bool, Float, Image
+from common.calibration import HandProfile, load
+from common.sim.record import record_scene
+from common.sim.scene import Scene
+from master.outputs.files import load_poses
+from master.rig import RigSetup, load_setup
+from tests.replay.test_datasets import command
+
+SECONDS, RADIUS_PX, MARKER = 0.5, 8.0, 1
+RIGHT_MM, WRONG_MM = 10.0, 20.0
+NEW_FRAMES = 3  # a slave without any past cannot tell a thing beside a cap from a piece of it
+STARTS_S = {1: 9.5, 2: 8.0}  # scene seed -> a first moment after which both cameras see the finger
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A rendered recording without clutter, and the truth of its T frames."""
+
+    folder: Path
+    setup: RigSetup
+    uv: Float  # (T, C, M, 2) px
+    area: Float  # (T, C, M) px^2
+    visible: Float  # (T, C, M) share
+    markers_m: Float  # (T, M, 3)
+    placed_m: Float  # (T, M, 3) by a replay of it
+
+
+@pytest.fixture(scope="module", params=list(STARTS_S))
+def recorded(
+    request: pytest.FixtureRequest, root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Recorded:
+    folder, tree = tmp_path_factory.mktemp("scene") / "plain", root / "calib_json"
+    setup = load_setup(tree, "desk")
+    profile = load(tree / "hands" / f"{setup.rig.hand}.json", HandProfile)
+    seed = int(request.param)
+    record_scene(folder, Scene.standard(setup.rig, setup.cameras, profile, seed), SECONDS, STARTS_S[seed])
+    with np.load(folder / "truth.npz") as truth:
+        known = truth["uv"], truth["px"], truth["frac"], truth["paint_centroid"]
+    return Recorded(folder, setup, *known, replayed(folder, root))
+
+
+def with_disc(image: Image, uv: Float, bgr: Float, rng: np.random.Generator) -> Image:
+    """A disc of paint with a soft rim and two grey levels of noise."""
+    share = np.zeros(image.shape[:2], np.uint8)
+    centre = (round(16 * float(uv[0])), round(16 * float(uv[1])))
+    cv2.circle(share, centre, round(16 * RADIUS_PX), 255, -1, cv2.LINE_AA, 4)
+    part = share[..., None] / 255.0
+    mixed = image * (1.0 - part) + (bgr + rng.normal(0.0, 2.0, image.shape)) * part
+    return np.clip(np.round(mixed), 0, 255).astype(np.uint8)
+
+
+def painted(recorded: Recorded, folder: Path, places: Float) -> Path:
+    """A copy of the recording with a disc at `places` (T, C, 2) [px]; NaN: none."""
+    copytree(recorded.folder, folder)
+    rng = np.random.default_rng(11)
+    for c, camera in enumerate(recorded.setup.rig.cameras):
+        for k in range(len(places)):
+            path = folder / camera / f"{k:06d}.png"
+            image = np.asarray(cv2.imread(str(path)), np.uint8)
+            u, v = np.round(recorded.uv[k, c, MARKER]).astype(int)
+            bgr = np.median(image[v - 1 : v + 2, u - 1 : u + 2].reshape(-1, 3), axis=0)
+            if np.isfinite(places[k, c]).all():
+                assert cv2.imwrite(str(path), with_disc(image, places[k, c], bgr, rng))
+    return folder
+
+
+def replayed(folder: Path, root: Path) -> Float:
+    """Replay by command: where the markers were placed (T, M, 3) [m]."""
+    out = folder.parent / f"{folder.name}-out"
+    command(
+        root, "deploy", "replay", str(folder), "--calibration", str(root / "calib_json"), "--out", str(out)
+    )
+    return load_poses(out / "poses.npz").markers_raw_m
+
+
+def apart(recorded: Recorded, places: Float) -> Bool:
+    """(T,) frames in which the disc touches the marker in no camera, nor in those before and after; not the first."""
+    distance = np.linalg.norm(places - recorded.uv[:, :, MARKER], axis=2)
+    clear = ~(distance < RADIUS_PX + 1.3 * np.sqrt(recorded.area[:, :, MARKER] / np.pi) + 4.0).any(axis=1)
+    near = np.concatenate([[True], clear, [True]])
+    clear = near[:-2] & clear & near[2:]
+    clear[:NEW_FRAMES] = False
+    return clear
+
+
+def one_view(recorded: Recorded) -> Float:
+    """At rest in the left image, 30 px from where the marker is in the middle of the run."""
+    places = np.full(recorded.uv[:, :, MARKER].shape, np.nan)
+    places[:, 0] = recorded.uv[len(places) // 2, 0, MARKER] + [24.0, -18.0]
+    return places
+
+
+def two_views_of_nothing(recorded: Recorded) -> Float:
+    """At rest in both images, at places that are not one point."""
+    middle = recorded.uv[len(recorded.uv) // 2, :, MARKER]
+    return np.broadcast_to(middle + np.array([(24.0, -18.0), (-22.0, 20.0)]), recorded.uv[:, :, MARKER].shape)
+
+
+def one_thing(recorded: Recorded) -> Float:
+    """A thing at rest, 4.5 cm beside the marker."""
+    place = recorded.markers_m[len(recorded.uv) // 2, MARKER] + [0.035, -0.025, 0.01]
+    views = [model.project(place) for model in recorded.setup.models.values()]
+    return np.broadcast_to(np.array(views), recorded.uv[:, :, MARKER].shape)
+
+
+def along_its_row(recorded: Recorded) -> Float:
+    """In the right image 30 px beside the marker, always: on its epipolar line."""
+    places = np.full(recorded.uv[:, :, MARKER].shape, np.nan)
+    places[:, 1] = recorded.uv[:, 1, MARKER] + [30.0, 0.0]
+    return places
+
+
+CLUTTER = {
+    "one view": one_view,
+    "two views of nothing": two_views_of_nothing,
+    "one thing": one_thing,
+    "along its row": along_its_row,
+}
+
+
+@pytest.mark.parametrize("clutter", CLUTTER)
+def test_a_thing_of_its_colour_costs_no_marker(
+    recorded: Recorded, clutter: str, root: Path, tmp_path: Path
+) -> None:
+    places = CLUTTER[clutter](recorded)
+    placed_m = replayed(painted(recorded, tmp_path / "painted", places), root)
+    shown = apart(recorded, places) & (recorded.visible[:, :, MARKER] > 0.9).all(axis=1)
+    assert shown.sum() >= 10, "the scene shows too little to judge by"
+    off_mm, plain_mm = (
+        1e3 * np.linalg.norm(found[shown, MARKER] - recorded.markers_m[shown, MARKER], axis=1)
+        for found in (placed_m, recorded.placed_m)
+    )
+    assert (plain_mm < RIGHT_MM).mean() >= 0.9
+    assert (off_mm > WRONG_MM).sum() <= (plain_mm > WRONG_MM).sum()
+    assert (off_mm < RIGHT_MM).sum() >= 0.95 * (plain_mm < RIGHT_MM).sum()
