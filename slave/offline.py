@@ -14,8 +14,8 @@ from common.frame_recording import FrameRecording, open_recording
 from common.npz import write_npz
 from slave.cameras.replay import read_png
 from slave.markers.autocolour import calibrate_moving, frames_for
-from slave.markers.autocolour_blobs import spread
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
+from slave.markers.autocolour_surroundings import spread
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.detector import MarkerDetector
 

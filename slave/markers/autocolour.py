@@ -14,21 +14,17 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.errors import FitError
-from slave.markers.autocolour_blobs import (
+from slave.markers.autocolour_surroundings import (
     RESTING_SKIN,
     SHIFT_PX,
     SHIFT_SHARE,
     SKIN_BESIDE,
-    Surroundings,
-    Thing,
     background_of,
-    coloured,
-    hsv_of,
     skin_of,
     spread,
     surroundings_of,
-    things_of,
 )
+from slave.markers.autocolour_things import Surroundings, Thing, coloured, hsv_of, things_of
 from slave.markers.classify import HUES
 from slave.markers.colours import (
     AROUND,

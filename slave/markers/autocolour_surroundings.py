@@ -1,112 +1,49 @@
-"""Coloured things in the frames of a moving hand: which of them move with it, and which stand on the desk.
+"""What all frames of a moving hand share: its skin, the desk, and the coloured things that stand on it.
 
 background   median over the frames: what stands still for most of the time
 skin         hue and saturation of what moves and has a skin's hue; a lamp shifts both, so they are measured
-mat          hues of which the background is full; no paint of such a hue can be seen anyway
-things       connected pixels that are saturated, and neither skin nor mat, cut where their hue jumps
+floor        saturation per hue that the desk itself has, noise included; paint has more
 clutter      things of the background that stay whole in one place while the hand moves: a mug, a pen
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import cast
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Float, Image, Int
 from common.errors import FitError
+from slave.markers.autocolour_things import (
+    DARK,
+    RING,
+    SKIN_HALF_WIDTH,
+    SKIN_VALUE,
+    Skin,
+    Surroundings,
+    Thing,
+    hsv_of,
+    things_of,
+)
 from slave.markers.classify import HUES
-from slave.markers.colours import HUE_GROW, PALE, SMALLEST, circular_median, hue_apart, hue_distance
+from slave.markers.colours import HUE_GROW, PALE, circular_median, hue_distance
 
 MEDIAN_FRAMES = 25  # enough for a median; more only cost memory
 DIFFERENT = 25  # grey levels that no noise reaches, in any channel
 MOVING_LEAST = 0.002  # share of the image that must differ from the background in a typical frame
 SKIN_HUES = 165, 30  # from magenta-red to yellow: skin of every tone under every lamp, wrapping through 0
 SKIN_SATURATION = 30, 210
-SKIN_VALUE = 60
-SKIN_HALF_WIDTH = 12  # in hue; nearer than this no paint can be told from skin
-DARK = 40  # value below which hue is noise
 DESK_FRAMES = 3  # that tell how saturated the desk is, noise included
 TILES = 8  # the image in so many rows and columns:
 DESK_SHARE = 0.2  # a hue that is seen in this share of the tiles is the desk's, not a thing's,
 DESK_TILE = 100.0  # where one pixel in so many has it
 DESK_TAIL = 99.9  # percentile of the desk's saturation that paint must exceed
 HUE_NEAR = 3  # hues of one tint
-LARGEST = 0.05  # share of the image; a larger coloured thing is a sleeve
-RING = 2, 5  # px: skin is sought outside the mixed pixels of the rim, and near
-HUES_OF_ONE = 3  # pieces into which a thing of several hues is cut at most
 SHIFT_PX, SHIFT_SHARE = 2.0, 0.05  # a thing that went farther, plus this share of its size, has moved
 WHOLE = 0.95  # of the area: a thing half covered shifts its centroid, but gets smaller
 MOVED_FRAMES = 3
-COVERED = 0.3  # share of a thing that lies on clutter of its hue: it is that clutter, or hidden before it
 SKIN_BESIDE = 0.08  # share of skin around a paint in a typical frame; painted caps have 0.12 and more
 RESTING_SKIN = 0.5  # share of skin around a thing that never moved, from which it is painted on the hand
 SKIN_DESK = 0.2  # share of the background that has the colour of skin, from which skin proves nothing: wood
-
-
-@dataclass(frozen=True, slots=True)
-class Skin:
-    """Measured skin: hue, and low and high saturation."""
-
-    hue: float
-    saturation: tuple[float, float]
-
-    def mask(self, hsv: Image) -> Bool:
-        """Skin pixels of (..., 3) HSV."""
-        low, high = self.saturation
-        near = hue_distance(hsv[..., 0], self.hue) <= SKIN_HALF_WIDTH
-        return near & (hsv[..., 1] >= low) & (hsv[..., 1] <= high) & (hsv[..., 2] >= SKIN_VALUE)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Thing:
-    """A connected thing of one hue in one frame.
-
-    Attributes:
-        frame: Index of the frame.
-        u, v: Centroid [px].
-        hue: Median hue.
-        pixels: (N,) flat indices of its pixels.
-        hsv: (N, 3) their colours.
-        skin: Share of skin just around it.
-    """
-
-    frame: int
-    u: float
-    v: float
-    hue: float
-    pixels: Int
-    hsv: Image
-    skin: float
-
-    @property
-    def area(self) -> int:
-        """Pixels."""
-        return len(self.pixels)
-
-    @property
-    def size(self) -> float:
-        """Side of a square of the same area [px]."""
-        return float(np.sqrt(self.area))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Surroundings:
-    """What all frames share.
-
-    Attributes:
-        skin: Its colour.
-        floor: (180,) saturation above which a pixel of that hue is coloured; 256: none is.
-        clutter: Coloured things that stand on the desk.
-        wooden: The desk has the colour of skin, so that skin beside a thing proves nothing.
-    """
-
-    skin: Skin
-    floor: Float
-    clutter: tuple[Thing, ...]
-    wooden: bool = False
 
 
 def background_of(images: Sequence[Image]) -> Image:
@@ -167,45 +104,6 @@ def surroundings_of(images: Sequence[Image], background: Image, skin: Skin) -> S
     return Surroundings(skin, empty.floor, tuple(clutter), wooden)
 
 
-def things_of(image: Image, frame: int, around: Surroundings, *, border: bool = False) -> list[Thing]:
-    """Coloured things of one frame, without clutter; `border`: those cut by the image's border, too."""
-    hsv = hsv_of(image)
-    skin = around.skin.mask(hsv)
-    mask = coloured(hsv, around).astype(np.uint8)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    height, width = mask.shape
-    found: list[Thing] = []
-    for label in range(1, count):
-        x, y, w, h, area = (int(value) for value in stats[label])
-        cut = x == 0 or y == 0 or x + w == width or y + h == height
-        if area < SMALLEST or area > LARGEST * mask.size or (cut and not border):
-            continue
-        piece = np.asarray(labels[y : y + h, x : x + w] == label)
-        for part in _cut_by_hue(hsv[y : y + h, x : x + w, 0], piece):
-            thing = _thing(hsv, skin, part, (x, y), frame)
-            if not any(hides(thing, clutter) for clutter in around.clutter):
-                found.append(thing)
-    return found
-
-
-def coloured(hsv: Image, around: Surroundings) -> Bool:
-    """Pixels (H, W) that may be paint: more saturated than the desk, not dark, and not of the skin's hue."""
-    return (hsv[..., 1] >= around.floor[hsv[..., 0]]) & (hsv[..., 2] >= DARK)
-
-
-def hides(thing: Thing, clutter: Thing) -> bool:
-    """Whether `thing` is the clutter, or a part of it."""
-    if hue_apart(thing.hue, clutter.hue) > HUE_GROW:
-        return False
-    inside = np.isin(thing.pixels, clutter.pixels, assume_unique=True)
-    return float(inside.mean()) > COVERED
-
-
-def hsv_of(image: Image) -> Image:
-    """OpenCV HSV of a BGR image."""
-    return cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
-
-
 def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
     """Saturation (180,) above which a pixel of that hue is coloured: more than what the whole desk shows of the hue."""
     height, width = background.shape[:2]
@@ -235,42 +133,6 @@ def _floor(images: Sequence[Image], background: Image, skin: Skin) -> Float:
         floor[hue] = float(np.percentile(near, DESK_TAIL))
     floor[hue_distance(np.arange(HUES), skin.hue) <= SKIN_HALF_WIDTH] = 256.0
     return floor
-
-
-def _cut_by_hue(hue: npt.NDArray[np.uint8], piece: Bool) -> list[Bool]:
-    """Connected parts of one hue each, the most frequent hue first: paints that touch are cut apart."""
-    parts: list[Bool] = []
-    rest = piece.copy()
-    for _ in range(HUES_OF_ONE):
-        if int(rest.sum()) < SMALLEST:
-            break
-        counts = np.bincount(hue[rest], minlength=HUES)[:HUES]
-        kernel = np.ones(2 * HUE_GROW + 1)
-        around = np.convolve(np.concatenate([counts, counts, counts]), kernel, "same")[HUES : 2 * HUES]
-        same = rest & (hue_distance(hue, float(np.argmax(around))) <= HUE_GROW)
-        count, labels, stats, _ = cv2.connectedComponentsWithStats(same.astype(np.uint8), connectivity=4)
-        rest &= ~same
-        if count > 1:
-            largest = 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA]))
-            if int(stats[largest, cv2.CC_STAT_AREA]) >= SMALLEST:
-                parts.append(np.asarray(labels == largest))
-    return parts
-
-
-def _thing(hsv: Image, skin: Bool, part: Bool, corner: tuple[int, int], frame: int) -> Thing:
-    height, width = skin.shape
-    y, x = np.nonzero(part)
-    y, x = y + corner[1], x + corner[0]
-    top, left = max(int(y.min()) - RING[1], 0), max(int(x.min()) - RING[1], 0)
-    bottom, right = min(int(y.max()) + RING[1] + 1, height), min(int(x.max()) + RING[1] + 1, width)
-    own = np.zeros((bottom - top, right - left), np.uint8)
-    own[y - top, x - left] = 1
-    inner, outer = (cv2.dilate(own, np.ones((2 * r + 1, 2 * r + 1), np.uint8)) for r in RING)
-    ring = np.asarray(outer != inner)
-    share = float(skin[top:bottom, left:right][ring].mean()) if ring.any() else 0.0
-    colours = hsv[y, x]
-    hue = circular_median(colours[:, 0])
-    return Thing(frame, float(x.mean()), float(y.mean()), hue, y * width + x, colours, share)
 
 
 def _moved(thing: Thing, images: Sequence[Image]) -> bool:
