@@ -9,6 +9,7 @@ described in docs/wire.md.
 
 from copy import copy
 from enum import IntEnum
+from functools import cache
 from typing import Annotated, TypeAlias, cast
 
 import msgspec
@@ -83,12 +84,13 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "area", np.float64, (m,))
         _freeze(self, "quality", np.float64, (m,))
         _freeze(self, "sigma_px", np.float64, (m,))
-        if self.rival_uv.size == 0:
-            msgspec.structs.force_setattr(self, "rival_uv", np.full((m, 2), np.nan))
-        _freeze(self, "rival_uv", np.float64, (m, 2))
         unseen = np.isnan(self.uv[:, 0])
-        if not np.where(unseen, np.isnan(self.sigma_px), self.sigma_px > 0.0).all():
+        if (np.isnan(self.sigma_px) != unseen).any() or (self.sigma_px <= 0.0).any():
             raise ValueError("sigma_px: must be positive where uv is seen and NaN elsewhere")
+        if self.rival_uv.size == 0:
+            msgspec.structs.force_setattr(self, "rival_uv", _nowhere(m))
+            return
+        _freeze(self, "rival_uv", np.float64, (m, 2))
         if not np.isnan(self.rival_uv[unseen]).all():
             raise ValueError("rival_uv: a rival of a marker that is not seen")
 
@@ -246,6 +248,14 @@ def _from_bytes(kind: type, raw: object) -> object:
     if dtype.kind == "b" and raw.translate(None, b"\0\1"):
         raise ValueError("truth value is neither 0 nor 1")
     return np.frombuffer(raw, dtype)
+
+
+@cache
+def _nowhere(markers: int) -> Float:
+    """The rivals of so many markers of which none has one, (M, 2), read-only; at most 49 are ever made."""
+    nowhere = np.full((markers, 2), np.nan)
+    nowhere.flags.writeable = False
+    return nowhere
 
 
 def _freeze(message: Message, field: str, dtype: type[np.generic], shape: tuple[int, ...]) -> None:
