@@ -16,6 +16,7 @@ What a few markers cannot tell stays near an anchor: the light that many markers
 marker whose paint differs a little from its reference would, look by look, carry the light away with it.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,20 +26,22 @@ from common.arrays import Float
 # Of red and blue against green: between any two lights of 3000-6500 K, and a little more.
 LIMIT_RED, LIMIT_BLUE = 2.2, 3.6
 LIMIT_EXPOSURE = 2.5  # of green
+LOG_LIMITS = math.log(LIMIT_BLUE), math.log(LIMIT_EXPOSURE), math.log(LIMIT_RED)
 RATE_PER_S = 0.5  # largest rate of each log gain: 3000 -> 6500 K within 10 s is at most 0.25
 TIME_S = 1.0  # time constant of following
 ANCHOR_S, MANY = 5.0, 4  # time constant of the anchor, and how many markers move it
-EVERY_NS = 50_000_000  # colours are looked at so often; light has no need of more
+EVERY_NS = 100_000_000  # colours are looked at so often; light has no need of more
 # How far the light may be from the anchor (sd of each channel, and of all together): where a look tells much it
 # decides, and a lone marker, which tells of two channels at most, moves the third one little.
 WEAK, WEAK_TOGETHER = 0.3, 0.6
-KNOWN = np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2)
+KNOWN = np.asarray(np.linalg.inv(WEAK**2 * np.eye(3) + WEAK_TOGETHER**2), np.float64)
 STRAY = 0.01  # linear light of sheen and skin on a paint, as it comes and goes
 UNEVEN = 0.06  # relative: other causes, such as a hue that differs between the lit and the shadow side
 SHADING = 0.35  # relative: the light on one marker against another's
 CLIPPED = 0.9  # linear light; of a brighter mean many pixels are clipped, and it tells no gain
 CAUCHY = 2.5  # standard deviations (of a triple, whose mean is 1.6) at which a marker has half its weight
-ROUNDS = 4
+ROUNDS = 3
+EYE = np.eye(3)
 GAP_NS = 500_000_000  # a step in time is taken as no longer than this
 
 
@@ -72,8 +75,10 @@ def fit_gains(colour: Float, reference: Float, weight: Float, known: Float) -> G
     shift = np.log(now / then)
     variance = UNEVEN**2 + (STRAY * np.exp(known) / now) ** 2 + (STRAY / then) ** 2
     variance[now > CLIPPED] += 1.0
-    covariance = variance[:, :, None] * np.eye(3) + SHADING**2
-    information = np.asarray(np.linalg.inv(covariance), np.float64)
+    # The inverse of diag(variance) + SHADING^2 for each marker, by Sherman and Morrison.
+    sure = 1.0 / variance
+    shared = sure / np.sqrt(SHADING**-2 + sure.sum(axis=1, keepdims=True))
+    information = sure[:, :, None] * EYE - shared[:, :, None] * shared[:, None, :]
     trust, x = weight[seen], known
     for _ in range(ROUNDS):
         away = shift - x
@@ -93,18 +98,18 @@ def _distance(away: Float, information: Float) -> Float:
 
 def bounded(log_gains: Float) -> Float:
     """Log gains (3,) held within the bounds: green first, then red and blue against it."""
-    blue, green, red = log_gains
-    green = float(np.clip(green, -np.log(LIMIT_EXPOSURE), np.log(LIMIT_EXPOSURE)))
-    b = float(np.clip(blue - log_gains[1], -np.log(LIMIT_BLUE), np.log(LIMIT_BLUE)))
-    r = float(np.clip(red - log_gains[1], -np.log(LIMIT_RED), np.log(LIMIT_RED)))
+    blue, green, red = log_gains.tolist()
+    b = min(max(blue - green, -LOG_LIMITS[0]), LOG_LIMITS[0])
+    r = min(max(red - green, -LOG_LIMITS[2]), LOG_LIMITS[2])
+    green = min(max(green, -LOG_LIMITS[1]), LOG_LIMITS[1])
     return np.array([green + b, green, green + r])
 
 
 def at_bound(log_gains: Float) -> bool:
     """Whether the light has reached a bound, so that it may be beyond."""
-    within = 0.98 * np.log([LIMIT_BLUE, LIMIT_EXPOSURE, LIMIT_RED])
-    blue, green, red = log_gains
-    return bool((np.abs([blue - green, green, red - green]) >= within).any())
+    blue, green, red = log_gains.tolist()
+    reached = (abs(blue - green), abs(green), abs(red - green))
+    return any(a >= 0.98 * limit for a, limit in zip(reached, LOG_LIMITS, strict=True))
 
 
 class ColourDrift:

@@ -2,7 +2,7 @@
 
     first_light   the first picture: all colours together prove one light      at the start, and after doubt
     light_meter   what stands still: how the light changes, at once             every frame
-    drift         the markers: where the light stands, slowly but for certain   20 times a second
+    drift         the markers: where the light stands, slowly but for certain   10 times a second
 
 The light is *proven* when two or more markers of one picture agree on it and on no other. It is in doubt again when
 much of the picture changes at once and no marker vouches for the old light, or when the markers fit it badly. A light
@@ -73,7 +73,9 @@ class CameraLight:
             image: (H, W, 3) BGR, C-contiguous.
             t_ns: Time of the frame [ns], rising; only differences matter.
         """
-        self._change(image, self._meter.push(image, t_ns))
+        change = self._meter.push(image, t_ns)
+        if change is not None and change.sure:
+            self._change(image, change)
         if self._provable and not self.proven:
             self._prove(image, t_ns)
 
@@ -112,8 +114,6 @@ class CameraLight:
 
     def _change(self, image: Image, change: Change) -> None:
         """Add a change of the light, unless something in front of the camera only looks like one."""
-        if not change.sure:
-            return
         sudden = apart(change.log_gains, np.zeros(3)) > SUDDEN
         if sudden and change.agreeing < CLEAR:
             half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
@@ -151,5 +151,5 @@ class CameraLight:
 
 def apart(a: Float, b: Float) -> float:
     """How different two lights (3,) look to the colour table, in log gains of red or blue against green."""
-    d = a - b
-    return float(max(abs(d[0] - d[1]), abs(d[2] - d[1]), DIM * abs(d[1])))
+    blue, green, red = (a - b).tolist()
+    return max(abs(blue - green), abs(red - green), DIM * abs(green))

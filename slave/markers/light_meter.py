@@ -9,6 +9,7 @@ light *changes*; where it stands against calibration only the paints know (`drif
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from common.arrays import Float, Image
 from common.srgb import to_linear
@@ -18,13 +19,18 @@ DARK, BRIGHT = 12, 250  # bytes beyond which a point tells nothing: noise, or cl
 ALIKE = 0.25  # a point agrees when its log ratios are this near the median: three standard deviations of a dark desk
 AGREE = 0.55  # share of the points that must agree
 LEAST = 48  # points that tell something
+EVERY_NS = 50_000_000  # a slow change is measured so often,
+LEAP, LEAPING = (
+    8,
+    0.2,
+)  # and at once when this share of the bytes leapt by so much (noise is 2) since the last frame
 QUICK_S, SLOW_S = 2.0, 10.0  # a point that agrees is learnt quickly, one that shows something else slowly
 LOG_LIGHT = np.log(np.maximum(to_linear(np.arange(256) / 255.0), 1e-4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
-    """How the light changed since the frame before.
+    """How the light changed since it was last measured.
 
     Attributes:
         log_gains: (3,) natural logarithms, blue, green, red; 0 where nothing can be said.
@@ -40,7 +46,8 @@ class Change:
 class LightMeter:
     """Measures changes of the light on the still points of one camera.
 
-    Holds what each point shows under the light of the first frame, the light since then, and the last time.
+    Holds what each point shows under the light of the first frame, the light since then, the last time it was
+    measured, and the last bytes.
     """
 
     def __init__(self, width: int, height: int) -> None:
@@ -49,28 +56,37 @@ class LightMeter:
         v = ((np.arange(GRID) + 0.5) * height / GRID).astype(np.intp)
         self._pixel = (v[:, None] * width + u).reshape(-1)
         self._still: Float | None = None
+        self._bytes: npt.NDArray[np.int16] | None = None
         self._light = np.zeros(3)
         self._t_ns = 0
 
-    def push(self, image: Image, t_ns: int) -> Change:
-        """The change since the frame before.
+    def push(self, image: Image, t_ns: int) -> Change | None:
+        """The change since it was last measured; None where it need not be measured now.
 
         Args:
             image: (H, W, 3) BGR, C-contiguous.
             t_ns: Time of the frame [ns], rising.
         """
         bytes_ = image.reshape(-1, 3).take(self._pixel, axis=0)
+        last, self._bytes = self._bytes, bytes_.astype(np.int16)
+        if self._still is None or last is None:
+            self._still, self._t_ns = LOG_LIGHT.take(bytes_), t_ns
+            return None
+        if 0 <= t_ns - self._t_ns < EVERY_NS:
+            leaps = np.count_nonzero(np.abs(self._bytes - last) > LEAP)
+            if leaps < LEAPING * bytes_.size:
+                return None
+        return self._measure(bytes_, self._still, t_ns)
+
+    def _measure(self, bytes_: Image, still: Float, t_ns: int) -> Change:
         seen = LOG_LIGHT.take(bytes_)
         dt_s, self._t_ns = max(t_ns - self._t_ns, 0) * 1e-9, t_ns
-        if self._still is None:
-            self._still = seen
-            return Change(np.zeros(3), sure=True, agreeing=1.0)
         usable = ((bytes_ >= DARK) & (bytes_ <= BRIGHT)).all(axis=1)
-        ratio = seen - self._still
+        ratio = seen - still
         count = int(np.count_nonzero(usable))
         if count < LEAST:
             return Change(np.zeros(3), sure=False, agreeing=0.0)
-        middle = np.median(ratio[usable], axis=0)
+        middle = np.partition(ratio[usable], count // 2, axis=0)[count // 2]
         near = usable & (np.abs(ratio - middle) <= ALIKE).all(axis=1)
         agreeing = float(np.count_nonzero(near)) / count
         sure = agreeing >= AGREE
@@ -81,5 +97,5 @@ class LightMeter:
         rate = np.full(GRID * GRID, -np.expm1(-dt_s / SLOW_S))
         rate[near] = -np.expm1(-dt_s / QUICK_S)
         rate[~usable] = 0.0
-        self._still += rate[:, None] * (ratio - self._light)
+        still += rate[:, None] * (ratio - self._light)
         return Change(change, sure=sure, agreeing=agreeing)

@@ -107,7 +107,7 @@ def test_the_bounds_hold_every_light_of_the_range(kelvin: float, calibrated: flo
         assert not at_bound(x)
 
 
-@given(arrays(np.float64, (20, 6, 3), elements=st.floats(1e-4, 1.0)), st.floats(0.06, 3.0))
+@given(arrays(np.float64, (20, 6, 3), elements=st.floats(1e-4, 1.0)), st.floats(0.11, 3.0))
 @settings(max_examples=30)
 def test_no_colours_drive_it_past_its_rate_and_its_bounds(colours: Float, dt_s: float) -> None:
     drift = ColourDrift(PAINTS)
@@ -144,7 +144,7 @@ def test_following_takes_its_time_constant() -> None:
 def test_looks_that_follow_too_closely_are_left_out() -> None:
     drift = ColourDrift(PAINTS)
     looks = [drift.push(PAINTS, ONES, k * 16_666_667) is not None for k in range(7)]
-    assert looks == [True, False, False, True, False, False, True]
+    assert looks == [True, *[False] * 5, True]
 
 
 @pytest.mark.parametrize(

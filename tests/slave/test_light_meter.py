@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from common.arrays import Float, Image
 from common.sim.illuminant import Light
 from common.srgb import relit_bytes
-from slave.markers.light_meter import AGREE, LightMeter
+from slave.markers.light_meter import AGREE, EVERY_NS, Change, LightMeter
 
 SIZE = (320, 240)
 FRAME_NS = 16_666_667
@@ -42,14 +42,40 @@ def covered(image: Image, share: float) -> Image:
     return image
 
 
+def measured(meter: LightMeter, image: Image, t_ns: int) -> Float:
+    """The change, 0 where none was measured."""
+    change = meter.push(image, t_ns)
+    return STILL if change is None else change.log_gains
+
+
+def forced(meter: LightMeter, image: Image, t_ns: int) -> Change:
+    change = meter.push(image, t_ns)
+    assert change is not None
+    return change
+
+
 @given(st.floats(3000.0, 6500.0), st.floats(0.7, 1.3))
 @settings(max_examples=20, deadline=None)
-def test_a_switched_lamp_is_seen_in_one_frame(kelvin: float, exposure: float) -> None:
+def test_any_change_is_measured(kelvin: float, exposure: float) -> None:
     gains = Light(kelvin, exposure).gains_bgr()
     meter = LightMeter(*SIZE)
     meter.push(seen(desk(), np.ones(3), 0), 0)
-    change = meter.push(seen(desk(), gains, 1), FRAME_NS)
+    change = meter.push(seen(desk(), gains, 1), EVERY_NS)
+    assert change is not None
     assert change.sure
+    np.testing.assert_allclose(change.log_gains, np.log(gains), atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("kelvin", "exposure"), [(3000.0, 1.0), (3400.0, 1.0), (6500.0, 1.0), (4300.0, 0.7), (4300.0, 1.3)]
+)
+def test_a_switched_lamp_is_seen_in_the_next_frame(kelvin: float, exposure: float) -> None:
+    gains = Light(kelvin, exposure).gains_bgr()
+    meter = LightMeter(*SIZE)
+    assert meter.push(seen(desk(), np.ones(3), 0), 0) is None
+    assert meter.push(seen(desk(), np.ones(3), 1), FRAME_NS) is None  # noise alone is no reason to measure
+    change = meter.push(seen(desk(), gains, 2), 2 * FRAME_NS)
+    assert change is not None
     np.testing.assert_allclose(change.log_gains, np.log(gains), atol=0.03)
 
 
@@ -57,7 +83,7 @@ def test_the_sum_of_all_changes_is_the_light_after_a_slow_day() -> None:
     meter, total = LightMeter(*SIZE), np.zeros(3)
     kelvin = np.r_[np.linspace(4300.0, 3000.0, 200), np.linspace(3000.0, 6500.0, 400)]
     for k, t in enumerate(kelvin):
-        total += meter.push(seen(desk(), Light(float(t)).gains_bgr(), k), 2 * k * FRAME_NS).log_gains
+        total += measured(meter, seen(desk(), Light(float(t)).gains_bgr(), k), 2 * k * FRAME_NS)
     np.testing.assert_allclose(total, np.log(Light(6500.0).gains_bgr()), atol=0.03)
 
 
@@ -66,7 +92,7 @@ def test_a_hand_over_part_of_the_picture_changes_no_light(share: float) -> None:
     meter, total = LightMeter(*SIZE), np.zeros(3)
     for k in range(60):
         image = covered(desk(), share) if 10 <= k < 50 else desk()
-        total += meter.push(seen(image, np.ones(3), k), k * FRAME_NS).log_gains
+        total += measured(meter, seen(image, np.ones(3), k), k * FRAME_NS)
         np.testing.assert_allclose(total, 0.0, atol=0.08)
     np.testing.assert_allclose(total, 0.0, atol=0.03)
 
@@ -74,11 +100,11 @@ def test_a_hand_over_part_of_the_picture_changes_no_light(share: float) -> None:
 def test_where_too_much_is_covered_there_is_no_answer() -> None:
     meter = LightMeter(*SIZE)
     meter.push(seen(desk(), np.ones(3), 0), 0)
-    half = meter.push(seen(covered(desk(), 0.5), np.ones(3), 1), FRAME_NS)
+    half = forced(meter, seen(covered(desk(), 0.5), np.ones(3), 1), FRAME_NS)
     assert half.agreeing < AGREE
     assert not half.sure
     np.testing.assert_array_equal(half.log_gains, 0.0)
-    again = meter.push(seen(desk(), np.ones(3), 2), 2 * FRAME_NS)
+    again = forced(meter, seen(desk(), np.ones(3), 2), 2 * FRAME_NS)
     assert again.sure
     np.testing.assert_allclose(again.log_gains, 0.0, atol=0.03)
 
@@ -88,7 +114,7 @@ def test_a_change_during_cover_is_caught_up_when_the_cover_goes() -> None:
     meter, total = LightMeter(*SIZE), np.zeros(3)
     for k in range(90):
         image = covered(desk(), 0.6) if 20 <= k < 60 else desk()
-        total += meter.push(seen(image, gains if k >= 40 else np.ones(3), k), k * FRAME_NS).log_gains
+        total += measured(meter, seen(image, gains if k >= 40 else np.ones(3), k), k * FRAME_NS)
     np.testing.assert_allclose(total, np.log(gains), atol=0.1)
 
 
@@ -97,7 +123,7 @@ def test_what_is_put_down_becomes_what_stands_still() -> None:
     cv2.rectangle(moved, (0, 0), (150, 239), (40, 60, 120), -1)  # a board over 47 % of the desk
     meter = LightMeter(*SIZE)
     meter.push(seen(desk(), np.ones(3), 0), 0)
-    agreeing = [meter.push(seen(moved, np.ones(3), k), k * 10 * FRAME_NS).agreeing for k in range(1, 300)]
+    agreeing = [forced(meter, seen(moved, np.ones(3), k), k * 10 * FRAME_NS).agreeing for k in range(1, 300)]
     assert agreeing[0] < 0.6
     assert agreeing[-1] > 0.95
 
@@ -106,6 +132,6 @@ def test_what_is_put_down_becomes_what_stands_still() -> None:
 def test_a_black_or_white_picture_tells_nothing(level: int) -> None:
     meter = LightMeter(*SIZE)
     meter.push(seen(desk(), np.ones(3), 0), 0)
-    change = meter.push(np.full((240, 320, 3), level, np.uint8), FRAME_NS)
+    change = forced(meter, np.full((240, 320, 3), level, np.uint8), FRAME_NS)
     assert (change.sure, change.agreeing) == (False, 0.0)
     np.testing.assert_array_equal(change.log_gains, STILL)
