@@ -29,6 +29,7 @@ Stage = Callable[[str], AbstractContextManager[None]]
 _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the others, within this
 # Where one camera sees all there is, its depth is held: perspective alone lets it drift.
 _HELD_DEPTH_M = 0.004
+_NAME = 64  # characters of a name in `Health`
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +139,8 @@ class MarkerPipeline:
         )
         self._count("rival", chosen.taken)
         self._count("unclear", chosen.dropped)
-        area = np.where(chosen.taken | chosen.dropped, np.nan, instant.area)  # that of the first place
+        # The area is that of the first place.
+        area = np.where(chosen.uv[..., 0] == instant.uv[..., 0], instant.area, np.nan)
         return replace(instant, uv=chosen.uv, sigma_px=chosen.sigma_px, area=area, rival_uv=None)
 
     def _apart(self, uv: Float, placed: Placed) -> Bool:
@@ -149,7 +151,7 @@ class MarkerPipeline:
     def _count(self, event: str, markers: Bool) -> None:
         """Count an event of each of the markers (M,) by name."""
         for m in np.flatnonzero(markers):
-            self.counts[f"{event}.{self.markers[m]}"] += 1
+            self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 
     def _locate(self, instant: Instant, hand: HandSolution | None) -> tuple[Float, Float, Bool]:
         """Cap centroids (M, 3) [m] and covariances (M, 3, 3) at the instant, given the hand known so far.

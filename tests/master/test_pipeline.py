@@ -129,6 +129,17 @@ def test_a_thing_that_one_slave_takes_for_a_marker_is_told_by_the_other_camera(
     assert sure.counts["apart.index"] >= 18
 
 
+def test_a_law_of_disparity_tells_a_thing_by_the_difference_of_rows() -> None:
+    run = synthetic_run(30, depth_model="power_law", power_law=PowerLawCalibration(k_m=37.5, z=-1.0))
+    pipeline = build_pipeline(run.setup, StageTimes())
+    poses = solve_all(pipeline, mistaken(run, OUT_OF_REACH, ("right",), doubt=True))
+    assert all(marker_mm(p)[1] < 5.0 for p in poses[3:])
+    sure = build_pipeline(run.setup, StageTimes())
+    lost = solve_all(sure, mistaken(run, np.array([-0.03, 0.08, 0.5]), ("right",), doubt=False))
+    assert all(np.isnan(p.markers_raw_m[1]).all() for p in lost[22:])
+    assert sure.counts["apart.index"] >= 8
+
+
 def test_a_thing_that_both_slaves_take_for_a_marker_is_told_by_where_the_hand_is(
     exact_run: SyntheticRun,
 ) -> None:
