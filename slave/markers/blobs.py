@@ -1,34 +1,40 @@
 """Find the connected blobs of every colour in the scanned frame: the candidates among which the markers are.
 
+The scan looks at every fourth pixel of every fourth row, which any round marker from 6 px on cannot slip through;
+smaller ones and slivers do now and then, so a colour that no point of the grid shows is sought on further grids.
+
 Labels are made per colour, never on the union of all colours: the hue runs through other markers' ranges on the
-rim between paint and skin, and such a fringe would split the blob. Only the box around a colour's own pixels is
-labelled, so the cost follows the number of coloured pixels, not of markers.
+rim between paint and skin, and such a fringe would split the blob. Points of a colour that fill their box are one
+blob without further looking; only scattered ones are labelled, in the box around them, so the cost follows the
+number of coloured points, not of markers.
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from slave.markers.classify import Codes
 
-SCALE = 2  # the scan looks at every second pixel of every second row
+SCALE = 4  # distance of the grid's lines [px]
 MAX_CANDIDATES = 6  # of one colour, the largest ones
+FULL = 0.6  # share of its box that one compact blob fills at least: an upright ellipse fills 0.79, two discs less
 FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest piece's size
 FRAGMENT_LEAST = 8.0  # px^2
 
 
-@dataclass(frozen=True, slots=True)
-class Blob:
+class Blob(NamedTuple):
     """One connected blob of one colour, in pixels of the full image.
 
     Attributes:
-        u, v: Centroid of the scanned pixels [px].
-        area: Area [px^2], from the count of scanned pixels.
-        left, top, right, bottom: Box [px], right and bottom exclusive.
+        u, v: Centroid of the scanned points [px].
+        area: Area [px^2], from the count of scanned points.
+        left, top, right, bottom: Box [px] outside which no point of the grid has its colour, as wide as the grid
+            leaves open; right and bottom exclusive.
     """
 
     u: float
@@ -40,36 +46,66 @@ class Blob:
     bottom: int
 
 
-def find_blobs(codes: Codes, bits: Sequence[int]) -> list[list[Blob]]:
+def find_blobs(
+    codes: Codes, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
+) -> list[list[Blob]]:
     """Blobs of each colour, largest first, at most `MAX_CANDIDATES` of a colour.
 
     Args:
-        codes: (H, W) codes of the scan, contiguous (`ColourTable.half_codes`).
+        codes: (H, W) codes of the scan, contiguous (`ColourTable.scan`).
         bits: Bit mask of each marker.
+        step, dx, dy: The grid of the scan.
 
     Returns:
         One list per marker, empty where its colour is not in the image.
     """
-    width = codes.shape[1]
+    found: list[list[Blob]] = [[] for _ in bits]
+    mine = np.array(bits, codes.dtype)
     flat = codes.reshape(-1)
-    index = _nonzero(flat)
+    index = _nonzero(flat, int(np.bitwise_or.reduce(mine)))
     if index.size == 0:
-        return [[] for _ in bits]
-    values = flat[index]
-    rows = index // width
-    columns = index - rows * width
-    found: list[list[Blob]] = []
-    for bit in bits:
-        mine = (values & bit) != 0
-        x, y = columns[mine], rows[mine]
-        if x.size == 0:
-            found.append([])
-            continue
-        left, right = int(x.min()), int(x.max()) + 1
-        top, bottom = int(y[0]), int(y[-1]) + 1  # the index runs row by row
-        mask = np.zeros((bottom - top, right - left), np.uint8)
-        mask[y - top, x - left] = 1
-        found.append(_label(mask, left, top))
+        return found
+    marker, place = ((flat[index] & mine[:, None]) != 0).nonzero()
+    y, x = np.divmod(index[place], codes.shape[1])
+    number = np.bincount(marker, minlength=len(bits))
+    present = number.nonzero()[0]
+    number = number[present]
+    ends = number.cumsum()
+    starts = ends - number
+    boxes = np.stack(
+        [
+            present,
+            starts,
+            number,
+            np.minimum.reduceat(x, starts),
+            np.maximum.reduceat(x, starts) + 1,
+            y[starts],  # the index runs row by row
+            y[ends - 1] + 1,
+            np.add.reduceat(x, starts),
+            np.add.reduceat(y, starts),
+        ]
+    ).T.tolist()
+    for m, start, count, left, right, top, bottom, sum_x, sum_y in boxes:
+        width, height = right - left, bottom - top
+        if count >= FULL * width * height:
+            stats = [(left, top, width, height, count, sum_x / count, sum_y / count)]
+        else:
+            mask = np.zeros((height, width), np.uint8)
+            mask[y[start : start + count] - top, x[start : start + count] - left] = 1
+            stats = _label(mask, left, top)
+        slack = step
+        found[m] = [
+            Blob(
+                dx + step * u,
+                dy + step * v,
+                float(step * step * area),
+                dx + step * x0 - slack,
+                dy + step * y0 - slack,
+                dx + step * (x0 + w - 1) + slack + 1,
+                dy + step * (y0 + h - 1) + slack + 1,
+            )
+            for x0, y0, w, h, area, u, v in stats
+        ]
     return found
 
 
@@ -82,7 +118,7 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float) -> Blob:
         extent: Largest width or height of the whole marker [px], as far as known, else inf.
     """
     left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
-    reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
+    reach = FRAGMENT_GAP * math.sqrt(blob.area)
     for piece in options:
         if (
             piece is blob
@@ -94,28 +130,28 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float) -> Blob:
         box = min(left, piece.left), min(top, piece.top), max(right, piece.right), max(bottom, piece.bottom)
         if gap <= reach and max(box[2] - box[0], box[3] - box[1]) <= extent:
             left, top, right, bottom = box
-    return replace(blob, left=left, top=top, right=right, bottom=bottom)
+    return blob._replace(left=left, top=top, right=right, bottom=bottom)
 
 
-def _nonzero(flat: Codes) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Indices of the set codes; whole 8-byte words are tested first, since nearly all are empty."""
+def _nonzero(flat: Codes, wanted: int) -> npt.NDArray[np.int64]:
+    """Indices of the codes with a wanted bit; 8-byte words are tested first, since nearly all have none."""
     per_word = 8 // flat.itemsize
     whole = flat.size - flat.size % per_word
-    words = np.flatnonzero(flat[:whole].view(np.uint64))
+    pattern = np.full(per_word, wanted, flat.dtype)
+    words = np.flatnonzero(flat[:whole].view(np.uint64) & pattern.view(np.uint64)[0])
     index = (words[:, None] * per_word + np.arange(per_word)).reshape(-1)
     if whole < flat.size:
         index = np.concatenate([index, np.arange(whole, flat.size)])
-    return index[flat[index] != 0]
+    return index[(flat[index] & pattern[0]) != 0]
 
 
-def _label(mask: np.ndarray[tuple[int, int], np.dtype[np.uint8]], left: int, top: int) -> list[Blob]:
+def _label(
+    mask: npt.NDArray[np.uint8], left: int, top: int
+) -> list[tuple[int, int, int, int, int, float, float]]:
+    """Connected parts of a mask, largest first: left, top, width, height, points, mean x, mean y on the grid."""
     count, _, stats, centres = cv2.connectedComponentsWithStats(mask, connectivity=8, ltype=cv2.CV_16U)
-    areas = stats[1:, cv2.CC_STAT_AREA]
-    order = (-areas).argsort(kind="stable")[:MAX_CANDIDATES] if count > 2 else range(count - 1)
-    blobs: list[Blob] = []
-    for i in order:
-        x, y, w, h, area = (int(value) for value in stats[i + 1])
-        u, v = SCALE * (left + float(centres[i + 1, 0])), SCALE * (top + float(centres[i + 1, 1]))
-        box = (SCALE * (left + x), SCALE * (top + y), SCALE * (left + x + w), SCALE * (top + y + h))
-        blobs.append(Blob(u, v, float(SCALE * SCALE * area), *box))
-    return blobs
+    rows = [
+        (left + x, top + y, w, h, area, left + u, top + v)
+        for (x, y, w, h, area), (u, v) in zip(stats[1:].tolist(), centres[1:].tolist(), strict=True)
+    ]
+    return sorted(rows, key=lambda row: -row[4])[:MAX_CANDIDATES] if count > 2 else rows

@@ -21,10 +21,14 @@ from common.errors import CalibrationError
 
 Codes: TypeAlias = npt.NDArray[np.unsignedinteger]
 HUES = 180
+COARSE = 0xF8F8F8
+# Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red, orange
+# and yellow markers, which is why those are not used).
+SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 
 
 class ColourTable:
-    """Which markers a colour may belong to: bit m of an entry belongs to marker m.
+    """Which markers a colour may belong to: bit m of an entry belongs to marker m, the bit after the last to skin.
 
     Holds the table (2^24 entries of 1, 2, 4 or 8 bytes) and the work buffers of the scan.
     """
@@ -33,15 +37,17 @@ class ColourTable:
         """Build the table, about 0.3 s for six markers.
 
         Args:
-            ranges: HSV range of each marker, in marker order, at most 64.
+            ranges: HSV range of each marker, in marker order, at most 63.
 
         Raises:
-            ValueError: No range, or more than 64.
+            ValueError: No range, or more than 63.
         """
-        if not 1 <= len(ranges) <= 64:
-            raise ValueError(f"{len(ranges)} colour ranges, from 1 to 64 are possible")
+        if not 1 <= len(ranges) <= 63:
+            raise ValueError(f"{len(ranges)} colour ranges, from 1 to 63 are possible")
         self.count = len(ranges)
-        self._table = _build(ranges)
+        self.bits = tuple(1 << m for m in range(self.count))
+        self.skin = 1 << self.count
+        self._table = _build([*ranges, SKIN])
         self._index = np.empty((0, 0), np.int64)
         self._codes: Codes = np.empty((0, 0), self._table.dtype)
 
@@ -63,11 +69,6 @@ class ColourTable:
         other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), made.dtype)
         return other
 
-    @property
-    def bits(self) -> tuple[int, ...]:
-        """Bit mask of each marker in a code."""
-        return tuple(1 << m for m in range(self.count))
-
     def codes(self, image: Image) -> Codes:
         """Class codes of every pixel of a window.
 
@@ -77,30 +78,45 @@ class ColourTable:
         Returns:
             (H, W) codes; bit m is set where the pixel is in the range of marker m.
         """
-        packed = cv2.cvtColor(image, cv2.COLOR_BGR2BGRA).view(np.uint32)[..., 0]
+        return self.packed_codes(cv2.cvtColor(image, cv2.COLOR_BGR2BGRA).view(np.uint32)[..., 0])
+
+    def packed_codes(self, packed: npt.NDArray[np.uint32]) -> Codes:
+        """Class codes of pixels packed into words: blue, green, red from the lowest byte on; the highest is ignored."""
         return self._table.take(packed & 0xFFFFFF)
 
-    def half_codes(self, image: Image) -> Codes:
-        """Class codes of every second pixel of every second row: the scan of a whole frame.
+    def scan(self, image: Image, step: int, dx: int = 0, dy: int = 0) -> Codes:
+        """Class codes on a grid: every `step`-th pixel of every `step`-th row.
 
         Decimated, not averaged: an averaged pixel on the rim of a marker has a hue that no paint has.
 
         Args:
             image: (H, W, 3) BGR, C-contiguous.
+            step: Distance of the grid's lines [px], at least 2.
+            dx, dy: Where the grid begins [px], less than `step`.
 
         Returns:
-            (H // 2, W // 2) codes of the pixels (2 v, 2 u). The array is reused by the next call.
+            (H // step, W // step) codes of the pixels (dy + step v, dx + step u). Reused by the next call.
         """
-        height, width = image.shape[0] // 2, image.shape[1] // 2
+        height, width = image.shape[0] // step, image.shape[1] // step
         row = image.shape[1] * 3
-        # A pixel is read as four bytes, of which the last belongs to its neighbour; since the neighbour of a
-        # pixel with an even column exists, the read never leaves the image.
-        words = np.ndarray((height, width), "<u4", buffer=image, strides=(2 * row, 6))
+        # A pixel is read as four bytes, of which the last belongs to its neighbour. Read from one byte before it
+        # instead, the first belongs to its other neighbour; so one of the two never leaves the image.
+        late = dx == step - 1
+        words = np.ndarray(
+            (height, width),
+            "<u4",
+            buffer=image,
+            offset=dy * row + 3 * dx - late,
+            strides=(step * row, 3 * step),
+        )
         if self._index.shape != words.shape:
             self._index = np.empty(words.shape, np.int64)
             self._codes = np.empty(words.shape, self._table.dtype)
-        np.bitwise_and(words, 0xFFFFFF, out=self._index, casting="unsafe")
-        return self._table.take(self._index, out=self._codes, mode="wrap")
+        if late:
+            np.bitwise_and(words >> 8, COARSE, out=self._index, casting="unsafe")
+        else:
+            np.bitwise_and(words, COARSE, out=self._index, casting="unsafe")
+        return self._table.take(self._index, out=self._codes, mode="clip")
 
 
 def table_of(markers: Sequence[str], ranges: Mapping[str, HsvRange] | None, where: str) -> ColourTable:

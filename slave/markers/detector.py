@@ -16,18 +16,23 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from slave.markers.blobs import Blob, find_blobs, with_fragments
+from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
 from slave.markers.centroid import Measured, measure
 from slave.markers.classify import ColourTable, table_of
-from slave.markers.group import CLICKED, TRACKED, Candidate, choose, linked, on_fringe, skin_share
+from slave.markers.edge import Ellipse, centre_of
+from slave.markers.group import CLICKED, TRACKED, Candidate, choose, connected, on_fringe, skin_share
 from slave.markers.roi import Track, advance
+from slave.markers.sigma import COVERED_PX, sigma_of
 
+FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
+OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
 SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
 CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that deserve full quality
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
-CLEAR_SIGMA_PX, DOUBT_SIGMA_PX = 0.1, 0.6  # of a centroid of full quality; added where there is none
+SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
+RIVAL = 0.3  # of the marker's area: a smaller blob is no rival
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,12 +40,14 @@ class Detections:
     """Markers of one frame, in marker order; a row that is NaN in all was not seen.
 
     Attributes:
-        uv: (M, 2) centroids of the visible paint [px], distorted image.
-        area: (M,) visible area [px^2].
+        uv: (M, 2) centroids of the visible paint [px], distorted image; of the whole cap where something covers a
+            part of it and the edge that is left tells.
+        area: (M,) area [px^2] of what `uv` is the centroid of.
         quality: (M,) 0..1; 1 is a whole, unambiguous, clear marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
-            would see of the whole cap: noise, doubt of occlusion, size.
+            would see of the whole cap: noise, doubt of occlusion, size, motion.
         rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; NaN: none.
+        colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
 
     uv: Float
@@ -48,6 +55,11 @@ class Detections:
     quality: Float
     sigma_px: Float
     rival_uv: Float
+    colour: Float
+
+    def nothing(self) -> "Detections":
+        """The same markers, none of them seen."""
+        return Detections(*(np.full_like(getattr(self, name), np.nan) for name in self.__slots__))
 
 
 class MarkerDetector:
@@ -72,10 +84,12 @@ class MarkerDetector:
             CalibrationError: The camera has no colour range for a marker.
         """
         self._camera = camera
+        self._exposure_s = camera.exposure_us * 1e-6
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
         self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
         self._tracks: list[Track | None] = [None] * len(markers)
+        self._turn = -1  # which further grid is next; negative before the first frame
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
@@ -95,34 +109,88 @@ class MarkerDetector:
         if image.shape != size or image.dtype != np.uint8:
             raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {size} uint8")
         image = np.ascontiguousarray(image)
-        blobs = find_blobs(self._table.half_codes(image), self._table.bits)
+        blobs = self._scan(image)
         chosen = self._decide(image, blobs, t_ns)
         self._seeds = {}
-        count = len(self._names)
-        uv, area, quality = np.full((count, 2), np.nan), np.full(count, np.nan), np.full(count, np.nan)
-        rival_uv = np.full((count, 2), np.nan)
         rows = list(chosen)
-        extents = [self._extent(m, t_ns) for m in rows]
-        for m, extent in zip(rows, extents, strict=True):
-            if len(blobs[m]) > 1:
-                chosen[m] = with_fragments(chosen[m], blobs[m], extent)
-        measured = measure(
-            image, self._table, [self._table.bits[m] for m in rows], [chosen[m] for m in rows], extents
-        )
-        for m, seen in zip(rows, measured, strict=True):
-            blob, track = chosen[m], self._tracks[m]
-            if seen is None or (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                continue
-            self._tracks[m] = track = advance(track, seen, blob, t_ns)
-            uv[m] = seen.u, seen.v
-            area[m] = seen.area
-            rivals = _rivals(blob, blobs[m])
-            quality[m] = _quality(seen, track, near_rival=bool(rivals))
-            if rivals:
-                largest = max(rivals, key=lambda b: b.area)
-                rival_uv[m] = largest.u, largest.v
-        sigma_px = CLEAR_SIGMA_PX + DOUBT_SIGMA_PX * (1.0 - quality)
-        return Detections(uv, area, quality, sigma_px, rival_uv)
+        alone = [len(blobs[m]) == 1 for m in rows]
+        rivals: dict[int, Blob] = {}
+        for m, lonely in zip(rows, alone, strict=True):
+            if not lonely:
+                rival = self._rival(m, chosen[m], blobs[m], t_ns)
+                chosen[m] = with_fragments(chosen[m], blobs[m], self._extent(m, t_ns))
+                if rival is not None:
+                    rivals[m] = rival
+        bits = [self._table.bits[m] for m in (*rows, *rivals)]
+        where = [*chosen.values(), *rivals.values()]
+        measured = measure(image, self._table, bits, where, alone + [False] * len(rivals))
+        second = dict(zip(rivals, measured[len(rows) :], strict=True))
+        result = np.full((10, len(self._names)), np.nan)
+        for m, seen in zip(rows, measured, strict=False):
+            if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
+                rival = second.get(m)
+                result[:, m] = self._report(m, seen, chosen[m], rival, t_ns)
+        return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
+
+    def recolour(self, table: ColourTable) -> None:
+        """Go on with another colour table of the same markers; what is tracked stays tracked."""
+        self._table = table
+
+    def _report(
+        self, m: int, seen: Measured, blob: Blob, rival: Measured | None, t_ns: int
+    ) -> tuple[float, ...]:
+        """One marker's column of the result; its track goes on."""
+        before = self._tracks[m]
+        if before is not None and not before.alive(t_ns):
+            before = None
+        self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
+        quality = _quality(seen, track)
+        sigma = sigma_of(seen, before, track, self._exposure_s)
+        u, v, area = seen.u, seen.v, seen.area
+        smear = math.hypot(track.du, track.dv) * self._exposure_s
+        if before is not None and track.covered and smear < SMEARED and not (seen.cut or seen.thin):
+            whole = centre_of(
+                seen.window, Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
+            )
+            if whole is not None:
+                u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
+                sigma = math.hypot(COVERED_PX, whole.rms)
+        other = (math.nan, math.nan)
+        if rival is not None and not rival.thin:
+            other = rival.u, rival.v
+            if math.hypot(other[0] - u, other[1] - v) < 3.0 * math.sqrt(blob.area):
+                quality *= 0.5
+        blue, green, red = seen.colour
+        return u, v, area, max(0.01, quality), sigma, *other, blue, green, red
+
+    def _rival(self, m: int, blob: Blob, options: list[Blob], t_ns: int) -> Blob | None:
+        """The largest other blob of the colour that may be the marker as far as size and motion tell."""
+        track = self._tracks[m]
+        others = [b for b in options if b is not blob and b.area > RIVAL * blob.area and not _within(b, blob)]
+        if track is not None and track.alive(t_ns):
+            width = self._camera.width_px
+            others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]
+        return max(others, key=lambda b: b.area) if others else None
+
+    def _scan(self, image: Image) -> list[list[Blob]]:
+        """Blobs of every colour; a colour that the grid shows nowhere is sought on further grids.
+
+        In the first frame on all of them, later on one more each time, in turn.
+        """
+        table = self._table
+        blobs = find_blobs(table.scan(image, SCALE), table.bits)
+        missing = [m for m, options in enumerate(blobs) if not options]
+        if missing:
+            step, dx, dy = FINER if self._turn < 0 else OTHERS[self._turn]
+            self._turn = (self._turn + 1) % len(OTHERS)
+            finer = find_blobs(
+                table.scan(image, step, dx, dy), [table.bits[m] for m in missing], step, dx, dy
+            )
+            for m, options in zip(missing, finer, strict=True):
+                blobs[m] = options
+        elif self._turn < 0:
+            self._turn = 0
+        return blobs
 
     def _extent(self, m: int, t_ns: int) -> float:
         """Largest side of the whole marker [px] as far as its track knows, else inf."""
@@ -150,14 +218,16 @@ class MarkerDetector:
                 certain &= not track.sudden(tracked[m])
             else:
                 certain = False
-        if certain and _connected(tracked):
+        if certain and connected(list(tracked.values())):
             return tracked
         candidates: list[Candidate] = []
         for m, options in enumerate(blobs):
             others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
             for blob in options:
                 bonus = self._bonus(m, blob, tracked.get(m))
-                candidates.append(Candidate(m, blob, skin_share(image, blob), on_fringe(blob, others), bonus))
+                candidates.append(
+                    Candidate(m, blob, skin_share(image, self._table, blob), on_fringe(blob, others), bonus)
+                )
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
         return {m: c.blob for m, c in choose(candidates).items()}
@@ -173,13 +243,7 @@ class MarkerDetector:
         return TRACKED if blob is tracked and track is not None and not track.sudden(blob) else 0.0
 
 
-def _connected(chosen: Mapping[int, Blob]) -> bool:
-    """Whether every chosen blob is linked to another one; skin is taken as given, since the past vouches."""
-    nodes = [Candidate(m, blob, 1.0, False, 0.0) for m, blob in chosen.items()]
-    return len(nodes) < 2 or all(any(linked(a, b) for b in nodes if b is not a) for a in nodes)
-
-
-def _quality(seen: Measured, track: Track, *, near_rival: bool) -> float:
+def _quality(seen: Measured, track: Track) -> float:
     """0..1: how far the centroid can be trusted to be the centroid of the whole cap's visible side."""
     quality = math.sqrt(min(1.0, seen.area / track.whole)) * min(1.0, seen.contrast / CLEAR_CONTRAST)
     quality *= math.sqrt(min(1.0, seen.area / SMALL))
@@ -187,15 +251,7 @@ def _quality(seen: Measured, track: Track, *, near_rival: bool) -> float:
         quality *= 0.5
     if seen.thin:
         quality *= 0.4
-    if near_rival:
-        quality *= 0.5
-    return max(0.01, min(1.0, quality))
-
-
-def _rivals(blob: Blob, options: list[Blob]) -> list[Blob]:
-    """The other blobs of its colour, near it and not much smaller, that may be the marker instead."""
-    others = [b for b in options if b.area > 0.3 * blob.area and not _within(b, blob)]
-    return [b for b in others if math.hypot(b.u - blob.u, b.v - blob.v) < 3.0 * math.sqrt(blob.area)]
+    return min(1.0, quality)
 
 
 def _within(piece: Blob, blob: Blob) -> bool:

@@ -13,14 +13,15 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import cv2
+import numpy as np
 
 from common.arrays import Image
 from slave.markers.blobs import SCALE, Blob
+from slave.markers.classify import ColourTable
 
 REACH = 8.5  # marker sizes between neighbours of one hand
 SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
-RING = 4  # px around the box in which skin is sought
+RING = 2  # px around the box in which skin is sought
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
 FRINGE = 0.3  # what a fringe counts
 FRINGE_RATIO = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
@@ -63,28 +64,30 @@ class Candidate:
         return there * (1.0 + min(1.0, 3.0 * self.skin)) + self.bonus
 
 
-def skin_share(image: Image, blob: Blob) -> float:
+def skin_share(image: Image, table: ColourTable, blob: Blob) -> float:
     """Share of the pixels around the blob's box that have the hue and saturation of skin, 0..1."""
     top, left = max(blob.top - RING, 0), max(blob.left - RING, 0)
     window = image[top : blob.bottom + RING, left : blob.right + RING]
-    hsv = cv2.cvtColor(window, cv2.COLOR_BGR2HSV)
-    # Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red,
-    # orange and yellow markers, which is why those are not used).
-    skin = cv2.countNonZero(cv2.inRange(hsv, (0, 60, 70), (22, 190, 255)))
-    skin += cv2.countNonZero(cv2.inRange(hsv, (174, 60, 70), (179, 190, 255)))
+    skin = np.count_nonzero(table.codes(window) & table.skin)
     around = window.shape[0] * window.shape[1] - blob.area
     return min(1.0, skin / max(around, 1.0))
 
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
-    """Whether `blob` touches one of the blobs of other colours that is much larger than itself."""
+    """Whether `blob` may be the rim of a blob of another colour, where the hue runs through its own: it touches one
+    that is much larger, or lies in the box of one that is larger at all (motion blur makes rims wide)."""
     return any(
-        other.area > FRINGE_RATIO * blob.area
-        and blob.left <= other.right + SCALE
-        and other.left <= blob.right + SCALE
-        and blob.top <= other.bottom + SCALE
-        and other.top <= blob.bottom + SCALE
+        blob.left <= other.right - SCALE
+        and other.left <= blob.right - SCALE
+        and blob.top <= other.bottom - SCALE
+        and other.top <= blob.bottom - SCALE
         for other in others
+        if other.area > FRINGE_RATIO * blob.area
+        or (
+            other.area > blob.area
+            and other.left <= blob.u <= other.right
+            and other.top <= blob.v <= other.bottom
+        )
     )
 
 
@@ -92,6 +95,21 @@ def linked(a: Candidate, b: Candidate) -> bool:
     """Whether two blobs are near enough to sit on one hand."""
     reach = REACH * (1.0 + SKIN_REACH * min(1.0, 4.0 * min(a.skin, b.skin)))
     return math.hypot(a.blob.u - b.blob.u, a.blob.v - b.blob.v) <= reach * math.sqrt(a.size * b.size)
+
+
+def connected(blobs: Sequence[Blob]) -> bool:
+    """Whether every blob is linked to another one; skin around both is taken as given, since the past vouches."""
+    reach = (REACH * (1.0 + SKIN_REACH)) ** 2
+    rest = list(blobs)
+    if len(rest) < 2:
+        return True
+    for a in rest:
+        limit = reach * math.sqrt(a.area)
+        if not any(
+            (a.u - b.u) ** 2 + (a.v - b.v) ** 2 <= limit * math.sqrt(b.area) for b in rest if b is not a
+        ):
+            return False
+    return True
 
 
 def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
@@ -107,9 +125,14 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
         if not strange:
             break
         rest = [c for c in rest if c not in strange]  # what it kept out may be the marker
-    second = _best_group([c for c in rest if c.marker not in best])
-    solid = [c for c in second.values() if c.blob.area >= SPECK and c.skin >= 2.0 * SKINLESS]
-    return best | {c.marker: c for c in solid} if len(solid) >= SECOND_HAND else best
+    # A fringe on the first hand must not keep a marker from the second.
+    free = [c for c in rest if c.marker not in best or (best[c.marker].fringe and not c.fringe)]
+    second = _best_group(free)
+    members = [c for c in second.values() if c.blob.area >= SPECK or c.bonus >= TRACKED]
+    solid = [c for c in members if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
+    if len(solid) < SECOND_HAND:
+        return best
+    return best | {c.marker: c for c in members if c in solid or not _strange(c, solid)}
 
 
 def _best_group(candidates: Sequence[Candidate]) -> dict[int, Candidate]:

@@ -6,7 +6,7 @@ marker; the scan has looked at the whole frame anyway, so a marker outside its w
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from slave.markers.blobs import Blob
 from slave.markers.centroid import Measured
@@ -16,19 +16,26 @@ HOLD_NS = 500_000_000  # a marker not seen for longer is sought like a new one
 VELOCITY_NS = 100_000_000  # a velocity is trusted no longer than this
 GROWTH_PER_S = 1.0  # of the image width: about 1 m/s at 0.6 m
 WHOLE_LIFE_S = 2.0  # the memory of the marker's whole area
+USUAL_LIFE_S = 0.25  # of its usual one: a finger turns in this time, something passes in front of it faster
 LARGEST = 4.0  # times the whole area
 SUDDEN = 2.5  # an area that changes by more between two frames is looked at closely
+COVERED = 0.06  # share of the usual area that is missing while something is in front
+COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
+TURNING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
 
 
-@dataclass(frozen=True, slots=True)
-class Track:
+class Track(NamedTuple):
     """What is known of one marker from its past.
 
     Attributes:
         u, v: Last centroid [px].
         du, dv: Velocity [px/s].
-        area: Last area [px^2].
+        area: Last area of the scan's blob [px^2].
+        seen: Last measured area [px^2].
         whole: Area of the whole marker [px^2]: the largest seen, slowly forgotten.
+        usual: Its area of late [px^2].
+        covered: Something came in front of it, and has not gone.
+        xx, xy, yy: Second central moments of its shape [px^2] of late, when it was not covered.
         width, height: Last box [px].
         t_ns: When it was last seen.
     """
@@ -38,7 +45,13 @@ class Track:
     du: float
     dv: float
     area: float
+    seen: float
     whole: float
+    usual: float
+    covered: bool
+    xx: float
+    xy: float
+    yy: float
     width: float
     height: float
     t_ns: int
@@ -63,21 +76,44 @@ class Track:
         return math.hypot(x, y) / margin + 0.5 * abs(math.log(blob.area / self.area))
 
     def sudden(self, blob: Blob) -> bool:
-        """Whether the area of `blob` jumped against the last frame."""
+        """Whether the area of `blob` jumped against the last frame, by more than the grid of the scan explains."""
         ratio = blob.area / self.area
-        return not 1.0 / SUDDEN <= ratio <= SUDDEN
+        return not 1.0 / SUDDEN <= ratio <= SUDDEN and abs(blob.area - self.area) > 80.0
+
+    def covers(self, area: float, t_ns: int) -> bool:
+        """Whether something has come in front of the marker, or still is."""
+        if self.hidden(area) <= COVERED:
+            return False
+        lost = 1.0 - area / self.seen
+        return self.covered or lost > max(COVERING, TURNING_PER_S * (t_ns - self.t_ns) * 1e-9)
+
+    def hidden(self, area: float) -> float:
+        """Share of the usual area that is missing, 0..1."""
+        return max(0.0, 1.0 - area / self.usual)
 
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
     """The track after one more sighting; a track that was lost starts anew, without velocity."""
+    u, v, area = seen.u, seen.v, max(seen.area, 1.0)
     width, height = float(blob.right - blob.left), float(blob.bottom - blob.top)
-    area = max(seen.area, 1.0)
     if track is None or not 0 < t_ns - track.t_ns <= HOLD_NS:
         whole = area if track is None else max(area, 0.5 * track.whole)
-        return Track(seen.u, seen.v, 0.0, 0.0, area, whole, width, height, t_ns)
+        shape = seen.xx, seen.xy, seen.yy
+        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, *shape, width, height, t_ns)
     dt_s = (t_ns - track.t_ns) * 1e-9
     whole = max(area, area + (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S))
-    du, dv = (seen.u - track.u) / dt_s, (seen.v - track.v) / dt_s
+    du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
     if dt_s > VELOCITY_NS * 1e-9:
         du = dv = 0.0
-    return Track(seen.u, seen.v, du, dv, area, whole, width, height, t_ns)
+    keep = math.exp(-dt_s / USUAL_LIFE_S)
+    usual = area + (track.usual - area) * keep
+    covered = track.covers(area, t_ns)
+    if covered:
+        shape = track.xx, track.xy, track.yy
+    else:
+        shape = (
+            seen.xx + (track.xx - seen.xx) * keep,
+            seen.xy + (track.xy - seen.xy) * keep,
+            seen.yy + (track.yy - seen.yy) * keep,
+        )
+    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, *shape, width, height, t_ns)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from common.calibration import HsvRange
 from common.errors import CalibrationError
-from slave.markers.classify import ColourTable, in_range, table_of
+from slave.markers.classify import SKIN, ColourTable, in_range, table_of
 from tests.slave.painted import NAMES, RANGES
 
 WRAPPED = HsvRange(hsv_low=(170, 60, 50), hsv_high=(8, 255, 255))
@@ -42,11 +42,21 @@ def test_every_one_of_the_65536_colours_of_a_plane_is_classified_as_in_range_doe
         np.testing.assert_array_equal((TABLE.codes(image) & bit) != 0, expected)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(2, 33), st.integers(2, 33))
-def test_the_scan_sees_every_second_pixel(seed: int, height: int, width: int) -> None:
+@given(st.integers(0, 2**32 - 1), st.integers(4, 33), st.integers(4, 33), st.sampled_from([2, 4]), st.data())
+def test_the_scan_sees_its_grid_in_colours_of_eight_levels(
+    seed: int, height: int, width: int, step: int, data: st.DataObject
+) -> None:
+    dx, dy = data.draw(st.integers(0, step - 1)), data.draw(st.integers(0, step - 1))
     image = np.random.default_rng(seed).integers(0, 256, (height, width, 3), np.uint8)
-    expected = TABLE.codes(np.ascontiguousarray(image[: height // 2 * 2 : 2, : width // 2 * 2 : 2]))
-    np.testing.assert_array_equal(TABLE.half_codes(image), expected)
+    rows, columns = dy + step * np.arange(height // step), dx + step * np.arange(width // step)
+    expected = TABLE.codes(np.ascontiguousarray(image[rows][:, columns] & np.uint8(0xF8)))
+    np.testing.assert_array_equal(TABLE.scan(image, step, dx, dy), expected)
+
+
+def test_the_bit_after_the_last_marker_is_skin() -> None:
+    image = np.random.default_rng(5).integers(0, 256, (200, 200, 3), np.uint8)
+    assert TABLE.skin == 4
+    np.testing.assert_array_equal((TABLE.codes(image) & TABLE.skin) != 0, by_opencv(image, SKIN))
 
 
 def test_own_range_test_equals_opencv_at_the_wrap() -> None:
@@ -79,5 +89,5 @@ def test_a_missing_range_names_the_marker_and_the_command_that_makes_it() -> Non
 def test_no_range_and_too_many_ranges_are_refused() -> None:
     with pytest.raises(ValueError, match="0 colour ranges"):
         ColourTable([])
-    with pytest.raises(ValueError, match="65 colour ranges"):
-        ColourTable([PLAIN] * 65)
+    with pytest.raises(ValueError, match="64 colour ranges"):
+        ColourTable([PLAIN] * 64)

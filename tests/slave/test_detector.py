@@ -95,14 +95,33 @@ def test_a_single_marker_without_a_hand_is_found_from_30_to_23000_px() -> None:
         assert np.isnan(found.uv[[0, 2, 3, 4, 5]]).all()
 
 
-def test_a_half_hidden_marker_is_reported_with_lower_quality() -> None:
+def test_what_passes_in_front_of_a_marker_moves_it_little_and_is_told() -> None:
     image = render(hand())
     whole = push_all([image, image])[1]
     hidden = image.copy()
+    hidden[:, :263] = render([])[:, :263]  # the edge of something, 2 px left of the index cap's centre
+    found = push_all([image, image, hidden])[2]
+    assert np.hypot(*(found.uv[1] - whole.uv[1])) < 0.5
+    assert found.sigma_px[1] > 1.3 * whole.sigma_px[1]
+    assert 0.0 < found.quality[1] < 0.9 * whole.quality[1]
+
+
+def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:
+    hidden = render(hand())
     hidden[:, :266] = render([])[:, :266]
-    half = push_all([image, hidden])[1]
-    assert 0.0 < half.quality[1] < 0.75 * whole.quality[1]
-    assert half.area[1] < 0.6 * whole.area[1]
+    (found,) = push_all([hidden])
+    assert found.uv[1, 0] > 267.0
+    assert found.area[1] < 0.6 * math.pi * 49.0
+
+
+def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
+    second = [Disc(paint(1), 300.0, 110.0, 7.0)]
+    frames = push_all([render(hand())] * 2 + [render(hand() + second)] * 2)
+    assert np.isnan(frames[1].rival_uv).all()
+    for found in frames[2:]:
+        assert (off(found, 300.0, 200.0)[[0, 1, 3, 4, 5]] < 0.3).all()
+        assert np.hypot(*(found.rival_uv[1] - (300.0, 110.0))) < 0.5
+        assert np.isnan(found.rival_uv[[0, 3, 4, 5]]).all()
 
 
 def test_an_empty_frame_finds_nothing_and_noise_is_nothing() -> None:

@@ -16,7 +16,7 @@ TRUTH = {
     "ring": (129.523, 33.863),
     "little": (155.400, 66.758),
 }
-LIMIT_PX = 0.45  # the thumb's cap ends in its own shadow; the other four stay below 0.2
+LIMIT_PX = 0.4  # the thumb's cap ends in its own shadow; the other four stay below 0.25
 
 
 def test_colours_and_centroids_of_a_rendered_hand(root: Path) -> None:
@@ -30,4 +30,4 @@ def test_colours_and_centroids_of_a_rendered_hand(root: Path) -> None:
     found = detector.push(image, 0)
     errors = {n: math.hypot(*(found.uv[i] - uv)) for i, (n, uv) in enumerate(TRUTH.items())}
     assert errors["thumb"] < LIMIT_PX
-    assert max(e for n, e in errors.items() if n != "thumb") < 0.2
+    assert max(e for n, e in errors.items() if n != "thumb") < 0.25

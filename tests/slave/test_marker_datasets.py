@@ -18,11 +18,11 @@ CLEAR_PX2 = 60.0  # a cap of this area is well visible
 
 # Recording -> RMS of the centroid error per axis [px] over well visible markers, measured plus a tenth.
 RMS_PX = {
-    "calib_colors": 0.15,
+    "calib_colors": 0.17,
     "lights_0_warm": 0.155,
-    "static": 0.12,
-    "translate_8ms": 0.19,
-    "flex90": 0.22,
+    "static": 0.14,
+    "translate_8ms": 0.21,
+    "flex90": 0.25,
     "poses_left": 0.2,
     "sweep_paper": 0.075,
     "sweep_rough": 0.055,
@@ -82,10 +82,10 @@ def test_found_never_wrong_and_precise(datasets: Path, colours: Path, name: str)
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) <= RMS_PX[name]
 
 
-def test_jitter_of_a_resting_hand_is_below_a_tenth_of_a_pixel(datasets: Path, colours: Path) -> None:
+def test_jitter_of_a_resting_hand_is_below_a_twentieth_of_a_pixel(datasets: Path, colours: Path) -> None:
     for camera in ("left", "right"):
         found = detect_recording(datasets / "stereo/static", camera, colours)
-        assert float(np.sqrt(found.uv.var(axis=0).mean())) <= 0.1  # px
+        assert float(np.sqrt(found.uv.var(axis=0).mean())) <= 0.05  # px
 
 
 def test_frames_of_unrelated_poses_do_not_know_of_each_other(datasets: Path, colours: Path) -> None:

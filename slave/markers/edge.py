@@ -1,0 +1,101 @@
+"""Find the centre of a cap that something in front of it covers in part, from the edge that is still its own.
+
+What is left of the cap has its centroid elsewhere: 15 % hidden moves it by an eighth of the radius. The shape that
+the cap had before is known (an ellipse with the second moments of its shares), so only its place is sought: rays
+from a point inside meet the visible edge at some distance, the ellipse at another; the difference of the two along
+all rays that see the cap's own edge gives the shift by least squares. Rays on which the cap ends too early see the
+edge of the thing in front; they are told by their residual and left out, one side only, until nothing changes.
+Where too little is left, or the rest does not fit the ellipse, there is no answer.
+"""
+
+import math
+from typing import NamedTuple, TypeAlias, cast
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Float
+
+Float32: TypeAlias = npt.NDArray[np.float32]
+
+RAYS = 48
+STEP_PX = 0.5
+ROUNDS = 10
+KEEP = (0.5, 0.55)  # share of the rays that the first rounds trust
+SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
+LEFT = 0.45  # share of the rays that must be left
+FIT_PX = 0.35  # RMS of their residuals
+_ANGLES = np.arange(RAYS, dtype=np.float64) * (2.0 * math.pi / RAYS)
+DIRECTIONS: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1).astype(np.float64)
+
+
+class Ellipse(NamedTuple):
+    """Second central moments [px^2] of a filled ellipse; its edge is at x' C^-1 x = 4."""
+
+    xx: float
+    xy: float
+    yy: float
+
+
+class Centre(NamedTuple):
+    """The centre of a cap (u, v) [px] in the frame of its window, and the RMS of the edge about it [px]."""
+
+    u: float
+    v: float
+    rms: float
+
+
+def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | None:
+    """Centre of a partly covered cap.
+
+    Args:
+        share: (H, W) share of paint of every pixel of a window, 0..1.
+        shape: The cap's shape when it was whole.
+        u, v: A point inside what is visible [px], in the window: its centroid.
+
+    Returns:
+        The centre, or None where the visible edge does not determine it.
+    """
+    determinant = shape.xx * shape.yy - shape.xy**2
+    if determinant <= 0.0:
+        return None
+    inverse: Float = np.array([[shape.yy, -shape.xy], [-shape.xy, shape.xx]]) / determinant
+    longest = 2.0 * math.sqrt(0.5 * (shape.xx + shape.yy) + math.hypot(0.5 * (shape.xx - shape.yy), shape.xy))
+    seen: Float = _edge(share, np.array([u, v]), 2.0 * longest + 2.0)
+    points: Float = np.array([u, v]) + seen[:, None] * DIRECTIONS
+    centre: Float = np.array([u, v])
+    own = np.ones(RAYS, np.bool_)
+    residual: Float = np.zeros(RAYS)
+    for turn in range(ROUNDS):
+        away = points - centre
+        bent = away @ inverse
+        level = np.sqrt(np.maximum((away * bent).sum(axis=1), 1e-9))  # 2 on the ellipse
+        slope: Float = bent / level[:, None]
+        length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
+        residual = (level - 2.0) / length  # distance from the ellipse, outwards positive
+        # At first the centre is off by a part of the radius, and the own edge is where the distances are largest.
+        kept = residual > (-SHORT_PX if turn >= 2 else float(np.quantile(residual, 1.0 - KEEP[turn])))
+        if kept.sum() < LEFT * RAYS:
+            return None
+        normal: Float = slope[kept] / length[kept, None]
+        shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
+        centre += shift
+        if turn >= 2 and bool((kept == own).all()) and float(np.abs(shift).max()) < 0.02:
+            break
+        own = kept
+    rms = float(np.sqrt(np.mean(np.square(residual[own]))))
+    if rms > FIT_PX or float(np.hypot(*(centre - (u, v)))) > longest:
+        return None
+    return Centre(float(centre[0]), float(centre[1]), rms)
+
+
+def _edge(share: Float32, start: Float, reach: float) -> Float:
+    """Distance (RAYS,) [px] from `start` to where the shares fall to a half: the paint on each ray, added up."""
+    steps = (np.arange(math.ceil(reach / STEP_PX)) + 0.5) * STEP_PX
+    x = (start[0] + DIRECTIONS[:, :1] * steps).astype(np.float32)
+    y = (start[1] + DIRECTIONS[:, 1:] * steps).astype(np.float32)
+    along = cast(Float32, cv2.remap(share, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT))
+    # Paint beyond a gap is not on this ray's stretch: only what comes before the first empty step counts.
+    gone = np.maximum.accumulate(along < 0.1, axis=1)
+    return np.where(gone, 0.0, along).sum(axis=1) * STEP_PX

@@ -1,0 +1,46 @@
+"""Say how far a measured centroid may be off, in pixels, from what was measured.
+
+Four independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
+
+    edge    the rim is known to a fraction of a pixel; a shift of one side moves the centroid the more the smaller
+            the marker, and the less clear its contrast
+    motion  the cap's shading does not smear like its outline
+    cover   something in front hides a share h: a straight edge moves the centroid of a disc by 0.9 h r
+            (segment of a circle, small h), one direction of two
+    cut     the border of the image does the same, unseen
+"""
+
+import math
+
+from slave.markers.centroid import Measured
+from slave.markers.roi import Track
+
+EDGE_PX2 = 0.5  # error times radius
+CLEAR = 15.0  # contrast below which the edge is less sure
+BLUR = 0.04  # px per px of way during the exposure
+COVER = 0.65
+LASTING = 0.3  # how much of a slow loss of area is cover, and not the finger turning away
+CUT = 0.3  # of the radius
+THIN = 2.0  # times, for a sliver
+COVERED_PX = 0.15  # a centre found from the edge that is left
+
+
+def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: float) -> float:
+    """Standard deviation per axis of the centroid [px].
+
+    Args:
+        seen: The measurement.
+        before: The track before it; None: the marker was not tracked.
+        track: The track after it.
+        exposure_s: Exposure time.
+    """
+    radius = math.sqrt(max(seen.area, 1.0) / math.pi)
+    edge = EDGE_PX2 / radius * max(1.0, CLEAR / max(seen.contrast, 1.0))
+    blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
+    hidden = LASTING * max(0.0, 1.0 - seen.area / track.whole)
+    if before is not None and track.covered:
+        hidden = max(hidden, before.hidden(seen.area))
+    cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8))
+    cut = CUT * radius if seen.cut else 0.0
+    sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut)
+    return THIN * sigma if seen.thin else sigma

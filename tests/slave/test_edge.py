@@ -1,0 +1,67 @@
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from slave.markers.edge import Ellipse, centre_of
+
+OVER = 8
+
+
+def covered_ellipse(
+    a: float, b: float, turn: float, u: float, v: float, share: float, side: float
+) -> tuple[np.ndarray, float, float]:
+    """Shares of an ellipse whose outermost `share` on the side `side` is covered, and the centroid of the rest."""
+    fine = (np.arange(48 * OVER) + 0.5) / OVER - 0.5
+    x, y = np.meshgrid(fine, fine)
+    c, s = math.cos(turn), math.sin(turn)
+    p, q = (c * (x - u) + s * (y - v)) / a, (c * (y - v) - s * (x - u)) / b
+    inside = p * p + q * q <= 1.0
+    along = p * math.cos(side) + q * math.sin(side)
+    inside &= along <= np.quantile(along[inside], 1.0 - share)
+    shares = inside.reshape(48, OVER, 48, OVER).mean(axis=(1, 3)).astype(np.float32)
+    return shares, float(x[inside].mean()), float(y[inside].mean())
+
+
+def moments(a: float, b: float, turn: float) -> Ellipse:
+    c, s = math.cos(turn), math.sin(turn)
+    xx, yy = a * a / 4.0, b * b / 4.0
+    return Ellipse(c * c * xx + s * s * yy, c * s * (xx - yy), s * s * xx + c * c * yy)
+
+
+@given(
+    st.floats(6.0, 12.0),
+    st.floats(0.75, 1.0),
+    st.floats(0.0, math.pi),
+    st.floats(0.08, 0.2),
+    st.floats(0.0, 2.0 * math.pi),
+)
+def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
+    a: float, aspect: float, turn: float, share: float, side: float
+) -> None:
+    u, v = 24.3, 23.6
+    shares, seen_u, seen_v = covered_ellipse(a, a * aspect, turn, u, v, share, side)
+    found = centre_of(shares, moments(a, a * aspect, turn), seen_u, seen_v)
+    assert found is not None
+    away = math.hypot(found.u - u, found.v - v)
+    assert away < 0.3
+    assert away < 0.6 * math.hypot(seen_u - u, seen_v - v)
+
+
+def test_a_part_that_is_too_small_for_the_shape_is_no_answer() -> None:
+    shares, u, v = covered_ellipse(3.0, 3.0, 0.0, 24.0, 24.0, 0.0, 0.0)
+    assert centre_of(shares, moments(9.0, 8.0, 0.3), u, v) is None
+
+
+def test_a_shape_that_is_no_ellipse_of_that_size_is_refused() -> None:
+    shares = np.zeros((48, 48), np.float32)
+    shares[20:24, 4:44] = 1.0
+    assert centre_of(shares, moments(9.0, 9.0, 0.0), 23.5, 21.5) is None
+
+
+@pytest.mark.parametrize("shape", [Ellipse(0.0, 0.0, 0.0), Ellipse(4.0, 5.0, 4.0)])
+def test_moments_of_nothing_are_refused(shape: Ellipse) -> None:
+    shares, u, v = covered_ellipse(8.0, 8.0, 0.0, 24.0, 24.0, 0.1, 0.0)
+    assert centre_of(shares, shape, u, v) is None
