@@ -72,19 +72,18 @@ def find_blobs(
     number = number[present]
     ends = number.cumsum()
     starts = ends - number
-    boxes = np.stack(
-        [
-            present,
-            starts,
-            number,
-            np.minimum.reduceat(x, starts),
-            np.maximum.reduceat(x, starts) + 1,
-            y[starts],  # the index runs row by row
-            y[ends - 1] + 1,
-            np.add.reduceat(x, starts),
-            np.add.reduceat(y, starts),
-        ]
-    ).T.tolist()
+    boxes = zip(
+        present.tolist(),
+        starts.tolist(),
+        number.tolist(),
+        np.minimum.reduceat(x, starts).tolist(),
+        (np.maximum.reduceat(x, starts) + 1).tolist(),
+        y[starts].tolist(),  # the index runs row by row
+        (y[ends - 1] + 1).tolist(),
+        np.add.reduceat(x, starts).tolist(),
+        np.add.reduceat(y, starts).tolist(),
+        strict=True,
+    )
     for m, start, count, left, right, top, bottom, sum_x, sum_y in boxes:
         width, height = right - left, bottom - top
         if count >= FULL * width * height:
@@ -93,7 +92,7 @@ def find_blobs(
             mask = np.zeros((height, width), np.uint8)
             mask[y[start : start + count] - top, x[start : start + count] - left] = 1
             stats = _label(mask, left, top)
-        slack = step
+        slack = step - 1
         found[m] = [
             Blob(
                 dx + step * u,

@@ -20,10 +20,9 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Image
-from common.srgb import to_linear
 from slave.markers.blobs import SCALE, Blob
 from slave.markers.classify import ColourTable
-from slave.markers.shares import Float32, grid_of, light_of, shares
+from slave.markers.shares import WHITE, Float32, grid_of, light_of, shares
 
 PAD = 4  # px around the box of a blob: 3 of rim, the rest ring
 SIDE = (7, 7)  # px, of the neighbourhood whose fullness tells core from rim
@@ -117,13 +116,15 @@ def _measure_stack(
     if not all(alone):
         _only_the_blob(own.reshape(count, height, width), blobs, alone)
     mask = own.reshape(tall.shape[:2])
-    box = cv2.boxFilter(mask.view(np.uint8), -1, SIDE, normalize=False, borderType=cv2.BORDER_CONSTANT)
-    full = np.asarray(box, np.uint8).reshape(flat)
+    full = cast(
+        Image,
+        cv2.boxFilter(mask.view(np.uint8), -1, SIDE, normalize=False, borderType=cv2.BORDER_CONSTANT),
+    ).reshape(flat)
     outside = ~own
     within = packed >= WITHIN
     core = full >= CORE
     core &= own
-    inner = _eroded(mask).reshape(flat)
+    inner = _eroded(own.reshape(-1), width).reshape(flat)
     solid = full >= HOLE
     solid &= outside
     solid &= within
@@ -138,7 +139,8 @@ def _measure_stack(
         thick = cv2.morphologyEx(others.view(np.uint8).reshape(mask.shape), cv2.MORPH_OPEN, SQUARE)
         near &= cast(Image, thick).reshape(flat) == 0  # a colour fringe is thinner
     grid = grid_of(height, width)
-    weights = np.stack([core, inner]).astype(np.float32)
+    weights = np.empty((2, *flat), np.float32)
+    weights[0], weights[1] = core, inner
     place = weights @ grid
     thin = place[1, :, 0] < MIN_PIXELS
     if place[0, :, 0].min() < MIN_PIXELS:
@@ -147,7 +149,8 @@ def _measure_stack(
             weights[0, i] = weights[1, i]
             place[:, i] = weights[1, i] @ grid
     share, contrast, mean = shares(light_of(tall).reshape(3, *flat), ring, weights, place, grid)
-    colour = to_linear(np.sqrt(np.maximum(mean, 0.0)))
+    # `light_of` is the square of the byte; this is linear light (IEC 61966-2-1, above its short straight piece).
+    colour = ((np.sqrt(mean / WHITE) + 0.055) / 1.055) ** 2.4
     inner &= share >= SURE
     solid |= inner
     np.maximum(share, 0.0, out=share)
@@ -231,13 +234,13 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
         tile &= np.isin(labels, np.unique(labels[rows, columns]))
 
 
-def _eroded(own: Bool) -> Bool:
-    """Pixels that have all four neighbours in the mask as well."""
+def _eroded(own: Bool, width: int) -> Bool:
+    """Pixels that have all four neighbours in the mask as well; windows of `width` one below the other, flat."""
     inner = own.copy()
-    inner[1:] &= own[:-1]
+    inner[1:] &= own[:-1]  # over the ends of the rows as well: nothing is in the mask there
     inner[:-1] &= own[1:]
-    inner[:, 1:] &= own[:, :-1]
-    inner[:, :-1] &= own[:, 1:]
+    inner[width:] &= own[:-width]
+    inner[:-width] &= own[width:]
     return inner
 
 

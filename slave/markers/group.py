@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Image
-from slave.markers.blobs import SCALE, Blob
+from slave.markers.blobs import Blob
 from slave.markers.classify import ColourTable
 
 REACH = 8.5  # marker sizes between neighbours of one hand
@@ -24,6 +24,7 @@ SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
 RING = 2  # px around the box in which skin is sought
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
 FRINGE = 0.3  # what a fringe counts
+SAME = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
 FRINGE_RATIO = 4.0  # areas: a blob so much smaller than its neighbour of another colour may be its fringe
 CLICKED = 10.0  # bonus of the blob that the user clicked: it outweighs every rival of its marker
 TRACKED = 1.0  # bonus of the blob where the marker is expected: as much as being there
@@ -75,16 +76,16 @@ def skin_share(image: Image, table: ColourTable, blob: Blob) -> float:
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
     """Whether `blob` may be the rim of a blob of another colour, where the hue runs through its own: it touches one
-    that is much larger, or lies in the box of one that is larger at all (motion blur makes rims wide)."""
+    that is much larger, or lies in the box of one that is as large (motion blur makes rims wide)."""
     return any(
-        blob.left <= other.right - SCALE
-        and other.left <= blob.right - SCALE
-        and blob.top <= other.bottom - SCALE
-        and other.top <= blob.bottom - SCALE
+        blob.left < other.right  # boxes are as wide as the grid leaves open, so neighbours overlap
+        and other.left < blob.right
+        and blob.top < other.bottom
+        and other.top < blob.bottom
         for other in others
         if other.area > FRINGE_RATIO * blob.area
         or (
-            other.area > blob.area
+            other.area > SAME * blob.area
             and other.left <= blob.u <= other.right
             and other.top <= blob.v <= other.bottom
         )

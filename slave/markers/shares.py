@@ -10,7 +10,7 @@ The sums over the pixels of all windows are products of matrices: one call for a
 """
 
 from functools import lru_cache
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -21,7 +21,8 @@ from common.arrays import Bool, Float, Image
 Float32: TypeAlias = npt.NDArray[np.float32]
 
 # Added to the scatter: one grey level of noise, so that a flat colour stays solvable.
-NOISE = 4e-6 * np.eye(3)
+WHITE = 255.0**2  # light of a full byte
+NOISE = 4e-6 * WHITE**2 * np.eye(3)
 SHADED = 0.002  # variance of the paint's brightness, relative, that the discriminant allows for
 EVERY = 3  # of the ring's pixels one in so many is looked at: hundreds of them tell what one number in three tells
 DARKEST = 0.3  # of the mean level of the core: shading is followed no further
@@ -40,14 +41,15 @@ def grid_of(height: int, width: int) -> Float32:
 
 
 def light_of(tall: Image) -> Float32:
-    """Light 0..1 of an image (H, W, 4), channel by channel: (3, H, W).
+    """Light 0..`WHITE` of an image (H, W, 4), channel by channel: (3, H, W).
 
-    The square of the code value: within 0.03 of the sRGB curve, at a third of a look-up's cost; measured on rendered
+    The square of the byte: within 0.03 of the sRGB curve, at a third of a look-up's cost; measured on rendered
     caps, centroids are as good.
     """
     light = np.empty((3, *tall.shape[:2]), np.float32)
-    for plane, into in zip(cv2.split(tall), light, strict=False):
-        cv2.multiply(plane, plane, cast(Image, into), 1.0 / 255.0**2, cv2.CV_32F)
+    blue, green, red, _ = cv2.split(tall)
+    light[0], light[1], light[2] = blue, green, red
+    light *= light
     return light
 
 
@@ -57,7 +59,7 @@ def shares(
     """Coordinate along the discriminant over shading of every pixel, unclipped.
 
     Args:
-        light: (3, M, P) linear light.
+        light: (3, M, P) of `light_of`.
         ring: (M, P) the surroundings.
         weights: (2, M, P) 0 or 1: the core, and where the shading is followed.
         place: (2, M, 6) sums of both over the grid.

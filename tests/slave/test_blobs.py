@@ -13,7 +13,7 @@ def test_a_rectangle_gives_its_area_centroid_and_box_in_full_pixels() -> None:
     (blob,) = second
     assert (blob.u, blob.v, blob.area) == (2 + 4 * 22.5, 1 + 4 * 11.5, 16.0 * 24)
     # As wide as the grid leaves open: the points before the first and after the last are not of its colour.
-    assert (blob.left, blob.top, blob.right, blob.bottom) == (2 + 76, 1 + 36, 2 + 104 + 1, 1 + 56 + 1)
+    assert (blob.left, blob.top, blob.right, blob.bottom) == (2 + 77, 1 + 37, 2 + 104, 1 + 56)
 
 
 def test_a_pixel_of_two_colours_belongs_to_both() -> None:
