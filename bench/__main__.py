@@ -16,6 +16,7 @@ SECTIONS = {
     "markers": "Marker detection, 640x480, six markers, one thread; baseline: the published pipeline rebuilt",
     "marker_accuracy": "Centroids on generated frames with exact truth, kind by kind; baseline: the published pipeline",
     "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
+    "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",
     "filters": "1 euro filter, 18 signals; baseline: one object per signal",
     "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",

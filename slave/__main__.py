@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -45,6 +46,11 @@ EXAMPLES = """examples:
 """
 CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
 PROGRESS_EVERY = 500  # frames
+NO_REFERENCE = (
+    "{}: markers: no reference_bgr_linear, so the colours do not follow the light; calibrate again with "
+    "`phalanx-slave colours`, or say --colours fixed"
+)
+_LOG = logging.getLogger(__name__)
 BEACON_PORT = 47800
 
 
@@ -67,7 +73,9 @@ def _run(options: argparse.Namespace) -> int:
     from common.keys import rig_key
     from common.zenoh_bus import ZenohBus
     from slave.app import run, wait_for_start
+    from slave.light_report import LightReport
     from slave.markers.detector import MarkerDetector
+    from slave.markers.following import FollowingDetector, detector_for
     from slave.preview import Previews
     from slave.report import Reporter
     from slave.tally import Tally
@@ -81,14 +89,24 @@ def _run(options: argparse.Namespace) -> int:
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
     source = _source(options, rig, camera, clock, true_clock, stop)
-    detector = MarkerDetector(camera, rig.markers)
+    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{options.name} colours")
+    if options.colours == "follow":
+        detector = detector_for(camera, rig.markers, workers)
+    else:
+        detector = MarkerDetector(camera, rig.markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
     previews = Previews(options.name, clock)
+    numbers, show = tally, previews.offer
+    if isinstance(detector, FollowingDetector):
+        numbers = LightReport(options.name, detector, tally, rig.markers, previews.offer)
+        show = numbers.offer
+    elif options.colours == "follow":
+        _LOG.warning("%s", NO_REFERENCE.format(options.calibration / "cameras" / f"{options.name}.json"))
     reporter = Reporter(
         options.name,
         uplink,
-        tally,
+        numbers,
         clock,
         lambda endpoint: ZenohBus(None, endpoint),
         stop.set,
@@ -99,12 +117,13 @@ def _run(options: argparse.Namespace) -> int:
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         print(f"{options.name}: ready, waiting for the master", flush=True)
         if wait_for_start(uplink, stop):
-            run(source, detector, uplink, options.name, tally, stop, previews.offer)
+            run(source, detector, uplink, options.name, tally, stop, show)
     finally:
         reporter.close()
         previews.close()
         uplink.close()
         source.close()
+        workers.shutdown(cancel_futures=True)
     print(f"{options.name}: {tally.counts()['frames']} frames, sent {uplink.counts['sent']}", flush=True)
     return 0
 
@@ -296,6 +315,12 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument(
         "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
     )
+    run.add_argument(
+        "--colours",
+        choices=("follow", "fixed"),
+        default="follow",
+        help="whether the colours follow changes of the light (default: %(default)s; docs/light.md)",
+    )
 
     record = commands.add_parser("record", help="raw frames to disk", epilog=EXAMPLES, formatter_class=keep)
     _add_camera(record)
@@ -379,7 +404,7 @@ def _add_camera(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
     real.add_options(parser)
     sim = parser.add_argument_group("synthetic camera")
-    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | leap:FILE.npz")
+    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | lights | leap:FILE.npz")
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(
         "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"

@@ -5,10 +5,19 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
+from common.arrays import Image
 from common.messages import MarkerDetections, Message
 from slave.cameras.source import Frame, FrameSource
-from slave.markers.detector import MarkerDetector
+from slave.markers.detector import Detections
 from slave.tally import Tally
+
+
+class Detector(Protocol):
+    """What finds the markers; a `MarkerDetector` or a `FollowingDetector`."""
+
+    def push(self, image: Image, t_ns: int) -> Detections:
+        """Markers of one frame; times [ns] rise."""
+        ...
 
 
 class Sender(Protocol):
@@ -45,7 +54,7 @@ def wait_for_start(barrier: Barrier, stop: threading.Event) -> bool:
 
 def run(
     source: FrameSource,
-    detector: MarkerDetector,
+    detector: Detector,
     sender: Sender,
     camera: str,
     tally: Tally,

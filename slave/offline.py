@@ -17,7 +17,8 @@ from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread
 from slave.markers.colours import ColourRow, calibrate
-from slave.markers.detector import MarkerDetector
+from slave.markers.following import detector_for
+from slave.markers.workers import Inline
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,7 +74,7 @@ def detect_recording(
     calibration: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RecordedDetections:
-    """Detect the markers in every frame of one camera.
+    """Detect the markers in every frame of one camera, with colours that follow the light where it has references.
 
     Args:
         folder: Recording.
@@ -92,7 +93,7 @@ def detect_recording(
         raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
     model = camera_of(recording, camera, calibration)
     names = recording.manifest.marker_rig().markers
-    detector = MarkerDetector(model, names, recording.manifest.clicks.get(camera))
+    detector = detector_for(model, names, Inline(), recording.manifest.clicks.get(camera))
     shape = (len(rows), len(names))
     uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)

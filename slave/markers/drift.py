@@ -27,7 +27,7 @@ from common.arrays import Float
 LIMIT_RED, LIMIT_BLUE = 2.2, 3.6
 LIMIT_EXPOSURE = 2.5  # of green
 LOG_LIMITS = math.log(LIMIT_BLUE), math.log(LIMIT_EXPOSURE), math.log(LIMIT_RED)
-RATE_PER_S = 0.5  # largest rate of each log gain: 3000 -> 6500 K within 10 s is at most 0.25
+RATE_PER_S = 0.5  # largest rate of each of the three: 3000 -> 6500 K within 10 s is at most 0.25
 TIME_S = 1.0  # time constant of following
 ANCHOR_S, MANY = 5.0, 4  # time constant of the anchor, and how many markers move it
 EVERY_NS = 100_000_000  # colours are looked at so often; light has no need of more
@@ -156,8 +156,10 @@ class ColourDrift:
         dt_s = 0.0 if self._t_ns is None else min(max(t_ns - self._t_ns, 0), GAP_NS) * 1e-9
         self._t_ns = t_ns
         fit = fit_gains(colour, self._reference, np.nan_to_num(quality), self._anchor)
-        step = (1.0 - np.exp(-dt_s / TIME_S)) * (fit.log_gains - self._x)
-        self._x = bounded(self._x + np.clip(step, -RATE_PER_S * dt_s, RATE_PER_S * dt_s))
+        blue, green, red = (-math.expm1(-dt_s / TIME_S) * (fit.log_gains - self._x)).tolist()
+        most = RATE_PER_S * dt_s
+        b, g, r = (min(max(step, -most), most) for step in (blue - green, green, red - green))
+        self._x = bounded(self._x + np.array([g + b, g, g + r]))
         if np.count_nonzero(np.isfinite(fit.misfit)) >= MANY:
-            self._anchor = self._anchor + (1.0 - np.exp(-dt_s / ANCHOR_S)) * (self._x - self._anchor)
+            self._anchor = self._anchor - math.expm1(-dt_s / ANCHOR_S) * (self._x - self._anchor)
         return fit

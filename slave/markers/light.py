@@ -18,7 +18,7 @@ from common.arrays import Float, Image
 from slave.markers.classify import ColourTable
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.drift import ColourDrift, GainFit, at_bound
-from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, evidence, first_light
+from slave.markers.first_light import AHEAD, FITS, PROOF, STRIDE, Evidence, different, evidence, first_light
 from slave.markers.light_meter import Change, LightMeter
 from slave.markers.workers import Workers
 
@@ -26,9 +26,9 @@ SUDDEN = (
     0.2  # log gains of red or blue against green between two frames: a lamp was switched, or a hand came near
 )
 CLEAR = 0.75  # share of still points that must agree on a sudden change that the markers do not vouch for
-DIM = 0.25  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
+DIM = 0.15  # what a change of brightness counts against a change of hue: the ranges are wide in brightness
 AGAIN_NS = 500_000_000  # between two attempts to prove the light
-MISFIT_NS = 500_000_000  # for which the markers may fit badly before the light is in doubt
+MISFITS = 5  # looks in a row, half a second, in which the markers fit badly and put the light in doubt
 
 
 class CameraLight:
@@ -52,7 +52,7 @@ class CameraLight:
         self._provable = len(reference) >= PROOF
         self.proven = not self._provable  # a rig of one marker can only be followed
         self._plausible = False
-        self._fitted_ns = 0
+        self._misfits = 0
         self._tried_ns: int | None = None
         self._proof: tuple[Float, Future[Evidence]] | None = None
 
@@ -91,9 +91,11 @@ class CameraLight:
         if fit is not None:
             seen = fit.misfit[np.isfinite(fit.misfit)]
             if not seen.size or float(np.median(seen)) <= FITS:
-                self._fitted_ns = t_ns
-            elif t_ns - self._fitted_ns > MISFIT_NS:
-                self._doubt()
+                self._misfits = 0
+            else:
+                self._misfits += 1
+                if self._misfits >= MISFITS:
+                    self._doubt()
         return fit
 
     def warnings(self) -> list[ColourWarning]:
@@ -143,13 +145,13 @@ class CameraLight:
         if self._proof is not None and self._proof[1].done():
             (since, job), self._proof = self._proof, None
             light = job.result()
-            self.proven, self._fitted_ns = light.proven, t_ns
+            self.proven, self._misfits = light.proven, 0
             self._plausible = not light.excluded
-            if light.proven:
+            if light.proven and different(light.log_gains + since, self.log_gains):
                 self._drift.restart(light.log_gains + since)
 
 
-def apart(a: Float, b: Float) -> float:
+def apart(a: Float, b: Float, dim: float = DIM) -> float:
     """How different two lights (3,) look to the colour table, in log gains of red or blue against green."""
     blue, green, red = (a - b).tolist()
-    return max(abs(blue - green), abs(red - green), DIM * abs(green))
+    return max(abs(blue - green), abs(red - green), dim * abs(green))

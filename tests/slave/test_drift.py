@@ -116,7 +116,8 @@ def test_no_colours_drive_it_past_its_rate_and_its_bounds(colours: Float, dt_s: 
         drift.push(colour, ONES, round(k * dt_s * 1e9))
         now = drift.log_gains
         assert np.isfinite(now).all()
-        assert np.abs(now - last).max() <= RATE_PER_S * min(dt_s, 0.5) + 1e-9
+        moved = [*against_green(now - last), now[1] - last[1]]
+        assert np.abs(moved).max() <= RATE_PER_S * min(dt_s, 0.5) + 1e-9
         assert abs(now[1]) <= np.log(LIMIT_EXPOSURE) + 1e-9
         assert (np.abs(against_green(now)) <= np.log([LIMIT_BLUE, LIMIT_RED]) + 1e-9).all()
         last = now

@@ -1,0 +1,102 @@
+"""Say what the light does to the colours: counts, gauges, and a log line before it costs a marker."""
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Protocol
+
+import numpy as np
+
+from common.arrays import Float
+from slave.cameras.source import Frame
+from slave.markers.colour_watch import ColourWarning
+
+LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
+ALL = "light"  # the subject of what concerns every marker
+_LOG = logging.getLogger(__name__)
+
+
+class Following(Protocol):
+    """What is reported on: a `FollowingDetector`."""
+
+    @property
+    def warnings(self) -> list[ColourWarning]:
+        """What is to be warned of as of the last frame."""
+        ...
+
+    @property
+    def log_gains(self) -> Float:
+        """Log gains (3,) of the light, blue, green, red."""
+        ...
+
+    @property
+    def refused(self) -> int:
+        """Frames in which nothing was reported."""
+        ...
+
+    @property
+    def tables(self) -> int:
+        """Colour tables made."""
+        ...
+
+
+class Numbers(Protocol):
+    """Counts and gauges of something else; a `Tally`."""
+
+    def counts(self) -> Mapping[str, int]:
+        """Event -> how often."""
+        ...
+
+    def gauges(self) -> Mapping[str, float]:
+        """Quantity with unit -> value."""
+        ...
+
+
+class LightReport:
+    """Counts warnings and logs them, and adds the light to what `others` report.
+
+    Holds the subjects warned of in the last frame, how often each was, and when each was last logged. The loop
+    writes, the health thread reads.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        detector: Following,
+        others: Numbers,
+        markers: tuple[str, ...],
+        show: Callable[[Frame], None] = lambda _frame: None,
+    ) -> None:
+        """Report on the `detector` of camera `name`; every frame is handed on to `show`."""
+        self._name, self._detector, self._others, self._show = name, detector, others, show
+        self._warned = dict.fromkeys((ALL, *markers), 0)
+        self._now: set[str] = set()
+        self._logged_ns: dict[str, int] = {}
+
+    def offer(self, frame: Frame) -> None:
+        """Take note after a frame, and hand it on."""
+        self._show(frame)
+        warnings = self._detector.warnings
+        if not warnings and not self._now:
+            return
+        now = {ALL if warning.marker is None else warning.marker for warning in warnings}
+        for subject in now - self._now:
+            self._warned[subject] += 1
+        self._now = now
+        for warning in warnings:
+            subject = ALL if warning.marker is None else warning.marker
+            last_ns = self._logged_ns.get(subject)
+            if last_ns is None or frame.t_ns - last_ns >= LOG_EVERY_NS:
+                self._logged_ns[subject] = frame.t_ns
+                _LOG.warning("%s: %s", self._name, warning.text)
+
+    def counts(self) -> dict[str, int]:
+        """Those of the others, and: warnings.light, warnings.<marker>, refused.light, colour_tables."""
+        warned = {f"warnings.{subject}": count for subject, count in self._warned.items()}
+        own = {"refused.light": self._detector.refused, "colour_tables": self._detector.tables}
+        return {**self._others.counts(), **warned, **own}
+
+    def gauges(self) -> dict[str, float]:
+        """Those of the others, and the light against calibration: red and blue relative to green, and green."""
+        blue, green, red = np.exp(self._detector.log_gains).tolist()
+        light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
+        return {**self._others.gauges(), **light}

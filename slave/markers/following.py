@@ -1,0 +1,150 @@
+"""A marker detector whose colours follow the light.
+
+The ranges of a camera file hold under the light of calibration. Here the detector is given, as the light moves, tables
+that see the picture as under that light. A table takes a few frames to make on a small machine, so it is made by
+`workers`: a thread of its own on a live slave, `Inline` where every run must give the same.
+
+Where the table is far from the light, or the light is not known and the markers do not fit it, one marker could be
+taken for another: then nothing is reported seen, and a warning says why.
+"""
+
+from collections.abc import Mapping
+from concurrent.futures import Future
+from copy import copy
+from functools import partial
+
+import numpy as np
+
+from common.arrays import Float, Image
+from common.calibration import CameraCalibration
+from common.srgb import relit_bytes
+from slave.markers.classify import ColourTable, table_of
+from slave.markers.colour_watch import ColourWarning, ColourWatch
+from slave.markers.detector import Detections, MarkerDetector
+from slave.markers.light import CameraLight, apart
+from slave.markers.workers import Workers
+
+STEP = 0.08  # log gains of red or blue against green from which a new table is made: one or two hues
+REFUSE = 0.2  # and from which the old one may take one marker for another: three to six hues
+
+
+class FollowingDetector:
+    """Detects with colours that follow the light. Holds the light, the table in use and the one being made.
+
+    Attributes:
+        warnings: What is to be warned of as of the last frame.
+        refused: Frames in which nothing was reported because the colours were not fit for the light.
+        tables: How many tables were made.
+    """
+
+    def __init__(
+        self,
+        camera: CameraCalibration,
+        markers: tuple[str, ...],
+        workers: Workers,
+        seeds: Mapping[str, tuple[float, float]] | None = None,
+    ) -> None:
+        """Build the detector and its colour table (0.3 s).
+
+        Args:
+            camera: Camera file; every marker has a range with its reference colour.
+            markers: Marker names in the order of the rig.
+            workers: Where tables are made and a first light is sought.
+            seeds: As of `MarkerDetector`.
+
+        Raises:
+            CalibrationError: The camera has no colour range for a marker.
+            ValueError: A range has no reference colour; see `can_follow`.
+        """
+        self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
+        ranges = camera.markers or {}
+        reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
+        self._detector = MarkerDetector(camera, markers, seeds, self._table)
+        self._light = CameraLight(self._table, reference, (camera.width_px, camera.height_px), workers)
+        self._watch = ColourWatch(markers, ranges)
+        self._workers = workers
+        self._in_use = np.zeros(3)  # log gains of the table in use
+        self._making: tuple[Float, Future[ColourTable]] | None = None
+        self._look_next = False
+        self._near: list[ColourWarning] = []
+        self.warnings: list[ColourWarning] = []
+        self.refused = 0
+        self.tables = 0
+
+    @property
+    def log_gains(self) -> Float:
+        """Log gains (3,) of the light against calibration, blue, green, red."""
+        return self._light.log_gains
+
+    def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "FollowingDetector":
+        """A detector of the same camera, under the same light, that has seen no marker yet."""
+        other = copy(self)
+        other._detector = self._detector.fresh(seeds)
+        return other
+
+    def push(self, image: Image, t_ns: int) -> Detections:
+        """Detect in one frame.
+
+        Args:
+            image: (H, W, 3) BGR of the camera's size.
+            t_ns: Time of the frame [ns], rising; only differences matter.
+
+        Raises:
+            ValueError: The image is not of the camera's size, or not 8-bit colour.
+        """
+        image = np.ascontiguousarray(image)
+        self._light.look(image, t_ns)
+        self._follow()
+        found = self._detector.push(image, t_ns)
+        stale = apart(self.log_gains, self._in_use) > REFUSE
+        if self._light.proven and not stale:
+            self._learn(found, t_ns)
+        self.warnings = [*self._near, *self._light.warnings()]
+        if stale or not self._light.trusted:
+            self.refused += 1
+            return found.nothing()
+        return found
+
+    def _learn(self, found: Detections, t_ns: int) -> None:
+        """Learn the light, and in the next frame, so that none takes long, look at the room of the colours."""
+        if self._look_next:
+            undone = found.colour * np.exp(-self.log_gains)
+            self._near = self._watch.push(undone, found.quality, t_ns)
+            self._look_next = False
+        else:
+            self._look_next = self._light.learn(found.colour, found.quality, t_ns) is not None
+
+    def _follow(self) -> None:
+        """Have a table made where the light has moved; use the one that is ready."""
+        if self._making is None and apart(self.log_gains, self._in_use) > STEP:
+            gains = self.log_gains
+            self._making = (
+                gains,
+                self._workers.submit(partial(self._table.relit, relit_bytes(np.exp(-gains)))),
+            )
+        if self._making is not None and self._making[1].done():
+            (self._in_use, job), self._making = self._making, None
+            self._detector.recolour(job.result())
+            self.tables += 1
+
+
+def detector_for(
+    camera: CameraCalibration,
+    markers: tuple[str, ...],
+    workers: Workers,
+    seeds: Mapping[str, tuple[float, float]] | None = None,
+) -> FollowingDetector | MarkerDetector:
+    """A detector that follows the light where the camera file allows it, else one with fixed colours.
+
+    Raises:
+        CalibrationError: The camera has no colour range for a marker.
+    """
+    if can_follow(camera, markers):
+        return FollowingDetector(camera, markers, workers, seeds)
+    return MarkerDetector(camera, markers, seeds)
+
+
+def can_follow(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:
+    """Whether the camera file says what every marker looked like at calibration."""
+    ranges = camera.markers or {}
+    return all(name in ranges and ranges[name].reference_bgr_linear is not None for name in markers)

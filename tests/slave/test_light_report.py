@@ -1,0 +1,70 @@
+"""Warnings about the light: counted once each time they begin, logged with marker and fix, not every frame."""
+
+import logging
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from slave.cameras.source import Frame
+from slave.light_report import LightReport
+from slave.markers.colour_watch import ColourWarning
+
+SECOND = 1_000_000_000
+IMAGE = np.zeros((2, 2, 3), np.uint8)
+THUMB = ColourWarning("thumb", "marker thumb: near the border: repaint it")
+LIGHT = ColourWarning(None, "the light is not known: show 2 or more markers")
+
+
+class Detector:
+    def __init__(self) -> None:
+        self.warnings: list[ColourWarning] = []
+        self.log_gains: Float = np.log([0.5, 1.25, 2.5])
+        self.refused = 3
+        self.tables = 4
+
+
+class Others:
+    def counts(self) -> dict[str, int]:
+        return {"frames": 7}
+
+    def gauges(self) -> dict[str, float]:
+        return {"rate_hz": 60.0}
+
+
+def frame(t_s: float) -> Frame:
+    return Frame(0, round(t_s * SECOND), round(t_s * SECOND), IMAGE)
+
+
+def report() -> tuple[Detector, LightReport]:
+    detector = Detector()
+    return detector, LightReport("left", detector, Others(), ("thumb", "index"))
+
+
+def test_a_warning_is_counted_when_it_begins() -> None:
+    detector, light = report()
+    for k, warnings in enumerate(([], [THUMB], [THUMB], [THUMB, LIGHT], [], [THUMB])):
+        detector.warnings = warnings
+        light.offer(frame(0.1 * k))
+    counts = light.counts()
+    assert (counts["warnings.thumb"], counts["warnings.index"], counts["warnings.light"]) == (2, 0, 1)
+    assert (counts["frames"], counts["refused.light"], counts["colour_tables"]) == (7, 3, 4)
+
+
+def test_the_log_names_marker_and_fix_and_is_quiet_for_a_while(caplog: pytest.LogCaptureFixture) -> None:
+    detector, light = report()
+    detector.warnings = [THUMB, LIGHT]
+    with caplog.at_level(logging.WARNING):
+        for k in range(120):
+            light.offer(frame(0.1 * k))
+    assert [record.getMessage() for record in caplog.records] == 2 * [
+        f"left: {THUMB.text}",
+        f"left: {LIGHT.text}",
+    ]
+
+
+def test_the_gauges_are_the_light_against_calibration() -> None:
+    gauges = report()[1].gauges()
+    assert gauges == pytest.approx(
+        {"rate_hz": 60.0, "light_red": 2.0, "light_blue": 0.4, "light_exposure": 1.25}
+    )
