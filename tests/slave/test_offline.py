@@ -120,7 +120,7 @@ def test_the_colours_command_writes_what_detect_reads(
     np.testing.assert_allclose(found.uv[0], CENTRES + np.array([300.0, 200.0]), atol=0.3)
 
 
-@pytest.mark.parametrize("driver", ["picamera2", "v4l2", "synthetic:7", "replay:", "replay"])
+@pytest.mark.parametrize("driver", ["picamera3", "usb:0", "synthetic:7", "replay:", "replay"])
 def test_a_driver_that_does_not_exist_names_those_that_do(
     driver: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
