@@ -22,14 +22,13 @@ import numpy as np
 from common.arrays import Bool, Image
 from slave.markers.blobs import SCALE, Blob
 from slave.markers.classify import ColourTable
-from slave.markers.shares import WHITE, Float32, grid_of, light_of, shares
+from slave.markers.shares import EVERY, WHITE, Float32, grid_of, light_of, shares
 
 PAD = 4  # px around the box of a blob: 3 of rim, the rest ring
 SIDE = (7, 7)  # px, of the neighbourhood whose fullness tells core from rim
 CORE = 33  # of its 49 pixels: two pixels inside a straight edge it holds 35, one pixel inside 28
 DEEP = 42  # three pixels inside
 HOLE = 26  # not in the mask yet inside it: outside a straight edge the neighbourhood holds at most 21
-SURE = 0.6  # a pixel surrounded by mask with this share, or more, is paint alone
 MIN_PIXELS = 4
 WITHIN = np.uint32(1 << 24)  # a packed pixel with any fourth channel is at least this
 UNEQUAL = 3.0  # largest to smallest window of one stack: beyond it, padding costs more than another stack
@@ -107,7 +106,7 @@ def _measure_stack(
 ) -> list[Measured | None]:
     count = len(blobs)
     height = max([b.bottom - b.top for b in blobs]) + 2 * PAD
-    width = max([b.right - b.left for b in blobs]) + 2 * PAD
+    width = -(-(max([b.right - b.left for b in blobs]) + 2 * PAD) // EVERY) * EVERY
     flat = count, height * width
     tall = _cut_tiles(image, blobs, height, width)
     packed = tall.view(np.uint32).reshape(flat)
@@ -141,29 +140,25 @@ def _measure_stack(
     grid = grid_of(height, width)
     weights = np.empty((2, *flat), np.float32)
     weights[0], weights[1] = core, inner
-    place = weights @ grid
+    place = weights.astype(np.float64) @ grid.sums
     thin = place[1, :, 0] < MIN_PIXELS
     if place[0, :, 0].min() < MIN_PIXELS:
         for i in np.flatnonzero(place[0, :, 0] < MIN_PIXELS):
             weights[1, i] = own[i] if thin[i] else inner[i]
             weights[0, i] = weights[1, i]
-            place[:, i] = weights[1, i] @ grid
+            place[:, i] = weights[1, i] @ grid.sums
     share, contrast, mean = shares(light_of(tall).reshape(3, *flat), ring, weights, place, grid)
-    # `light_of` is the square of the byte; this is linear light (IEC 61966-2-1, above its short straight piece).
-    colour = ((np.sqrt(mean / WHITE) + 0.055) / 1.055) ** 2.4
-    inner &= share >= SURE
-    solid |= inner
     np.maximum(share, 0.0, out=share)
     np.minimum(share, 1.0, out=share)
     share *= near.astype(np.float32)
     np.maximum(share, solid.astype(np.float32), out=share)
-    moments = (share @ grid).astype(np.float64)
+    moments = share.astype(np.float64) @ grid.sums
     area = moments[:, 0].copy()
     moments /= np.maximum(area, 1.0)[:, None]
-    half = 0.5 * width
     centre = moments[:, 1:3]
-    spread = (moments[:, 3:] - centre[:, FIRST] * centre[:, SECOND]) * half**2
-    centre = (centre + np.array([1.0, height / width])) * half - 0.5
+    spread = moments[:, 3:] - centre[:, FIRST] * centre[:, SECOND]
+    centre += grid.middle
+    colour = mean / WHITE
     windows = share.reshape(count, height, width)
     found: list[Measured | None] = []
     rows = zip(

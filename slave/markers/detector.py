@@ -32,6 +32,7 @@ SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
 CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that deserve full quality
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
+DIGITS = 6  # of what is reported: what comes after them differs between processors
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival
 
 
@@ -130,6 +131,7 @@ class MarkerDetector:
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
                 rival = second.get(m)
                 result[:, m] = self._report(m, seen, chosen[m], rival, t_ns)
+        np.round(result, DIGITS, out=result)
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
     def recolour(self, table: ColourTable) -> None:

@@ -24,7 +24,7 @@ RMS_PX = {
     "translate_8ms": 0.21,
     "flex90": 0.25,
     "poses_left": 0.2,
-    "sweep_paper": 0.075,
+    "sweep_paper": 0.08,
     "sweep_rough": 0.055,
 }
 SWEPT = {"sweep_paper": 1, "sweep_rough": 2}  # the paint of which marker the flat target has
