@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from typing import Final
 
+import msgspec
+
 from bench.marker_paints import camera_file, paints
 from common.calibration import CameraCalibration
 
@@ -41,7 +43,11 @@ class Kind:
     @property
     def camera(self) -> CameraCalibration:
         """The camera file of these frames."""
-        return camera_file(self.count, self.size)
+        still = camera_file(self.count, self.size)
+        # Blurred caps move by the way of one frame: such a camera exposes from frame to frame.
+        return (
+            msgspec.structs.replace(still, exposure_us=1e6 / still.frame_rate_hz) if self.blur_px else still
+        )
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 Four independent causes, added in squares; the numbers are those of generated caps (bench/marker_accuracy):
 
     edge    the rim is known to a fraction of a pixel; a shift of one side moves the centroid the more the smaller
-            the marker, and the less clear its contrast
+            the marker, and the less clear its contrast; shading and highlights keep a part at any size
     motion  the cap's shading does not smear like its outline
     cover   something in front hides a share h: a straight edge moves the centroid of a disc by 0.9 h r
             (segment of a circle, small h), one direction of two
@@ -15,7 +15,8 @@ import math
 from slave.markers.centroid import Measured
 from slave.markers.roi import Track
 
-EDGE_PX2 = 0.5  # error times radius
+EDGE_PX2 = 0.45  # error times radius
+LEAST_PX = 0.06  # at any radius
 CLEAR = 15.0  # contrast below which the edge is less sure
 BLUR = 0.04  # px per px of way during the exposure
 COVER = 0.65
@@ -35,7 +36,7 @@ def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: flo
         exposure_s: Exposure time.
     """
     radius = math.sqrt(max(seen.area, 1.0) / math.pi)
-    edge = EDGE_PX2 / radius * max(1.0, CLEAR / max(seen.contrast, 1.0))
+    edge = math.hypot(EDGE_PX2 / radius, LEAST_PX) * max(1.0, CLEAR / max(seen.contrast, 1.0))
     blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
     hidden = LASTING * max(0.0, 1.0 - seen.area / track.whole)
     if before is not None and track.covered:
