@@ -30,7 +30,7 @@ from bench.light import (
 from common.sim.illuminant import LightCourse
 from common.sim.render import Renderer
 from slave.markers.detector import MarkerDetector
-from slave.markers.following import REFUSE, FollowingDetector, can_follow
+from slave.markers.following import REFUSE, FollowingDetector, can_follow, detector_for
 from slave.markers.light import apart
 from slave.markers.workers import Inline
 from tests.slave import painted
@@ -155,6 +155,8 @@ def test_a_camera_file_without_reference_colours_cannot_follow() -> None:
     assert can_follow(standard_scene(7).cameras["left"], MARKERS)
     assert not can_follow(painted.camera(), painted.NAMES)
     assert not can_follow(msgspec.structs.replace(painted.camera(), markers=None), painted.NAMES)
+    assert isinstance(detector_for(standard_scene(7).cameras["left"], MARKERS, Inline()), FollowingDetector)
+    assert isinstance(detector_for(painted.camera(), painted.NAMES, Inline()), MarkerDetector)
     with pytest.raises(ValueError, match="reference"):
         FollowingDetector(painted.camera(), painted.NAMES, Inline())
 
