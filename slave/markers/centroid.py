@@ -222,11 +222,14 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
     for tile, b, lonely in zip(own, blobs, alone, strict=True):
         if lonely:
             continue
-        labels = np.asarray(cv2.connectedComponents(tile.view(np.uint8), connectivity=8)[1], np.int32)
+        parts = cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U)
+        count, labels = int(parts[0]), np.asarray(parts[1], np.uint16)
         # The blob's points of the grid lie inside its box by the width of the grid.
-        rows = slice(PAD + SCALE, max(PAD + b.bottom - b.top - SCALE, PAD + SCALE + 1))
-        columns = slice(PAD + SCALE, max(PAD + b.right - b.left - SCALE, PAD + SCALE + 1))
-        tile &= np.isin(labels, np.unique(labels[rows, columns]))
+        rows = slice(PAD + SCALE - 1, max(PAD + b.bottom - b.top - SCALE + 1, PAD + SCALE))
+        columns = slice(PAD + SCALE - 1, max(PAD + b.right - b.left - SCALE + 1, PAD + SCALE))
+        mine = np.zeros(count, np.bool_)
+        mine[labels[rows, columns]] = True
+        tile &= mine[labels]
 
 
 def _eroded(own: Bool, width: int) -> Bool:

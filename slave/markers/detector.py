@@ -17,10 +17,19 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
-from slave.markers.centroid import Measured, measure
-from slave.markers.classify import ColourTable, table_of
+from slave.markers.centroid import PAD, Measured, measure
+from slave.markers.classify import Codes, ColourTable, table_of
 from slave.markers.edge import Ellipse, centre_of
-from slave.markers.group import CLICKED, TRACKED, Candidate, choose, connected, on_fringe, skin_share
+from slave.markers.group import (
+    CLICKED,
+    TRACKED,
+    Candidate,
+    candidate,
+    choose,
+    connected,
+    on_fringe,
+    skin_share,
+)
 from slave.markers.roi import Track, advance
 from slave.markers.sigma import COVERED_PX, sigma_of
 
@@ -47,7 +56,8 @@ class Detections:
         quality: (M,) 0..1; 1 is a whole, unambiguous, clear marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, doubt of occlusion, size, motion.
-        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; NaN: none.
+        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px], as the scan saw
+            it, a pixel or so; NaN: none.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
 
@@ -110,27 +120,24 @@ class MarkerDetector:
         if image.shape != size or image.dtype != np.uint8:
             raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {size} uint8")
         image = np.ascontiguousarray(image)
-        blobs = self._scan(image)
-        chosen = self._decide(image, blobs, t_ns)
+        codes, blobs = self._scan(image)
+        chosen = self._decide(codes, blobs, t_ns)
         self._seeds = {}
         rows = list(chosen)
-        alone = [len(blobs[m]) == 1 for m in rows]
         rivals: dict[int, Blob] = {}
-        for m, lonely in zip(rows, alone, strict=True):
-            if not lonely:
+        for m in rows:
+            if len(blobs[m]) > 1:
                 rival = self._rival(m, chosen[m], blobs[m], t_ns)
-                chosen[m] = with_fragments(chosen[m], blobs[m], self._extent(m, t_ns))
                 if rival is not None:
                     rivals[m] = rival
-        bits = [self._table.bits[m] for m in (*rows, *rivals)]
-        where = [*chosen.values(), *rivals.values()]
-        measured = measure(image, self._table, bits, where, alone + [False] * len(rivals))
-        second = dict(zip(rivals, measured[len(rows) :], strict=True))
+                chosen[m] = with_fragments(chosen[m], blobs[m], self._extent(m, t_ns))
+        alone = [len(blobs[m]) == 1 or _alone(chosen[m], blobs[m]) for m in rows]
+        bits = [self._table.bits[m] for m in rows]
+        measured = measure(image, self._table, bits, list(chosen.values()), alone)
         result = np.full((10, len(self._names)), np.nan)
-        for m, seen in zip(rows, measured, strict=False):
+        for m, seen in zip(rows, measured, strict=True):
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                rival = second.get(m)
-                result[:, m] = self._report(m, seen, chosen[m], rival, t_ns)
+                result[:, m] = self._report(m, seen, chosen[m], rivals.get(m), t_ns)
         np.round(result, DIGITS, out=result)
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
@@ -138,9 +145,7 @@ class MarkerDetector:
         """Go on with another colour table of the same markers; what is tracked stays tracked."""
         self._table = table
 
-    def _report(
-        self, m: int, seen: Measured, blob: Blob, rival: Measured | None, t_ns: int
-    ) -> tuple[float, ...]:
+    def _report(self, m: int, seen: Measured, blob: Blob, rival: Blob | None, t_ns: int) -> tuple[float, ...]:
         """One marker's column of the result; its track goes on."""
         before = self._tracks[m]
         if before is not None and not before.alive(t_ns):
@@ -158,7 +163,7 @@ class MarkerDetector:
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
                 sigma = math.hypot(COVERED_PX, whole.rms)
         other = (math.nan, math.nan)
-        if rival is not None and not rival.thin:
+        if rival is not None:
             other = rival.u, rival.v
             if math.hypot(other[0] - u, other[1] - v) < 3.0 * math.sqrt(blob.area):
                 quality *= 0.5
@@ -174,15 +179,18 @@ class MarkerDetector:
             others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]
         return max(others, key=lambda b: b.area) if others else None
 
-    def _scan(self, image: Image) -> list[list[Blob]]:
-        """Blobs of every colour; a colour that the grid shows nowhere is sought on further grids.
+    def _scan(self, image: Image) -> tuple[Codes, list[list[Blob]]]:
+        """Codes of the scan, and blobs of every colour.
 
-        In the first frame on all of them, later on one more each time, in turn.
+        A colour that the grid shows nowhere is sought on further grids: in the first frame on all of them, later on
+        one more each time, in turn.
         """
         table = self._table
-        blobs = find_blobs(table.scan(image, SCALE), table.bits)
+        codes = table.scan(image, SCALE)
+        blobs = find_blobs(codes, table.bits)
         missing = [m for m, options in enumerate(blobs) if not options]
         if missing:
+            codes = codes.copy()  # the next scan reuses it
             step, dx, dy = FINER if self._turn < 0 else OTHERS[self._turn]
             self._turn = (self._turn + 1) % len(OTHERS)
             finer = find_blobs(
@@ -192,7 +200,7 @@ class MarkerDetector:
                 blobs[m] = options
         elif self._turn < 0:
             self._turn = 0
-        return blobs
+        return codes, blobs
 
     def _extent(self, m: int, t_ns: int) -> float:
         """Largest side of the whole marker [px] as far as its track knows, else inf."""
@@ -201,9 +209,9 @@ class MarkerDetector:
             return math.inf
         return 1.3 * max(track.width, track.height) + 2.0
 
-    def _decide(self, image: Image, blobs: list[list[Blob]], t_ns: int) -> dict[int, Blob]:
+    def _decide(self, codes: Codes, blobs: list[list[Blob]], t_ns: int) -> dict[int, Blob]:
         """Marker row -> its blob, by prediction alone where that answers for every colour in the image."""
-        width = image.shape[1]
+        width = self._camera.width_px
         tracked: dict[int, Blob] = {}
         certain = not self._seeds
         for m, options in enumerate(blobs):
@@ -227,9 +235,8 @@ class MarkerDetector:
             others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
             for blob in options:
                 bonus = self._bonus(m, blob, tracked.get(m))
-                candidates.append(
-                    Candidate(m, blob, skin_share(image, self._table, blob), on_fringe(blob, others), bonus)
-                )
+                skin = skin_share(codes, self._table.skin, blob)
+                candidates.append(candidate(m, blob, skin, on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
         return {m: c.blob for m, c in choose(candidates).items()}
@@ -254,6 +261,20 @@ def _quality(seen: Measured, track: Track) -> float:
     if seen.thin:
         quality *= 0.4
     return min(1.0, quality)
+
+
+def _alone(blob: Blob, options: list[Blob]) -> bool:
+    """Whether no other blob of the colour reaches into the window in which `blob` is measured."""
+    return not any(
+        b.left < blob.right + PAD
+        and blob.left - PAD < b.right
+        and b.top < blob.bottom + PAD
+        and blob.top - PAD < b.bottom
+        for b in options
+        if not (
+            b.left >= blob.left and b.right <= blob.right and b.top >= blob.top and b.bottom <= blob.bottom
+        )
+    )
 
 
 def _within(piece: Blob, blob: Blob) -> bool:

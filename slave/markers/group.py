@@ -11,17 +11,15 @@ tips are 2-4 sizes apart, the little finger and the thumb 12, back and middle fi
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Image
-from slave.markers.blobs import Blob
-from slave.markers.classify import ColourTable
+from slave.markers.blobs import SCALE, Blob
+from slave.markers.classify import Codes
 
 REACH = 8.5  # marker sizes between neighbours of one hand
 SKIN_REACH = 0.8  # how much farther, relatively, skin around both lets them be
-RING = 2  # px around the box in which skin is sought
 SPECK = 24.0  # px^2; smaller blobs are rarely markers
 FRINGE = 0.3  # what a fringe counts
 SAME = 0.7  # areas: a blob in the box of another colour's that is as large may be the rim of it
@@ -35,9 +33,8 @@ STRANGE_FILL = 0.3  # of its box; less is thin like a pen
 SECOND_HAND = 3  # markers
 
 
-@dataclass(frozen=True, slots=True)
-class Candidate:
-    """A blob that may be marker `marker`, and what speaks for it.
+class Candidate(NamedTuple):
+    """A blob that may be marker `marker`, and what speaks for it; made by `candidate`.
 
     Attributes:
         marker: Row of the marker.
@@ -45,6 +42,8 @@ class Candidate:
         skin: Share of its surroundings that is skin, 0..1.
         fringe: It touches a much larger blob of another colour: perhaps only the rim of that one.
         bonus: What click or track add to its score.
+        size: Side of a square of the same area [px].
+        score: Sum of evidence; 1 for being there at all.
     """
 
     marker: int
@@ -52,26 +51,30 @@ class Candidate:
     skin: float
     fringe: bool
     bonus: float
-
-    @property
-    def size(self) -> float:
-        """Side of a square of the same area [px]."""
-        return math.sqrt(self.blob.area)
-
-    @property
-    def score(self) -> float:
-        """Sum of evidence; 1 for being there at all."""
-        there = min(1.0, self.blob.area / SPECK) ** 2 * (FRINGE if self.fringe else 1.0)
-        return there * (1.0 + min(1.0, 3.0 * self.skin)) + self.bonus
+    size: float
+    score: float
 
 
-def skin_share(image: Image, table: ColourTable, blob: Blob) -> float:
-    """Share of the pixels around the blob's box that have the hue and saturation of skin, 0..1."""
-    top, left = max(blob.top - RING, 0), max(blob.left - RING, 0)
-    window = image[top : blob.bottom + RING, left : blob.right + RING]
-    skin = np.count_nonzero(table.codes(window) & table.skin)
-    around = window.shape[0] * window.shape[1] - blob.area
-    return min(1.0, skin / max(around, 1.0))
+def candidate(marker: int, blob: Blob, skin: float, fringe: bool, bonus: float) -> Candidate:
+    """A candidate with its size and its score."""
+    there = min(1.0, blob.area / SPECK) ** 2 * (FRINGE if fringe else 1.0)
+    score = there * (1.0 + min(1.0, 3.0 * skin)) + bonus
+    return Candidate(marker, blob, skin, fringe, bonus, math.sqrt(blob.area), score)
+
+
+def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
+    """Share of the points around a blob that are skin, 0..1.
+
+    Args:
+        codes: (H, W) codes of the scan at every `SCALE`-th pixel.
+        skin: Bit mask of skin.
+        blob: The blob; its box reaches to the next points around it.
+    """
+    # The box is as wide as the grid leaves open: its border lies one pixel before the points around the blob.
+    top, left = max((blob.top - 1) // SCALE, 0), max((blob.left - 1) // SCALE, 0)
+    window = codes[top : blob.bottom // SCALE + 1, left : blob.right // SCALE + 1]
+    around = window.size - blob.area / SCALE**2
+    return min(1.0, float(np.count_nonzero(window & skin)) / max(around, 1.0))
 
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
@@ -90,12 +93,6 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
             and other.top <= blob.v <= other.bottom
         )
     )
-
-
-def linked(a: Candidate, b: Candidate) -> bool:
-    """Whether two blobs are near enough to sit on one hand."""
-    reach = REACH * (1.0 + SKIN_REACH * min(1.0, 4.0 * min(a.skin, b.skin)))
-    return math.hypot(a.blob.u - b.blob.u, a.blob.v - b.blob.v) <= reach * math.sqrt(a.size * b.size)
 
 
 def connected(blobs: Sequence[Blob]) -> bool:
@@ -119,49 +116,74 @@ def choose(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
     The best group is a hand. Markers that it has not may be on a second hand: a group of at least `SECOND_HAND`
     markers with skin. Less than that is clutter that happens to lie together.
     """
-    rest = list(candidates)
+    links = _links(candidates)
+    rest = set(range(len(candidates)))
     while True:
-        best = _best_group(rest)
-        strange = [c for c in best.values() if _strange(c, [o for o in best.values() if o is not c])]
+        best = _best_group(candidates, links, rest)
+        members = [candidates[i] for i in best]
+        strange = {
+            i for i, c in zip(best, members, strict=True) if _strange(c, [o for o in members if o is not c])
+        }
         if not strange:
             break
-        rest = [c for c in rest if c not in strange]  # what it kept out may be the marker
+        rest -= strange  # what it kept out may be the marker
+    found = {c.marker: c for c in members}
     # A fringe on the first hand must not keep a marker from the second.
-    free = [c for c in rest if c.marker not in best or (best[c.marker].fringe and not c.fringe)]
-    second = _best_group(free)
-    members = [c for c in second.values() if c.blob.area >= SPECK or c.bonus >= TRACKED]
-    solid = [c for c in members if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
-    if len(solid) < SECOND_HAND:
-        return best
-    return best | {c.marker: c for c in members if c in solid or not _strange(c, solid)}
+    free = {
+        i
+        for i in rest
+        if (taken := found.get(candidates[i].marker)) is None or (taken.fringe and not candidates[i].fringe)
+    }
+    second = [candidates[i] for i in _best_group(candidates, links, free)]
+    second = [c for c in second if c.blob.area >= SPECK or c.bonus >= TRACKED]
+    solid = [c for c in second if c.skin >= 2.0 * SKINLESS or c.bonus >= TRACKED]
+    if len(solid) >= SECOND_HAND:
+        markers = {c.marker for c in solid}
+        found |= {c.marker: c for c in second if c.marker in markers or not _strange(c, solid)}
+    return found
 
 
-def _best_group(candidates: Sequence[Candidate]) -> dict[int, Candidate]:
-    best: dict[int, Candidate] = {}
+def _links(candidates: Sequence[Candidate]) -> list[set[int]]:
+    """Of each candidate those near enough to sit on one hand with it."""
+    if not candidates:
+        return []
+    u, v, size, skin = np.array([(c.blob.u, c.blob.v, c.size, c.skin) for c in candidates]).T
+    reach = REACH * (1.0 + SKIN_REACH * np.minimum(1.0, 4.0 * np.minimum(skin, skin[:, None])))
+    near = (u - u[:, None]) ** 2 + (v - v[:, None]) ** 2 <= reach**2 * (size * size[:, None])
+    return [set(row.nonzero()[0].tolist()) for row in near]
+
+
+def _best_group(candidates: Sequence[Candidate], links: Sequence[set[int]], among: set[int]) -> list[int]:
+    """The linked set with the best sum of evidence, one candidate of each marker."""
+    best: list[int] = []
     best_score = -1.0
-    for members in _components(candidates):
-        chosen: dict[int, Candidate] = {}
-        for candidate in members:
-            rival = chosen.get(candidate.marker)
-            if rival is None or _fit(candidate, members) > _fit(rival, members):
-                chosen[candidate.marker] = candidate
-        score = sum(c.score for c in chosen.values())
+    for group in _components(links, among):
+        rivals: dict[int, list[int]] = {}
+        for i in group:
+            rivals.setdefault(candidates[i].marker, []).append(i)
+        members = [candidates[i] for i in group]
+        chosen = [
+            some[0] if len(some) == 1 else max(some, key=lambda i: _fit(candidates[i], members))
+            for some in rivals.values()
+        ]
+        score = sum(candidates[i].score for i in chosen)
         if score > best_score:
             best, best_score = chosen, score
     return best
 
 
-def _components(candidates: Sequence[Candidate]) -> list[list[Candidate]]:
-    """Groups of candidates that are linked directly or through others, in a fixed order."""
-    rest = list(candidates)
-    groups: list[list[Candidate]] = []
+def _components(links: Sequence[set[int]], among: set[int]) -> list[list[int]]:
+    """Sets of candidates that are linked directly or through others, in a fixed order."""
+    rest = set(among)
+    groups: list[list[int]] = []
     while rest:
-        group = [rest.pop(0)]
-        for member in group:  # grows while it is walked
-            near = [c for c in rest if linked(member, c)]
-            group.extend(near)
-            rest = [c for c in rest if c not in near]
-        groups.append(group)
+        first = min(rest)
+        group, edge = {first}, {first}
+        while edge:
+            edge = set[int]().union(*(links[i] for i in edge)) & rest - group
+            group |= edge
+        rest -= group
+        groups.append(sorted(group))
     return groups
 
 
@@ -186,7 +208,8 @@ def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
     if _median([c.skin for c in others]) < 3.0 * SKINLESS:
         return False
     blob = candidate.blob
-    fill = blob.area / ((blob.right - blob.left) * (blob.bottom - blob.top))
+    slack = SCALE - 1  # of the box, see `Blob`
+    fill = blob.area / ((blob.right - blob.left - slack) * (blob.bottom - blob.top - slack))
     largest, typical = max(c.blob.area for c in others), _median([c.blob.area for c in others])
     return blob.area > min(STRANGE_SIZE * typical, STRANGE_SHARE * largest) or (
         blob.area >= SPECK and fill < STRANGE_FILL
