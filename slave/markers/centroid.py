@@ -222,8 +222,11 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
     for tile, b, lonely in zip(own, blobs, alone, strict=True):
         if lonely:
             continue
-        parts = cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U)
-        count, labels = int(parts[0]), np.asarray(parts[1], np.uint16)
+        parts = cast(
+            tuple[int, Image],
+            cv2.connectedComponents(tile.view(np.uint8), connectivity=8, ltype=cv2.CV_16U),
+        )
+        count, labels = parts
         # The blob's points of the grid lie inside its box by the width of the grid.
         rows = slice(PAD + SCALE - 1, max(PAD + b.bottom - b.top - SCALE + 1, PAD + SCALE))
         columns = slice(PAD + SCALE - 1, max(PAD + b.right - b.left - SCALE + 1, PAD + SCALE))
