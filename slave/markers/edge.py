@@ -21,8 +21,9 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 
 RAYS = 48
 STEP_PX = 0.5
-ROUNDS = 10
-KEEP = (0.5, 0.55)  # share of the rays that the first rounds trust
+ROUNDS = 8
+KEEP = (RAYS // 2, RAYS * 11 // 20)  # rays that the first rounds trust
+DONE_PX = 0.03  # a shift that changes nothing
 SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
 LEFT = 0.45  # share of the rays that must be left
 FIT_PX = 0.35  # RMS of their residuals
@@ -75,13 +76,14 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         length = np.sqrt(np.maximum((slope * slope).sum(axis=1), 1e-9))
         residual = (level - 2.0) / length  # distance from the ellipse, outwards positive
         # At first the centre is off by a part of the radius, and the own edge is where the distances are largest.
-        kept = residual > (-SHORT_PX if turn >= 2 else float(np.quantile(residual, 1.0 - KEEP[turn])))
+        least = -SHORT_PX if turn >= len(KEEP) else float(np.sort(residual)[RAYS - KEEP[turn]])
+        kept = residual >= least
         if kept.sum() < LEFT * RAYS:
             return None
         normal: Float = slope[kept] / length[kept, None]
         shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
         centre += shift
-        if turn >= 2 and bool((kept == own).all()) and float(np.abs(shift).max()) < 0.02:
+        if turn >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
             break
         own = kept
     rms = float(np.sqrt(np.mean(np.square(residual[own]))))

@@ -58,7 +58,7 @@ class Grid(NamedTuple):
     middle: tuple[int, int]
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=32)
 def grid_of(height: int, width: int) -> Grid:
     """The grid of windows (height, width) [px]."""
     y, x = np.mgrid[0:height, 0:width].reshape(2, -1)
