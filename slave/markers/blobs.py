@@ -25,6 +25,8 @@ FULL = 0.6  # share of its box that one compact blob fills at least: an upright 
 FRAGMENT_SHARE = 0.04  # of the largest piece, below which a piece is noise or fringe
 FRAGMENT_GAP = 0.5  # of the largest piece's size
 FRAGMENT_LEAST = 8.0  # px^2
+FRAGMENT_UNKNOWN = 0.3  # of the largest piece: what is larger is a rival, where the whole is not known
+POINT = float(SCALE * SCALE)  # px^2; areas are known to about this
 
 
 class Blob(NamedTuple):
@@ -108,28 +110,44 @@ def find_blobs(
     return found
 
 
-def with_fragments(blob: Blob, options: Sequence[Blob], extent: float) -> Blob:
-    """`blob`, its box widened over the pieces that something in front of the marker split from it.
+def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: float) -> tuple[Blob, float]:
+    """`blob` with the pieces that something in front of the marker split from it, and how far that may mislead.
 
     Args:
         blob: The marker's largest piece.
         options: All blobs of its colour.
         extent: Largest width or height of the whole marker [px], as far as known, else inf.
+        whole: Its whole area [px^2], as far as known, else nan: then only small pieces are joined, since a large one
+            may as well be a thing beside it.
+
+    Returns:
+        The blob, its box widened over all pieces. And the way [px] of the centroid that joining makes, where it is
+        not known that so much is missing: if the pieces are something else, the centroid is off by that.
     """
     left, top, right, bottom = blob.left, blob.top, blob.right, blob.bottom
     reach = FRAGMENT_GAP * math.sqrt(blob.area)
+    known = math.isfinite(whole)
+    most = 1.3 * max(whole - blob.area, 0.0) if known else FRAGMENT_UNKNOWN * blob.area
+    area, u, v = blob.area, blob.u * blob.area, blob.v * blob.area
     for piece in options:
         if (
             piece is blob
-            or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area)
             or piece.area > blob.area
+            or piece.area < max(FRAGMENT_LEAST, FRAGMENT_SHARE * blob.area)
         ):
             continue
-        gap = max(piece.left - right, left - piece.right, piece.top - bottom, top - piece.bottom)
+        # Boxes leave open where between two points of the grid the colour ends: on average half of it, on each side.
+        gap = max(piece.left - right, left - piece.right, piece.top - bottom, top - piece.bottom) + SCALE
         box = min(left, piece.left), min(top, piece.top), max(right, piece.right), max(bottom, piece.bottom)
-        if gap <= reach and max(box[2] - box[0], box[3] - box[1]) <= extent:
+        if (
+            gap <= reach
+            and area - blob.area + piece.area <= most + POINT
+            and max(box[2] - box[0], box[3] - box[1]) <= extent
+        ):
             left, top, right, bottom = box
-    return blob._replace(left=left, top=top, right=right, bottom=bottom)
+            area, u, v = area + piece.area, u + piece.u * piece.area, v + piece.v * piece.area
+    doubt = 0.0 if known and area <= whole else math.hypot(u / area - blob.u, v / area - blob.v)
+    return blob._replace(left=left, top=top, right=right, bottom=bottom), doubt
 
 
 def _nonzero(flat: Codes, wanted: int) -> npt.NDArray[np.int64]:

@@ -19,7 +19,7 @@ from common.calibration import CameraCalibration
 from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
 from slave.markers.centroid import PAD, Measured, measure
 from slave.markers.classify import Codes, ColourTable, table_of
-from slave.markers.edge import Ellipse, centre_of
+from slave.markers.edge import Ellipse, centre_of, explained
 from slave.markers.group import (
     CLICKED,
     TRACKED,
@@ -42,6 +42,7 @@ CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that 
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
+RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival
 
 
@@ -56,8 +57,8 @@ class Detections:
         quality: (M,) 0..1; 1 is a whole, unambiguous, clear marker.
         sigma_px: (M,) standard deviation per axis of `uv` as an estimate of the centroid of all that the camera
             would see of the whole cap: noise, doubt of occlusion, size, motion.
-        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px], as the scan saw
-            it, a pixel or so; NaN: none.
+        rival_uv: (M, 2) centroid of a second blob of the colour that may be the marker instead [px]; in a frame with
+            many only as the scan saw it, to a pixel or so; NaN: none.
         colour: (M, 3) mean of the core in linear light 0..1: blue, green, red.
     """
 
@@ -125,19 +126,26 @@ class MarkerDetector:
         self._seeds = {}
         rows = list(chosen)
         rivals: dict[int, Blob] = {}
+        doubt: dict[int, float] = {}
         for m in rows:
             if len(blobs[m]) > 1:
+                chosen[m], doubt[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
                 rival = self._rival(m, chosen[m], blobs[m], t_ns)
                 if rival is not None:
                     rivals[m] = rival
-                chosen[m] = with_fragments(chosen[m], blobs[m], self._extent(m, t_ns))
-        alone = [len(blobs[m]) == 1 or _alone(chosen[m], blobs[m]) for m in rows]
-        bits = [self._table.bits[m] for m in rows]
-        measured = measure(image, self._table, bits, list(chosen.values()), alone)
+        # A rival costs as much as a marker, so a frame full of them is not measured through.
+        closely = sorted(rivals, key=lambda m: -rivals[m].area)[:RIVALS]
+        windows = [(m, chosen[m]) for m in rows] + [(m, rivals[m]) for m in closely]
+        alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in windows]
+        bits = [self._table.bits[m] for m, _ in windows]
+        measured = measure(image, self._table, bits, [blob for _, blob in windows], alone)
+        for m, seen in zip(closely, measured[len(rows) :], strict=True):
+            if seen is not None:
+                rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
         result = np.full((10, len(self._names)), np.nan)
-        for m, seen in zip(rows, measured, strict=True):
+        for m, seen in zip(rows, measured, strict=False):
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                result[:, m] = self._report(m, seen, chosen[m], rivals.get(m), t_ns)
+                result[:, m] = self._report(m, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
         np.round(result, DIGITS, out=result)
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
@@ -145,7 +153,9 @@ class MarkerDetector:
         """Go on with another colour table of the same markers; what is tracked stays tracked."""
         self._table = table
 
-    def _report(self, m: int, seen: Measured, blob: Blob, rival: Blob | None, t_ns: int) -> tuple[float, ...]:
+    def _report(
+        self, m: int, seen: Measured, blob: Blob, rival: Blob | None, t_ns: int, doubt: float
+    ) -> tuple[float, ...]:
         """One marker's column of the result; its track goes on."""
         before = self._tracks[m]
         if before is not None and not before.alive(t_ns):
@@ -156,12 +166,12 @@ class MarkerDetector:
         u, v, area = seen.u, seen.v, seen.area
         smear = math.hypot(track.du, track.dv) * self._exposure_s
         if before is not None and track.covered and smear < SMEARED and not (seen.cut or seen.thin):
-            whole = centre_of(
-                seen.window, Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
-            )
-            if whole is not None:
+            shape, x, y = Ellipse(before.xx, before.xy, before.yy), u - seen.left, v - seen.top
+            whole = centre_of(seen.window, shape, x, y)
+            if whole is not None and explained(before.hidden(seen.area), shape, whole.u - x, whole.v - y):
                 u, v, area = seen.left + whole.u, seen.top + whole.v, before.usual
                 sigma = math.hypot(COVERED_PX, whole.rms)
+        sigma = math.hypot(sigma, doubt)
         other = (math.nan, math.nan)
         if rival is not None:
             other = rival.u, rival.v
@@ -173,7 +183,7 @@ class MarkerDetector:
     def _rival(self, m: int, blob: Blob, options: list[Blob], t_ns: int) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell."""
         track = self._tracks[m]
-        others = [b for b in options if b is not blob and b.area > RIVAL * blob.area and not _within(b, blob)]
+        others = [b for b in options if b.area > RIVAL * blob.area and not _within(b, blob)]
         if track is not None and track.alive(t_ns):
             width = self._camera.width_px
             others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]
@@ -202,12 +212,12 @@ class MarkerDetector:
             self._turn = 0
         return codes, blobs
 
-    def _extent(self, m: int, t_ns: int) -> float:
-        """Largest side of the whole marker [px] as far as its track knows, else inf."""
+    def _known(self, m: int, t_ns: int) -> tuple[float, float]:
+        """Largest side [px] and area [px^2] of the whole marker as far as its track knows, else inf and nan."""
         track = self._tracks[m]
         if track is None or not track.alive(t_ns):
-            return math.inf
-        return 1.3 * max(track.width, track.height) + 2.0
+            return math.inf, math.nan
+        return 1.3 * max(track.width, track.height) + 2.0, track.whole
 
     def _decide(self, codes: Codes, blobs: list[list[Blob]], t_ns: int) -> dict[int, Blob]:
         """Marker row -> its blob, by prediction alone where that answers for every colour in the image."""

@@ -27,8 +27,15 @@ DONE_PX = 0.03  # a shift that changes nothing
 SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
 LEFT = 0.45  # share of the rays that must be left
 FIT_PX = 0.35  # RMS of their residuals
+UNSURE = 0.05  # by so much the hidden share may be larger than the areas tell,
+UNSURE_PX = 0.3  # and a centre off: two standard deviations
 _ANGLES = np.arange(RAYS, dtype=np.float64) * (2.0 * math.pi / RAYS)
 DIRECTIONS: Float = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1).astype(np.float64)
+
+# Segments of a unit disc behind a straight edge: share of the area, and the way of the rest's centroid.
+_CHORD: Float = np.linspace(0.999, 0.0, 200)
+_SHARE: Float = (np.arccos(_CHORD) - _CHORD * np.sqrt(1.0 - _CHORD**2)) / math.pi
+_WAY: Float = 2.0 / 3.0 * (1.0 - _CHORD**2) ** 1.5 / (math.pi * (1.0 - _SHARE))
 
 
 class Ellipse(NamedTuple):
@@ -90,6 +97,20 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
     if rms > FIT_PX or float(np.hypot(*(centre - (u, v)))) > longest:
         return None
     return Centre(float(centre[0]), float(centre[1]), rms)
+
+
+def explained(hidden: float, shape: Ellipse, du: float, dv: float) -> bool:
+    """Whether what hides this share of a cap can have moved the centroid of the rest by (du, dv) [px].
+
+    Of all parts of one area the segment behind a straight edge lies farthest out, so nothing moves the centroid more:
+    in a unit disc whose edge is at d by 2/3 (1 - d^2)^1.5 / (pi (1 - h)). An ellipse is such a disc, stretched.
+    """
+    determinant = shape.xx * shape.yy - shape.xy**2
+    if determinant <= 0.0:
+        return False
+    squared = (du * du * shape.yy - 2.0 * du * dv * shape.xy + dv * dv * shape.xx) / determinant
+    radius = 2.0 * math.sqrt(math.sqrt(determinant))  # of a disc of the same area
+    return 0.5 * math.sqrt(squared) <= float(np.interp(hidden + UNSURE, _SHARE, _WAY)) + UNSURE_PX / radius
 
 
 def _edge(share: Float32, start: Float, reach: float) -> Float:

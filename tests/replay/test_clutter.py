@@ -22,7 +22,6 @@ from tests.replay.test_datasets import command
 
 SECONDS, RADIUS_PX, MARKER = 0.5, 8.0, 1
 RIGHT_MM, WRONG_MM = 10.0, 20.0
-NEW_FRAMES = 3  # a slave without any past cannot tell a thing beside a cap from a piece of it
 STARTS_S = {1: 9.5, 2: 8.0}  # scene seed -> a first moment after which both cameras see the finger
 
 
@@ -88,12 +87,11 @@ def replayed(folder: Path, root: Path) -> Float:
 
 
 def apart(recorded: Recorded, places: Float) -> Bool:
-    """(T,) frames in which the disc touches the marker in no camera, nor in those before and after; not the first."""
+    """(T,) frames in which the disc touches the marker in no camera, nor in those before and after."""
     distance = np.linalg.norm(places - recorded.uv[:, :, MARKER], axis=2)
     clear = ~(distance < RADIUS_PX + 1.3 * np.sqrt(recorded.area[:, :, MARKER] / np.pi) + 4.0).any(axis=1)
     near = np.concatenate([[True], clear, [True]])
     clear = near[:-2] & clear & near[2:]
-    clear[:NEW_FRAMES] = False
     return clear
 
 

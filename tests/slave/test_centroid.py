@@ -15,9 +15,9 @@ TABLE = ColourTable(list(RANGES.values()))
 FAR = math.inf
 
 
-def measured(image: Image, marker: int, extent: float = FAR) -> Measured:
+def measured(image: Image, marker: int, extent: float = FAR, whole: float = math.nan) -> Measured:
     options = find_blobs(TABLE.scan(image, SCALE), TABLE.bits)[marker]
-    blob = with_fragments(options[0], options, extent)
+    blob, _ = with_fragments(options[0], options, extent, whole)
     (result,) = measure(image, TABLE, [TABLE.bits[marker]], [blob], [len(options) == 1])
     assert result is not None
     return result
@@ -58,7 +58,7 @@ def test_something_in_front_splits_the_marker_and_both_parts_count() -> None:
     scene = [Disc(paint(5), 60.0, 50.0, 14.0)]
     image = render(scene, 120, 100)
     image[:, 58:63] = render([], 120, 100)[:, 58:63]  # a stick of the desk's colour across it
-    seen = measured(image, 5, extent=40.0)
+    seen = measured(image, 5, extent=40.0, whole=math.pi * 14.0**2)
     columns = np.r_[46:58, 63:75]
     heights = 2.0 * np.sqrt(np.maximum(14.0**2 - (columns - 60.0) ** 2, 0.0))
     assert seen.u == pytest.approx((columns * heights).sum() / heights.sum(), abs=0.15)

@@ -124,6 +124,32 @@ def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
         assert np.isnan(found.rival_uv[[0, 3, 4, 5]]).all()
 
 
+@pytest.mark.parametrize("radius", [5.0, 7.0])
+@pytest.mark.parametrize("gap", [6.0, 9.0, 12.0])
+@pytest.mark.parametrize("turn", [-2.8, 3.6, 4.2])
+def test_a_thing_beside_a_marker_never_seen_before_is_its_rival_not_a_part_of_it(
+    radius: float, gap: float, turn: float
+) -> None:
+    away = 7.0 + gap + radius
+    thing = 265.0 + away * math.cos(turn), 110.0 + away * math.sin(turn)
+    for found in push_all([render([*hand(), Disc(paint(1), *thing, radius)])] * 2):
+        place, rival = (np.hypot(*(uv[1] - (265.0, 110.0))) for uv in (found.uv, found.rival_uv))
+        assert min(place, rival) < 0.3
+        assert np.hypot(*(found.rival_uv[1] - thing)) < 0.3 or np.hypot(*(found.uv[1] - thing)) < 0.3
+
+
+def test_a_piece_split_off_is_joined_in_doubt_where_the_whole_is_not_known() -> None:
+    whole, empty = render([Disc(paint(1), 300.0, 240.0, 30.0)]), render([])
+    split = whole.copy()
+    split[242:258] = empty[242:258]  # something in front, across the cap
+    new, known = push_all([split])[0], push_all([whole, whole, split])[2]
+    for found in (new, known):
+        assert np.hypot(*(found.uv[1] - (300.0, 240.0))) < 6.0  # 12 px without the piece
+        assert np.isnan(found.rival_uv[1]).all()
+    assert new.sigma_px[1] > 3.0
+    assert known.sigma_px[1] < 0.8 * new.sigma_px[1]
+
+
 def test_an_empty_frame_finds_nothing_and_noise_is_nothing() -> None:
     for noise in (0.0, 4.0):
         (found,) = push_all([render([], noise=noise)])

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.markers.edge import Ellipse, centre_of
+from slave.markers.edge import Ellipse, centre_of, explained
 
 OVER = 8
 
@@ -48,6 +48,29 @@ def test_the_centre_of_a_covered_ellipse_is_found_from_its_own_edge(
     away = math.hypot(found.u - u, found.v - v)
     assert away < 0.3
     assert away < 0.6 * math.hypot(seen_u - u, seen_v - v)
+
+
+@given(
+    st.floats(5.0, 12.0),
+    st.floats(0.5, 1.0),
+    st.floats(0.0, math.pi),
+    st.floats(0.06, 0.45),
+    st.floats(0.0, 2.0 * math.pi),
+)
+def test_a_straight_edge_explains_the_way_that_it_makes_and_not_twice_as_far(
+    a: float, aspect: float, turn: float, share: float, side: float
+) -> None:
+    _, seen_u, seen_v = covered_ellipse(a, a * aspect, turn, 24.3, 23.6, share, side)
+    du, dv = 24.3 - seen_u, 23.6 - seen_v
+    shape = moments(a, a * aspect, turn)
+    assert explained(share, shape, du, dv)
+    assert not explained(share, shape, 2.0 * du + math.copysign(1.5, du), 2.0 * dv + math.copysign(1.5, dv))
+
+
+def test_a_loss_of_a_tenth_does_not_move_a_small_cap_by_its_radius() -> None:
+    # A finger that turns its end to the camera: a crescent is left, whose edge fits an ellipse far away.
+    assert not explained(0.1, Ellipse(12.0, 1.6, 4.5), 3.0, 1.5)
+    assert not explained(0.1, Ellipse(0.0, 0.0, 0.0), 0.0, 0.0)
 
 
 def test_a_part_that_is_too_small_for_the_shape_is_no_answer() -> None:
