@@ -43,7 +43,7 @@ SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
 RIVALS = 2  # that are measured in one frame
-RIVAL = 0.3  # of the marker's area: a smaller blob is no rival
+RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +183,8 @@ class MarkerDetector:
     def _rival(self, m: int, blob: Blob, options: list[Blob], t_ns: int) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell."""
         track = self._tracks[m]
-        others = [b for b in options if b.area > RIVAL * blob.area and not _within(b, blob)]
+        least, most = RIVAL * blob.area, blob.area / RIVAL
+        others = [b for b in options if least < b.area < most and not _within(b, blob)]
         if track is not None and track.alive(t_ns):
             width = self._camera.width_px
             others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]

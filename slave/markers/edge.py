@@ -21,9 +21,9 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 
 RAYS = 48
 STEP_PX = 0.5
-ROUNDS = 8
+ROUNDS = 6
 KEEP = (RAYS // 2, RAYS * 11 // 20)  # rays that the first rounds trust
-DONE_PX = 0.03  # a shift that changes nothing
+DONE_PX = 0.06  # a shift that changes nothing
 SHORT_PX = 0.6  # a ray that ends so much before the ellipse sees something else
 LEFT = 0.45  # share of the rays that must be left
 FIT_PX = 0.35  # RMS of their residuals
