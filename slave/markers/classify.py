@@ -51,6 +51,11 @@ class ColourTable:
         self._index = np.empty((0, 0), np.int64)
         self._codes: Codes = np.empty((0, 0), self._table.dtype)
 
+    @property
+    def entries(self) -> Codes:
+        """The table itself: codes (2^24,) of packed pixels, blue in the lowest byte."""
+        return self._table
+
     def relit(self, tables: Image) -> "ColourTable":
         """The table for pictures whose bytes must be mapped before these ranges hold, about 50 ms.
 

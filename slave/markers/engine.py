@@ -1,0 +1,65 @@
+"""Which code scans and measures: OpenCV and numpy, or machine code that does the same. Chosen by name alone."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from common.arrays import Image
+from slave.markers.blobs import SCALE, Blob, find_blobs
+from slave.markers.centroid import Measured, measure
+from slave.markers.classify import Codes, ColourTable
+
+ScanBlobs: TypeAlias = Callable[
+    [Image, ColourTable, Sequence[int], int, int, int], tuple[Codes, list[list[Blob]]]
+]
+Measure: TypeAlias = Callable[
+    [Image, ColourTable, Sequence[int], Sequence[Blob], Sequence[bool]], list[Measured | None]
+]
+ENGINES = ("numpy", "numba")
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """The two steps of a detector that look at pixels.
+
+    Attributes:
+        scan_blobs: Image, table, bits, step, dx, dy -> codes of the scan (may be reused by the next call), and the
+            blobs of each colour (`blobs.find_blobs`).
+        measure: As `centroid.measure`.
+        prepare: Makes ready for a table what would else be made in the first frame: machine code, brief tables.
+    """
+
+    scan_blobs: ScanBlobs
+    measure: Measure
+    prepare: Callable[[ColourTable], None]
+
+
+def scan_blobs(
+    image: Image, table: ColourTable, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
+) -> tuple[Codes, list[list[Blob]]]:
+    """Codes of the scan, which the next call reuses, and blobs of each colour."""
+    codes = table.scan(image, step, dx, dy)
+    return codes, find_blobs(codes, bits, step, dx, dy)
+
+
+def _nothing(_table: ColourTable) -> None:
+    """Numpy needs no preparation."""
+
+
+NUMPY = Engine(scan_blobs, measure, _nothing)
+
+
+def engine_named(name: str) -> Engine:
+    """The engine of a name of `ENGINES`.
+
+    Raises:
+        PhalanxError: numba is asked for and not installed; the text says how to install it.
+        ValueError: No such name.
+    """
+    if name == "numpy":
+        return NUMPY
+    if name == "numba":
+        from slave.markers.fast import NUMBA  # an optional package: only who asks for it loads it
+
+        return NUMBA
+    raise ValueError(f"engine {name!r}, not one of {', '.join(ENGINES)}")

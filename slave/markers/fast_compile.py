@@ -1,0 +1,31 @@
+"""Compile a function to machine code with numba, the package of the `fast` extra; a clear error where it is missing.
+
+Machine code is kept beside the source (or in the user's cache folder where that is read-only), so only the first
+start of a version compiles. The cache does not know the constants of other modules: what may change there is passed
+as an argument.
+"""
+
+import importlib
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+from common.errors import PhalanxError
+
+INSTALL = "install it with `pip install 'phalanx-hand[fast]'`, or say --engine numpy"
+F = TypeVar("F", bound=Callable[..., object])
+
+
+def compiled(function: F) -> F:
+    """`function` as machine code, compiled at the first call with arguments of new types.
+
+    It releases the interpreter's lock. Sums may be added up in another order (`reassoc`, `contract`); NaN and
+    infinity keep their meaning.
+
+    Raises:
+        PhalanxError: numba is not installed, or does not fit the installed numpy.
+    """
+    try:
+        numba = cast(Any, importlib.import_module("numba"))
+    except ImportError as error:
+        raise PhalanxError(f"--engine numba: numba cannot be used ({error}); {INSTALL}") from error
+    return cast(F, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))

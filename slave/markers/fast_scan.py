@@ -1,0 +1,226 @@
+"""Scan a frame and find its blobs as `ColourTable.scan` and `blobs.find_blobs` do, as machine code in one go.
+
+The scan asks the table only for colours whose lowest three bits are 0, so the cells of the
+table answer it (`fast_cells`). Points of a colour are counted while the frame is read; only scattered ones are
+labelled.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float, Image, Int
+from slave.markers import blobs
+from slave.markers.blobs import SCALE, Blob
+from slave.markers.classify import Codes, ColourTable
+from slave.markers.fast_cells import cells_of
+from slave.markers.fast_compile import compiled
+
+
+class Grid(NamedTuple):
+    """The grid of the scan, and the constants of `blobs`, as arguments of machine code.
+
+    Attributes:
+        step, dx, dy: Distance of its lines, and where it begins [px].
+        slack: How far a blob's box reaches beyond its points [px].
+        most: Blobs of one colour, at most.
+        full: Share of its box that one compact blob fills at least.
+    """
+
+    step: int
+    dx: int
+    dy: int
+    slack: int
+    most: int
+    full: float
+
+
+def scan_blobs(
+    image: Image, table: ColourTable, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
+) -> tuple[Codes, list[list[Blob]]]:
+    """Codes of the scan, and the blobs of each colour, largest first.
+
+    Args:
+        image: (H, W, 3) BGR.
+        table: Colour table of the camera.
+        bits: Bit mask of each marker that is sought.
+        step, dx, dy: The grid, as for `ColourTable.scan`.
+
+    Returns:
+        (H // step, W // step) codes, and one list per marker, empty where its colour is not in the image.
+    """
+    pixels = np.ascontiguousarray(image).view()
+    pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
+    cells = cells_of(table).first
+    codes = np.empty((image.shape[0] // step, image.shape[1] // step), cells.dtype)
+    grid = Grid(step, dx, dy, step - 1, blobs.MAX_CANDIDATES, blobs.FULL)
+    places, boxes = np.empty((len(bits) * grid.most, 3)), np.empty((len(bits) * grid.most, 5), np.int64)
+    number = _scan_blobs(pixels, cells, np.array(bits, np.int64), grid, codes, places, boxes)
+    found: list[list[Blob]] = [[] for _ in bits]
+    for (u, v, area), (m, left, top, right, bottom) in zip(
+        places[:number].tolist(), boxes[:number].tolist(), strict=True
+    ):
+        found[m].append(Blob(u, v, area, left, top, right, bottom))
+    return codes, found
+
+
+@compiled
+def _scan_blobs(
+    image: Image, cells: Codes, bits: Int, grid: Grid, codes: Codes, places: Float, boxes: Int
+) -> int:
+    """Fill in the codes (H, W), and a row for each blob: u, v, area and marker, left, top, right, bottom [px].
+
+    Returns:
+        The number of rows.
+    """
+    hits = np.empty(codes.size, np.int64)
+    wanted = 0
+    for bit in bits:
+        wanted |= bit
+    count = _read(image, cells, wanted, grid, codes, hits)
+    width = codes.shape[1]
+    # Of each marker: points, sums of x and y, left, top, right, bottom (inclusive).
+    sums = np.zeros((len(bits), 7), np.int64)
+    flat = codes.reshape(-1)
+    for k in range(count):
+        place = np.int64(hits[k])
+        code = np.int64(flat[place])
+        y = place // width
+        x = place - y * width
+        for m in range(len(bits)):
+            if code & bits[m] == 0:
+                continue
+            s = sums[m]
+            if s[0] == 0:
+                s[3], s[4], s[5] = x, y, x
+            s[0] += 1
+            s[1] += x
+            s[2] += y
+            s[3] = min(s[3], x)
+            s[5] = max(s[5], x)
+            s[6] = y  # they come row by row
+    number = 0
+    for m in range(len(bits)):
+        n, sum_x, sum_y, left, top, right, bottom = sums[m]
+        if n == 0:
+            continue
+        if n >= grid.full * ((right - left + 1) * (bottom - top + 1)):
+            _put(grid, m, n, sum_x / n, sum_y / n, left, top, right, bottom, places[number], boxes[number])
+            number += 1
+        else:
+            parts = _label(codes, bits[m], left, top, right, bottom, grid.most)
+            for part in range(len(parts)):
+                n, _, sum_x, sum_y, left, top, right, bottom = parts[part]
+                _put(
+                    grid, m, n, sum_x / n, sum_y / n, left, top, right, bottom, places[number], boxes[number]
+                )
+                number += 1
+    return number
+
+
+@compiled
+def _read(image: Image, cells: Codes, wanted: int, grid: Grid, codes: Codes, hits: Int) -> int:
+    """Codes of the points, and the places of those with a wanted bit; return how many."""
+    count = 0
+    height, width = codes.shape
+    five, ten = np.uint64(5), np.uint64(10)
+    three = np.uint64(3)
+    line = 64 // 3  # pixels in a line of the cache
+    ahead = 0
+    for v in range(height):
+        row = image[grid.dy + grid.step * v, grid.dx :]
+        # The next row is asked from memory while this one is worked on.
+        later = image[min(grid.dy + grid.step * (v + 1), image.shape[0] - 1)]
+        for x in range(0, len(later), line):
+            ahead |= later[x, 0]
+        into = codes[v]
+        base = v * width
+        for u in range(width):
+            x = np.uint64(u * grid.step)
+            blue, green, red = np.uint64(row[x, 0]), np.uint64(row[x, 1]), np.uint64(row[x, 2])
+            code = cells[(blue >> three) | ((green >> three) << five) | ((red >> three) << ten)]
+            into[np.uint64(u)] = code
+            if np.int64(code) & wanted:
+                hits[count] = base + u
+                count += 1
+    return count + (ahead >> 8)  # 0: bytes have 8 bits
+
+
+@compiled
+def _put(
+    grid: Grid,
+    m: int,
+    points: int,
+    x: float,
+    y: float,
+    left: int,
+    top: int,
+    right: int,
+    bottom: int,
+    place: Float,
+    box: Int,
+) -> None:
+    """From points of the grid to pixels of the image; the box reaches to where the next points would be."""
+    step = grid.step
+    place[0], place[1], place[2] = grid.dx + step * x, grid.dy + step * y, step * step * points
+    box[0] = m
+    box[1], box[2] = grid.dx + step * left - grid.slack, grid.dy + step * top - grid.slack
+    box[3], box[4] = grid.dx + step * right + grid.slack + 1, grid.dy + step * bottom + grid.slack + 1
+
+
+@compiled
+def _label(codes: Codes, bit: int, left: int, top: int, right: int, bottom: int, most: int) -> Int:
+    """Connected parts (8 neighbours) of a colour in its box, largest first.
+
+    Returns:
+        (N, 8) points, rank, sum of x, sum of y, left, top, right, bottom (inclusive). Of parts of one size the first
+        is the one whose first block of 2 x 2 points comes first, as OpenCV numbers them.
+    """
+    width, height = right - left + 1, bottom - top + 1
+    stride = width + 2
+    mask = np.zeros(stride * (height + 2), np.uint8)
+    for y in range(height):
+        for x in range(width):
+            if np.int64(codes[top + y, left + x]) & bit:
+                mask[(y + 1) * stride + x + 1] = 1
+    stack = np.empty(width * height, np.int64)
+    parts = np.empty((most + 1, 8), np.int64)
+    number = 0
+    for start in range(len(mask)):
+        if mask[start] == 0:
+            continue
+        part = parts[number]
+        part[:] = 0
+        part[1] = width * height
+        part[4], part[5] = right, bottom
+        mask[start] = 0
+        stack[0] = start
+        depth = 1
+        while depth > 0:
+            depth -= 1
+            p = stack[depth]
+            y = p // stride - 1
+            x = p - (y + 1) * stride - 1
+            part[0] += 1
+            part[1] = min(part[1], (y // 2) * width + x // 2)
+            part[2] += left + x
+            part[3] += top + y
+            part[4], part[6] = min(part[4], left + x), max(part[6], left + x)
+            part[5], part[7] = min(part[5], top + y), max(part[7], top + y)
+            for row in range(p - stride, p + stride + 1, stride):
+                for q in range(row - 1, row + 2):
+                    if mask[q]:
+                        mask[q] = 0
+                        stack[depth] = q
+                        depth += 1
+        k = number
+        while k > 0 and (
+            parts[k, 0] > parts[k - 1, 0]
+            or (parts[k, 0] == parts[k - 1, 0] and parts[k, 1] < parts[k - 1, 1])
+        ):
+            for column in range(8):
+                parts[k, column], parts[k - 1, column] = parts[k - 1, column], parts[k, column]
+            k -= 1
+        number = min(number + 1, most)
+    return parts[:number]
