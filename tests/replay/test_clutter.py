@@ -91,8 +91,7 @@ def apart(recorded: Recorded, places: Float) -> Bool:
     distance = np.linalg.norm(places - recorded.uv[:, :, MARKER], axis=2)
     clear = ~(distance < RADIUS_PX + 1.3 * np.sqrt(recorded.area[:, :, MARKER] / np.pi) + 4.0).any(axis=1)
     near = np.concatenate([[True], clear, [True]])
-    clear = near[:-2] & clear & near[2:]
-    return clear
+    return near[:-2] & clear & near[2:]
 
 
 def one_view(recorded: Recorded) -> Float:
