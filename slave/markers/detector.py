@@ -16,10 +16,11 @@ import numpy as np
 
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration
-from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
-from slave.markers.centroid import PAD, Measured, measure
+from slave.markers.blobs import SCALE, Blob, with_fragments
+from slave.markers.centroid import PAD, Measured
 from slave.markers.classify import Codes, ColourTable, table_of
 from slave.markers.edge import Ellipse, centre_of, explained
+from slave.markers.engine import NUMPY, Engine
 from slave.markers.group import (
     CLICKED,
     TRACKED,
@@ -83,6 +84,7 @@ class MarkerDetector:
         markers: tuple[str, ...],
         seeds: Mapping[str, tuple[float, float]] | None = None,
         table: ColourTable | None = None,
+        engine: Engine = NUMPY,
     ) -> None:
         """Build the colour table (0.3 s) unless one is given.
 
@@ -91,6 +93,7 @@ class MarkerDetector:
             markers: Marker names in the order of the rig.
             seeds: Marker -> (u, v) [px], a pixel on that marker in the first frame, where known.
             table: Table built before from the same ranges.
+            engine: What scans and measures.
 
         Raises:
             CalibrationError: The camera has no colour range for a marker.
@@ -99,13 +102,15 @@ class MarkerDetector:
         self._exposure_s = camera.exposure_us * 1e-6
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
+        self._engine = engine
+        engine.prepare(self._table)
         self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
         self._tracks: list[Track | None] = [None] * len(markers)
         self._turn = -1  # which further grid is next; negative before the first frame
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
-        return MarkerDetector(self._camera, self._names, seeds, self._table)
+        return MarkerDetector(self._camera, self._names, seeds, self._table, self._engine)
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame.
@@ -138,7 +143,7 @@ class MarkerDetector:
         windows = [(m, chosen[m]) for m in rows] + [(m, rivals[m]) for m in closely]
         alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in windows]
         bits = [self._table.bits[m] for m, _ in windows]
-        measured = measure(image, self._table, bits, [blob for _, blob in windows], alone)
+        measured = self._engine.measure(image, self._table, bits, [blob for _, blob in windows], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
@@ -150,7 +155,7 @@ class MarkerDetector:
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
     def recolour(self, table: ColourTable) -> None:
-        """Go on with another colour table of the same markers; what is tracked stays tracked."""
+        """Go on with another colour table of the same markers, prepared for the engine; tracks go on."""
         self._table = table
 
     def _report(
@@ -196,17 +201,14 @@ class MarkerDetector:
         A colour that the grid shows nowhere is sought on further grids: in the first frame on all of them, later on
         one more each time, in turn.
         """
-        table = self._table
-        codes = table.scan(image, SCALE)
-        blobs = find_blobs(codes, table.bits)
+        table, scan = self._table, self._engine.scan_blobs
+        codes, blobs = scan(image, table, table.bits, SCALE, 0, 0)
         missing = [m for m, options in enumerate(blobs) if not options]
         if missing:
             codes = codes.copy()  # the next scan reuses it
             step, dx, dy = FINER if self._turn < 0 else OTHERS[self._turn]
             self._turn = (self._turn + 1) % len(OTHERS)
-            finer = find_blobs(
-                table.scan(image, step, dx, dy), [table.bits[m] for m in missing], step, dx, dy
-            )
+            _, finer = scan(image, table, [table.bits[m] for m in missing], step, dx, dy)
             for m, options in zip(missing, finer, strict=True):
                 blobs[m] = options
         elif self._turn < 0:

@@ -21,6 +21,7 @@ from common.srgb import relit_bytes
 from slave.markers.classify import ColourTable, table_of
 from slave.markers.colour_watch import ColourWarning, ColourWatch
 from slave.markers.detector import Detections, MarkerDetector
+from slave.markers.engine import NUMPY, Engine
 from slave.markers.light import CameraLight, apart
 from slave.markers.workers import Workers
 
@@ -43,6 +44,7 @@ class FollowingDetector:
         markers: tuple[str, ...],
         workers: Workers,
         seeds: Mapping[str, tuple[float, float]] | None = None,
+        engine: Engine = NUMPY,
     ) -> None:
         """Build the detector and its colour table (0.3 s).
 
@@ -51,6 +53,7 @@ class FollowingDetector:
             markers: Marker names in the order of the rig.
             workers: Where tables are made and a first light is sought.
             seeds: As of `MarkerDetector`.
+            engine: As of `MarkerDetector`.
 
         Raises:
             CalibrationError: The camera has no colour range for a marker.
@@ -59,10 +62,10 @@ class FollowingDetector:
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
-        self._detector = MarkerDetector(camera, markers, seeds, self._table)
+        self._detector = MarkerDetector(camera, markers, seeds, self._table, engine)
         self._light = CameraLight(self._table, reference, (camera.width_px, camera.height_px), workers)
         self._watch = ColourWatch(markers, ranges)
-        self._workers = workers
+        self._workers, self._engine = workers, engine
         self._in_use = np.zeros(3)  # log gains of the table in use
         self._making: tuple[Float, Future[ColourTable]] | None = None
         self._look_next = False
@@ -120,7 +123,7 @@ class FollowingDetector:
             gains = self.log_gains
             self._making = (
                 gains,
-                self._workers.submit(partial(self._table.relit, relit_bytes(np.exp(-gains)))),
+                self._workers.submit(partial(_relit, self._table, gains, self._engine)),
             )
         if self._making is not None and self._making[1].done():
             (self._in_use, job), self._making = self._making, None
@@ -128,11 +131,19 @@ class FollowingDetector:
             self.tables += 1
 
 
+def _relit(table: ColourTable, log_gains: Float, engine: Engine) -> ColourTable:
+    """A table for pictures under a light of these log gains (3,), ready for use."""
+    relit = table.relit(relit_bytes(np.exp(-log_gains)))
+    engine.prepare(relit)
+    return relit
+
+
 def detector_for(
     camera: CameraCalibration,
     markers: tuple[str, ...],
     workers: Workers,
     seeds: Mapping[str, tuple[float, float]] | None = None,
+    engine: Engine = NUMPY,
 ) -> FollowingDetector | MarkerDetector:
     """A detector that follows the light where the camera file allows it, else one with fixed colours.
 
@@ -140,8 +151,8 @@ def detector_for(
         CalibrationError: The camera has no colour range for a marker.
     """
     if can_follow(camera, markers):
-        return FollowingDetector(camera, markers, workers, seeds)
-    return MarkerDetector(camera, markers, seeds)
+        return FollowingDetector(camera, markers, workers, seeds, engine)
+    return MarkerDetector(camera, markers, seeds, None, engine)
 
 
 def can_follow(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:
