@@ -16,15 +16,17 @@ CELLS = 32  # of each channel
 
 
 class Cells(NamedTuple):
-    """Codes (32^3,) at (blue >> 3) | (green >> 3) << 5 | (red >> 3) << 10.
+    """Codes (32^3,) of cells at (blue >> 3) | (green >> 3) << 5 | (red >> 3) << 10.
 
     Attributes:
         first: Of the cell's first colour, whose lowest three bits are 0: what a scan asks for.
         markers: Of all its colours, markers alone; the bit of skin says that they differ.
+        skin: (1,) that bit.
     """
 
     first: Codes
     markers: Codes
+    skin: Codes
 
 
 _KNOWN: WeakKeyDictionary[ColourTable, Cells] = WeakKeyDictionary()  # a table never changes
@@ -35,16 +37,16 @@ def cells_of(table: ColourTable) -> Cells:
     known = _KNOWN.get(table)
     if known is None:
         kind = table.entries.dtype
-        known = _KNOWN[table] = Cells(np.empty(CELLS**3, kind), np.empty(CELLS**3, kind))
-        _fill(table.entries, np.array([table.skin], np.uint64).astype(kind), known.first, known.markers)
+        skin = np.array([table.skin], np.uint64).astype(kind)
+        known = Cells(np.empty(CELLS**3, kind), np.empty(CELLS**3, kind), skin)
+        _fill(table.entries, skin, known.first, known.markers)
+        _KNOWN[table] = known
     return known
 
 
 @compiled
 def _fill(entries: Codes, skin: Codes, first: Codes, markers: Codes) -> None:
     flag = skin[0]
-    every = flag - flag
-    every = ~every
     for red in range(CELLS):
         for green in range(CELLS):
             for blue in range(CELLS):

@@ -28,4 +28,11 @@ def compiled(function: F) -> F:
         numba = cast(Any, importlib.import_module("numba"))
     except ImportError as error:
         raise PhalanxError(f"--engine numba: numba cannot be used ({error}); {INSTALL}") from error
-    return cast(F, numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})(function))
+    # A division by 0 gives infinity, as in numpy: a check of each one would keep loops from being vectorised.
+    options = {
+        "cache": True,
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"reassoc", "contract", "nsz"},
+    }
+    return cast(F, numba.njit(**options)(function))

@@ -15,26 +15,7 @@ from slave.markers.blobs import SCALE, Blob
 from slave.markers.centroid import Measured
 from slave.markers.classify import ColourTable
 from slave.markers.fast_cells import cells_of
-from slave.markers.fast_window import (
-    AREA,
-    BLUE,
-    CONTRAST,
-    CUT,
-    FOREIGN,
-    FOUND,
-    LEFT,
-    RED,
-    START,
-    THIN,
-    TOP,
-    XX,
-    XY,
-    YY,
-    Rules,
-    U,
-    V,
-    measure_windows,
-)
+from slave.markers.fast_window import ANSWERED, ASKED, Rules, measure_windows
 
 Float32 = npt.NDArray[np.float32]
 
@@ -47,6 +28,7 @@ RULES = Rules(
     centroid.MIN_PIXELS,
     SCALE,
     shares.EVERY,
+    float(shares.WHITE),
     shares.DARKEST,
     shares.SHADED,
     float(shares.NOISE[0, 0]),
@@ -61,44 +43,55 @@ def measure(
     """Measure the markers at `blobs`; arguments and answer are those of `centroid.measure`."""
     if not blobs:
         return []
-    pad = 2 * centroid.PAD
-    sizes = [(b.bottom - b.top + pad, b.right - b.left + pad) for b in blobs]
-    asked: list[tuple[int, ...]] = []
+    pad = centroid.PAD
+    asked: list[int] = []
+    places: list[tuple[int, int, int, int]] = []
     start = 0
-    for b, bit, lonely, (height, width) in zip(blobs, bits, alone, sizes, strict=True):
-        asked.append((b.left, b.top, b.right, b.bottom, bit, lonely, start))
-        start += height * width
-    answers = np.zeros((len(blobs), 14))
+    for b, bit, lonely in zip(blobs, bits, alone, strict=True):
+        end = start + (b.bottom - b.top + 2 * pad) * (b.right - b.left + 2 * pad)
+        asked += (b.left, b.top, b.right, b.bottom, bit, lonely, start)
+        places.append((start, end, b.bottom - b.top + 2 * pad, b.right - b.left + 2 * pad))
+        start = end
+    answers = np.zeros((len(blobs), ANSWERED))
     windows = np.zeros(start, np.float32)
-    cells = cells_of(table).markers
-    skin = np.array([table.skin], np.uint64).astype(cells.dtype)
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
-    measure_windows(
-        pixels, table.entries, cells, skin, shares.LIGHT, np.array(asked, np.int64), RULES, answers, windows
-    )
-    found: list[Measured | None] = []
-    for row, request, (height, width) in zip(answers.tolist(), asked, sizes, strict=True):
-        if not row[FOUND]:
-            found.append(None)
-            continue
-        start = request[START]
-        found.append(
-            Measured(
-                row[U],
-                row[V],
-                row[AREA],
-                row[CONTRAST],
-                [value / shares.WHITE for value in row[BLUE : RED + 1]],
-                row[CUT] != 0.0,
-                row[THIN] != 0.0,
-                row[FOREIGN],
-                row[XX],
-                row[XY],
-                row[YY],
-                windows[start : start + height * width].reshape(height, width),
-                request[LEFT] - centroid.PAD,
-                request[TOP] - centroid.PAD,
-            )
+    requests = np.array(asked, np.int64).reshape(-1, ASKED)
+    _, cells, skin = cells_of(table)
+    measure_windows(pixels, table.entries, cells, skin, shares.LIGHT, requests, RULES, answers, windows)
+    return [
+        Measured(
+            u,
+            v,
+            area,
+            contrast,
+            [blue, green, red],
+            cut != 0.0,
+            thin != 0.0,
+            foreign,
+            xx,
+            xy,
+            yy,
+            windows[first:end].reshape(height, width),
+            b.left - pad,
+            b.top - pad,
         )
-    return found
+        if found
+        else None
+        for b, (first, end, height, width), (
+            found,
+            u,
+            v,
+            area,
+            contrast,
+            blue,
+            green,
+            red,
+            cut,
+            thin,
+            foreign,
+            xx,
+            xy,
+            yy,
+        ) in zip(blobs, places, answers.tolist(), strict=True)
+    ]

@@ -24,8 +24,9 @@ OWN, OTHER = 1, 2  # classes
 CORE, INNER, NEAR, SOLID = 1, 2, 4, 8  # kinds
 SHIFTS = tuple(np.uint64(n) for n in (3, 5, 8, 10, 16))  # of one type with what they shift
 # Columns of what is asked for, and of what is answered.
-LEFT, TOP, RIGHT, BOTTOM, BIT, ALONE, START = range(7)
-FOUND, U, V, AREA, CONTRAST, BLUE, GREEN, RED, CUT, THIN, FOREIGN, XX, XY, YY = range(14)
+ASKED, ANSWERED = 7, 14
+LEFT, TOP, RIGHT, BOTTOM, BIT, ALONE, START = range(ASKED)
+FOUND, U, V, AREA, CONTRAST, BLUE, GREEN, RED, CUT, THIN, FOREIGN, XX, XY, YY = range(ANSWERED)
 
 
 class Rules(NamedTuple):
@@ -39,6 +40,7 @@ class Rules(NamedTuple):
     least: int
     grid: int
     every: int
+    white: float
     darkest: float
     shaded: float
     noise: float
@@ -82,14 +84,14 @@ def measure_windows(
         height = asked[k, BOTTOM] - asked[k, TOP] + 2 * rules.pad
         width = asked[k, RIGHT] - asked[k, LEFT] + 2 * rules.pad
         largest = max(largest, (height + 2 * EDGE) * (width + 2 * EDGE))
-    room = np.empty((6, largest), np.uint8)
-    light = np.empty((3, largest), np.float32)
-    ramp = np.arange(np.float64(largest))
+    room = np.empty(6 * largest, np.uint8)
+    levels = np.empty(3 * largest, np.float32)
+    ramp = np.arange(largest).astype(np.float32)
     if _ask_ahead(image, asked, rules.pad) > 255:
         return
     for k in range(len(asked)):
         _measure_window(
-            image, table, cells, skin, curve, asked[k], rules, answers[k], windows, room, light, ramp
+            image, table, cells, skin, curve, asked[k], rules, answers[k], windows, room, levels, ramp
         )
 
 
@@ -119,8 +121,8 @@ def _measure_window(
     answer: Float,
     windows: Float32,
     room: Image,
-    light: Float32,
-    ramp: Float,
+    levels: Float32,
+    ramp: Float32,
 ) -> None:
     """Measure one marker.
 
@@ -133,15 +135,16 @@ def _measure_window(
         rules: Constants.
         answer: (14,) zeros; stays so where nothing is found.
         windows: Shares of all windows, flat, zeros.
-        room, light: For the largest window: (6, N), (3, N).
+        room, levels: For the masks and the light of the largest window, (6 N,) and (3 N,).
         ramp: 0, 1, 2 ...
     """
     left, top = ask[LEFT] - rules.pad, ask[TOP] - rules.pad
     width, height = ask[RIGHT] + rules.pad - left, ask[BOTTOM] + rules.pad - top
     stride = width + 2 * EDGE
     size = stride * (height + 2 * EDGE)
-    room, light = room[:, :size], light[:, :size]
-    classes, kinds = room[4], room[5]
+    # As arrays of their own: the rows of a part of an array could not be vectorised.
+    masks, light = room[: 6 * size].reshape(6, size), levels[: 3 * size].reshape(3, size)
+    classes, kinds, room = masks[4], masks[5], masks[:4]
     classes[:] = 0
     kinds[:] = 0
     light[:] = 0.0
@@ -188,7 +191,11 @@ def _measure_window(
     n = max(area, 1.0)
     x, y = moments[1] / n, moments[2] / n
     answer[U], answer[V], answer[AREA], answer[CONTRAST] = left + x, top + y, area, math.sqrt(power)
-    answer[BLUE], answer[GREEN], answer[RED] = mean
+    answer[BLUE], answer[GREEN], answer[RED] = (
+        mean[0] / rules.white,
+        mean[1] / rules.white,
+        mean[2] / rules.white,
+    )
     answer[XX], answer[XY], answer[YY] = (
         moments[3] / n - x * x,
         moments[4] / n - x * y,
@@ -384,7 +391,7 @@ def _drop_thick_others(part: Frame, classes: Image, kinds: Image, room: Image) -
 
 
 @compiled
-def _sums_over(mask: Image, bit: int, part: Frame, light: Float32, ramp: Float) -> tuple[float, ...]:
+def _sums_over(mask: Image, bit: int, part: Frame, light: Float32, ramp: Float32) -> tuple[float, ...]:
     """Over the pixels with `bit`: number, x, y, xx, xy, yy, light of 3 channels, that times x, that times y."""
     n, sx, sy, sxx, sxy, syy = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     b, g, r, bx, gx, rx, by, gy, ry = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -401,7 +408,7 @@ def _sums_over(mask: Image, bit: int, part: Frame, light: Float32, ramp: Float) 
         k, x1, x2, b0, g0, r0, b1, g1, r1 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for p in range(count):
             one = 1.0 if here[p] & bit else 0.0
-            x = (ramp[p] - middle) * one
+            x = (np.float64(ramp[p]) - middle) * one
             k += one
             x1 += x
             x2 += x * x
@@ -492,7 +499,7 @@ def _share_out(
     part: Frame,
     width: int,
     into: Float32,
-    ramp: Float,
+    ramp: Float32,
 ) -> tuple[float, ...]:
     """Fill in the shares; return their moments 1, x, y, xx, xy, yy in pixels of the window."""
     w0, w1, w2, at_zero = np.float32(w[0]), np.float32(w[1]), np.float32(w[2]), np.float32(zero)
@@ -510,21 +517,23 @@ def _share_out(
             into[y * width + part.x0 : y * width + part.x1],
         )
         row = np.float32(level[0] + level[1] * (part.x0 - part.x_middle) + level[2] * (y - part.y_middle))
-        k, x1, x2 = 0.0, 0.0, 0.0
         for p in range(count):
-            bright = row + slope * np.float32(ramp[p])
+            bright = row + slope * ramp[p]
             bright = bright if bright > darkest else darkest
             share = (w0 * blue[p] + w1 * green[p] + w2 * red[p] - at_zero) / bright
             share = share if share > nothing else nothing
             share = share if share < all_paint else all_paint
             share = share if kind[p] & NEAR else nothing
-            share = all_paint if kind[p] & SOLID else share
-            out[p] = share
-            s, x = np.float64(share), ramp[p] + first
-            k += s
-            x1 += s * x
-            x2 += s * x * x
+            out[p] = all_paint if kind[p] & SOLID else share
+        k, x1, x2 = 0.0, 0.0, 0.0
+        for p in range(count):
+            here, x = np.float64(out[p]), np.float64(ramp[p])
+            k += here
+            x1 += here * x
+            x2 += here * x * x
         v = np.float64(y)
+        x2 += 2.0 * first * x1 + first * first * k
+        x1 += first * k
         n, sx, sy, sxx, sxy, syy = n + k, sx + x1, sy + k * v, sxx + x2, sxy + x1 * v, syy + k * v * v
     return n, sx, sy, sxx, sxy, syy
 

@@ -2,7 +2,7 @@
 
 import importlib.util
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCali
 from common.errors import PhalanxError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
-from slave.markers import centroid, detector
+from slave.markers import centroid
 from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured
 from slave.markers.classify import ColourTable
@@ -38,9 +38,9 @@ def numba() -> Engine:
     return engine_named("numba")
 
 
-def generated(name: str) -> Iterator[tuple[MarkerDetector, Image, int]]:
+def generated(name: str, engine: Engine) -> Iterator[tuple[MarkerDetector, Image, int]]:
     kind = KINDS[name]
-    first = MarkerDetector(kind.camera, kind.names)
+    first = MarkerDetector(kind.camera, kind.names, engine=engine)
     for frames in sequences(kind, 2, seed=5):
         pushed = None
         for frame in frames:
@@ -48,27 +48,32 @@ def generated(name: str) -> Iterator[tuple[MarkerDetector, Image, int]]:
             yield pushed, frame.image, frame.t_ns
 
 
-def standard() -> Iterator[tuple[MarkerDetector, Image, int]]:
+def standard(engine: Engine) -> Iterator[tuple[MarkerDetector, Image, int]]:
     rig = load(CALIBRATION / "rigs/desk.json", RigCalibration)
     cameras = {n: load(CALIBRATION / f"cameras/{n}.json", CameraCalibration) for n in rig.cameras}
     hand_file = load(CALIBRATION / f"hands/{rig.hand}.json", HandProfile)
     name = rig.cameras[0]
     renderer = Renderer(Scene.standard(rig, cameras, hand_file), name)
-    pushed = MarkerDetector(cameras[name], rig.markers)
+    pushed = MarkerDetector(cameras[name], rig.markers, engine=engine)
     for k in range(12):
         yield pushed, renderer.render(5.0 * k), round(5e9 * k)
 
 
-def calls_of(monkeypatch: pytest.MonkeyPatch, name: str) -> list[Call]:
+def frames(name: str, engine: Engine = NUMPY) -> Iterator[tuple[MarkerDetector, Image, int]]:
+    return standard(engine) if name == "standard" else generated(name, engine)
+
+
+def calls_of(name: str) -> list[Call]:
     """What the detector asks to be measured on the frames of a kind."""
     calls: list[Call] = []
 
-    def noting(*call: object) -> list[Measured | None]:
-        calls.append(call)  # pyright: ignore[reportArgumentType]
-        return centroid.measure(*call)  # pyright: ignore[reportArgumentType]
+    def noting(
+        image: Image, table: ColourTable, bits: Sequence[int], blobs: Sequence[Blob], alone: Sequence[bool]
+    ) -> list[Measured | None]:
+        calls.append((image, table, list(bits), list(blobs), list(alone)))
+        return centroid.measure(image, table, bits, blobs, alone)
 
-    monkeypatch.setattr(detector, "measure", noting)
-    for pushed, image, t_ns in standard() if name == "standard" else generated(name):
+    for pushed, image, t_ns in frames(name, Engine(NUMPY.scan_blobs, noting, NUMPY.prepare)):
         pushed.push(image, t_ns)
     return calls
 
@@ -88,9 +93,9 @@ def differs(a: Measured | None, b: Measured | None) -> bool:
 
 @needs_numba
 @pytest.mark.parametrize("name", [*KINDS, "standard"])
-def test_what_is_measured_is_the_same(numba: Engine, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_what_is_measured_is_the_same(numba: Engine, name: str) -> None:
     count = doubtful = 0
-    for image, table, bits, blobs, alone in calls_of(monkeypatch, name):
+    for image, table, bits, blobs, alone in calls_of(name):
         together = centroid.measure(image, table, bits, blobs, alone)
         fast = numba.measure(image, table, bits, blobs, alone)
         for k, (one, other) in enumerate(zip(together, fast, strict=True)):
@@ -113,7 +118,7 @@ def test_what_is_measured_is_the_same(numba: Engine, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("name", [*KINDS, "standard"])
 def test_blobs_and_codes_are_the_same_on_every_grid(numba: Engine, name: str) -> None:
     seen = 0
-    for pushed, image, _ in standard() if name == "standard" else generated(name):
+    for pushed, image, _ in frames(name):
         table = pushed._table
         for grid in ((4, 0, 0), (2, 0, 0), (4, 2, 2), (4, 0, 2), (4, 3, 3)):
             codes = table.scan(image, *grid)
@@ -122,6 +127,20 @@ def test_blobs_and_codes_are_the_same_on_every_grid(numba: Engine, name: str) ->
             assert_same_blobs(find_blobs(codes, table.bits, *grid), fast)
             seen += sum(map(len, fast))
     assert seen > 100
+
+
+@needs_numba
+@pytest.mark.parametrize("name", ["finger_end", "clutter", "standard"])
+def test_the_detections_of_a_sequence_are_the_same(numba: Engine, name: str) -> None:
+    rows = 0
+    for (ours, image, t_ns), (theirs, _, _) in zip(frames(name, numba), frames(name), strict=True):
+        fast, slow = ours.push(image, t_ns), theirs.push(image, t_ns)
+        np.testing.assert_allclose(fast.uv, slow.uv, atol=1e-3)
+        np.testing.assert_allclose(fast.area, slow.area, rtol=1e-3)
+        np.testing.assert_allclose(fast.sigma_px, slow.sigma_px, atol=1e-3)
+        np.testing.assert_allclose(fast.quality, slow.quality, atol=1e-3)
+        rows += int(np.isfinite(fast.area).sum())
+    assert rows > 30
 
 
 def assert_same_blobs(expected: list[list[Blob]], found: list[list[Blob]]) -> None:
