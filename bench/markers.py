@@ -5,6 +5,7 @@ machine slows all alike; a ratio comes with half the distance of its quartiles o
 follows, with what both pipelines find in it.
 """
 
+import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.markers.detector import MarkerDetector
+from slave.markers.engine import NUMPY, Engine, engine_named
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
 FRAMES: Final = 240  # judged, spread over the minute of the standard scene
@@ -30,6 +32,7 @@ TIMED: Final = 12
 REPEATS, WARM, BURST = 40, 3, 4
 OPEN_S: Final = 20.0  # an open hand: all six markers in view
 VISIBLE: Final = 0.5
+NUMBA: Final = importlib.util.find_spec("numba") is not None  # an optional package: its row only where it is
 
 Step = Callable[[], object]
 Row = tuple[str, float, str, str]
@@ -44,8 +47,10 @@ def rows() -> list[Row]:
 def _generated() -> list[Row]:
     six, twelve, many = (Timed(KINDS[name]) for name in ("finger_end", "twelve", "twentyfour"))
     small, large = Timed(KINDS["320x240"]), Timed(KINDS["1456x1088"], scenes=1, frames=4)
+    numba = {"numba": six.ours(6, engine_named("numba"))} if NUMBA else {}
     took = interleaved(
-        {
+        numba
+        | {
             "published": six.published(),
             "ours": six.ours(6),
             "anew": six.anew(),
@@ -64,6 +69,7 @@ def _generated() -> list[Row]:
         _time("published pipeline, 6 markers", took["published"], "baseline"),
         _time("our detector, 6 markers, whole frame, refined", took["ours"], ""),
         _ratio("published / ours", took["published"], took["ours"], "goal >= 9"),
+        *[_ratio("published / ours with numba", took["published"], took[n], "goal >= 20") for n in numba],
         _ratio("every marker sought anew / tracked", took["anew"], took["ours"], "goal <= 1.3"),
         _ratio("12 markers / 6 of them", took["12"], took["6 of 12"], "goal <= 1.5"),
         _ratio("24 markers / 6 of them", took["24"], took["6 of 24"], ""),
@@ -90,10 +96,10 @@ class Timed:
         ranges = [(self._camera.markers or {})[name] for name in self.kind.names]
         return self._each(lambda scene, image, t_ns: detect(image, ranges))
 
-    def ours(self, count: int) -> Step:
+    def ours(self, count: int, engine: Engine = NUMPY) -> Step:
         """Our detector, looking for the first `count` markers, each pointed out in the first frame."""
         names = self.kind.names[:count]
-        first = MarkerDetector(self._camera, names)
+        first = MarkerDetector(self._camera, names, engine=engine)
         detectors = [first.fresh(clicks(self.kind, scene[0])) for scene in self.scenes]
         return self._each(lambda scene, image, t_ns: detectors[scene].push(image, t_ns))
 
