@@ -78,8 +78,11 @@ def skin_share(codes: Codes, skin: int, blob: Blob) -> float:
 
 
 def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
-    """Whether `blob` may be the rim of a blob of another colour, where the hue runs through its own: it touches one
-    that is much larger, or lies in the box of one that is as large (motion blur makes rims wide)."""
+    """Whether `blob` may be the rim of a blob of another colour, where the hue runs through its own.
+
+    It touches one that is much larger, or its middle lies in or next to the box of one that is as large: motion
+    blur makes rims wide.
+    """
     return any(
         blob.left < other.right  # boxes are as wide as the grid leaves open, so neighbours overlap
         and other.left < blob.right
@@ -89,8 +92,8 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
         if other.area > FRINGE_RATIO * blob.area
         or (
             other.area > SAME * blob.area
-            and other.left <= blob.u <= other.right
-            and other.top <= blob.v <= other.bottom
+            and other.left - SCALE <= blob.u <= other.right + SCALE
+            and other.top - SCALE <= blob.v <= other.bottom + SCALE
         )
     )
 
