@@ -126,7 +126,7 @@ def _read(image: Image, cells: Codes, wanted: int, grid: Grid, codes: Codes, hit
     height, width = codes.shape
     five, ten = np.uint64(5), np.uint64(10)
     three = np.uint64(3)
-    line = 64 // 3  # pixels in a line of the cache
+    line = 64 // 3  # pixels in a line of the processor's cache
     ahead = 0
     for v in range(height):
         row = image[grid.dy + grid.step * v, grid.dx :]

@@ -3,6 +3,9 @@
 The masks of a window lie in flat arrays of rows of `stride`, `EDGE` of nothing around them, so that no neighbourhood
 leaves them: pixel (x, y) of the window is at (y + EDGE) * stride + EDGE + x. `classes` says what the colour table
 makes of a pixel, `kinds` what its neighbourhood does. The formulas stand in `centroid` and `shares`.
+
+All in one file: the cache of compiled code looks for changes only in the file of the function that is called, so code
+taken in from another file could be old.
 """
 
 import math
@@ -105,7 +108,6 @@ def _ask_ahead(image: Image, asked: Int, pad: int) -> int:
             row = image[y, x0:x1]
             for x in range(0, len(row), CACHE_LINE // 3):
                 touched |= row[x, 0]
-            touched |= row[len(row) - 1, 2]
     return touched
 
 

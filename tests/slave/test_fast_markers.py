@@ -193,6 +193,8 @@ def test_nothing_gives_nothing(numba: Engine) -> None:
     assert numba.scan_blobs(image, TABLE, (1, 2), 4, 0, 0)[1] == [[], []]
     assert numba.measure(image, TABLE, [], [], []) == []
     assert numba.measure(image, TABLE, [1], [Blob(60.0, 50.0, 40.0, 56, 46, 64, 54)], [True]) == [None]
+    beyond = [Blob(400.0, 50.0, 40.0, 396, 46, 404, 54), Blob(60.0, -50.0, 40.0, 56, -54, 64, -46)]
+    assert numba.measure(image, TABLE, [1, 1], beyond, [False, True]) == [None, None]
 
 
 def test_an_engine_is_chosen_by_name_and_no_other_takes_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
