@@ -33,6 +33,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "smbus2": ("slave/imu/*.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),
+    "numba": ("slave/markers/fast*.py",),
 }
 NEVER = frozenset({"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"})
 # Import name -> name in pyproject.toml, where they differ. picamera2 and libcamera come with the Pi's system.
@@ -115,6 +116,8 @@ def undeclared(path: str, text: str) -> set[str]:
     promised = [*project["dependencies"]]
     if path.startswith(("master/", "deploy/")):
         promised += project["optional-dependencies"]["master"]
+    if fnmatch(path, "slave/markers/fast*.py"):
+        promised += project["optional-dependencies"]["fast"]
     have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())
     names = set(imported(text)) - OURS - sys.stdlib_module_names
     return {name for name in names if DISTRIBUTION.get(name, name) not in have}
@@ -205,6 +208,8 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (wrong_side, "deploy/demo.py", "import common.clock", "import subprocess"),
     (undeclared, "slave/app.py", "import typer", "import cv2, numpy, msgspec"),
     (undeclared, "master/app.py", "import scipy.optimize", "import typer, rerun"),
+    (undeclared, "slave/markers/centroid.py", "import numba", "import cv2"),
+    (undeclared, "slave/markers/fast_scan.py", "import scipy", "import numba"),
     (relative_imports, "slave/app.py", "from . import cameras", "from slave import cameras"),
     (
         bare_excepts,
