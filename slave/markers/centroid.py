@@ -102,16 +102,24 @@ def measure(
 
 
 def _measure_stack(
-    image: Image, table: ColourTable, bits: Sequence[int], blobs: Sequence[Blob], alone: Sequence[bool]
+    image: Image,
+    table: ColourTable,
+    bits: Sequence[int],
+    blobs: Sequence[Blob],
+    alone: Sequence[bool],
+    gap: int = 0,
 ) -> list[Measured | None]:
+    """Measure in windows of one size; `gap` empty rows and columns keep them apart where paint meets their border."""
     count = len(blobs)
-    height = max([b.bottom - b.top for b in blobs]) + 2 * PAD
-    width = -(-(max([b.right - b.left for b in blobs]) + 2 * PAD) // EVERY) * EVERY
+    height = max([b.bottom - b.top for b in blobs]) + 2 * PAD + gap
+    width = -(-(max([b.right - b.left for b in blobs]) + 2 * PAD + gap) // EVERY) * EVERY
     flat = count, height * width
     tall = _cut_tiles(image, blobs, height, width)
     packed = tall.view(np.uint32).reshape(flat)
     codes = table.packed_codes(packed)
     own = (codes & np.array(bits, codes.dtype)[:, None]) != 0
+    if not gap and count > 1 and _meets_border(own.reshape(count, height, width)):
+        return _measure_stack(image, table, bits, blobs, alone, SIDE[0] // 2)
     if not all(alone):
         _only_the_blob(own.reshape(count, height, width), blobs, alone)
     mask = own.reshape(tall.shape[:2])
@@ -233,6 +241,12 @@ def _only_the_blob(own: Bool, blobs: Sequence[Blob], alone: Sequence[bool]) -> N
         mine = np.zeros(count, np.bool_)
         mine[labels[rows, columns]] = True
         tile &= mine[labels]
+
+
+def _meets_border(own: Bool) -> bool:
+    """Whether paint lies so near to the border of a tile (M, H, W) that a neighbourhood would reach over it."""
+    reach = SIDE[0] // 2
+    return bool(own[:, :reach].any() or own[:, -reach:].any() or own[:, :, 0].any() or own[:, :, -1].any())
 
 
 def _eroded(own: Bool, width: int) -> Bool:

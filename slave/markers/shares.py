@@ -93,9 +93,9 @@ def shares(
     """
     count = len(ring)
     around = light[:, :, ::EVERY].astype(np.float64)  # columns, as windows are a multiple of it wide
-    some = ring[:, ::EVERY]
+    some = ring[:, ::EVERY].astype(np.float64)
     apart: Float = around * some
-    number = np.maximum(np.count_nonzero(some, axis=1), 1)[:, None]
+    number = np.maximum(some.sum(axis=1), 1.0)[:, None]
     ring_mean = apart.sum(axis=2).T / number
     scatter = apart.transpose(1, 0, 2) @ around.transpose(1, 2, 0) / number[..., None]
     scatter -= ring_mean[:, :, None] * ring_mean[:, None, :]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from common.arrays import Image
 from slave.markers.blobs import SCALE, Blob, find_blobs, with_fragments
-from slave.markers.centroid import Measured, measure
+from slave.markers.centroid import PAD, Measured, measure
 from slave.markers.classify import ColourTable
 from tests.slave.painted import DESK, RANGES, SKIN, Disc, finger, paint, render
 
@@ -128,3 +128,19 @@ def test_a_marker_of_23000_px_at_20_cm_is_measured() -> None:
 def test_the_desk_is_no_paint() -> None:
     codes = TABLE.codes(render([Disc(DESK, 60.0, 50.0, 20.0), Disc(SKIN, 30.0, 30.0, 10.0)], 120, 100))
     assert set(np.unique(codes)) == {0, TABLE.skin}
+
+
+def test_specks_at_the_border_of_a_window_do_not_reach_into_the_next() -> None:
+    scene = [Disc(paint(m), 40.0 + 45.0 * m, 50.0, 7.0) for m in range(6)]
+    image = render(scene, 320, 100)
+    blobs = [b[0] for b in find_blobs(TABLE.scan(image, SCALE), TABLE.bits)]
+    for m, blob in enumerate(blobs):
+        colour = image[50, 40 + 45 * m]
+        image[blob.bottom + PAD - 2 : blob.bottom + PAD, blob.left : blob.right] = colour
+    together = measure(image, TABLE, TABLE.bits, blobs, [True] * 6)
+    for m in range(6):
+        (alone,) = measure(image, TABLE, [TABLE.bits[m]], [blobs[m]], [True])
+        one = together[m]
+        assert alone is not None
+        assert one is not None
+        assert (one.u, one.v, one.area) == pytest.approx((alone.u, alone.v, alone.area), abs=1e-4)
