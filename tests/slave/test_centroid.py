@@ -136,7 +136,8 @@ def test_specks_at_the_border_of_a_window_do_not_reach_into_the_next() -> None:
     blobs = [b[0] for b in find_blobs(TABLE.scan(image, SCALE), TABLE.bits)]
     for m, blob in enumerate(blobs):
         colour = image[50, 40 + 45 * m]
-        image[blob.bottom + PAD - 2 : blob.bottom + PAD, blob.left : blob.right] = colour
+        image[blob.bottom + PAD - 3 : blob.bottom + PAD, blob.left : blob.right] = colour
+        image[blob.top - PAD : blob.top - PAD + 3, blob.left : blob.right] = colour
     together = measure(image, TABLE, TABLE.bits, blobs, [True] * 6)
     for m in range(6):
         (alone,) = measure(image, TABLE, [TABLE.bits[m]], [blobs[m]], [True])
