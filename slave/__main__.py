@@ -93,9 +93,9 @@ def _run(options: argparse.Namespace) -> int:
     source = _source(options, rig, camera, clock, true_clock, stop)
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{options.name} colours")
     if options.colours == "follow":
-        detector = detector_for(camera, rig.markers, workers, engine=engine)
+        detector = detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
     else:
-        detector = MarkerDetector(camera, rig.markers, engine=engine)
+        detector = MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
     previews = Previews(options.name, clock)

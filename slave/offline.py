@@ -92,8 +92,9 @@ def detect_recording(
     if not rows:
         raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
     model = camera_of(recording, camera, calibration)
-    names = recording.manifest.marker_rig().markers
-    detector = detector_for(model, names, Inline(), recording.manifest.clicks.get(camera))
+    rig = recording.manifest.marker_rig()
+    names, clicks = rig.markers, recording.manifest.clicks.get(camera)
+    detector = detector_for(model, names, Inline(), clicks, free=rig.free_markers)
     shape = (len(rows), len(names))
     uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)

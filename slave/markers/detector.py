@@ -9,7 +9,7 @@ A push machine. It holds one track per marker, nothing else; a new recording get
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +85,7 @@ class MarkerDetector:
         seeds: Mapping[str, tuple[float, float]] | None = None,
         table: ColourTable | None = None,
         engine: Engine = NUMPY,
+        free: Collection[str] = (),
     ) -> None:
         """Build the colour table (0.3 s) unless one is given.
 
@@ -94,6 +95,7 @@ class MarkerDetector:
             seeds: Marker -> (u, v) [px], a pixel on that marker in the first frame, where known.
             table: Table built before from the same ranges.
             engine: What scans and measures.
+            free: Those of the markers that sit on no hand: neither skin nor neighbours are expected about them.
 
         Raises:
             CalibrationError: The camera has no colour range for a marker.
@@ -102,6 +104,7 @@ class MarkerDetector:
         self._exposure_s = camera.exposure_us * 1e-6
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
+        self._free = tuple(markers.index(name) for name in free)
         self._engine = engine
         engine.prepare(self._table)
         self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
@@ -110,7 +113,8 @@ class MarkerDetector:
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
-        return MarkerDetector(self._camera, self._names, seeds, self._table, self._engine)
+        free = [self._names[m] for m in self._free]
+        return MarkerDetector(self._camera, self._names, seeds, self._table, self._engine, free)
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame.
@@ -241,7 +245,7 @@ class MarkerDetector:
                 certain &= not track.sudden(tracked[m])
             else:
                 certain = False
-        if certain and connected(list(tracked.values())):
+        if certain and connected([blob for m, blob in tracked.items() if m not in self._free]):
             return tracked
         candidates: list[Candidate] = []
         for m, options in enumerate(blobs):
@@ -252,7 +256,13 @@ class MarkerDetector:
                 candidates.append(candidate(m, blob, skin, on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
-        return {m: c.blob for m, c in choose(candidates).items()}
+        chosen = choose([c for c in candidates if c.marker not in self._free])
+        for m in self._free:
+            # One that was tracked is followed; one that appears is the largest that is no rim of another colour.
+            mine = [c for c in candidates if c.marker == m and (c.bonus > 0.0 or not c.fringe)]
+            if mine:
+                chosen[m] = max(mine, key=lambda c: (c.bonus, c.blob.area))
+        return {m: c.blob for m, c in chosen.items()}
 
     def _bonus(self, m: int, blob: Blob, tracked: Blob | None) -> float:
         seed = self._seeds.get(m)

@@ -8,7 +8,7 @@ Where the table is far from the light, or the light is not known and the markers
 taken for another: then nothing is reported seen, and a warning says why.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from concurrent.futures import Future
 from copy import copy
 from functools import partial
@@ -45,6 +45,7 @@ class FollowingDetector:
         workers: Workers,
         seeds: Mapping[str, tuple[float, float]] | None = None,
         engine: Engine = NUMPY,
+        free: Collection[str] = (),
     ) -> None:
         """Build the detector and its colour table (0.3 s).
 
@@ -53,7 +54,7 @@ class FollowingDetector:
             markers: Marker names in the order of the rig.
             workers: Where tables are made and a first light is sought.
             seeds: As of `MarkerDetector`.
-            engine: As of `MarkerDetector`.
+            engine, free: As of `MarkerDetector`.
 
         Raises:
             CalibrationError: The camera has no colour range for a marker.
@@ -62,7 +63,7 @@ class FollowingDetector:
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}")
         ranges = camera.markers or {}
         reference = np.array([ranges[name].reference_bgr_linear or (np.nan,) * 3 for name in markers])
-        self._detector = MarkerDetector(camera, markers, seeds, self._table, engine)
+        self._detector = MarkerDetector(camera, markers, seeds, self._table, engine, free)
         self._light = CameraLight(self._table, reference, (camera.width_px, camera.height_px), workers)
         self._watch = ColourWatch(markers, ranges)
         self._workers, self._engine = workers, engine
@@ -144,6 +145,7 @@ def detector_for(
     workers: Workers,
     seeds: Mapping[str, tuple[float, float]] | None = None,
     engine: Engine = NUMPY,
+    free: Collection[str] = (),
 ) -> FollowingDetector | MarkerDetector:
     """A detector that follows the light where the camera file allows it, else one with fixed colours.
 
@@ -151,8 +153,8 @@ def detector_for(
         CalibrationError: The camera has no colour range for a marker.
     """
     if can_follow(camera, markers):
-        return FollowingDetector(camera, markers, workers, seeds, engine)
-    return MarkerDetector(camera, markers, seeds, None, engine)
+        return FollowingDetector(camera, markers, workers, seeds, engine, free)
+    return MarkerDetector(camera, markers, seeds, None, engine, free)
 
 
 def can_follow(camera: CameraCalibration, markers: tuple[str, ...]) -> bool:

@@ -173,7 +173,7 @@ def test_pip_of_a_quarter_turn_bends_only_what_follows() -> None:
     np.testing.assert_allclose(joints.position_m[others], rest[others], atol=1e-15)
 
 
-# Limits of the two presets [deg], formats.md: MCP flexion, abduction, PIP, DIP of index ... little.
+# Limits of the two presets [deg]: MCP flexion, abduction, PIP, DIP of index ... little.
 PRESETS = {
     "K": ((0, 90), (-15, 15), (0, 110), (0, 90), (0, 0)),
     "D": ((0, 100), (-20, 20), (0, 120), (0, 101), (-20, 20)),

@@ -72,7 +72,7 @@ def test_a_run_is_written_scored_and_repeated_byte_by_byte(tmp_path: Path, short
     assert (poses.latency_ns == 0).all()
     stored = json.loads((outs[1] / "summary.json").read_text())
     assert stored == json.loads(json.dumps(summary))
-    # The names of formats.md; numbers only.
+    # The names that other tools rely on; numbers only.
     for key in ("marker_mm", "joint_mm", "joint_mm_visible", "pip_deg", "pip_deg_visible"):
         assert isinstance(stored[key], float)
     assert stored["joint_mm"] < 6.0

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from common.arrays import Image
+from common.calibration import HsvRange
 from slave.markers.detector import Detections, MarkerDetector
-from tests.slave.painted import CENTRES, NAMES, Disc, camera, finger, hand, paint, render
+from tests.slave.painted import CENTRES, NAMES, RANGES, Disc, camera, finger, hand, paint, render
 
 STEP_NS = 16_666_667
 MUG = [Disc(paint(1), 560.0, 120.0, 17.0)]
@@ -170,3 +171,25 @@ def test_a_frame_of_another_size_or_kind_is_refused() -> None:
         DETECTOR.fresh().push(np.zeros((240, 320, 3), np.uint8), 0)
     with pytest.raises(ValueError, match="camera file says"):
         DETECTOR.fresh().push(np.zeros((480, 640, 3), np.float32), 0)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_free_marker_is_found_wherever_it_lies_beside_a_hand_or_alone() -> None:
+    ranges = {**RANGES, "puck": HsvRange(hsv_low=(0, 150, 40), hsv_high=(4, 255, 255))}
+    names = (*NAMES, "puck")
+    puck = (2, 230, 180)
+    detector = MarkerDetector(camera(ranges=ranges), names, free=("puck",))
+    alone = detector.fresh().push(render([Disc(puck, 60.0, 420.0, 8.0)]), 0)
+    np.testing.assert_allclose(alone.uv[6], (60.0, 420.0), atol=0.1)
+    detector = detector.fresh()
+    images = [render([Disc(puck, 60.0, 420.0, 8.0)])] * 2 + [
+        render([*hand(), Disc(puck, 60.0, 420.0, 8.0)])
+    ] * 3
+    images += [render([*hand(), Disc(puck, 560.0, 60.0, 8.0)])] * 2  # set down elsewhere
+    for k, image in enumerate(images):
+        found = detector.push(image, k * STEP_NS)
+        place = (60.0, 420.0) if k < 5 else (560.0, 60.0)
+        np.testing.assert_allclose(found.uv[6], place, atol=0.1)
+        if k >= 2:
+            assert (np.hypot(*(found.uv[:6] - CENTRES - (300.0, 200.0)).T) < 0.3).all()
+    bound = MarkerDetector(camera(ranges=ranges), names).push(images[2], 0)
+    assert np.isnan(bound.uv[6]).all()  # a marker of the hand would not be believed there
