@@ -139,7 +139,7 @@ class MarkerDetector:
         for m in rows:
             if len(blobs[m]) > 1:
                 chosen[m], doubt[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
-                rival = self._rival(m, chosen[m], blobs[m], t_ns)
+                rival = self._rival(m, chosen[m], blobs, t_ns)
                 if rival is not None:
                     rivals[m] = rival
         # A rival costs as much as a marker, so a frame full of them is not measured through.
@@ -189,14 +189,16 @@ class MarkerDetector:
         blue, green, red = seen.colour
         return u, v, area, max(0.01, quality), sigma, *other, blue, green, red
 
-    def _rival(self, m: int, blob: Blob, options: list[Blob], t_ns: int) -> Blob | None:
-        """The largest other blob of the colour that may be the marker as far as size and motion tell."""
+    def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], t_ns: int) -> Blob | None:
+        """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""
         track = self._tracks[m]
         least, most = RIVAL * blob.area, blob.area / RIVAL
-        others = [b for b in options if least < b.area < most and not _within(b, blob)]
+        others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
         if track is not None and track.alive(t_ns):
             width = self._camera.width_px
             others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]
+        foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
+        others = [b for b in others if not on_fringe(b, foreign)]
         return max(others, key=lambda b: b.area) if others else None
 
     def _scan(self, image: Image) -> tuple[Codes, list[list[Blob]]]:

@@ -116,12 +116,12 @@ def test_a_marker_first_seen_half_hidden_is_measured_as_it_is() -> None:
 
 
 def test_a_rival_of_the_same_colour_within_reach_is_named() -> None:
-    second = [Disc(paint(1), 300.0, 110.0, 7.0)]
+    second = [Disc(paint(1), 245.0, 145.0, 7.0)]
     frames = push_all([render(hand())] * 2 + [render(hand() + second)] * 2)
     assert np.isnan(frames[1].rival_uv).all()
     for found in frames[2:]:
         assert (off(found, 300.0, 200.0)[[0, 1, 3, 4, 5]] < 0.3).all()
-        assert np.hypot(*(found.rival_uv[1] - (300.0, 110.0))) < 0.5
+        assert np.hypot(*(found.rival_uv[1] - (245.0, 145.0))) < 0.5
         assert np.isnan(found.rival_uv[[0, 3, 4, 5]]).all()
 
 
