@@ -86,6 +86,7 @@ def find_blobs(
         np.add.reduceat(y, starts).tolist(),
         strict=True,
     )
+    slack = step - 1
     for m, start, count, left, right, top, bottom, sum_x, sum_y in boxes:
         width, height = right - left, bottom - top
         if count >= FULL * width * height:
@@ -94,7 +95,6 @@ def find_blobs(
             mask = np.zeros((height, width), np.uint8)
             mask[y[start : start + count] - top, x[start : start + count] - left] = 1
             stats = _label(mask, left, top)
-        slack = step - 1
         found[m] = [
             Blob(
                 dx + step * u,

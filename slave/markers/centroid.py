@@ -150,11 +150,9 @@ def _measure_stack(
     weights[0], weights[1] = core, inner
     place = weights.astype(np.float64) @ grid.sums
     thin = place[1, :, 0] < MIN_PIXELS
-    if place[0, :, 0].min() < MIN_PIXELS:
-        for i in np.flatnonzero(place[0, :, 0] < MIN_PIXELS):
-            weights[1, i] = own[i] if thin[i] else inner[i]
-            weights[0, i] = weights[1, i]
-            place[:, i] = weights[1, i] @ grid.sums
+    for i in np.flatnonzero(place[0, :, 0] < MIN_PIXELS):  # too small for a core: the inner pixels, or all
+        weights[:, i] = own[i] if thin[i] else inner[i]
+        place[:, i] = weights[1, i] @ grid.sums
     share, contrast, mean = shares(light_of(tall).reshape(3, *flat), ring, weights, place, grid)
     np.maximum(share, 0.0, out=share)
     np.minimum(share, 1.0, out=share)

@@ -21,7 +21,7 @@ from common.errors import CalibrationError
 
 Codes: TypeAlias = npt.NDArray[np.unsignedinteger]
 HUES = 180
-COARSE = 0xF8F8F8
+COARSE = 0xF8F8F8  # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
 # Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red, orange
 # and yellow markers, which is why those are not used).
 SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
@@ -117,10 +117,7 @@ class ColourTable:
         if self._index.shape != words.shape:
             self._index = np.empty(words.shape, np.int64)
             self._codes = np.empty(words.shape, self._table.dtype)
-        if late:
-            np.bitwise_and(words >> 8, COARSE, out=self._index, casting="unsafe")
-        else:
-            np.bitwise_and(words, COARSE, out=self._index, casting="unsafe")
+        np.bitwise_and(words >> 8 if late else words, COARSE, out=self._index, casting="unsafe")
         return self._table.take(self._index, out=self._codes, mode="clip")
 
 

@@ -23,8 +23,8 @@ from common.srgb import to_linear
 
 Float32: TypeAlias = npt.NDArray[np.float32]
 
-# Added to the scatter: one grey level of noise, so that a flat colour stays solvable.
 WHITE = 4095  # light of a full byte
+# Added to the scatter: one grey level of noise, so that a flat colour stays solvable.
 NOISE = 4e-6 * WHITE**2 * np.eye(3)
 SHADED = 0.002  # variance of the paint's brightness, relative, that the discriminant allows for
 EVERY = 3  # of the ring's pixels one in so many is looked at: hundreds of them tell what one number in three tells

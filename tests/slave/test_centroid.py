@@ -23,6 +23,16 @@ def measured(image: Image, marker: int, extent: float = FAR, whole: float = math
     return result
 
 
+def assert_each_as_alone(image: Image, blobs: list[Blob], tolerance: float) -> None:
+    """Every blob, blob m of marker m, measured in one stack with the others and in a window of its own."""
+    together = measure(image, TABLE, TABLE.bits, blobs, [True] * len(blobs))
+    for bit, blob, one in zip(TABLE.bits, blobs, together, strict=True):
+        (alone,) = measure(image, TABLE, [bit], [blob], [True])
+        assert alone is not None
+        assert one is not None
+        assert (one.u, one.v, one.area) == pytest.approx((alone.u, alone.v, alone.area), abs=tolerance)
+
+
 @settings(max_examples=40)
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(4.0, 14.0), st.integers(0, 5))
 def test_a_disc_on_the_desk_is_found_to_a_twentieth_of_a_pixel(
@@ -82,13 +92,7 @@ def test_the_same_in_a_stack_as_alone() -> None:
     scene = [Disc(paint(m), 40.0 + 45.0 * m, 50.0, 5.0 + m) for m in range(6)]
     image = render(scene, 320, 100)
     blobs = [b[0] for b in find_blobs(TABLE.scan(image, SCALE), TABLE.bits)]
-    together = measure(image, TABLE, TABLE.bits, blobs, [True] * 6)
-    for m in range(6):
-        (alone,) = measure(image, TABLE, [TABLE.bits[m]], [blobs[m]], [True])
-        one = together[m]
-        assert alone is not None
-        assert one is not None
-        assert (one.u, one.v, one.area) == pytest.approx((alone.u, alone.v, alone.area), abs=1e-3)
+    assert_each_as_alone(image, blobs, 1e-3)
 
 
 @pytest.mark.parametrize(("u", "v"), [(2.0, 50.0), (118.0, 50.0), (60.0, 1.0), (60.0, 98.0), (0.0, 0.0)])
@@ -138,10 +142,4 @@ def test_specks_at_the_border_of_a_window_do_not_reach_into_the_next() -> None:
         colour = image[50, 40 + 45 * m]
         image[blob.bottom + PAD - 3 : blob.bottom + PAD, blob.left : blob.right] = colour
         image[blob.top - PAD : blob.top - PAD + 3, blob.left : blob.right] = colour
-    together = measure(image, TABLE, TABLE.bits, blobs, [True] * 6)
-    for m in range(6):
-        (alone,) = measure(image, TABLE, [TABLE.bits[m]], [blobs[m]], [True])
-        one = together[m]
-        assert alone is not None
-        assert one is not None
-        assert (one.u, one.v, one.area) == pytest.approx((alone.u, alone.v, alone.area), abs=1e-4)
+    assert_each_as_alone(image, blobs, 1e-4)
