@@ -92,7 +92,9 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
 def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
     """All cameras' detections in the order of their capture times; ties in the rig's order of cameras."""
     count = len(setup.rig.markers)
-    messages = [message for camera in setup.rig.cameras for message in _of_camera(folder, camera, count)]
+    messages = [
+        message for camera in setup.rig.cameras for message in recorded_detections(folder, camera, count)
+    ]
     order = {camera: index for index, camera in enumerate(setup.rig.cameras)}
     return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
 
@@ -105,7 +107,12 @@ def _gaps(messages: list[MarkerDetections]) -> int:
     return sum(max(numbers) - min(numbers) + 1 - len(numbers) for numbers in seen.values())
 
 
-def _of_camera(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
+def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[MarkerDetections]:
+    """The rows of detections_<camera>.npz, which has `count` markers.
+
+    Raises:
+        RecordingError: The file is missing or broken, or has another number of markers.
+    """
     path = folder / f"detections_{camera}.npz"
     fix = f"run `phalanx-slave detect` for camera {camera!r} first"
     data = read_npz(path, ("t_ns", "seq", "uv", "area_px2", "quality"), fix, also=("sigma_px", "rival_uv"))
