@@ -107,7 +107,7 @@ class ScriptedMotion:
         self._model = model
         self._centre = np.asarray(centre_m, dtype=np.float64)
         self._rest = np.array(REST, dtype=np.float64)
-        self._drift = _Drift(rng)
+        self._drift = Drift(rng)
         self.acts = _half(rng, 0.0, 0) + _half(rng, PERIOD_S / 2, 1)
 
     @property
@@ -161,7 +161,7 @@ def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float
     return rigid(rotation, centre_m + shift_m - rotation @ middle)
 
 
-class _Drift:
+class Drift:
     """Slow natural wandering: random Fourier sums, closed over the period."""
 
     def __init__(self, rng: np.random.Generator) -> None:

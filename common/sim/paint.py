@@ -14,7 +14,7 @@ from common.geometry import cross
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX
 from common.sim.raster import Coverage, Shape
-from common.sim.surface import CAPSULES, PALM_HULL, SPHERE_COUNT, unit
+from common.sim.surface import CAPSULES, PALM_HULL, SLEEVE_SPHERES, SPHERE_COUNT, unit
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 
 BLUR_STEP_PX = 1.2
@@ -85,7 +85,11 @@ class Painter:
         for c, cap in enumerate(surface.caps):
             skin[c, 3 * cap.finger + 2] = False  # that one is the cap's own, see `own_finger`
             nearer = [*_phalanges(snapshot, skin[c]), *(caps[n] for n in np.flatnonzero(touching[c]))]
-            nearer += [*([palm] if hidden[c] else []), *cards]
+            nearer += [
+                *([palm] if hidden[c] else []),
+                *self._sleeve_before(snapshot, caps[c], float(centre[c, 2])),
+                *cards,
+            ]
             cut = view.own_finger(snapshot, c)
             cover = raster.cover(caps[c], cut, nearer, self._moments(caps[c]), self._size)
             painted.append(Painted(cap.marker, cover, caps[c], float(snapshot.t_s[cap.centre])))
@@ -96,6 +100,7 @@ class Painter:
             at = uv.min(axis=0)[None] - REACH_PX, uv.max(axis=0)[None] + REACH_PX
             before = self._skin_before(snapshot, uv.mean(axis=0)[None], depth, *at)[0]
             nearer = [*_phalanges(snapshot, before), *([] if view.shows_back(snapshot) else [palm]), *cards]
+            nearer += self._sleeve_before(snapshot, shape, float(depth[0]))
             cover = raster.cover(shape, None, nearer, self._moments(shape), self._size)
             painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
         return sorted(painted, key=lambda item: item.marker)
@@ -105,6 +110,19 @@ class Painter:
         skin = snapshot.outlines[:PHALANGES, 0]
         touched = raster.overlaps(low[:, None], high[:, None], skin.min(axis=1), skin.max(axis=1))
         return touched & (self._view.phalanx_depth(snapshot, uv) < depth[:, None])
+
+    def _sleeve_before(self, snapshot: Snapshot, marker: Shape, depth_m: float) -> list[Shape]:
+        """The sleeve, where it may lie before a marker at that depth."""
+        view = self._view
+        reach = snapshot.discs_px[list(SLEEVE_SPHERES), 0, None]
+        ends = snapshot.uv[list(SLEEVE_SPHERES)]
+        low, high = marker.corners.min(axis=0), marker.corners.max(axis=0)
+        if not raster.overlaps(low, high, (ends - reach).min(axis=0), (ends + reach).max(axis=0)):
+            return []
+        before = view.sleeve_depth(snapshot, marker.corners.mean(axis=0)) < depth_m
+        if not before or view.looks_into_sleeve(snapshot):
+            return []
+        return [Shape(view.sleeve(snapshot), snapshot.speed_uv[SLEEVE_SPHERES[0]])]
 
     def window(self, image: Image, group: list[Painted], snapshot: Snapshot) -> tuple[int, int, Image]:
         """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""

@@ -1,7 +1,8 @@
 """Scene -> camera image: hand, paint, desk, card, blur and noise, with the truth of what each marker shows.
 
 Order of drawing: desk; finger parts and palm from far to near, each as nested discs that make it look round;
-sleeve; motion blur; card; markers (see `paint`); lens blur; the light, where it is not the calibrated one; noise.
+sleeve (first where the camera looks into it); motion blur; card; markers (see `paint`); lens blur; the light, where
+it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
 there stays as bright as white paint under the new light, also where a real one would outshine it.
@@ -16,7 +17,7 @@ from common.sim.desk import LENS_SIGMA_PX, NoiseTiles, desk_image
 from common.sim.paint import MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.sim.surface import CAPSULES, PALM_HULL, SLEEVE_SPHERES, WEB_HULL
+from common.sim.surface import CAPSULES, PALM_HULL, WEB_HULL
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 from common.srgb import relit_bytes
 
@@ -92,6 +93,9 @@ class Renderer:
             far = float(depth[CAPSULES[list(part)]].mean())
             parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
         palm = [[raster.fixed(h) for h in self._view.hulls(snapshot, hull)] for hull in (WEB_HULL, PALM_HULL)]
+        behind = self._view.looks_into_sleeve(snapshot)
+        if behind:
+            self._draw_sleeve(image, snapshot)
         raster.fill(image, raster.fixed(snapshot.cuff_uv[0]), self._card)  # the dark inside of the sleeve
         for _, part in sorted(parts, key=lambda item: -item[0]):
             for layer in range(LAYERS):
@@ -100,11 +104,12 @@ class Renderer:
                     shapes += [corners[k, layer] for k in ROOTS]  # knuckles and thumb flow out of the palm
                 for shape in shapes:
                     raster.fill(image, shape, self._skin[layer])
-        end = SLEEVE_SPHERES[1]
+        if not behind:
+            self._draw_sleeve(image, snapshot)
+
+    def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
         for layer in range(LAYERS):
-            disc = snapshot.discs_uv[end, layer] + snapshot.discs_px[end, layer] * self._view.circle
-            sleeve = raster.hull(np.vstack([snapshot.cuff_uv[layer], disc]))
-            raster.fill(image, raster.fixed(sleeve), self._sleeve[layer])
+            raster.fill(image, raster.fixed(self._view.sleeve(snapshot, layer)), self._sleeve[layer])
 
     def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> tuple[int, int, int, int]:
         """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""

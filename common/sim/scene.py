@@ -188,6 +188,6 @@ class Scene:
 
 
 def view_centre(rig: RigCalibration) -> Float:
-    """Middle of the volume (3,) [m], rig frame: between the cameras, at the hand's working distance."""
-    centres = np.stack([rig.camera_pose(name)[:3, 3] for name in rig.cameras])
+    """Middle of the scene (3,) [m], rig frame: before the rig's first two cameras, at the hand's working distance."""
+    centres = np.stack([rig.camera_pose(name)[:3, 3] for name in rig.cameras[:2]])
     return centres.mean(axis=0) + np.array([0.0, 0.01, HAND_DEPTH_M])

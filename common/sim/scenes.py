@@ -9,16 +9,18 @@ from common.errors import PhalanxError
 from common.hand_model import HandModel
 from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
+from common.sim.poses import StudyPoses
 from common.sim.scene import Scene, view_centre
 
-NAMES = "standard | lights | leap:FILE.npz"
+NAMES = "standard | lights | poses | leap:FILE.npz"
 _LEAP = "leap:"
 
 
 def scene_by_name(
     name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
 ) -> Scene:
-    """The scene called `standard`, the same under light that changes, `lights`, or one that follows a recorded motion.
+    """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
+    (`poses`), or one that follows a recorded motion.
 
     Raises:
         PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
@@ -27,6 +29,9 @@ def scene_by_name(
         return Scene.standard(rig, cameras, hand, seed)
     if name == "lights":
         return replace(Scene.standard(rig, cameras, hand, seed), light=ROOM)
+    if name == "poses":
+        motion = StudyPoses(HandModel.of(hand), view_centre(rig), seed)
+        return Scene.of_motion(rig, cameras, hand, motion, seed)
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
         return Scene.of_motion(rig, cameras, hand, motion, seed)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
@@ -33,6 +33,7 @@ from common.sim.surface import (
 
 NEAREST_M = 0.05
 FURTHEST_PX = 4000.0
+INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
 LAYER_SINES = np.sqrt(1.0 - LAYER_COSINES**2)
 PHALANGES = len(CAPSULES)
@@ -168,13 +169,7 @@ class View:
 
     def phalanx_depth(self, snapshot: Snapshot, uv: Float) -> Float:
         """Depth (..., PHALANGES) [m] of every phalanx where it passes nearest to the pixels `uv` (..., 2)."""
-        a, b = CAPSULES[:, 0], CAPSULES[:, 1]
-        start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
-        share = ((uv[..., None, :] - start) * along).sum(axis=-1) / np.maximum(
-            (along * along).sum(axis=-1), 1e-9
-        )
-        share = np.minimum(np.maximum(share, 0.0), 1.0)
-        return snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share
+        return _depth_along(snapshot, uv[..., None, :], CAPSULES[:, 0], CAPSULES[:, 1])
 
     def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
         """Whether the plane of the palm passes between the camera and points (..., 3) [m], camera frame."""
@@ -187,6 +182,23 @@ class View:
         """Whether the back of the hand is turned to the camera."""
         _, offset = _palm_plane(snapshot)
         return offset * self.scene.model.side_sign > 0.0
+
+    def looks_into_sleeve(self, snapshot: Snapshot) -> bool:
+        """Whether the camera looks into the sleeve rather than at its side: the hand then lies before it."""
+        cuff, end = snapshot.points[list(SLEEVE_SPHERES)]
+        return float((end - cuff) @ cuff) > INTO_COSINE * float(
+            np.linalg.norm(end - cuff) * np.linalg.norm(cuff)
+        )
+
+    def sleeve(self, snapshot: Snapshot, layer: int = 0) -> Float:
+        """Outline of one layer of the sleeve [px]; the first is the sleeve's own."""
+        end = SLEEVE_SPHERES[1]
+        disc = snapshot.discs_uv[end, layer] + snapshot.discs_px[end, layer] * self.circle
+        return raster.hull(np.vstack([snapshot.cuff_uv[layer], disc]))
+
+    def sleeve_depth(self, snapshot: Snapshot, uv: Float) -> Float:
+        """Depth (...) [m] of the sleeve where it passes nearest to the pixels `uv` (..., 2)."""
+        return _depth_along(snapshot, uv, *SLEEVE_SPHERES)
 
     def cards(self, snapshot: Snapshot) -> tuple[Shape, ...]:
         """Outlines of the cards near the view, at the moment of the hand's middle row."""
@@ -232,6 +244,14 @@ class View:
         return [
             flat.reshape(*part.shape[:-1], 2) for flat, part in zip(np.split(uv, ends), parts, strict=True)
         ]
+
+
+def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
+    """Depth (...) [m] of the lines from key points `a` to `b` where they pass nearest to `uv` (..., 2) [px]."""
+    start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
+    share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
+    share = np.minimum(np.maximum(share, 0.0), 1.0)
+    return np.asarray(snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share)
 
 
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
