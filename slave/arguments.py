@@ -1,0 +1,223 @@
+"""The slave's command line as text: commands, options, help. Each command's help shows its own examples."""
+
+import argparse
+import math
+from pathlib import Path
+
+from slave.cameras import real
+
+ABOUT = (
+    "The slave stands beside a camera: it finds the painted markers and sends their centroids.\n"
+    "Images leave it only as small previews, on request, while somebody looks."
+)
+# Command -> what it is for, in the list of commands; and its examples.
+HELP = {
+    "run": (
+        "detect live and send",
+        """\
+  PHALANX_RIG_KEY=$(cat rig.key) phalanx-slave run --name left --rig desk --camera replay:recordings/wave
+        waits for the master's start, then sends one sealed datagram per frame
+  phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
+        without hardware: renders the standard scene in real time
+  phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
+        with a USB camera; docs/cameras.md says which settings are fixed and checked
+""",
+    ),
+    "record": (
+        "raw frames to disk",
+        """\
+  phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
+        without master or network; one folder per camera
+""",
+    ),
+    "join": (
+        "one recording of several cameras",
+        """\
+  phalanx-slave join recordings/wave-left recordings/wave-right -o recordings/wave
+        one recording of all cameras, for `phalanx replay` and the calibrations
+""",
+    ),
+    "detect": (
+        "detect in a recording",
+        """\
+  phalanx-slave detect recordings/wave --camera left --calibration calib_json -o detections_left.npz
+        offline: every frame of one camera, the same bytes on every run
+""",
+    ),
+    "colours": (
+        "colours of the markers",
+        """\
+  phalanx-slave colours recordings/paints --camera left -o calib_json/cameras/left.json
+        HSV ranges from one click per marker, or, without clicks, from a few seconds of the moving hand;
+        prints what collides with what
+  phalanx-slave colours recordings/paints --camera right --like calib_json/cameras/left.json -o right.json
+        the same, the names taken from a camera file that has them
+""",
+    ),
+}
+CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
+BEACON_PORT = 47800
+
+
+def parser() -> argparse.ArgumentParser:
+    """The parser of `phalanx-slave`; the command is in `command`."""
+    whole = argparse.ArgumentParser(
+        "phalanx-slave",
+        description=ABOUT,
+        epilog="`phalanx-slave COMMAND --help` shows its examples.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    fill = {"run": _run, "record": _record, "join": _join, "detect": _detect, "colours": _colours}
+    for name, add_options in fill.items():
+        purpose, examples = HELP[name]
+        command = commands.add_parser(
+            name,
+            help=purpose,
+            epilog=f"examples:\n{examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        add_options(command)
+    return whole
+
+
+def _run(run: argparse.ArgumentParser) -> None:
+    _camera(run)
+    run.add_argument(
+        "--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
+    )
+    run.add_argument(
+        "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
+    )
+    run.add_argument(
+        "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
+    )
+    run.add_argument(
+        "--colours",
+        choices=("follow", "fixed"),
+        default="follow",
+        help="whether the colours follow changes of the light (default: %(default)s; docs/light.md)",
+    )
+    run.add_argument(
+        "--engine",
+        choices=("numpy", "numba"),
+        default="numpy",
+        help="what detects: numba is several times faster, needs the extra `fast` (default: %(default)s)",
+    )
+
+
+def _record(record: argparse.ArgumentParser) -> None:
+    _camera(record)
+    record.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty; one per camera"
+    )
+    record.add_argument("--seconds", type=_positive, metavar="S", help="default: until Ctrl-C")
+    record.add_argument("--frames", type=_count, metavar="N", help="end after so many recorded frames")
+    record.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
+    record.add_argument(
+        "--reserve-mb", type=_megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
+    )
+    record.add_argument(
+        "--queue-mb", type=_megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
+    )
+
+
+def _join(join: argparse.ArgumentParser) -> None:
+    join.add_argument("recordings", type=Path, nargs="+", metavar="RECORDING", help="one folder per camera")
+    join.add_argument("-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty")
+    join.add_argument(
+        "--by-wall-clock",
+        action="store_true",
+        help="recorded on several machines: trust their wall clocks (keep them together by NTP or PTP)",
+    )
+
+
+def _detect(detect: argparse.ArgumentParser) -> None:
+    detect.add_argument(
+        "recording", type=Path, metavar="RECORDING", help="folder with recording.json, frames.csv"
+    )
+    detect.add_argument("--camera", required=True, metavar="NAME")
+    detect.add_argument(
+        "--calibration", type=Path, metavar="DIR", help="its cameras/NAME.json gives the colours"
+    )
+    detect.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
+    )
+
+
+def _colours(colours: argparse.ArgumentParser) -> None:
+    colours.add_argument(
+        "recording",
+        type=Path,
+        metavar="RECORDING",
+        help="folder; with clicks in recording.json, or a few seconds of the moving, open hand",
+    )
+    colours.add_argument("--camera", required=True, metavar="NAME")
+    colours.add_argument(
+        "--auto",
+        action="store_true",
+        help="from all frames though there are clicks, which then only name paints",
+    )
+    colours.add_argument(
+        "--like",
+        type=Path,
+        metavar="CAMERA.json",
+        help="from all frames; names by the hues of this camera file",
+    )
+    colours.add_argument(
+        "--hand",
+        type=Path,
+        metavar="HAND.json",
+        help="from all frames; names by the shape of this hand, which checks those of --like "
+        "(default: calib_json/hands/, the rig's hand)",
+    )
+    colours.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FILE", help="camera file to write"
+    )
+
+
+def _camera(command: argparse.ArgumentParser) -> None:
+    """All that opening a camera asks for."""
+    command.add_argument("--name", required=True, help="camera of this slave, a member of the rig")
+    command.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
+    command.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+    command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    real.add_options(command)
+    sim = command.add_argument_group("synthetic camera")
+    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | lights | leap:FILE.npz")
+    sim.add_argument("--seed", type=int, default=7)
+    sim.add_argument(
+        "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
+    )
+    sim.add_argument(
+        "--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead"
+    )
+    sim.add_argument("--clock-ppm", type=float, default=0.0, metavar="Y", help="and gains on the true one")
+    sim.add_argument("--start-offset-ms", type=float, default=0.0, metavar="Z", help="its frames come later")
+
+
+def _positive(text: str) -> float:
+    value = _number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be positive")
+    return value
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text}: must be a whole number, at least 1")
+    return int(text)
+
+
+def _megabytes(text: str) -> float:
+    value = _number(text)
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must not be negative")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:  # argparse would tell the name of the function
+        raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
