@@ -212,7 +212,7 @@ def _strange(candidate: Candidate, others: Sequence[Candidate]) -> bool:
         return False
     blob = candidate.blob
     slack = SCALE - 1  # of the box, see `Blob`
-    fill = blob.area / ((blob.right - blob.left - slack) * (blob.bottom - blob.top - slack))
+    fill = blob.area / (max(blob.right - blob.left - slack, 1) * max(blob.bottom - blob.top - slack, 1))
     largest, typical = max(c.blob.area for c in others), _median([c.blob.area for c in others])
     return blob.area > min(STRANGE_SIZE * typical, STRANGE_SHARE * largest) or (
         blob.area >= SPECK and fill < STRANGE_FILL
