@@ -62,6 +62,19 @@ class HsvRange(_File, frozen=True):
     reference_bgr_linear: tuple[LinearLight, LinearLight, LinearLight] | None = None
 
 
+class Provenance(_File, frozen=True):
+    """Where a measured part of a file comes from: when, by what, from which data, and how well the fit agrees.
+
+    `residual`: quantity with its unit -> value, such as rms_px.
+    """
+
+    date: Annotated[str, Meta(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ(?!\n)$")]
+    tool: str
+    data: tuple[str, ...]
+    residual: dict[str, Number]
+    note: str = ""
+
+
 class CameraCalibration(_File, frozen=True):
     """cameras/<name>.json: mode, exposure, optics and marker colours of one camera."""
 
@@ -76,6 +89,7 @@ class CameraCalibration(_File, frozen=True):
     row_time_us: NonNegative
     intrinsics: Intrinsics | None = None
     markers: dict[Name, HsvRange] | None = None
+    provenance: dict[str, Provenance] = {}
 
 
 class PowerLawCalibration(_File, frozen=True):
@@ -117,10 +131,18 @@ class FilterCalibration(_File, frozen=True):
     d_cutoff_hz: Positive = 6.0
 
 
+class Volume(_File, frozen=True):
+    """A box in the rig frame, sides along its axes: where the rig was tested."""
+
+    low_m: Vector3
+    high_m: Vector3
+
+
 class RigCalibration(_File, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
+    `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
     """
 
     version: Literal[1]
@@ -136,6 +158,9 @@ class RigCalibration(_File, frozen=True):
     affine_disparity: AffineDisparityCalibration | None = None
     pairing: Literal["interpolate", "predict"] = "interpolate"
     filter: FilterCalibration = FilterCalibration()
+    volume: Volume | None = None
+    stamp_offset_us: dict[Name, Number] = {}
+    provenance: dict[str, Provenance] = {}
     laser_plane: LaserPlane | None = None
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
@@ -257,6 +282,13 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
     for name in rig.free_markers:
         if name not in rig.markers:
             raise CalibrationError(f"{where}: free_markers: {name!r} is not one of markers")
+    for name in rig.stamp_offset_us:
+        if name not in rig.cameras:
+            raise CalibrationError(f"{where}: stamp_offset_us: {name!r} is not one of cameras")
+    if rig.volume is not None and any(
+        a >= b for a, b in zip(rig.volume.low_m, rig.volume.high_m, strict=True)
+    ):
+        raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
     if rig.kind == "wrist":
         return
     for camera in rig.cameras:

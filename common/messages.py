@@ -19,11 +19,13 @@ from msgspec import Meta, Struct
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 2
+WIRE_VERSION = 3
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
 MAX_PREVIEW_BYTES = 256 * 1024
+MAX_STILL_BYTES = 900 * 1024
+MAX_BODY_CHARACTERS = 64 * 1024
 
 # The look-ahead: in Python `$` also matches before a final line feed, and names become keys and file names.
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
@@ -63,6 +65,8 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         rival_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
             this is the marker. NaN: none, the usual case. Only where `uv` is seen.
             A row that is NaN in all was not seen.
+        t_sigma_ns: Standard deviation of `t_ns` [ns]: of the sender's stamp until `ingest`, with that of the clock
+            conversion afterwards. 0: exact, or not known (a recording).
     """
 
     camera: Name
@@ -75,6 +79,7 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
     quality: Float
     sigma_px: Float
     rival_uv: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
 
     def __post_init__(self) -> None:
         m = len(self.area)
@@ -113,6 +118,9 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             DIP (thumb IP), zero in the profile's rest pose.
         markers_m: Filtered cap centroids (M, 3) [m], rig frame. NaN: not seen.
         markers_raw_m: The same before the filter.
+        markers_cov_m2: Covariances (M, 3, 3) [m^2] of `markers_raw_m`, rig frame. NaN: not seen.
+        inside_volume: (26,) the joint lies in the volume that the rig states; all True where it states none. Outside,
+            accuracy is not known; that alone does not clear `valid`.
         latency_ns: From the hand-over of the last contributing frame to its slave, to
             the publication of this pose [ns]; 0 in an offline run.
     """
@@ -129,6 +137,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     angles_rad: Float
     markers_m: Float
     markers_raw_m: Float
+    markers_cov_m2: Float
+    inside_volume: Bool
     latency_ns: TimeNs = 0
 
     def __post_init__(self) -> None:
@@ -148,6 +158,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "angles_rad", np.float64, (FINGER_COUNT, 4))
         _freeze(self, "markers_m", np.float64, (m, 3))
         _freeze(self, "markers_raw_m", np.float64, (m, 3))
+        _freeze(self, "markers_cov_m2", np.float64, (m, 3, 3))
+        _freeze(self, "inside_volume", np.bool_, (j,))
 
 
 class Health(Message, frozen=True, eq=False, tag=True):
@@ -174,10 +186,12 @@ class Command(Message, frozen=True, eq=False, tag=True):
     Attributes:
         target: Process name.
         verb: What to do; each process documents its verbs ("report", "stop").
+        body: What the verb needs, as JSON; empty for most.
     """
 
     target: Name
     verb: Name
+    body: Annotated[str, Meta(max_length=MAX_BODY_CHARACTERS)] = ""
 
 
 class Preview(Message, frozen=True, eq=False, tag=True):
@@ -198,13 +212,33 @@ class Preview(Message, frozen=True, eq=False, tag=True):
             raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_PREVIEW_BYTES}")
 
 
-AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command | Preview
+class Still(Message, frozen=True, eq=False, tag=True):
+    """One whole frame of a camera, on request: what the cameras themselves are calibrated from.
+
+    Attributes:
+        camera: Camera name.
+        seq: Frame counter of this camera.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock.
+        jpeg: A whole JPEG file of the camera's width and height.
+    """
+
+    camera: Name
+    seq: Count
+    t_ns: TimeNs
+    jpeg: Annotated[bytes, Meta(max_length=MAX_STILL_BYTES)]
+
+    def __post_init__(self) -> None:
+        if len(self.jpeg) > MAX_STILL_BYTES or not self.jpeg.startswith(_JPEG_START):
+            raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_STILL_BYTES}")
+
+
+AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command | Preview | Still
 
 _JPEG_START = b"\xff\xd8\xff"
 _NONE = np.empty((0, 2))
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
-    MarkerDetections | HandPose | Health | Command | Preview,
+    MarkerDetections | HandPose | Health | Command | Preview | Still,
     dec_hook=lambda kind, raw: _from_bytes(kind, raw),
 )
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from common.messages import Command, HandPose, Health, MarkerDetections, Message, Preview
+from common.messages import Command, HandPose, Health, MarkerDetections, Message, Preview, Still
 
 
 class Path(StrEnum):
@@ -35,6 +35,7 @@ STREAMS = {
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
     "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
+    "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False),
     "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", False),
 }
 

@@ -1,4 +1,4 @@
-"""Command line of the master: `phalanx-master run | solve | view | report`."""
+"""Command line of the master: `phalanx-master run | solve | view | report | calibrate`."""
 
 import logging
 import os
@@ -20,6 +20,7 @@ from common.frame_recording import open_recording
 from common.keys import rig_key
 from common.sim.scenes import NAMES, scene_by_name
 from common.zenoh_bus import ZenohBus
+from master.calibrate.cli import calibrate_app
 from master.live import LiveSettings, run_live
 from master.rig import RigSetup, load_hand, load_setup
 from master.solve import solve
@@ -161,6 +162,7 @@ def main() -> None:
     """Entry point `phalanx-master`."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
+    app.add_typer(calibrate_app(), name="calibrate")
     try:
         app()
     except PhalanxError as error:

@@ -207,7 +207,7 @@ PLANTED: list[tuple[Guard, str, str, str]] = [
     (wrong_side, "master/app.py", "if True:\n    import pickle", "import json"),
     (wrong_side, "deploy/demo.py", "import common.clock", "import subprocess"),
     (undeclared, "slave/app.py", "import typer", "import cv2, numpy, msgspec"),
-    (undeclared, "master/app.py", "import scipy.optimize", "import typer, rerun"),
+    (undeclared, "master/app.py", "import pandas", "import typer, rerun, scipy.optimize"),
     (undeclared, "slave/markers/centroid.py", "import numba", "import cv2"),
     (undeclared, "slave/markers/fast_scan.py", "import scipy", "import numba"),
     (relative_imports, "slave/app.py", "from . import cameras", "from slave import cameras"),

@@ -193,7 +193,12 @@ class HandTracker:
 
 
 def pose_of(
-    hand: TrackedHand, model: HandModel, t_ns: int, markers_m: Float, markers_raw_m: Float
+    hand: TrackedHand,
+    model: HandModel,
+    t_ns: int,
+    markers_m: Float,
+    markers_raw_m: Float,
+    markers_cov_m2: Float,
 ) -> HandPose:
     """The message for one tracked hand; all NaN and not valid where nothing has been solved yet."""
     solution = hand.solution
@@ -217,6 +222,8 @@ def pose_of(
         angles_rad=angles,
         markers_m=markers_m,
         markers_raw_m=markers_raw_m,
+        markers_cov_m2=markers_cov_m2,
+        inside_volume=np.ones(26, np.bool_),
     )
 
 

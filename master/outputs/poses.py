@@ -24,6 +24,8 @@ class Poses:
         source: (T, 26) `Source` codes.
         angles_rad: (T, 5, 4) [rad].
         markers_m, markers_raw_m: (T, M, 3) [m], after and before the filter.
+        markers_cov_m2: (T, M, 3, 3) [m^2], of `markers_raw_m`.
+        inside_volume: (T, 26).
         latency_ns: (T,) [ns]; 0 in an offline run.
     """
 
@@ -39,6 +41,8 @@ class Poses:
     angles_rad: Float
     markers_m: Float
     markers_raw_m: Float
+    markers_cov_m2: Float
+    inside_volume: Bool
     latency_ns: Int
 
     def __post_init__(self) -> None:
@@ -112,6 +116,8 @@ def record(marker_count: int) -> np.dtype[np.void]:
             ("angles_rad", "<f8", (FINGER_COUNT, 4)),
             ("markers_m", "<f8", (m, 3)),
             ("markers_raw_m", "<f8", (m, 3)),
+            ("markers_cov_m2", "<f8", (m, 3, 3)),
+            ("inside_volume", "?", (j,)),
             ("latency_ns", "<i8"),
         ]
     )

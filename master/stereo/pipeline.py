@@ -111,7 +111,7 @@ class MarkerPipeline:
             aims = self._with_rays(instant, markers, cov, last)
             measured = np.isfinite(markers[self._on_hand, 0])
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
-            pose = pose_of(hand, self.model, instant.t_ns, markers, raw)
+            pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
         self._count("apart", apart)

@@ -17,6 +17,7 @@ class Frame:
         ready_t_ns: When the frame was handed to the slave [ns], same clock.
         image: (H, W, 3) BGR, or (H, W) grey, uint8. Nobody writes to it any more: others may still look at it.
         illumination: What lit the scene.
+        t_sigma_ns: Standard deviation of `t_ns` [ns], as far as the driver knows its camera; 0: exact.
     """
 
     seq: int
@@ -24,6 +25,7 @@ class Frame:
     ready_t_ns: int
     image: Image
     illumination: Illumination = Illumination.AMBIENT
+    t_sigma_ns: float = 0.0
 
 
 class FrameSource(Protocol):

@@ -16,8 +16,10 @@ from common.errors import MessageError
 from common.messages import (
     FINGER_COUNT,
     JOINT_COUNT,
+    MAX_BODY_CHARACTERS,
     MAX_MARKERS,
     MAX_PREVIEW_BYTES,
+    MAX_STILL_BYTES,
     AnyMessage,
     Command,
     HandPose,
@@ -26,6 +28,7 @@ from common.messages import (
     Message,
     Preview,
     Source,
+    Still,
     decode,
     encode,
 )
@@ -61,6 +64,7 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
         quality=draw(floats(m)),
         sigma_px=positive(draw, seen),
         rival_uv=np.where(seen[:, None], draw(floats(m, 2)), np.nan),
+        t_sigma_ns=draw(st.floats(0.0, 1e18)),
     )
 
 
@@ -80,6 +84,8 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         angles_rad=draw(floats(FINGER_COUNT, 4)),
         markers_m=draw(floats(m, 3)),
         markers_raw_m=draw(floats(m, 3)),
+        markers_cov_m2=draw(floats(m, 3, 3)),
+        inside_volume=draw(arrays(np.bool_, j)),
         latency_ns=draw(times),
     )
 
@@ -92,7 +98,7 @@ healths = st.builds(
     counts=st.dictionaries(names, counts, max_size=64),
     gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
-commands = st.builds(Command, target=names, verb=names)
+commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
 previews = st.builds(
     Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: b"\xff\xd8\xff" + tail)
 )
@@ -113,6 +119,8 @@ def sample_pose(markers: int = 6) -> HandPose:
         angles_rad=np.zeros((FINGER_COUNT, 4)),
         markers_m=np.full((markers, 3), np.nan),
         markers_raw_m=np.full((markers, 3), np.nan),
+        markers_cov_m2=np.full((markers, 3, 3), np.nan),
+        inside_volume=np.ones(j, dtype=np.bool_),
     )
 
 
@@ -130,6 +138,7 @@ SAMPLES: tuple[Message, ...] = (
     Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}),
     Command("left", "stop"),
     Preview("left", 2, b"\xff\xd8\xff\xe0jpeg"),
+    Still("left", 1, 2, b"\xff\xd8\xff\xe0jpeg"),
 )
 
 
@@ -273,6 +282,10 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (4, {"jpeg": b"GIF89a"}),
         (4, {"jpeg": "text"}),
         (4, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 2)}),
+        (5, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_STILL_BYTES - 2)}),
+        (0, {"t_sigma_ns": -1.0}),
+        (0, {"t_sigma_ns": float("nan")}),
+        (3, {"body": "x" * (MAX_BODY_CHARACTERS + 1)}),
     ],
 )
 def test_one_wrong_field_is_refused(sample: int, change: dict[str, object]) -> None:
@@ -287,7 +300,7 @@ def test_a_missing_field_is_refused_unless_it_has_a_default(message: Message) ->
     content = as_map(message)
     for field in content:
         wire = msgspec.msgpack.encode({key: value for key, value in content.items() if key != field})
-        if field == "latency_ns":
+        if field in ("latency_ns", "t_sigma_ns", "body"):
             decode(wire)
             continue
         with pytest.raises(MessageError):

@@ -24,7 +24,11 @@ def test_marker_data_never_waits_for_a_lost_frame() -> None:
 
 
 def test_commands_are_not_replayed_and_pictures_not_kept() -> None:
-    assert {name for name, stream in STREAMS.items() if not stream.recorded} == {"command", "preview"}
+    assert {name for name, stream in STREAMS.items() if not stream.recorded} == {
+        "command",
+        "preview",
+        "still",
+    }
 
 
 def test_keys_differ_by_stream_and_by_name() -> None:

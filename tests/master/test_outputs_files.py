@@ -31,6 +31,8 @@ def random_pose(index: int, markers: int = 6, hand: str = "default-right") -> Ha
         angles_rad=rng.normal(size=(5, 4)),
         markers_m=raw * 0.5,
         markers_raw_m=raw,
+        markers_cov_m2=rng.normal(size=(len(raw), 3, 3)),
+        inside_volume=rng.random(26) < 0.5,
         latency_ns=index * 1000,
     )
 

@@ -53,6 +53,8 @@ def pose(index: int = 0, flexion: float = 0.0) -> HandPose:
         angles_rad=angles,
         markers_m=markers,
         markers_raw_m=markers + 0.001,
+        markers_cov_m2=np.full((len(markers), 3, 3), np.nan),
+        inside_volume=np.ones(26, np.bool_),
         latency_ns=8_000_000 + index * 1000,
     )
 

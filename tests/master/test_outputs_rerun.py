@@ -83,6 +83,8 @@ def moving_hand(rows: int) -> list[HandPose]:
                 angles_rad=angles,
                 markers_m=markers,
                 markers_raw_m=markers + 0.001,
+                markers_cov_m2=np.full((len(markers), 3, 3), np.nan),
+                inside_volume=np.ones(26, np.bool_),
                 latency_ns=8_000_000,
             )
         )
@@ -344,7 +346,13 @@ def test_an_uncertainty_larger_than_the_fingers_is_not_drawn(tmp_path: Path) -> 
 def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
     bus = LoopbackBus()
     pose = moving_hand(1)[0]
-    other = replace(pose, hand="other", markers_m=np.zeros((2, 3)), markers_raw_m=np.zeros((2, 3)))
+    other = replace(
+        pose,
+        hand="other",
+        markers_m=np.zeros((2, 3)),
+        markers_raw_m=np.zeros((2, 3)),
+        markers_cov_m2=np.zeros((2, 3, 3)),
+    )
     with Viewing(bus, tmp_path / "live.rrd"):
         bus.publish("hand", pose.hand, pose)
         bus.publish("hand", other.hand, other)

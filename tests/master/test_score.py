@@ -32,6 +32,8 @@ def poses(count: int, position: Float, angles: Float, markers: Float, start_ns: 
                 angles_rad=angles,
                 markers_m=markers,
                 markers_raw_m=markers + np.array([0.0, 0.0, 1e-3]),
+                markers_cov_m2=np.zeros((len(markers), 3, 3)),
+                inside_volume=np.ones(26, dtype=bool),
             )
             for k in range(count)
         ]

@@ -165,7 +165,8 @@ def test_nothing_seen_yet_is_no_hand() -> None:
     hand = tracker.push(0, np.full((6, 3), np.nan), np.full((6, 3, 3), np.nan), FACING)
     assert hand.solution is None
     assert not hand.valid.any()
-    pose = pose_of(hand, RIGHT, 5, np.full((6, 3), np.nan), np.full((6, 3), np.nan))
+    unseen = np.full((6, 3), np.nan)
+    pose = pose_of(hand, RIGHT, 5, unseen, unseen, np.full((6, 3, 3), np.nan))
     assert pose.t_ns == 5
     assert np.isnan(pose.position_m).all()
     assert np.isnan(pose.angles_rad).all()
@@ -186,11 +187,12 @@ def test_the_message_holds_the_solution() -> None:
     tracker = HandTracker(RIGHT, MARKERS)
     hand = run(tracker, range(2))[-1]
     points = points_of(bent(1 / 60))
-    pose = pose_of(hand, RIGHT, STEP_NS, points, points + 1e-3)
+    pose = pose_of(hand, RIGHT, STEP_NS, points, points + 1e-3, small_cov())
     assert hand.solution is not None
     np.testing.assert_array_equal(pose.position_m, hand.solution.joints.position_m)
     np.testing.assert_allclose(np.linalg.norm(pose.orientation_wxyz, axis=1), 1.0)
     np.testing.assert_array_equal(pose.markers_raw_m, points + 1e-3)
+    np.testing.assert_array_equal(pose.markers_cov_m2, small_cov())
     assert pose.hand == "made-right"
     assert pose.valid[pose.tracked].all()
 

@@ -1,0 +1,1 @@
+"""Calibrations: pure fits, observations -> (value, residual), and the thin commands around them."""

@@ -1,0 +1,19 @@
+"""`phalanx-master calibrate`: each command is one function of the module that holds its subject."""
+
+from collections.abc import Callable
+
+import typer
+
+COMMANDS: dict[str, Callable[..., None]] = {}
+
+
+def calibrate_app() -> typer.Typer:
+    """The commands as one program, to be put under a name."""
+    app = typer.Typer(no_args_is_help=True, add_completion=False, callback=_about)
+    for name, command in COMMANDS.items():
+        app.command(name)(command)
+    return app
+
+
+def _about() -> None:
+    """Measure a rig: lenses, places, depth, time. Every result is a new file with date, residual and source."""
