@@ -8,9 +8,9 @@ def _cap(marker: int, u: float) -> tuple[int, Blob, float]:
     return marker, Blob(u, 100.0, 60.0, int(u) - 5, 95, int(u) + 5, 105), 0.5
 
 
-def test_a_blob_one_pixel_wide_is_judged_like_any_other() -> None:
-    """The finer grids leave a box as narrow as its pixels, so that nothing is left of it without the slack."""
+def test_a_blob_of_one_column_is_judged_like_any_other() -> None:
+    """The finer grid leaves its box as wide as the slack of the usual one."""
     caps = [candidate(*_cap(m, 60.0 + 20.0 * m), fringe=False, bonus=0.0) for m in range(4)]
-    line = candidate(4, Blob(150.5, 95.0, 4.0, 150, 93, 151, 97), 0.0, fringe=False, bonus=0.0)
+    line = candidate(4, Blob(136.0, 96.0, 16.0, 135, 91, 138, 101), 0.0, fringe=False, bonus=0.0)
     chosen = choose([*caps, line])
     assert [chosen[m] for m in range(4)] == caps
