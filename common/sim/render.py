@@ -5,8 +5,11 @@ sleeve (first where the camera looks into it); motion blur; card; markers (see `
 it is not the calibrated one; noise.
 
 Another light multiplies the finished picture, channel by channel, in linear light. A highlight that is already white
-there stays as bright as white paint under the new light, also where a real one would outshine it.
+there stays as bright as white paint under the new light, also where a real one would outshine it. Another exposure or
+gain of the camera does the same (`Renderer.exposed`), and a longer exposure smears more.
 """
+
+from copy import copy
 
 import cv2
 import numpy as np
@@ -45,7 +48,22 @@ class Renderer:
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
         self._light = scene.light
+        self._gains_bgr = np.ones(3)
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
+
+    def exposed(self, exposure_us: float, gains_bgr: Float) -> "Renderer":
+        """The same scene before a camera with other settings; shares all that was prepared.
+
+        Args:
+            exposure_us: Exposure [us], which smears what moves.
+            gains_bgr: Brightness (3,) of the channels in linear light, blue first, against that of the camera file
+                that the scene was made with. The noise stays as it is.
+        """
+        other = copy(self)
+        other._view = self._view.exposed(exposure_us)
+        other._painter = Painter(other._view)
+        other._gains_bgr = np.array(gains_bgr, dtype=np.float64)
+        return other
 
     def render(self, t_s: float) -> Image:
         """Image (H, W, 3) BGR of the frame whose row 0 is at mid-exposure at scene time `t_s` [s]."""
@@ -76,9 +94,11 @@ class Renderer:
         cv2.GaussianBlur(roi, (3, 3), LENS_SIGMA_PX, dst=roi)
         for x, y, patch in windows:
             image[y : y + patch.shape[0], x : x + patch.shape[1]] = patch
+        gains_bgr = self._gains_bgr
         if self._light is not None:
-            tables = relit_bytes(self._light.gains_bgr(max(t_s, 0.0) % self._view.scene.period_s))
-            image = np.asarray(cv2.LUT(image, tables.T[None]), dtype=np.uint8)
+            gains_bgr = gains_bgr * self._light.gains_bgr(max(t_s, 0.0) % self._view.scene.period_s)
+        if (gains_bgr != 1.0).any():
+            image = np.asarray(cv2.LUT(image, relit_bytes(gains_bgr).T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
         return image, self._painter.truth(painted)
 

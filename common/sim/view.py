@@ -5,6 +5,7 @@ together, by two rounds of projecting and moving (the hand moves far less than a
 exact instants the key points follow a parabola.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,6 +113,12 @@ class View:
             together[[cap.centre, cap.base], cap.centre] = 1.0 + ahead
             together[[cap.centre, cap.base], cap.base] = -ahead
         self._together = together
+
+    def exposed(self, exposure_us: float) -> "View":
+        """The same view with another exposure [us]."""
+        other = copy(self)
+        other.exposure_s = exposure_us * 1e-6
+        return other
 
     def project(self, points: Float) -> Float:
         """Pixels (..., 2) of points (..., 3) [m] in the camera frame; what is too near or far out is held there."""

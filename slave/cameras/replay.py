@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 
 from common.arrays import Image
+from common.calibration import CameraCalibration
+from common.camera_settings import figures
 from common.clock import Clock
 from common.errors import CameraError, RecordingError
 from common.frame_recording import FrameRow, open_recording
@@ -37,7 +39,7 @@ class ReplayCamera:
         if not self._rows:
             raise CameraError(f"{folder}: frames.csv has no frame of camera {camera!r}")
         calibration = recording.manifest.cameras[camera]
-        self._size = (calibration.height_px, calibration.width_px)
+        self._calibration = calibration
         self._folder = folder
         self._paced = paced
         self._clock = clock
@@ -67,8 +69,27 @@ class ReplayCamera:
         """End the stream."""
         self._next = len(self._rows)
 
+    def tune(self, camera: CameraCalibration) -> None:
+        """Refused: what was recorded stays as it was exposed.
+
+        Raises:
+            CameraError: Always.
+        """
+        raise CameraError(
+            f"{self._folder}: its pictures are taken, with exposure_us {self._calibration.exposure_us:g}: a "
+            "recording has no exposure or gain to change; only the colours of markers can be loaded"
+        )
+
+    def figures(self) -> dict[str, float]:
+        """The settings that the recording was made with."""
+        return figures(self._calibration)
+
+    def counts(self) -> dict[str, int]:
+        """Nothing happens to a recording."""
+        return {}
+
     def _load(self, row: FrameRow) -> Image:
-        return read_png(self._folder / row.file, self._size)
+        return read_png(self._folder / row.file, (self._calibration.height_px, self._calibration.width_px))
 
     def _wait_until(self, t_ns: int) -> None:
         while (left_s := (t_ns - self._clock.now_ns()) * 1e-9) > 0.0:

@@ -5,10 +5,34 @@ read back may be from the value wanted, and why. Whatever is further off is an e
 got and what to do; nothing is taken on trust.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
+from common.calibration import CameraCalibration
 from common.errors import CameraError
+
+
+@runtime_checkable
+class Tunable(Protocol):
+    """A camera that tells what it has, and whose settings may be changed by another thread while it is read."""
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """Take exposure and gains of `camera`; size and rate are those it was opened with.
+
+        Raises:
+            CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or
+                the text says that they are not.
+        """
+        ...
+
+    def figures(self) -> dict[str, float]:
+        """What the camera has and does now, read back; names of `common.camera_settings`, and others."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """Events of the camera -> how often since it was first opened."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +95,29 @@ def demand(where: str, wanted: Iterable[Setting], got: Mapping[str, object], fix
     found = differences(wanted, got)
     if found:
         raise CameraError(f"{where} did not take its settings: {'; '.join(found)}. {fix}")
+
+
+def change(
+    apply: Callable[[CameraCalibration], None], old: CameraCalibration, new: CameraCalibration
+) -> None:
+    """Have `new` applied; if that fails, `old`, and see that it came back.
+
+    Args:
+        apply: Writes the settings of a camera file, reads them back and raises `CameraError` at a difference.
+        old: What the camera has.
+        new: What it is to have.
+
+    Raises:
+        CameraError: `new` was not taken; the text says so, and what became of `old`.
+    """
+    try:
+        apply(new)
+    except CameraError as error:
+        try:
+            apply(old)
+        except CameraError as second:
+            raise CameraError(f"{error}; and the settings before did not come back: {second}") from second
+        raise CameraError(f"{error}; the settings before are back") from error
 
 
 def _say(values: Sequence[float], unit: str) -> str:

@@ -4,13 +4,22 @@ Frame k is exposed when the camera's own oscillator, which is the slave's (perha
 `epoch + start offset + k periods`. It is handed over when a real sensor would have read out its last row. The
 picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame rate loses
 frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
+
+The lamp of the simulated room is such that the settings of the camera file at the start expose it well. Exposure and
+gains that are changed later make the picture brighter or darker against that, and the exposure smears more or less.
 """
 
 import time
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import CameraCalibration
+from common.camera_settings import figures
 from common.clock import Clock
+from common.errors import CameraError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
 from slave.cameras.source import Frame
@@ -28,7 +37,7 @@ class _Skewed(Protocol):
 
 
 class SyntheticCamera:
-    """A `FrameSource` that renders. Holds the number of the next frame and how many were skipped."""
+    """A `FrameSource` that renders. Holds its settings, the number of the next frame and how many were skipped."""
 
     def __init__(
         self,
@@ -56,11 +65,12 @@ class SyntheticCamera:
         """
         self._renderer = Renderer(scene, camera_name)
         camera = scene.cameras[camera_name]
+        self._lit_for, self._camera = camera, camera
         self._clock, self._true, self._sleep = clock, true_clock, sleep
         self._epoch_ns = epoch_ns
         self._first_ns = self._own(epoch_ns + start_offset_ns)
         self._rate_hz = camera.frame_rate_hz
-        self._readout_ns = round(camera.exposure_us * 500.0 + camera.height_px * camera.row_time_us * 1e3)
+        self._rows_ns = camera.height_px * camera.row_time_us * 1e3
         self._next = 0
         self._started = False
         self._closed = False
@@ -82,6 +92,33 @@ class SyntheticCamera:
     def close(self) -> None:
         """End the stream."""
         self._closed = True
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """Take other exposure and gains from the next frame on.
+
+        Raises:
+            CameraError: The exposure does not fit into a frame.
+        """
+        if camera.exposure_us >= 1e6 / self._rate_hz:
+            raise CameraError(
+                f"exposure_us: wanted {camera.exposure_us:g}, a frame at {self._rate_hz:g} Hz has "
+                f"{1e6 / self._rate_hz:g}; the settings before are still in use"
+            )
+        gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
+        self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
+
+    def figures(self) -> dict[str, float]:
+        """Its settings."""
+        return figures(self._camera)
+
+    def counts(self) -> dict[str, int]:
+        """`camera.skipped`: frames that this process was too slow to draw; they count as dropped, too."""
+        return {"camera.skipped": self.skipped}
+
+    @property
+    def _readout_ns(self) -> int:
+        """From the middle of the exposure of row 0 to the last row's read-out [ns]."""
+        return round(self._camera.exposure_us * 500.0 + self._rows_ns)
 
     def _due_next(self) -> int:
         """Number of the next frame: the one after the last, or the first that is not yet read out."""
@@ -105,3 +142,9 @@ class SyntheticCamera:
 
     def _true_ns(self, t_ns: int) -> int:
         return self._clock.to_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+
+
+def _sensitivity(camera: CameraCalibration) -> Float:
+    """What the settings make of one light, blue, green, red (3,): exposure [us] times the gains of each channel."""
+    red, blue = camera.colour_gains
+    return camera.exposure_us * camera.analogue_gain * np.array([blue, 1.0, red])

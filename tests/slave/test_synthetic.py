@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import SkewedClock
-from common.errors import CalibrationError
+from common.errors import CalibrationError, CameraError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
+from common.srgb import to_linear
 from slave.cameras.synthetic import SyntheticCamera
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -129,3 +131,90 @@ def test_closed_camera_ends_the_stream_and_unknown_one_is_refused() -> None:
     assert source.read() is None
     with pytest.raises(CalibrationError, match="third"):
         camera(clock, "third")
+
+
+def retuned(**changes: object) -> tuple[np.ndarray, np.ndarray]:
+    """The same moment before and after a change of settings, as linear light (H, W, 3)."""
+    clock = StageClock(EPOCH_NS + 20_000_000_000)
+    source = camera(clock)
+    before = source.read()
+    source.tune(msgspec.structs.replace(CAMERAS["left"], **changes))
+    clock.t_ns -= 30_000_000
+    source._next -= 1  # the same frame once more
+    after = source.read()
+    assert before is not None
+    assert after is not None
+    assert before.t_ns == after.t_ns
+    return to_linear(before.image / 255.0), to_linear(after.image / 255.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "factor_bgr"),
+    [
+        ({"exposure_us": 2500.0}, (0.5, 0.5, 0.5)),
+        ({"analogue_gain": 2.5}, (2.0, 2.0, 2.0)),
+        ({"exposure_us": 10_000.0, "analogue_gain": 0.625}, (1.0, 1.0, 1.0)),
+        ({"colour_gains": (0.83 * 1.5, 1.24 * 0.6)}, (0.6, 1.0, 1.5)),
+    ],
+)
+def test_exposure_and_gains_make_the_picture_brighter_or_darker(
+    changes: dict[str, object], factor_bgr: tuple[float, float, float]
+) -> None:
+    before, after = retuned(**changes)
+    middle = (before.min(axis=2) > 0.05) & (before.max(axis=2) < 0.35)
+    ratio = after[middle].sum(axis=0) / before[middle].sum(axis=0)
+    np.testing.assert_allclose(ratio, factor_bgr, rtol=0.05)
+
+
+def test_a_longer_exposure_smears_what_moves() -> None:
+    still = CAMERAS["left"]
+    moving = Renderer(SCENE, "left")
+    long = moving.exposed(15_000.0, np.ones(3))
+    fastest = max(np.arange(0.0, 30.0, 0.5).tolist(), key=lambda t_s: _speed(moving, t_s))
+    assert _speed(moving, fastest) * 0.010 > 4.0  # px: what 10 ms more must smear
+    assert _sharpness(long, fastest) < 0.9 * _sharpness(moving, fastest)
+    assert still.exposure_us == 5000.0
+    np.testing.assert_array_equal(
+        moving.exposed(still.exposure_us, np.ones(3)).render(fastest), moving.render(fastest)
+    )
+
+
+def _speed(renderer: Renderer, t_s: float) -> float:
+    """Speed of the hand in the picture [px/s]."""
+    now, later = (renderer.markers(t).uv for t in (t_s, t_s + 0.005))
+    return float(np.nanmedian(np.linalg.norm(later - now, axis=1))) / 0.005
+
+
+def _sharpness(renderer: Renderer, t_s: float) -> float:
+    """Mean step between neighbours, where the hand is."""
+    image = renderer.render(t_s).astype(float)
+    uv = renderer.markers(t_s).uv
+    u0, v0 = np.nanmin(uv, axis=0).astype(int) - 10
+    u1, v1 = np.nanmax(uv, axis=0).astype(int) + 10
+    part = image[max(v0, 0) : v1, max(u0, 0) : u1]
+    return float(np.abs(np.diff(part, axis=1)).mean() + np.abs(np.diff(part, axis=0)).mean())
+
+
+def test_it_says_what_it_has_and_refuses_what_does_not_fit_into_a_frame() -> None:
+    source = camera(StageClock(EPOCH_NS))
+    with pytest.raises(CameraError, match="exposure_us: wanted 17000, a frame at 60 Hz has 16666"):
+        source.tune(msgspec.structs.replace(CAMERAS["left"], exposure_us=17_000.0))
+    assert source.figures()["exposure_us"] == 5000.0
+    source.tune(msgspec.structs.replace(CAMERAS["left"], exposure_us=7000.0, colour_gains=(0.9, 1.1)))
+    got = source.figures()
+    assert (got["exposure_us"], got["red_gain"], got["blue_gain"], got["frame_rate_hz"]) == (
+        7000,
+        0.9,
+        1.1,
+        60,
+    )
+    assert source.counts() == {"camera.skipped": 0}
+
+
+def test_frames_are_handed_over_when_the_longer_exposure_is_over() -> None:
+    clock = StageClock(EPOCH_NS)
+    source = camera(clock)
+    source.tune(msgspec.structs.replace(CAMERAS["left"], exposure_us=9000.0))
+    frame = source.read()
+    assert frame is not None
+    assert 0 <= frame.ready_t_ns - frame.t_ns - READOUT_NS - 2_000_000 < 1_000
