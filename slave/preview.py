@@ -2,7 +2,8 @@
 
 The loop only offers its frames: one comparison when nobody looks, otherwise a reference is left behind ten times
 a second. A thread of its own shrinks, encodes and publishes; while it is busy the newest frame replaces the
-waiting one, so a slow bus costs pictures and never a measurement.
+waiting one, so a slow bus costs pictures and never a measurement. A *still*, one whole frame on request, goes the
+same way: cameras are calibrated from stills.
 """
 
 import threading
@@ -15,12 +16,13 @@ from common.arrays import Image
 from common.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
-from common.messages import MAX_PREVIEW_BYTES, Preview
+from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
 from slave.cameras.source import Frame
 
 PERIOD_NS = 100_000_000
 LOOK_NS = 3_000_000_000
 QUALITY = 80
+STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
 WAIT_S = 0.5
 _NEVER_NS = -(2**63)
 
@@ -51,9 +53,9 @@ class Gate:
 
 
 class Previews:
-    """Publishes one camera on stream "preview" while somebody looks.
+    """Publishes one camera on stream "preview" while somebody looks, and on "still" when one is asked for.
 
-    Holds the gate, the newest frame that waits, the bus while there is one, and how many pictures went out.
+    Holds the gate, the newest frames that wait, the bus while there is one, and how many pictures went out.
     """
 
     def __init__(self, camera: str, clock: Clock) -> None:
@@ -67,6 +69,8 @@ class Previews:
         self._clock = clock
         self._gate = Gate()
         self._waiting: deque[Frame] = deque(maxlen=1)
+        self._still_wanted = False
+        self._still: deque[Frame] = deque(maxlen=1)
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._lock = threading.Lock()  # a bus is never closed while it is published on
@@ -79,8 +83,16 @@ class Previews:
         """Somebody looks: show the camera for the next 3 s. Never waits."""
         self._gate.ask(self._clock.now_ns())
 
+    def ask_still(self) -> None:
+        """Publish the next frame whole. Never waits."""
+        self._still_wanted = True
+
     def offer(self, frame: Frame) -> None:
         """The loop has a new frame, which nobody will write to any more. Never waits."""
+        if self._still_wanted:
+            self._still_wanted = False
+            self._still.append(frame)
+            self._wake.set()
         if self._gate.wants(frame.t_ns):
             self._waiting.append(frame)
             self._wake.set()
@@ -100,19 +112,32 @@ class Previews:
         while not self._closing.is_set():
             self._wake.wait(WAIT_S)
             self._wake.clear()
+            if self._still and not self._closing.is_set():
+                frame = self._still.popleft()
+                self._publish("still", Still(self._camera, frame.seq, frame.t_ns, whole_jpeg(frame.image)))
             if self._waiting and not self._closing.is_set():
                 frame = self._waiting.popleft()
-                self._publish(Preview(self._camera, frame.t_ns, small_jpeg(frame.image)))
+                self._publish("preview", Preview(self._camera, frame.t_ns, small_jpeg(frame.image)))
 
-    def _publish(self, preview: Preview) -> None:
+    def _publish(self, stream: str, picture: Preview | Still) -> None:
         with self._lock:
             if self._bus is None:
                 return
             try:
-                self._bus.publish("preview", self._camera, preview)
+                self._bus.publish(stream, self._camera, picture)
                 self.published += 1
             except BusError:
                 return  # the bus has gone; the reporter finds the next one
+
+
+def whole_jpeg(image: Image) -> bytes:
+    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey in its full size, as good as fits into a message."""
+    data = b""
+    for quality in STILL_QUALITIES:
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(data) <= MAX_STILL_BYTES:
+            break
+    return data
 
 
 def small_jpeg(image: Image) -> bytes:

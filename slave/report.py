@@ -58,13 +58,17 @@ class Shown(Protocol):
         """Somebody looks."""
         ...
 
+    def ask_still(self) -> None:
+        """Somebody wants one whole frame."""
+        ...
+
     def use(self, bus: Bus | None) -> None:
         """Publish there from now on."""
         ...
 
 
 class Reporter:
-    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview".
+    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview" and "still".
 
     Holds the bus while a master is there, and the gauges of the last period.
     """
@@ -113,17 +117,22 @@ class Reporter:
         return Health(self._name, self._link.session, self._clock.now_ns(), counts, dict(self._gauges))
 
     def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "preview" shows the picture for 3 s, "stop" ends the slave.
+        """Obey a command.
+
+        "report" says how it is, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
+        the slave.
 
         Raises:
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = ("report", "stop") if self._shown is None else ("report", "stop", "preview")
+        verbs = ("report", "stop") if self._shown is None else ("report", "stop", "preview", "still")
         if command.verb not in verbs:
             raise ValueError(f"{self._name}: no command {command.verb!r}; there are {', '.join(verbs)}")
         health = self.health()
         if command.verb == "preview" and self._shown is not None:
             self._shown.ask()
+        if command.verb == "still" and self._shown is not None:
+            self._shown.ask_still()
         if command.verb == "stop":
             self._stop()
         return health

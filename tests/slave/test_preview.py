@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from common.arrays import Image
 from common.bus import LoopbackBus
 from common.errors import BusError
-from common.messages import MAX_PREVIEW_BYTES, Command, Message, Preview
+from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Command, Message, Preview, Still
 from slave import preview
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.markers.detector import MarkerDetector
-from slave.preview import LOOK_NS, PERIOD_NS, Gate, Previews, small_jpeg
+from slave.preview import LOOK_NS, PERIOD_NS, Gate, Previews, small_jpeg, whole_jpeg
 from slave.report import Reporter
 from slave.tally import Tally
 from tests.network_helpers import ManualClock, until
@@ -193,3 +193,34 @@ def test_half_the_size_in_colour_and_grey(shape: tuple[int, ...]) -> None:
 def test_a_picture_too_large_for_the_wire_gets_smaller_still() -> None:
     noise = np.random.default_rng(7).integers(0, 256, (3000, 4000), np.uint8)
     assert len(small_jpeg(noise)) <= MAX_PREVIEW_BYTES
+
+
+def test_a_still_is_the_next_frame_whole_and_only_one() -> None:
+    bus, clock = LoopbackBus(), ManualClock()
+    shown = Previews("left", clock)
+    feed = bus.subscribe("still")
+    shown.use(bus)
+    rng = np.random.default_rng(3)
+    noise = rng.integers(0, 256, (480, 640, 3), np.uint8)
+    image = np.asarray(cv2.GaussianBlur(noise, (0, 0), 3.0), np.uint8)
+    try:
+        shown.offer(Frame(1, 1, 1, IMAGE))
+        shown.ask_still()
+        for seq in range(2, 6):
+            shown.offer(Frame(seq, seq, seq, image))
+        message = feed.get(5.0)
+        assert isinstance(message, Still)
+        assert (message.camera, message.seq, message.t_ns) == ("left", 2, 2)
+        back = cv2.imdecode(np.frombuffer(message.jpeg, np.uint8), cv2.IMREAD_COLOR)
+        assert back is not None
+        assert back.shape == image.shape
+        assert np.abs(back.astype(float) - image).mean() < 2.0
+        assert feed.get(0.2) is None
+    finally:
+        shown.close()
+
+
+def test_a_still_of_any_size_fits_into_a_message() -> None:
+    noise = np.random.default_rng(4).integers(0, 256, (1088, 1456, 3), np.uint8)
+    assert len(whole_jpeg(noise)) <= MAX_STILL_BYTES
+    assert cv2.imdecode(np.frombuffer(whole_jpeg(IMAGE), np.uint8), cv2.IMREAD_COLOR) is not None
