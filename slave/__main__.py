@@ -131,14 +131,14 @@ def _source(
 
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
     if kind == "synthetic" and not folder:
-        from common.sim.scenes import scene_by_name
+        from common.sim.scenes import view_by_name
         from slave.cameras.synthetic import SyntheticCamera
 
         hand = load(options.calibration / "hands" / f"{rig.hand}.json", HandProfile)
         cameras = {
             n: load(options.calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras
         }
-        scene = scene_by_name(options.scene, rig, cameras, hand, options.seed)
+        scene = view_by_name(options.scene, rig, cameras, hand, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
         return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock)

@@ -184,7 +184,7 @@ def _camera(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
     real.add_options(command)
     sim = command.add_argument_group("synthetic camera")
-    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | lights | leap:FILE.npz")
+    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | lights | poses | board | leap:FILE.npz")
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(
         "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"

@@ -7,12 +7,15 @@ from pathlib import Path
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.errors import PhalanxError
 from common.hand_model import HandModel
+from common.sim.board import BoardRenderer, BoardScene
 from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
 from common.sim.poses import StudyPoses
+from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 
 NAMES = "standard | lights | poses | leap:FILE.npz"
+VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
 
 
@@ -36,3 +39,25 @@ def scene_by_name(
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
         return Scene.of_motion(rig, cameras, hand, motion, seed)
     raise PhalanxError(f"scene {name!r}: there are {NAMES}")
+
+
+def view_by_name(
+    name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
+) -> Scene | BoardScene:
+    """What a simulated camera may look at: a scene with a hand, or `board`, a checkerboard to calibrate cameras with.
+
+    Raises:
+        PhalanxError: As `scene_by_name`.
+    """
+    return (
+        BoardScene(rig, cameras, seed) if name == "board" else scene_by_name(name, rig, cameras, hand, seed)
+    )
+
+
+def renderer_of(scene: Scene | BoardScene, camera: str) -> Renderer | BoardRenderer:
+    """What draws the scene as one camera sees it.
+
+    Raises:
+        CalibrationError: The scene has no such camera, or a marker without paint.
+    """
+    return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

@@ -20,8 +20,9 @@ from common.calibration import CameraCalibration
 from common.camera_settings import figures
 from common.clock import Clock
 from common.errors import CameraError
-from common.sim.render import Renderer
+from common.sim.board import BoardScene
 from common.sim.scene import Scene
+from common.sim.scenes import renderer_of
 from slave.cameras.source import Frame
 
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
@@ -41,7 +42,7 @@ class SyntheticCamera:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | BoardScene,
         camera_name: str,
         epoch_ns: int,
         clock: Clock,
@@ -63,7 +64,7 @@ class SyntheticCamera:
         Raises:
             CalibrationError: The scene has no such camera, or a marker without paint.
         """
-        self._renderer = Renderer(scene, camera_name)
+        self._renderer = renderer_of(scene, camera_name)
         camera = scene.cameras[camera_name]
         self._lit_for, self._camera = camera, camera
         self._clock, self._true, self._sleep = clock, true_clock, sleep

@@ -1,0 +1,196 @@
+"""A calibration board before the cameras of a rig: held still, turned, held again, as a person does it.
+
+For the calibration of cameras without hardware. The board is flat and exact, each pixel is the mean of the part of
+the board that it sees, light falls off with the board's tilt, and the sensor's noise is that of every simulated
+camera. Left out: motion blur and rolling shutter, since a board is measured while it is held still.
+"""
+
+from collections.abc import Mapping
+from copy import copy
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Image
+from common.calibration import CameraCalibration, RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.geometry import invert
+from common.sim.desk import LENS_SIGMA_PX, NoiseTiles
+from common.sim.light import Float32, SrgbTables
+
+COLUMNS, ROWS = 9, 6  # inner corners
+SQUARE_M = 0.025
+MARGIN_M = 0.0125  # white paper around the squares
+TEXELS_PER_M = 8000.0
+FINE = 3  # rays per pixel and axis
+POSES = 24
+HELD_S, MOVED_S = 1.6, 0.6
+NEAR_M, FAR_M = 0.34, 0.70
+TILT_RAD, ROLL_RAD = np.radians(38.0), np.radians(25.0)
+WHITE, BLACK, WALL = 0.62, 0.035, 0.10  # linear light
+INTO_VIEW = 0.92  # share of the half view that corners may reach
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BoardScene:
+    """A checkerboard of 9 x 6 inner corners, squares of 25 mm, moved through the view of a rig's cameras.
+
+    Attributes:
+        rig: Which cameras, where.
+        cameras: Camera name -> its file, with intrinsics.
+        seed: Of the poses and the noise.
+        poses: (POSES, 4, 4) board -> rig [m]: held one after the other. The board's origin is its first inner
+            corner, +x along a row of COLUMNS corners, +y to the next row, +z away from the viewer.
+    """
+
+    rig: RigCalibration
+    cameras: Mapping[str, CameraCalibration]
+    seed: int
+    poses: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        for name in self.rig.cameras:
+            if name not in self.cameras:
+                raise CalibrationError(f"rig {self.rig.name!r}: cameras: no camera file for {name!r}")
+        object.__setattr__(self, "poses", _poses([self.optics(name) for name in self.rig.cameras], self.seed))
+
+    def optics(self, camera: str) -> CameraModel:
+        """One camera as geometry.
+
+        Raises:
+            CalibrationError: It has no intrinsics: a simulated camera must have a lens.
+        """
+        return CameraModel.of(self.cameras[camera], self.rig.camera_pose(camera))
+
+    def T_rig_board(self, t_s: float) -> Float:
+        """Where the board is (4, 4) [m] at scene time `t_s` [s]; the poses come round again."""
+        count, step_s = len(self.poses), HELD_S + MOVED_S
+        k = int(max(t_s, 0.0) // step_s)
+        past = max(t_s, 0.0) - k * step_s - HELD_S
+        now, then = self.poses[k % count], self.poses[(k + 1) % count]
+        return now if past <= 0.0 else _between(now, then, past / MOVED_S)
+
+    def corners_m(self) -> Float:
+        """The inner corners (54, 3) [m] in the board's frame, row by row."""
+        return board_corners()
+
+
+def board_corners() -> Float:
+    """Inner corners (ROWS * COLUMNS, 3) [m], row by row, board frame."""
+    x, y = np.meshgrid(np.arange(COLUMNS), np.arange(ROWS))
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1).astype(np.float64) * SQUARE_M
+
+
+class BoardRenderer:
+    """Images of a board scene by one camera. It holds rays, texture and noise; a frame is a pure function of t."""
+
+    def __init__(self, scene: BoardScene, camera: str) -> None:
+        """Prepare the ray of every fine pixel.
+
+        Raises:
+            CalibrationError: No such camera, or one without intrinsics.
+        """
+        self._scene, self._optics = scene, scene.optics(camera)
+        height, width = self._optics.height_px, self._optics.width_px
+        fine = (np.arange(FINE) + 0.5) / FINE - 0.5
+        u = (np.arange(width)[:, None] + fine).ravel()
+        v = (np.arange(height)[:, None] + fine).ravel()
+        uv = np.stack(np.meshgrid(u, v), axis=-1)
+        self._xy = self._optics.undistort(uv).astype(np.float32)
+        self._texture, self._origin = _texture()
+        self._noise = NoiseTiles.make(height, width, scene.seed * 64 + scene.rig.cameras.index(camera))
+        self._encode = SrgbTables.make()
+        self._gains_bgr = np.ones(3, dtype=np.float32)
+
+    def exposed(self, exposure_us: float, gains_bgr: Float) -> "BoardRenderer":
+        """The same before a camera of other brightness (3,), blue first; nothing here is smeared by `exposure_us`."""
+        del exposure_us
+        other = copy(self)
+        other._gains_bgr = np.array(gains_bgr, dtype=np.float32)
+        return other
+
+    def render(self, t_s: float) -> Image:
+        """Image (H, W, 3) BGR of scene time `t_s` [s]."""
+        T = invert(self._optics.T_rig_camera) @ self._scene.T_rig_board(t_s)
+        # board (x, y, 1) -> ray: the columns of rotation and translation of a plane (Hartley & Zisserman, 8.1.1)
+        to_board = np.linalg.inv(T[:3, [0, 1, 3]])
+        texels = np.diag([TEXELS_PER_M, TEXELS_PER_M, 1.0]) @ to_board
+        texels[:2] += self._origin[:, None] * texels[2]
+        u, v = cv2.split(cv2.perspectiveTransform(self._xy, texels))
+        shade = 0.55 + 0.45 * abs(float(T[2, 2]))
+        board: Float32 = np.asarray(
+            cv2.remap(
+                self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,)
+            ),
+            np.float32,
+        )
+        fine = np.where(board > 0.0, board * np.float32(shade), np.float32(WALL))
+        size = (self._optics.width_px, self._optics.height_px)
+        light = cv2.GaussianBlur(
+            cv2.resize(fine, size, interpolation=cv2.INTER_AREA), (5, 5), 1.5 * LENS_SIGMA_PX
+        )
+        image = self._encode.encode(np.asarray(light[..., None] * self._gains_bgr, np.float32))
+        self._noise.add_to(image, round(t_s * 1e6))
+        return image
+
+
+def _texture() -> tuple[Float32, Float]:
+    """The board in linear light (rows, columns) float32, and the texel (2,) of its first inner corner."""
+    step = round(SQUARE_M * TEXELS_PER_M)
+    margin = round(MARGIN_M * TEXELS_PER_M)
+    y, x = np.indices(((ROWS + 1) * step, (COLUMNS + 1) * step)) // step
+    squares = np.where((x + y) % 2 == 0, BLACK, WHITE).astype(np.float32)
+    texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(WHITE,))
+    # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
+    return np.asarray(texture, np.float32), np.array([margin + step - 0.5, margin + step - 0.5])
+
+
+def _poses(optics: list[CameraModel], seed: int) -> Float:
+    """Poses (POSES, 4, 4) that at least one camera sees whole, most of them all: near and far, tilted every way.
+
+    Raises:
+        CalibrationError: No pose was found that the rig's first camera sees whole: it looks past the volume.
+    """
+    rng = np.random.default_rng([seed, 5])
+    found: list[Float] = []
+    for _ in range(200 * POSES):
+        lead = optics[len(found) % len(optics)]
+        T = lead.T_rig_camera @ _before(lead, rng)
+        seen = [_sees(camera, T) for camera in optics]
+        if seen[len(found) % len(optics)] and (all(seen) or len(found) % 4 == 3):
+            found.append(T)
+        if len(found) == POSES:
+            return np.stack(found)
+    raise CalibrationError("scene board: the cameras of this rig have no view in common that holds a board")
+
+
+def _before(camera: CameraModel, rng: np.random.Generator) -> Float:
+    """A random pose of the board before one camera, camera frame: its middle anywhere in the view."""
+    z = 1.0 / rng.uniform(1.0 / FAR_M, 1.0 / NEAR_M)
+    reach = np.array([camera.width_px / camera.matrix[0, 0], camera.height_px / camera.matrix[1, 1]]) / 2.0
+    middle = np.append(rng.uniform(-1.0, 1.0, 2) * INTO_VIEW * reach, 1.0) * z
+    T = np.eye(4)
+    most = np.array([TILT_RAD, TILT_RAD, ROLL_RAD])
+    T[:3, :3] = cv2.Rodrigues(rng.uniform(-most, most))[0]
+    T[:3, 3] = middle - T[:3, :3] @ board_corners().mean(axis=0)
+    return T
+
+
+def _sees(camera: CameraModel, T: Float) -> bool:
+    """Whether the whole board, with half a square around the corners, is in a camera's picture."""
+    rim = np.array([[-1, -1, 0], [COLUMNS, -1, 0], [COLUMNS, ROWS, 0], [-1, ROWS, 0]]) * SQUARE_M
+    uv = camera.project(rim @ T[:3, :3].T + T[:3, 3])
+    inside = (uv > 2.0) & (uv < np.array([camera.width_px, camera.height_px]) - 3.0)
+    return bool(inside.all())
+
+
+def _between(now: Float, then: Float, share: float) -> Float:
+    """The pose on the way from one to the other: smooth start and end, about one axis."""
+    s = share * share * (3.0 - 2.0 * share)
+    turn = np.asarray(cv2.Rodrigues(then[:3, :3] @ now[:3, :3].T)[0], np.float64)
+    T = np.eye(4)
+    T[:3, :3] = np.asarray(cv2.Rodrigues(turn * s)[0], np.float64) @ now[:3, :3]
+    T[:3, 3] = (1.0 - s) * now[:3, 3] + s * then[:3, 3]
+    return T
