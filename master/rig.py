@@ -115,5 +115,6 @@ def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = Tru
         law=depth_law(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
+        volume=setup.rig.volume,
         stage=timed,
     )

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Code, Float
+from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.fingers import FingerRefiner
 from master.ik.hand import HandSolution, HandSolver, seen_markers
 from master.ik.priors import Priors
+from master.volume import inside
 
 _COAST_S = 0.12  # a lost finger's motion fades with this time constant
 _DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
@@ -199,6 +201,7 @@ def pose_of(
     markers_m: Float,
     markers_raw_m: Float,
     markers_cov_m2: Float,
+    volume: Volume | None = None,
 ) -> HandPose:
     """The message for one tracked hand; all NaN and not valid where nothing has been solved yet."""
     solution = hand.solution
@@ -223,7 +226,7 @@ def pose_of(
         markers_m=markers_m,
         markers_raw_m=markers_raw_m,
         markers_cov_m2=markers_cov_m2,
-        inside_volume=np.ones(26, np.bool_),
+        inside_volume=inside(volume, position),
     )
 
 

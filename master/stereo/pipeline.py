@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.calibration import Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
@@ -53,6 +54,7 @@ class MarkerPipeline:
         law: DepthLaw | None = None,
         smooth: OneEuro | None = None,
         tracker: HandTracker,
+        volume: Volume | None = None,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
@@ -65,6 +67,7 @@ class MarkerPipeline:
             law: Depth from disparity of the first two cameras; None: triangulate all cameras.
             smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
             tracker: Solves the hand from its own markers, some or all of these.
+            volume: What the rig states, or None; joints say whether they lie in it.
             stage: Opens a timer by stage name.
         """
         self.model, self.markers = model, markers
@@ -76,7 +79,7 @@ class MarkerPipeline:
         self._on_hand = np.array([markers.index(name) for name in tracker.markers], np.int64)
         self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
-        self._stage = stage
+        self._stage, self._volume = stage, volume
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
         axes = np.array([camera.T_rig_camera[:3, 2] for camera in self._cameras])
@@ -111,12 +114,13 @@ class MarkerPipeline:
             aims = self._with_rays(instant, markers, cov, last)
             measured = np.isfinite(markers[self._on_hand, 0])
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
-            pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov)
+            pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
         self._count("apart", apart)
         self.counts["epipolar_misfits"] += int(apart.sum())
         self.counts["poses"] += 1
+        self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
         return SolvedPose(pose, instant.ready_t_ns)
 
