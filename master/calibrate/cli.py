@@ -4,7 +4,9 @@ from collections.abc import Callable
 
 import typer
 
-COMMANDS: dict[str, Callable[..., None]] = {}
+from master.calibrate.depth_commands import depth
+
+COMMANDS: dict[str, Callable[..., None]] = {"depth": depth}
 
 
 def calibrate_app() -> typer.Typer:

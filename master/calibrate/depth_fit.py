@@ -1,7 +1,7 @@
 """Laws of raw disparity from a sweep of known distances: pure fits, (disparity, distance) -> (law, residual).
 
 What is made small is the *relative* error of depth, every distance alike. Two errors add up in a sweep: that of the
-disparity, s_x, costs s_x |dx/D|^-1 / D = s_x D / a of the depth and grows with the distance; that of the ruler,
+disparity, s_x, costs s_x D / a of the depth and grows with the distance; that of the ruler,
 s_D, costs s_D / D and shrinks with it. They are equal at D = sqrt(a s_D / s_x): 0.6 m for the published rig (a = 37
 m px), 1 mm and 0.1 px, the middle of 20...100 cm. So the relative error is nearly the same everywhere, and equal
 weights are nearly the best ones; least squares in disparity would give the nearest points 25 times the weight of the
@@ -18,7 +18,6 @@ the published constants come out: k = 45.28 m for the pair that the published la
 """
 
 from collections.abc import Callable
-from itertools import combinations
 from math import atan
 
 import numpy as np
@@ -84,8 +83,8 @@ def outliers(disparity: Float, distance: Float) -> Bool:
     Of the laws through two points each, the one with the least median of squares is taken (Rousseeuw 1984: half of
     the points may be wrong); a point is out beyond three of its robust standard deviations and 1 % of depth.
     """
-    power = _least_median(np.log(disparity), np.log(distance))
-    affine = _least_median(1.0 / distance, disparity)
+    power = _least_median(np.log(disparity), np.log(distance), np.ones_like(distance))
+    affine = _least_median(1.0 / distance, disparity, distance)
     by_power = np.abs(np.log(distance) - power[0] * np.log(disparity) - power[1])
     by_affine = np.abs(distance * (disparity - affine[1]) / affine[0] - 1.0)
     return _beyond(by_power) & _beyond(by_affine)
@@ -104,16 +103,14 @@ def _line(x: Float, y: Float, weight: Float) -> tuple[float, float]:
     return float(slope), float(offset)
 
 
-def _least_median(x: Float, y: Float) -> tuple[float, float]:
-    """Slope and offset of the line through two of the points that leaves the least median of |residual|."""
-    pairs = np.array(list(combinations(range(x.size), 2)))
-    pairs = pairs[:: -(-len(pairs) // _MAX_PAIRS)]
-    i, j = pairs.T
+def _least_median(x: Float, y: Float, weight: Float) -> tuple[float, float]:
+    """Slope and offset of the line through two of the points that leaves the least median of weighted residuals."""
+    i, j = np.triu_indices(x.size, 1)
+    some = slice(None, None, -(-i.size // _MAX_PAIRS))
+    i, j = i[some], j[some]
     slope = (y[j] - y[i]) / (x[j] - x[i])
     offset = y[i] - slope * x[i]
-    # Not of y but of what y means: relative depth, for which a residual of x = a / D + x0 counts D-fold.
-    scale = np.ones_like(x) if y.max() <= 0.0 or slope.mean() < 0.0 else 1.0 / x
-    residual = np.abs(y - slope[:, None] * x - offset[:, None]) * scale
+    residual = np.abs(y - slope[:, None] * x - offset[:, None]) * weight
     best = int(np.argmin(np.median(residual, axis=1)))
     return float(slope[best]), float(offset[best])
 

@@ -1,0 +1,172 @@
+"""`phalanx-master calibrate depth`: the published session, from known distances to the two laws of raw disparity."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from common.arrays import Float
+from common.calibration import (
+    RigCalibration,
+)
+from common.errors import CalibrationError
+from common.frame_recording import FrameRecording
+from common.keys import rig_key
+from master.calibrate.depth_fit import ideal_of
+from master.calibrate.depth_live import sweep_live
+from master.calibrate.depth_report import fit_depth, report_json, report_lines
+from master.calibrate.depth_save import conclusion, rig_to_write, write_laws
+from master.calibrate.depth_source import (
+    Measured,
+    Pair,
+    from_recording,
+    from_table,
+    load_pair,
+    pair_of,
+    parse_target,
+)
+from master.calibrate.depth_sweep import checked
+from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw
+from master.summary import write_summary
+
+Source = Annotated[
+    Path | None,
+    typer.Argument(help="Folder of a recording, or a .csv; none with --live.", show_default=False),
+]
+Detections = Annotated[
+    Path | None, typer.Option(help="Folder with detections_<camera>.npz of the recording.")
+]
+Marker = Annotated[
+    str | None, typer.Option(help="Marker whose paint the target has; default: the only one seen.")
+]
+Distances = Annotated[
+    str | None, typer.Option(help="FIRST:LAST:STEP in metres, a list, or a .csv; default: truth.npz.")
+]
+RigName = Annotated[
+    str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")
+]
+Calibration = Annotated[Path, typer.Option(help="Folder with rigs/ and cameras/.")]
+Target = Annotated[str, typer.Option(help="Its shape, WIDTHxHEIGHT or round: the lens shifts its centroid.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
+Picture = Annotated[Path | None, typer.Option(help="Write a picture of the errors to this .png.")]
+FovDeg = Annotated[
+    float | None, typer.Option(help="Nominal horizontal field of view, for cameras without intrinsics.")
+]
+
+CALIB_JSON = Path("calib_json")
+_SWEEP = "1.00:0.20:-0.05"  # the published one
+
+
+def depth(
+    source: Source = None,
+    detections: Detections = None,
+    marker: Marker = None,
+    distances: Distances = None,
+    rig: RigName = None,
+    calibration: Calibration = CALIB_JSON,
+    target: Target = "75x50",
+    fov_deg: FovDeg = None,
+    out: Annotated[Path | None, typer.Option(help="Tree to write rigs/<rig>.json into.")] = None,
+    use: Annotated[
+        Literal["power_law", "affine_disparity", "stereo"] | None,
+        typer.Option(help="Also make this the rig's depth_model."),
+    ] = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+    live: Annotated[bool, typer.Option("--live", help="Measure now, with the running slaves.")] = False,
+    save_table: Annotated[
+        Path | None, typer.Option("--save", help="With --live: keep the readings in this .csv.")
+    ] = None,
+    frames: Annotated[int, typer.Option(min=8, help="With --live: frames to average, at least.")] = 30,
+    seconds: Annotated[float, typer.Option(min=1.0, max=60.0, help="With --live: time to average.")] = 1.0,
+    beacon: Annotated[
+        str, typer.Option(help="With --live: ADDRESS:PORT of the slaves.")
+    ] = "127.255.255.255:47800",
+    bind: Annotated[str, typer.Option(help="With --live: own ADDRESS:PORT.")] = "127.0.0.1:47801",
+    key_file: Annotated[Path | None, typer.Option(help="With --live: rig key.")] = None,
+) -> None:
+    """Fit depth to disparity from a target at known distances: the power law D = k x^z, and x = a/D + x0.
+
+    Examples:
+
+      phalanx-master calibrate depth RECORDING --detections DIR --distances 1.00:0.20:-0.05 --out calib_json
+
+      phalanx-master calibrate depth sweep.csv                       columns distance_m,disparity_px
+
+      phalanx-master calibrate depth --live --rig desk --marker index --out calib_json
+    """
+    outline = parse_target(target)
+    if live:
+        link = (_address(beacon, "--beacon"), _address(bind, "--bind"), rig_key(os.environ, key_file))
+        pair = load_pair(calibration, rig or "desk", fov_deg)
+        measured = sweep_live(pair, marker, distances or _SWEEP, frames, seconds, link, save_table, outline)
+    else:
+        measured = measured_from(source, detections, marker, distances, rig, calibration, fov_deg, outline)
+    pair = measured.pair
+    base = rig_to_write(pair.rig, out)
+    sweep = checked(measured.sweep, pair.cameras, pair.size_px)
+    report = fit_depth(sweep, laws_before(pair, base))
+    typer.echo(measured.about)
+    for line in report_lines(report):
+        typer.echo(line)
+    written = None if out is None else write_laws(out, base, report, measured, use)
+    typer.echo(conclusion(report, base, use, written))
+    if json_file is not None:
+        write_summary(json_file, report_json(report) | {"written": None if written is None else str(written)})
+    if picture is not None:
+        from master.calibrate.depth_picture import draw_errors
+
+        draw_errors(picture, measured.about, sweep.distance_m, report.errors, used=report.used)
+
+
+def measured_from(
+    source: Path | None,
+    detections: Path | None,
+    marker: str | None,
+    distances: str | None,
+    rig: str | None,
+    calibration: Path,
+    fov_deg: float | None,
+    outline: Float,
+) -> Measured:
+    """The sweep of a recording or a table.
+
+    Raises:
+        PhalanxError: What the user gave does not make one; the text says what is missing.
+    """
+    if source is None:
+        raise CalibrationError("what to read is missing: give the folder of a recording, a .csv, or --live")
+    if source.is_dir():
+
+        def pair_for(recording: FrameRecording) -> Pair:
+            manifest = recording.manifest
+            return (
+                pair_of(manifest.marker_rig(), manifest.cameras)
+                if rig is None
+                else load_pair(calibration, rig, fov_deg, manifest.cameras)
+            )
+
+        return from_recording(source, detections, marker, distances, pair_for, outline)
+    if source.suffix.lower() != ".csv":
+        raise CalibrationError(f"{source}: neither the folder of a recording nor a .csv")
+    return from_table(source, Pair() if rig is None else load_pair(calibration, rig, fov_deg), outline)
+
+
+def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
+    """The laws without this fit: that of ideal cameras, and what the rig file holds."""
+    laws: dict[str, DepthLaw] = {}
+    if pair.models is not None:
+        laws["ideal"] = ideal_of(*pair.models)
+    if rig is not None and rig.power_law is not None:
+        laws["previous power"] = PowerLaw.of(rig.power_law)
+    if rig is not None and rig.affine_disparity is not None:
+        laws["previous affine"] = AffineDisparity.of(rig.affine_disparity)
+    return laws
+
+
+def _address(text: str, option: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise CalibrationError(f"{option} {text!r}: expected ADDRESS:PORT, for example 127.0.0.1:47801")
+    return host, int(port)
