@@ -36,9 +36,9 @@ class Passing(Generic[T]):
         Raises:
             CameraError: None came for `timeout_s` [s].
         """
-        with self._changed:
-            last = end = self._count
-            end += count
+        return self._after(self._count, self._count + count, timeout_s)
+
+    def _after(self, last: int, end: int, timeout_s: float) -> Iterator[T]:
         while last < end:
             with self._changed:
                 if not self._changed.wait_for(lambda seen=last: self._count > seen, timeout_s):

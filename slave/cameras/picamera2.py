@@ -3,12 +3,17 @@
 Settings are part of the configuration, so the first frames already have them. libcamera takes some frames until what
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
 those of the camera file. Image and metadata always come from the same captured request, which is released whatever
-happens. When a frame was taken, and its number, are in `picamera2_frames`.
+happens. When a frame was taken, and its number, are in `picamera2_frames`; whether cameras run in step, in
+`picamera2_sync`.
+
+Exposure and gains can be changed while frames are read: another thread writes the controls and watches the metadata
+of the frames that the loop reads, until three in a row show them.
 """
 
 import contextlib
 import logging
 import threading
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,11 +22,20 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.passing import Passing
 from slave.cameras.picamera2_frames import Timeline, without_padding
-from slave.cameras.picamera2_library import Enums, Request, open_library
+from slave.cameras.picamera2_library import Request, open_library
 from slave.cameras.picamera2_modes import choose_mode, read_modes, view_text
-from slave.cameras.picamera2_settings import Picamera2Options, check_ranges, controls, wanted_settings
-from slave.cameras.settings import demand, differences
+from slave.cameras.picamera2_settings import (
+    LIVE_CONTROLS,
+    Picamera2Options,
+    check_ranges,
+    controls,
+    read_figures,
+    wanted_settings,
+)
+from slave.cameras.picamera2_sync import SyncWatch, wait_in_step
+from slave.cameras.settings import change, demand, differences
 from slave.cameras.source import Frame
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
@@ -29,13 +43,12 @@ TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 GOOD_FRAMES = 3
 SYNC_MARGIN = 1.05  # a client catches up by shorter frames, so the mode must be faster than the rig
-PROGRESS_FRAMES = 120
 GIVE_BACK_S = 5.0
 _LOG = logging.getLogger(__name__)
 
 
 class Picamera2Camera:
-    """A `FrameSource`. Holds the open camera, the timeline of its frames, and the small image of the last one."""
+    """A `FrameSource`. Holds the open camera, the timeline of its frames, and metadata and small image of the last."""
 
     def __init__(
         self,
@@ -61,10 +74,14 @@ class Picamera2Camera:
         self._timeline = Timeline(calibration.frame_rate_hz, clock)
         self._lores: Image | None = None
         self._closed = self._lost = False
-        self._library, enums = open_library(options.index)
+        self._metadata = Passing[Mapping[str, object]]()
+        self._sync = (
+            SyncWatch(self._where, client=options.sync == "client") if options.sync != "off" else None
+        )
+        self._library, self._enums = open_library(options.index)
         try:
-            self._start(enums)
-            self._check_settings()
+            self._start()
+            self._settle(calibration, (self._capture(with_image=False)[0] for _ in range(SETTLE_FRAMES)))
             if options.sync != "off":
                 self._synchronise(stop)
         except BaseException:
@@ -85,6 +102,9 @@ class Picamera2Camera:
         """
         while not self._closed:
             metadata, image, lores = self._capture(with_image=True)
+            self._metadata.put(metadata)
+            if self._sync is not None:
+                self._sync.push(metadata)
             try:
                 place = self._timeline.place(metadata)
             except CameraError as error:
@@ -123,14 +143,47 @@ class Picamera2Camera:
         if failure:
             raise CameraError(f"{self._where}: could not be closed: {failure[0]}") from failure[0]
 
-    def _start(self, enums: Enums) -> None:
+    def tune(self, camera: CameraCalibration) -> None:
+        """Change exposure and gains while another thread reads frames; see `Tunable`.
+
+        Raises:
+            CameraError: Out of range, not taken, or no frames are read.
+        """
+        change(self._apply, self._calibration, camera)
+        self._calibration = camera
+
+    def figures(self) -> dict[str, float]:
+        """Settings as the metadata of the last frame has them, and whether it runs in step."""
+        metadata = self._metadata.newest
+        found = {} if metadata is None else read_figures(metadata)
+        return found if self._sync is None else found | self._sync.figures()
+
+    def counts(self) -> dict[str, int]:
+        """`camera.out_of_step`, where it is to be in step."""
+        return {} if self._sync is None else {"camera.out_of_step": self._sync.lost}
+
+    def _apply(self, camera: CameraCalibration) -> None:
+        """Write the settings that can change, and wait until the frames show all of them."""
+        available = self._library.camera_controls
+        try:
+            asked = controls(camera, self._options, self._enums, available)
+            live = {name: asked[name] for name in LIVE_CONTROLS}
+            check_ranges(live, available)
+            self._library.set_controls(live)
+        except CameraError as error:
+            raise CameraError(f"{self._where}: {error}") from error
+        except RuntimeError as error:
+            raise CameraError(f"{self._where}: its settings cannot be changed: {error}") from error
+        self._settle(camera, self._metadata.following(SETTLE_FRAMES, TIMEOUT_S))
+
+    def _start(self) -> None:
         camera, library = self._calibration, self._library
         size = (camera.width_px, camera.height_px)
         need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else SYNC_MARGIN)
         try:
             modes = read_modes(library.sensor_modes)
             mode = choose_mode(modes, need_hz, size)
-            asked = controls(camera, self._options, enums, library.camera_controls)
+            asked = controls(camera, self._options, self._enums, library.camera_controls)
             parts: dict[str, Any] = {
                 "main": {
                     "size": size,
@@ -168,16 +221,19 @@ class Picamera2Camera:
                     f"{got[0][0]}x{got[0][1]} {got[1]} of it; use a size with even width and height"
                 )
 
-    def _check_settings(self) -> None:
-        """Wait until some frames in a row have every setting.
+    def _settle(self, camera: CameraCalibration, frames: Iterable[Mapping[str, object]]) -> None:
+        """Wait until some frames in a row have every setting of `camera`.
+
+        Args:
+            camera: What was asked for.
+            frames: Metadata of frames, as many as may pass until then.
 
         Raises:
             CameraError: They do not; every setting that differs is named.
         """
-        wanted = wanted_settings(self._calibration, self._options, self._library.camera_controls)
+        wanted = wanted_settings(camera, self._options, self._library.camera_controls)
         good, metadata = 0, dict[str, object]()
-        for _ in range(SETTLE_FRAMES):
-            metadata = self._capture(with_image=False)[0]
+        for metadata in frames:
             good = 0 if differences(wanted, metadata) else good + 1
             if good == GOOD_FRAMES:
                 _LOG.info("%s: settings checked, view %s", self._where, metadata.get("ScalerCrop", "unknown"))
@@ -189,36 +245,15 @@ class Picamera2Camera:
         )
 
     def _synchronise(self, stop: threading.Event | None) -> None:
-        """Read frames until libcamera says that those of all cameras are in step.
-
-        Raises:
-            CameraError: It did not within the time, or before the slave was to stop.
-        """
-        role = self._options.sync
-        other = "clients" if role == "server" else "the server"
-        end_ns = self._clock.now_ns() + round(self._options.sync_timeout_s * 1e9)
-        count = 0
-        while True:
-            metadata = self._capture(with_image=False)[0]
-            timer = metadata.get(
-                "SyncTimer"
-            )  # us until the agreed moment; a client that heard no server has none
-            if metadata.get("SyncReady"):
-                wall = metadata.get("FrameWallClock", "unknown")
-                _LOG.info("%s: in step, %s us off; first frame at wall clock %s ns", self._where, timer, wall)
-                return
-            if stop is not None and stop.is_set():
-                raise CameraError(f"{self._where}: stopped while it waited for {other}")
-            if self._clock.now_ns() > end_ns:
-                heard = "no server was heard" if timer is None else f"{timer} us were left"
-                raise CameraError(
-                    f"{self._where}: --sync {role}: not in step after {self._options.sync_timeout_s:g} s, {heard}. "
-                    "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
-                    "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
-                )
-            if count % PROGRESS_FRAMES == 0:
-                _LOG.info("%s: --sync %s: waiting for %s, timer %s us", self._where, role, other, timer)
-            count += 1
+        options = self._options
+        wait_in_step(
+            lambda: self._capture(with_image=False)[0],
+            self._where,
+            options.sync,
+            options.sync_timeout_s,
+            self._clock,
+            lambda: stop is not None and stop.is_set(),
+        )
 
     def _capture(self, with_image: bool) -> tuple[dict[str, object], Image, Image | None]:
         """Metadata, image (H, W, 3) BGR and small image of one request; empty images where not asked for.

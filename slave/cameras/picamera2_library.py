@@ -70,6 +70,10 @@ class Library(Protocol):
         """Start the camera with the controls of the configuration."""
         ...
 
+    def set_controls(self, controls: Mapping[str, Any]) -> None:
+        """Change controls of the running camera, from any thread; frames show them some frames later."""
+        ...
+
     def capture_request(self, wait: float) -> Request:
         """Next frame. Raises `TimeoutError` after `wait` seconds; the job stays queued."""
         ...

@@ -18,6 +18,7 @@ from slave.cameras.picamera2_library import Enums
 from slave.cameras.settings import Setting, as_values
 
 Sync = Literal["off", "server", "client"]
+LIVE_CONTROLS = ("ExposureTime", "AnalogueGain", "ColourGains")  # that may change while frames come
 
 GLOBAL_SHUTTER_ROW_US = (
     30.0  # where the camera file says 0: no official sensor needs longer for a row at video rates
@@ -163,3 +164,23 @@ def wanted_settings(
     if "AfMode" in available and options.focus_m is not None:
         wanted.append(Setting("LensPosition", (1.0 / options.focus_m,), DIOPTRES, "dioptres", "--focus"))
     return tuple(wanted)
+
+
+def read_figures(metadata: Mapping[str, object]) -> dict[str, float]:
+    """What the metadata of a frame says of the settings, by the names of `common.camera_settings`, and more."""
+    found: dict[str, float] = {}
+    for name, gauges in (
+        ("ExposureTime", ("exposure_us",)),
+        ("AnalogueGain", ("analogue_gain",)),
+        ("DigitalGain", ("digital_gain",)),
+        ("ColourGains", ("red_gain", "blue_gain")),
+        ("LensPosition", ("focus_dioptres",)),
+        ("SensorTemperature", ("sensor_celsius",)),
+    ):
+        values = as_values(metadata.get(name))
+        if values is not None and len(values) == len(gauges):
+            found |= dict(zip(gauges, values, strict=True))
+    duration = as_values(metadata.get("FrameDuration"))
+    if duration is not None and duration[0] > 0.0:
+        found["frame_rate_hz"] = 1e6 / duration[0]
+    return found

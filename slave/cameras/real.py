@@ -90,17 +90,20 @@ def open_real(
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     if kind == "picamera2":
         pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, options.focus)
-        return _lasting(lambda: Picamera2Camera(camera, pi, clock, stop), camera, clock, stop)
+        return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop)
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing))
-        return _lasting(lambda: V4l2Camera(camera, usb, clock), camera, clock, stop)
+        return _lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop)
     return None
 
 
 def _lasting(
-    opener: Callable[[], FrameSource], camera: CameraCalibration, clock: Clock, stop: threading.Event | None
+    opener: Callable[[CameraCalibration], FrameSource],
+    camera: CameraCalibration,
+    clock: Clock,
+    stop: threading.Event | None,
 ) -> FrameSource:
-    return opener() if stop is None else ReopeningCamera(opener, camera.frame_rate_hz, clock, stop)
+    return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop)
 
 
 def _index(place: str) -> int:

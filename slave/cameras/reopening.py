@@ -2,16 +2,20 @@
 
 An error while the camera is opened for the first time is an error. Once it has run, losing it is an event: it is
 given back, and opened again after 0.2 s, 0.4 s … at most 2 s, until it is there or the slave is told to stop. Every
-opening writes and checks all settings again. `seq` keeps rising, by as many frames as fit into the absence, so that
-those count as dropped.
+opening writes and checks all settings again, as they were last changed. `seq` keeps rising, by as many frames as fit
+into the absence, so that those count as dropped.
 """
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
+from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.settings import Tunable
 from slave.cameras.source import Frame, FrameSource
 
 FIRST_WAIT_S = 0.2
@@ -23,22 +27,22 @@ _LOG = logging.getLogger(__name__)
 class ReopeningCamera:
     """A `FrameSource` around one that can be lost.
 
-    Holds the open camera, if there is one, the number and time of the last frame, and in `lost` how often the
-    camera went away.
+    Holds the open camera, if there is one, its settings, the number and time of the last frame, and in `lost` how
+    often the camera went away.
     """
 
     def __init__(
         self,
-        opener: Callable[[], FrameSource],
-        frame_rate_hz: float,
+        opener: Callable[[CameraCalibration], FrameSource],
+        camera: CameraCalibration,
         clock: Clock,
         stop: threading.Event,
     ) -> None:
         """Open the camera.
 
         Args:
-            opener: Opens the camera; called again after each loss.
-            frame_rate_hz: Its nominal rate [Hz], to count the frames of an absence.
+            opener: Opens the camera with these settings; called again after each loss.
+            camera: Its settings at first. Its rate counts the frames of an absence.
             clock: The clock of the frames' times.
             stop: Set when the slave is to end; `read` then gives up waiting for a camera.
 
@@ -46,16 +50,17 @@ class ReopeningCamera:
             CameraError: The camera is not there or refused a setting.
         """
         self._open = opener
-        self._rate_hz = frame_rate_hz
+        self._camera = camera
         self._clock = clock
         self._stop = stop
         self._closed = threading.Event()
-        self._source: FrameSource | None = opener()
+        self._source: FrameSource | None = opener(camera)
         self._base = 0  # added to the camera's own numbers
         self._fresh = False  # the next frame is the first one after a loss
         self._last: tuple[int, int] | None = None  # seq, t_ns
         self._wait_s = FIRST_WAIT_S
         self._said_ns: int | None = None
+        self._past: Counter[str] = Counter()  # of the cameras that were given back
         self.lost = 0
 
     def read(self) -> Frame | None:
@@ -78,10 +83,37 @@ class ReopeningCamera:
         self._closed.set()
         self._drop()
 
+    def tune(self, camera: CameraCalibration) -> None:
+        """Change the settings of the open camera, and of every one that is opened from now on.
+
+        Raises:
+            CameraError: It is away, or did not take them.
+        """
+        source = self._source
+        if not isinstance(source, Tunable):
+            raise CameraError(f"camera {camera.name!r} is away: its settings can be changed when it is back")
+        source.tune(camera)
+        self._camera = camera
+
+    def figures(self) -> dict[str, float]:
+        """Those of the open camera; none while it is away."""
+        source = self._source
+        return source.figures() if isinstance(source, Tunable) else {}
+
+    def counts(self) -> dict[str, int]:
+        """`camera.lost`, and the events of all cameras that were opened."""
+        source = self._source
+        counts = Counter({"camera.lost": self.lost})
+        counts.update(self._past)
+        counts.update(source.counts() if isinstance(source, Tunable) else {})
+        return dict(counts)
+
     def _drop(self) -> None:
         source, self._source = self._source, None
         if source is None:
             return
+        if isinstance(source, Tunable):
+            self._past.update(source.counts())
         try:
             source.close()
         except CameraError as error:
@@ -92,7 +124,7 @@ class ReopeningCamera:
         while not (self._stop.wait(self._wait_s) or self._closed.is_set()):
             self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a frame has come
             try:
-                self._source, self._fresh = self._open(), True
+                self._source, self._fresh = self._open(self._camera), True
             except CameraError as error:
                 self._say(f"still away: {error}")
                 continue
@@ -108,12 +140,12 @@ class ReopeningCamera:
             self._said_ns, self._wait_s, self._fresh = None, FIRST_WAIT_S, False
             if self._last is not None:
                 seq, t_ns = self._last
-                self._base = seq + max(1, round((frame.t_ns - t_ns) * 1e-9 * self._rate_hz)) - frame.seq
+                self._base = (
+                    seq + max(1, round((frame.t_ns - t_ns) * 1e-9 * self._camera.frame_rate_hz)) - frame.seq
+                )
         seq = frame.seq + self._base
         self._last = (seq, frame.t_ns)
-        if self._base == 0:
-            return frame
-        return Frame(seq, frame.t_ns, frame.ready_t_ns, frame.image, frame.illumination)
+        return frame if self._base == 0 else replace(frame, seq=seq)
 
     def _say(self, text: str) -> None:
         """Log the first event of an absence at once, further ones every ten seconds."""

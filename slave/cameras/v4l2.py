@@ -8,6 +8,8 @@ When a frame was taken. The kernel stamps each buffer and says on which clock an
 exposure (USB: reckoned from the camera's own clock where it has one), or the end of the frame, that is the last row's
 read-out. From there it is half an exposure forward, or all rows and half an exposure back. `sequence` counts every
 frame of the camera, so a gap in it is a dropped one; a frame that arrived damaged is one, too.
+
+Its settings, which another thread may change while frames are read, are in `v4l2_settings`.
 """
 
 import ctypes as c
@@ -24,15 +26,13 @@ from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
-from slave.cameras.settings import demand, differences
+from slave.cameras.passing import Passing
 from slave.cameras.source import Frame
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
-from slave.cameras.v4l2_controls import plan, read_back, read_controls, write
 from slave.cameras.v4l2_formats import Offer, choose_offer, decode, read_offers
+from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 
 BUFFERS = 4
-TIMEOUT_S = 2.0
-SETTLE_FRAMES = 12  # UVC cameras apply settings within a few frames; the rate is measured over as many
 RATE_SHARE = (
     0.1  # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
 )
@@ -84,6 +84,9 @@ class V4l2Camera:
         self._sequence: int | None = None
         self._pixel_format = self._stride = 0
         self._streaming = False
+        self._settings: V4l2Settings | None = None
+        self._rate_hz = 0.0
+        self._numbers = Passing[int]()
         self.broken = 0
         self._device: abi.Device | None = self._open(open_device)
         try:
@@ -110,6 +113,7 @@ class V4l2Camera:
             except CameraError as error:
                 raise CameraError(f"{self._where}: {error}") from error
             self._count(int(buffer.sequence))
+            self._numbers.put(self._seq)
             if image is None:
                 self.broken += 1
                 continue
@@ -127,7 +131,32 @@ class V4l2Camera:
         except OSError as error:
             _LOG.info("%s: was gone before it was stopped: %s", self._where, error.strerror)
         self._buffers.clear()
+        if self._settings is not None:
+            self._settings.end()
         device.close()
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """Change the exposure while another thread reads frames; see `Tunable`.
+
+        Raises:
+            CameraError: See `V4l2Settings.tune`.
+        """
+        settings = self._settings
+        assert settings is not None  # the constructor opened it
+        try:
+            settings.tune(self._calibration, camera, self._numbers)
+        except CameraError as error:
+            raise CameraError(f"{self._where}: {error}") from error
+        self._calibration = camera  # its exposure is in the time of every frame from now on
+
+    def figures(self) -> dict[str, float]:
+        """Settings as the camera has them now, and the rate measured at the start; nothing where it is gone."""
+        found = {} if self._settings is None else self._settings.figures()
+        return found | {"frame_rate_hz": self._rate_hz} if found else found
+
+    def counts(self) -> dict[str, int]:
+        """`camera.broken`: frames that arrived damaged."""
+        return {"camera.broken": self.broken}
 
     def _open(self, open_device: Callable[[Path], abi.Device]) -> abi.Device:
         try:
@@ -147,18 +176,10 @@ class V4l2Camera:
         size = (camera.width_px, camera.height_px)
         offer = choose_offer(read_offers(device, size), size, camera.frame_rate_hz)
         self._set_format(device, offer)
-        controls = read_controls(device)
-        settings = plan(camera, controls, options.controls, options.allow_missing)
-        write(device, controls, settings)
+        self._settings = settings = V4l2Settings(device, camera, options.controls, options.allow_missing)
         self._stream(device)
         self._settle(device)
-        if differences(settings, read_back(device, controls, settings)):
-            write(
-                device, controls, settings
-            )  # some cameras fall back to their own values when the stream starts
-            self._settle(device)
-        fix = "Take values that the camera keeps, and see that no other program controls it"
-        demand("it", settings, read_back(device, controls, settings), fix)
+        settings.check(lambda: self._settle(device))
         _LOG.info("%s: %s, %s, %d settings checked", self._where, name, offer.text(), len(settings))
 
     def _check_capabilities(self, device: abi.Device) -> str:
@@ -219,7 +240,7 @@ class V4l2Camera:
             _, buffer = self._next(device)
             times.append((int(buffer.sequence), self._row_zero_ns(buffer)))
         periods = [(b[1] - a[1]) / max(b[0] - a[0], 1) for a, b in pairwise(times) if b[1] > a[1]]
-        got_hz = 1e9 / median(periods) if periods else 0.0
+        self._rate_hz = got_hz = 1e9 / median(periods) if periods else 0.0
         rate_hz = self._calibration.frame_rate_hz
         if abs(got_hz - rate_hz) > RATE_SHARE * rate_hz:
             raise CameraError(

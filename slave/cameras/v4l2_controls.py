@@ -40,11 +40,12 @@ from slave.cameras.v4l2_abi import (
     QueryMenu,
 )
 
+EXPOSURE = "exposure_time_absolute"
 EXPOSURE_UNIT_US = 100.0
 # Numbers of linux/v4l2-controls.h -> name in current kernels.
 NAMES = {
     0x009A0901: "auto_exposure",
-    0x009A0902: "exposure_time_absolute",
+    0x009A0902: EXPOSURE,
     0x009A0903: "exposure_dynamic_framerate",
     0x009A090A: "focus_absolute",
     0x009A090C: "focus_automatic_continuous",
@@ -81,7 +82,7 @@ AUTOMATICS = {
 }
 # What the camera file wants -> ways to have it, each a set of controls.
 NEEDS: dict[str, tuple[tuple[str, ...], ...]] = {
-    "exposure": (("exposure_time_absolute",), ("exposure",)),
+    "exposure": ((EXPOSURE,), ("exposure",)),
     "gain": (("gain",), ("analogue_gain",)),
     "white_balance": (("white_balance_temperature",), ("red_balance", "blue_balance")),
 }
@@ -197,7 +198,7 @@ def plan(
         if name not in controls:
             known = "; ".join(control.text() for control in controls.values()) or "none"
             raise CameraError(f"--control {name}: it has no such control; it has {known}")
-    if "exposure_time_absolute" in given:
+    if EXPOSURE in given:
         raise CameraError("--control exposure_time_absolute: the exposure is exposure_us of the camera file")
     settings: dict[str, Setting] = {}
     for name, off in AUTOMATICS.items():
@@ -207,8 +208,8 @@ def plan(
             )
         if name in controls:
             settings[name] = Setting(name, (float(off),), 0.0, "", "no automatic")
-    if "exposure_time_absolute" in controls:
-        settings["exposure_time_absolute"] = _exposure(camera, controls["exposure_time_absolute"])
+    if EXPOSURE in controls:
+        settings[EXPOSURE] = _exposure(camera, controls[EXPOSURE])
     for name, value in given.items():
         if not controls[name].allows(value):
             raise CameraError(f"--control {name}={value}: out of range; {controls[name].text()}")
@@ -235,9 +236,7 @@ def _check_needs(
     say: list[str] = []
     for need, ways in NEEDS.items():
         have = [way for way in ways if all(name in controls for name in way)]
-        set_already = any(
-            all(name in given or name == "exposure_time_absolute" for name in way) for way in have
-        )
+        set_already = any(all(name in given or name == EXPOSURE for name in way) for way in have)
         if not have and need not in allowed:
             say.append(
                 f"it has no {need} control for {FILE_KEYS[need]} of the camera file: allow that with "

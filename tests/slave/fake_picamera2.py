@@ -112,6 +112,7 @@ class Picamera2:
         self._mode = self._sensor.modes[-1]
         self._config: dict[str, Any] = {}
         self._frame = 0
+        self._changes: list[tuple[int, dict[str, Any]]] = []  # from which frame on
         self._out: set[int] = set()
         self._stuck = False
         self._flushed = threading.Event()
@@ -221,6 +222,12 @@ class Picamera2:
             raise RuntimeError("Camera has not been configured")
         self.started = True
 
+    def set_controls(self, controls: Any) -> None:
+        for name in controls:
+            if name not in self.camera_controls:
+                raise RuntimeError(f"Control {name} is not advertised by libcamera")
+        self._changes.append((self._frame + self._sensor.delay, dict(controls)))
+
     def capture_request(
         self, wait: Any = None, signal_function: Any = None, flush: Any = None
     ) -> "CompletedRequest":
@@ -252,7 +259,10 @@ class Picamera2:
     def metadata_of(self, number: int) -> dict[str, Any]:
         """What libcamera says of frame `number`."""
         row_us = self._mode["_row_us"]
-        asked = self._config["controls"]
+        asked = dict(self._config["controls"])
+        for since, changed in self._changes:
+            if number >= since:
+                asked |= changed
         late = number < self._sensor.delay
         period_us = math.floor(asked["FrameDurationLimits"][0] / row_us) * row_us
         exposure = 20_000 if late else int(math.floor(asked["ExposureTime"] / row_us) * row_us)

@@ -128,8 +128,8 @@ def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytes
     asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600})
     clock = SystemClock()
     source = ReopeningCamera(
-        lambda: V4l2Camera(CALIBRATION, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
-        CALIBRATION.frame_rate_hz,
+        lambda file: V4l2Camera(file, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
+        CALIBRATION,
         clock,
         threading.Event(),
     )

@@ -5,12 +5,23 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from common.calibration import CameraCalibration
 from common.errors import CameraError
 from slave.cameras import reopening
 from slave.cameras.reopening import LOG_EVERY_NS, LONGEST_WAIT_S, ReopeningCamera
 from slave.cameras.source import Frame
 
-RATE_HZ = 50.0
+CALIBRATION = CameraCalibration(
+    version=1,
+    name="left",
+    width_px=16,
+    height_px=16,
+    frame_rate_hz=50.0,
+    exposure_us=5000.0,
+    analogue_gain=1.25,
+    colour_gains=(0.83, 1.24),
+    row_time_us=30.0,
+)
 PERIOD_NS = 20_000_000
 IMAGE = np.zeros((2, 2, 3), np.uint8)
 
@@ -37,7 +48,7 @@ class World:
             self.plugged = True
         return self.stop.is_set()
 
-    def open(self) -> "Camera":
+    def open(self, _camera: CameraCalibration) -> "Camera":
         if not self.plugged:
             raise CameraError("no such device")
         self.opened += 1
@@ -72,7 +83,7 @@ class Stop(threading.Event):
 
 
 def reopening_camera(world: World) -> ReopeningCamera:
-    return ReopeningCamera(world.open, RATE_HZ, world, Stop(world))
+    return ReopeningCamera(world.open, CALIBRATION, world, Stop(world))
 
 
 def frames(camera: ReopeningCamera) -> Iterator[Frame]:
@@ -139,7 +150,7 @@ def test_a_stop_and_a_close_end_the_wait() -> None:
         world = World()
         world.lives = [1]
         stop = Stop(world)
-        camera = ReopeningCamera(world.open, RATE_HZ, world, stop)
+        camera = ReopeningCamera(world.open, CALIBRATION, world, stop)
         world.stop = stop
         assert camera.read() is not None
         world.plugged = False
@@ -180,7 +191,7 @@ def test_real_waiting_ends_when_the_slave_is_stopped() -> None:
     world = World()
     world.lives = [1]
     stop = threading.Event()
-    camera = ReopeningCamera(world.open, RATE_HZ, world, stop)
+    camera = ReopeningCamera(world.open, CALIBRATION, world, stop)
     assert camera.read() is not None
     world.plugged = False
     threading.Timer(0.05, stop.set).start()

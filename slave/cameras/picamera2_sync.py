@@ -1,0 +1,148 @@
+"""Whether the frames of a Pi camera run in step with those of the others, before the first frame and ever after.
+
+libcamera's algorithm (src/ipa/rpi/controller/rpi/sync.cpp): every 30 frames the server tells when one of its frames
+began and when all shall be ready. A client that finds itself 50 us or more off makes one single frame shorter or longer
+by that much; less it leaves alone. `SyncReady` says that the agreed moment has passed, and stays; `SyncTimer` is the
+time from the frame to that moment. After it the timer tells nothing about the lag: the server reckons the moment back
+over all frames since, so its error grows with their number. What tells is
+
+    that the server is heard     the agreed moment, FrameWallClock + SyncTimer, is reckoned anew with every message, and
+                                 stands still without any
+    how far the client was off   the frame it made shorter or longer: FrameDuration against that of its neighbours
+
+A server knows nothing of its clients: it is in step when it is ready.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+
+from common.clock import Clock
+from common.errors import CameraError
+
+PERIOD_FRAMES = 30  # from message to message
+SILENT_FRAMES = (
+    10 * PERIOD_FRAMES
+)  # some are lost on a wireless network; crystals drift 0.25 ms in 300 frames
+MOST_OFF_US = 1000.0  # further off in one correction, and it had not been in step
+LEAST_US = 50.0  # what libcamera corrects
+LOG_FRAMES = 120
+_LOG = logging.getLogger(__name__)
+
+
+class SyncWatch:
+    """Push machine for a camera's metadata. Holds whether it is in step, and how far off the last message found it."""
+
+    def __init__(self, where: str, *, client: bool) -> None:
+        """Watch a client, or the server. `where` names the camera in the log."""
+        self._where, self._client = where, client
+        self._ready_us: int | None = None  # the agreed moment, wall clock
+        self._silent = 0  # frames since it was reckoned anew
+        self._durations: tuple[float, float] = (0.0, 0.0)  # of the last frame, and of an uncorrected one
+        self._since_error = 0
+        self._was_locked = False
+        self.lost = 0
+        self.locked = False
+        self.error_us = 0.0
+
+    def push(self, metadata: Mapping[str, object]) -> None:
+        """Take in one frame."""
+        if self._client:
+            self._listen(metadata)
+            self._measure(metadata)
+        near = abs(self.error_us) <= MOST_OFF_US
+        self.locked = bool(metadata.get("SyncReady")) and self._silent < SILENT_FRAMES and near
+        if self.locked == self._was_locked:
+            return
+        if self.locked:
+            _LOG.info(
+                "%s: in step%s", self._where, f" again, after loss number {self.lost}" if self.lost else ""
+            )
+        else:
+            self.lost += 1
+            _LOG.warning("%s: no longer in step with the others: %s", self._where, self._why(metadata))
+        self._was_locked = self.locked
+
+    def figures(self) -> dict[str, float]:
+        """`sync_locked` 0 or 1; of a client also `sync_error_us`, the last correction: 0 is below 50 us."""
+        found = {"sync_locked": float(self.locked)}
+        return found | {"sync_error_us": self.error_us} if self._client else found
+
+    def _listen(self, metadata: Mapping[str, object]) -> None:
+        timer, wall = metadata.get("SyncTimer"), metadata.get("FrameWallClock")
+        self._silent += 1
+        if isinstance(timer, int) and isinstance(wall, int):
+            ready_us = (
+                wall // 1000 + timer
+            )  # libcamera rounds as well: without a message it is the same to the us
+            if ready_us != self._ready_us:
+                self._ready_us, self._silent = ready_us, 0
+
+    def _measure(self, metadata: Mapping[str, object]) -> None:
+        """A corrected frame stands alone; two alike are the usual length."""
+        duration = metadata.get("FrameDuration")
+        self._since_error += 1
+        if self._since_error > PERIOD_FRAMES + PERIOD_FRAMES // 2:  # a message later nothing was corrected
+            self.error_us = 0.0
+        if not isinstance(duration, (int, float)):
+            return
+        last, usual = self._durations
+        if duration == last:
+            usual = float(duration)
+        off_us = usual - duration if usual else 0.0
+        if abs(off_us) >= LEAST_US:
+            self.error_us, self._since_error = off_us, 0
+        self._durations = (float(duration), usual)
+
+    def _why(self, metadata: Mapping[str, object]) -> str:
+        if not metadata.get("SyncReady"):
+            return "libcamera began anew"
+        if self._silent >= SILENT_FRAMES:
+            return f"the server was not heard for {self._silent} frames"
+        return f"it was {self.error_us:.0f} us off"
+
+
+def wait_in_step(
+    capture: Callable[[], Mapping[str, object]],
+    where: str,
+    role: str,
+    timeout_s: float,
+    clock: Clock,
+    stopped: Callable[[], bool],
+) -> None:
+    """Read frames until libcamera says that those of all cameras are in step.
+
+    Args:
+        capture: The metadata of the next frame.
+        where: Names the camera.
+        role: "server" or "client".
+        timeout_s: How long to wait [s] of `clock`.
+        clock: The slave's clock.
+        stopped: Whether the slave is to end.
+
+    Raises:
+        CameraError: They are not within the time, or the slave was to stop before.
+    """
+    other = "clients" if role == "server" else "the server"
+    end_ns = clock.now_ns() + round(timeout_s * 1e9)
+    count = 0
+    while True:
+        metadata = capture()
+        timer = metadata.get(
+            "SyncTimer"
+        )  # us until the agreed moment; a client that heard no server has none
+        if metadata.get("SyncReady"):
+            wall = metadata.get("FrameWallClock", "unknown")
+            _LOG.info("%s: in step, %s us off; first frame at wall clock %s ns", where, timer, wall)
+            return
+        if stopped():
+            raise CameraError(f"{where}: stopped while it waited for {other}")
+        if clock.now_ns() > end_ns:
+            heard = "no server was heard" if timer is None else f"{timer} us were left"
+            raise CameraError(
+                f"{where}: --sync {role}: not in step after {timeout_s:g} s, {heard}. "
+                "Exactly one camera of the rig is the server, all have the same frame_rate_hz, clients start "
+                "first, and UDP multicast 239.255.255.250:10000 must pass between the machines"
+            )
+        if count % LOG_FRAMES == 0:
+            _LOG.info("%s: --sync %s: waiting for %s, timer %s us", where, role, other, timer)
+        count += 1

@@ -1,0 +1,222 @@
+"""Exposure and gains of a camera that is being read: changed, read back, compared; what it refuses changes nothing."""
+
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import Any
+
+import msgspec
+import pytest
+
+from common.calibration import CameraCalibration
+from common.clock import SystemClock
+from common.errors import CameraError
+from slave.cameras import passing, picamera2, reopening, v4l2_settings
+from slave.cameras.picamera2 import Picamera2Camera
+from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.source import FrameSource
+from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from tests.slave.fake_picamera2 import Sensor, install
+from tests.slave.fake_v4l2 import Camera, FakeDevice
+
+FILE = CameraCalibration(
+    version=1,
+    name="left",
+    width_px=640,
+    height_px=480,
+    frame_rate_hz=30.0,
+    exposure_us=5000.0,
+    analogue_gain=1.25,
+    colour_gains=(0.83, 1.24),
+    row_time_us=33.6,
+)
+GIVEN = {"gain": 32, "white_balance_temperature": 4600}
+
+
+def changed(**changes: Any) -> CameraCalibration:
+    return msgspec.structs.replace(FILE, **changes)
+
+
+@contextmanager
+def reading(source: FrameSource) -> Generator[list[int], None, None]:
+    """Read frames on another thread, as the slave's loop does; their times gather in the list."""
+    stop, times = threading.Event(), list[int]()
+
+    def loop() -> None:
+        while not stop.is_set() and (frame := source.read()) is not None:
+            times.append(frame.t_ns)
+            time.sleep(0.001)
+
+    thread = threading.Thread(target=loop)
+    thread.start()
+    try:
+        yield times
+    finally:
+        stop.set()
+        thread.join()
+        source.close()
+
+
+def pi(monkeypatch: pytest.MonkeyPatch, sensor: Sensor) -> Picamera2Camera:
+    install(monkeypatch, sensor)
+    return Picamera2Camera(FILE, Picamera2Options(), SystemClock())
+
+
+def usb(camera: Camera, file: CameraCalibration = FILE) -> V4l2Camera:
+    return V4l2Camera(file, V4l2Options(controls=GIVEN), SystemClock(), lambda _path: FakeDevice(camera))
+
+
+def test_a_pi_camera_takes_settings_while_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = pi(monkeypatch, Sensor(delay=7))
+    with reading(source):
+        source.tune(changed(exposure_us=9000.0, analogue_gain=2.0, colour_gains=(1.1, 1.6)))
+        got = source.figures()
+    assert got["exposure_us"] == pytest.approx(9000.0, abs=33.6)
+    assert got["analogue_gain"] == 2.0
+    assert (got["red_gain"], got["blue_gain"]) == pytest.approx((1.1, 1.6), abs=1e-6)
+    assert got["frame_rate_hz"] == pytest.approx(30.0, rel=2e-3)
+
+
+def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any]], None]:
+    """Metadata that say `value` where another than the first was asked for, from some frame on."""
+
+    def tamper(number: int, metadata: dict[str, Any]) -> None:
+        if number > after and metadata[name] > {"ExposureTime": 6000, "AnalogueGain": 1.5}[name]:
+            metadata[name] = value
+
+    return tamper
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "says"),
+    [
+        ("ExposureTime", 7777, "ExposureTime: wanted 9000 us .exposure_us., got 7777 us"),
+        ("AnalogueGain", 1.75, "AnalogueGain: wanted 2 .analogue_gain., got 1.75"),
+    ],
+)
+def test_what_a_pi_camera_does_not_take_is_named_and_the_old_settings_come_back(
+    name: str, value: object, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = pi(monkeypatch, Sensor(tamper=pinned(name, value, 10)))
+    with reading(source):
+        with pytest.raises(CameraError, match=says) as error:
+            source.tune(changed(exposure_us=9000.0, analogue_gain=2.0))
+        assert str(error.value).endswith("the settings before are back")
+        got = source.figures()
+    assert got["exposure_us"] == pytest.approx(5000.0, abs=33.6)
+    assert got["analogue_gain"] == 1.25
+
+
+def test_settings_that_do_not_come_back_are_said_to_be_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    def stuck(number: int, metadata: dict[str, Any]) -> None:
+        if number > 10:
+            metadata["ExposureTime"] = 100
+
+    source = pi(monkeypatch, Sensor(tamper=stuck))
+    with reading(source), pytest.raises(CameraError, match="and the settings before did not come back"):
+        source.tune(changed(exposure_us=9000.0))
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"exposure_us": 40_000.0}, "does not fit into a frame of 33333 us"),
+        ({"analogue_gain": 90.0}, "AnalogueGain 90 is not within 1 to 63.9375"),
+        ({"colour_gains": (40.0, 1.0)}, "ColourGains 40, 1 is not within 0 to 32"),
+    ],
+)
+def test_what_is_out_of_range_is_refused_before_anything_is_written(
+    changes: dict[str, Any], says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sensor = Sensor()
+    source = pi(monkeypatch, sensor)
+    with reading(source), pytest.raises(CameraError, match=says):
+        source.tune(changed(**changes))
+    written = {value for _, controls in sensor.opened[0]._changes for value in controls.values()}
+    assert written <= {5000, 1.25, (0.83, 1.24)}
+
+
+def test_a_usb_camera_takes_an_exposure_while_it_is_read() -> None:
+    camera = Camera()
+    source = usb(camera)
+    with reading(source) as times:
+        while len(times) < 5:
+            time.sleep(0.001)
+        source.tune(changed(exposure_us=9000.0))
+        assert source.figures()["exposure_us"] == 9000.0
+        assert source.figures()["control.gain"] == 32.0
+        count = len(times)
+        while len(times) < count + 5:
+            time.sleep(0.001)
+    period_ns = 1e9 / 30.0
+    early, late = times[0] % period_ns, times[-1] % period_ns
+    # The stamp is the start of the exposure: its middle comes 2 ms later now.
+    assert (late - early + period_ns / 2) % period_ns - period_ns / 2 == pytest.approx(2e6, abs=1e5)
+
+
+def test_what_a_usb_camera_does_not_take_is_named_and_the_old_exposure_comes_back() -> None:
+    camera = Camera(
+        keeps=lambda name, value: 77 if name.startswith("Exposure Time") and value > 50 else value
+    )
+    source = usb(camera)
+    with reading(source):
+        with pytest.raises(CameraError, match=r"wanted 90 x 100 us .exposure_us., got 77 x") as error:
+            source.tune(changed(exposure_us=9000.0))
+        assert str(error.value).endswith("the settings before are back")
+    assert camera.knob("Exposure Time").value == 50
+
+
+def test_what_a_usb_camera_cannot_change_is_said() -> None:
+    source = usb(Camera())
+    with reading(source):
+        with pytest.raises(CameraError, match="analogue_gain and colour_gains cannot be changed"):
+            source.tune(changed(analogue_gain=2.0, colour_gains=(1.0, 1.0)))
+        with pytest.raises(CameraError, match="exposure_us 600000 does not fit into a frame"):
+            source.tune(changed(exposure_us=600_000.0))
+        source.tune(changed(exposure_us=5000.0))
+
+
+def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(v4l2_settings, "TIMEOUT_S", 0.01)
+    monkeypatch.setattr(picamera2, "TIMEOUT_S", 0.01)
+    for source in (usb(Camera()), pi(monkeypatch, Sensor())):
+        with pytest.raises(CameraError, match=r"no frame was read for 0.01 s"):
+            source.tune(changed(exposure_us=9000.0))
+        source.close()
+
+
+def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    first, second = Camera(gone_after=200, damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
+    plugged = [first, second]
+    source = ReopeningCamera(lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event())
+    with reading(source):
+        source.tune(changed(exposure_us=9000.0))
+        while source.lost == 0 or not source.figures():
+            time.sleep(0.001)
+        time.sleep(0.05)
+        assert source.figures()["exposure_us"] == 9000.0
+        assert source.counts() == {"camera.lost": 1, "camera.broken": 3}
+    assert second.knob("Exposure Time").value == 90
+
+
+def test_a_camera_that_is_away_cannot_be_changed() -> None:
+    source = ReopeningCamera(lambda file: usb(Camera(), file), FILE, SystemClock(), threading.Event())
+    source.close()
+    with pytest.raises(CameraError, match="camera 'left' is away"):
+        source.tune(changed(exposure_us=9000.0))
+    assert source.figures() == {}
+
+
+def test_a_late_watcher_sees_only_the_newest() -> None:
+    frames = passing.Passing[int]()
+    assert frames.newest is None
+    frames.put(1)
+    seen = frames.following(3, 5.0)
+    for number in (2, 3, 4, 5):
+        frames.put(number)
+    assert list(seen) == [5]
+    with pytest.raises(CameraError, match="no frame was read"):
+        next(frames.following(1, 0.01))
