@@ -168,7 +168,16 @@ class RigCalibration(_File, frozen=True):
     imu: dict[str, Json] | None = None
 
     def camera_pose(self, camera: str) -> Float:
-        """`T_rig_camera` (4, 4) [m] of one camera."""
+        """`T_rig_camera` (4, 4) [m] of one camera.
+
+        Raises:
+            CalibrationError: The rig's places are not measured yet.
+        """
+        if camera not in self.T_rig_camera:
+            raise CalibrationError(
+                f"rig {self.name!r}: T_rig_camera: camera {camera!r} has no place yet, which"
+                " `phalanx-master calibrate stereo` measures"
+            )
         return np.array(self.T_rig_camera[camera], dtype=np.float64)
 
 
@@ -291,7 +300,8 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
     if rig.kind == "wrist":
         return
-    for camera in rig.cameras:
+    # None at all: a rig that is still to be measured.
+    for camera in rig.cameras if rig.T_rig_camera else ():
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
         pose = rig.camera_pose(camera)

@@ -49,6 +49,7 @@ def _run(options: argparse.Namespace) -> int:
     from common.zenoh_bus import ZenohBus
     from slave.app import run, wait_for_start
     from slave.light_report import LightReport
+    from slave.markers.blind import BlindDetector
     from slave.markers.detector import MarkerDetector
     from slave.markers.engine import engine_named
     from slave.markers.following import FollowingDetector, detector_for
@@ -69,6 +70,8 @@ def _run(options: argparse.Namespace) -> int:
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{options.name} colours")
     if options.colours == "follow":
         detector = detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
+    elif options.colours == "none":
+        detector = BlindDetector(len(rig.markers))
     else:
         detector = MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)

@@ -19,6 +19,8 @@ HELP = {
         waits for the master's start, then sends one sealed datagram per frame
   phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
         without hardware: renders the standard scene in real time
+  phalanx-slave run --name left --rig desk --camera picamera2 --colours none --key-file rig.key
+        before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
         with a USB camera; docs/cameras.md says which settings are fixed and checked
 """,
@@ -94,9 +96,10 @@ def _run(run: argparse.ArgumentParser) -> None:
     )
     run.add_argument(
         "--colours",
-        choices=("follow", "fixed"),
+        choices=("follow", "fixed", "none"),
         default="follow",
-        help="whether the colours follow changes of the light (default: %(default)s; docs/light.md)",
+        help="whether the colours follow changes of the light (default: %(default)s; docs/light.md); none: detect "
+        "nothing, while the lens or the place of a camera without colours is calibrated",
     )
     run.add_argument(
         "--engine",
@@ -184,7 +187,12 @@ def _camera(command: argparse.ArgumentParser) -> None:
     command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
     real.add_options(command)
     sim = command.add_argument_group("synthetic camera")
-    sim.add_argument("--scene", default="standard", metavar="NAME", help="standard | lights | poses | board | leap:FILE.npz")
+    sim.add_argument(
+        "--scene",
+        default="standard",
+        metavar="NAME",
+        help="standard | lights | poses | board | leap:FILE.npz",
+    )
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(
         "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"

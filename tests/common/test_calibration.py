@@ -352,3 +352,12 @@ def test_hands_of_the_data_sets_load(datasets: Path) -> None:
         assert len(hand.rest_joints) == 25
         norms = [np.linalg.norm(joint.orientation_wxyz) for joint in hand.rest_joints.values()]
         np.testing.assert_allclose(norms, 1.0, atol=1e-3)
+
+
+def test_a_rig_that_is_still_to_be_measured_has_no_places_and_says_what_measures_them() -> None:
+    rig = msgspec.structs.replace(
+        load(ROOT / "calib_json" / "rigs" / "desk.json", RigCalibration), T_rig_camera={}
+    )
+    calibration.check(rig, "desk.json")
+    with pytest.raises(CalibrationError, match="calibrate stereo"):
+        rig.camera_pose("left")
