@@ -1,0 +1,114 @@
+"""Pictures of a board for a calibration: kept when the board is held still somewhere new."""
+
+import threading
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Image
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.errors import CalibrationError
+from common.messages import Still
+from common.sim.board import COLUMNS, HELD_S, MOVED_S, ROWS, SQUARE_M, BoardRenderer, BoardScene
+from master.calibrate.boards import Checkerboard
+from master.calibrate.capture import NOTES, Round, capture
+from master.calibrate.image_sets import image_sets
+from master.calibrate.live_views import LiveViews
+from master.calibrate.views import look
+
+CALIB = Path(__file__).parents[3] / "calib_json"
+RIG = load(CALIB / "rigs" / "desk.json", RigCalibration)
+CAMERAS = {name: load(CALIB / "cameras" / f"{name}.json", CameraCalibration) for name in RIG.cameras}
+SCENE = BoardScene(RIG, CAMERAS, 3)
+BOARD = Checkerboard(COLUMNS, ROWS, SQUARE_M)
+STEP_S = HELD_S + MOVED_S
+
+
+@pytest.fixture(scope="module")
+def renderers() -> dict[str, BoardRenderer]:
+    return {name: BoardRenderer(SCENE, name) for name in RIG.cameras}
+
+
+def at(renderers: dict[str, BoardRenderer], t_s: float) -> dict[str, Image]:
+    return {name: renderer.render(t_s) for name, renderer in renderers.items()}
+
+
+def test_a_view_is_kept_once_it_is_held_still_and_only_once(renderers: dict[str, BoardRenderer]) -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    said = [live.push(at(renderers, t)) for t in (0.1, 0.4, 0.7, 1.0)]
+    assert [verdict.kept for verdict in said] == [False, True, False, False]
+    assert "hold it still" in said[0].text
+    assert "seen there already" in said[2].text
+    again = [live.push(at(renderers, STEP_S + t)) for t in (0.1, 0.4)]
+    assert [verdict.kept for verdict in again] == [False, True]
+    assert [view.name for view in live.views] == ["001", "002"]
+    assert set(live.views[0].sightings) == {"left", "right"}
+    assert live.board_views().sizes_px == {"left": (640, 480), "right": (640, 480)}
+
+
+def test_a_moving_board_is_never_kept(renderers: dict[str, BoardRenderer]) -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    for t_s in HELD_S + MOVED_S * np.linspace(0.25, 0.75, 5):
+        assert not live.push(at(renderers, float(t_s))).kept
+
+
+def test_one_camera_that_moved_is_enough_to_refuse(renderers: dict[str, BoardRenderer]) -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    first = at(renderers, 0.1)
+    live.push(first)
+    shifted = np.roll(first["right"], 3, axis=1)
+    assert "hold it still" in live.push(first | {"right": shifted}).text
+
+
+def test_without_a_board_it_says_so() -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    assert live.push({"left": np.full((480, 640, 3), 90, np.uint8)}).text == "no camera sees the board"
+
+
+def stills(images: dict[str, Image], seq: int) -> dict[str, Still]:
+    encoded = {
+        name: cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 95])[1] for name, image in images.items()
+    }
+    return {name: Still(name, seq, seq, data.tobytes()) for name, data in encoded.items()}
+
+
+def test_what_was_kept_is_a_folder_that_the_calibrations_read(
+    renderers: dict[str, BoardRenderer], tmp_path: Path
+) -> None:
+    times = iter([k * STEP_S + t for k in range(10) for t in (0.2, 0.5)])
+    lines: list[str] = []
+
+    def take() -> Round:
+        images = at(renderers, next(times))
+        return Round(stills(images, 1), images, 4.0)
+
+    live = LiveViews(BOARD, RIG.cameras)
+    folder = tmp_path / "board"
+    count = capture(take, live, folder, 3, threading.Event(), lines.append, lambda: "tilt it more")
+    assert count == 3
+    assert [line for line in lines if line.startswith("view 3 of 3: left and right; tilt it more")]
+    assert msgspec.json.decode((folder / NOTES).read_bytes())["largest_spread_ms"] == 4.0
+    views = look(BOARD, image_sets(folder, RIG.cameras))
+    assert [view.name for view in views.views] == ["001", "002", "003"]
+    for mine, read in zip(live.views, views.views, strict=True):
+        for name in RIG.cameras:
+            step = mine.sightings[name].corners_px - read.sightings[name].corners_px
+            assert np.abs(step).max() < 0.2  # what JPEG costs
+    with pytest.raises(CalibrationError, match=r"holds .* already"):
+        capture(take, live, folder, 3, threading.Event(), lines.append)
+
+
+def test_a_stop_ends_it_with_what_there_is(tmp_path: Path) -> None:
+    stop = threading.Event()
+    lines: list[str] = []
+
+    def take() -> Round:
+        stop.set()
+        return Round({}, {}, float("nan"))
+
+    assert capture(take, LiveViews(BOARD, ("left",)), tmp_path / "new", 5, stop, lines.append) == 0
+    assert lines == ["no camera answers"]
+    assert msgspec.json.decode((tmp_path / "new" / NOTES).read_bytes())["views"] == 0
