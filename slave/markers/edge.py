@@ -88,7 +88,10 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         if kept.sum() < LEFT * RAYS:
             return None
         normal: Float = slope[kept] / length[kept, None]
-        shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
+        try:
+            shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
+        except np.linalg.LinAlgError:  # no edge about the centroid: of a thin crescent it lies beside the paint
+            return None
         centre += shift
         if turn >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
             break

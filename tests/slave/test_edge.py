@@ -88,3 +88,10 @@ def test_a_shape_that_is_no_ellipse_of_that_size_is_refused() -> None:
 def test_moments_of_nothing_are_refused(shape: Ellipse) -> None:
     shares, u, v = covered_ellipse(8.0, 8.0, 0.0, 24.0, 24.0, 0.1, 0.0)
     assert centre_of(shares, shape, u, v) is None
+
+
+def test_a_crescent_whose_centroid_lies_beside_its_paint_is_no_answer() -> None:
+    y, x = np.mgrid[0:48, 0:48]
+    far = np.hypot(x - 24.0, y - 24.0)
+    shares = ((far > 9.0) & (far < 11.0) & (x > 24)).astype(np.float32)
+    assert centre_of(shares, moments(11.0, 11.0, 0.0), 24.0, 24.0) is None
