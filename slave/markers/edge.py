@@ -90,8 +90,8 @@ def centre_of(share: Float32, shape: Ellipse, u: float, v: float) -> Centre | No
         normal: Float = slope[kept] / length[kept, None]
         try:
             shift: Float = np.linalg.solve(normal.T @ normal, normal.T @ residual[kept]).astype(np.float64)
-        except np.linalg.LinAlgError:  # no edge about the centroid: of a thin crescent it lies beside the paint
-            return None
+        except np.linalg.LinAlgError:
+            return None  # no edge about the centroid: that of a thin crescent lies beside its paint
         centre += shift
         if turn >= len(KEEP) and float(np.abs(shift).max()) < DONE_PX:
             break
