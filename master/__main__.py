@@ -22,20 +22,26 @@ from common.sim.scenes import NAMES, scene_by_name
 from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
 from master.live import LiveSettings, run_live
+from master.options import (
+    CALIB_JSON,
+    HERE_BEACON,
+    HERE_BIND,
+    HERE_BUS,
+    Beacon,
+    Bind,
+    BusEnd,
+    Calibration,
+    KeyFile,
+    Rig,
+    address,
+)
 from master.rig import RigSetup, load_hand, load_setup
 from master.solve import solve
 from master.summary import read_summary, write_summary
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
-Rig = Annotated[str, typer.Option(help="Rig: a file of CALIBRATION/rigs, without .json.")]
-Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and hands/.")]
 Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
-KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
-BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
-
-_HERE = Path("calib_json")
-_BUS = "tcp/127.0.0.1:47802"
 _TRY_AGAIN_S = 0.3
 
 
@@ -58,13 +64,11 @@ def phalanx_master() -> None:
 @app.command()
 def run(
     rig: Rig = "desk",
-    calibration: Calibration = _HERE,
+    calibration: Calibration = CALIB_JSON,
     hand: Hand = None,
-    beacon: Annotated[
-        str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")
-    ] = "127.255.255.255:47800",
-    bind: Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")] = "127.0.0.1:47801",
-    bus: BusEnd = _BUS,
+    beacon: Beacon = HERE_BEACON,
+    bind: Bind = HERE_BIND,
+    bus: BusEnd = HERE_BUS,
     key_file: KeyFile = None,
     start_timeout_s: Annotated[
         float, typer.Option(help="How long the first camera waits for the others.")
@@ -75,7 +79,7 @@ def run(
     """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file."""
     setup = load_setup(calibration, rig, hand)
     settings = LiveSettings(
-        _address(beacon, "--beacon"), _address(bind, "--bind"), bus, start_timeout_s, poses, summary
+        address(beacon, "--beacon"), address(bind, "--bind"), bus, start_timeout_s, poses, summary
     )
     run_live(setup, rig_key(os.environ, key_file), settings, _stop_on_signals(), _say)
 
@@ -102,9 +106,9 @@ def solve_command(
 @app.command()
 def view(
     rig: Rig = "desk",
-    calibration: Calibration = _HERE,
+    calibration: Calibration = CALIB_JSON,
     hand: Hand = None,
-    bus: BusEnd = _BUS,
+    bus: BusEnd = HERE_BUS,
     web: Annotated[
         bool, typer.Option(help="Serve the viewer to a browser on 127.0.0.1 instead of a window.")
     ] = False,
@@ -144,7 +148,7 @@ def report(
     scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}.")] = "standard",
     seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
     rig: Rig = "desk",
-    calibration: Calibration = _HERE,
+    calibration: Calibration = CALIB_JSON,
     summary: Annotated[Path | None, typer.Option(help="summary.json of the run, to be completed.")] = None,
 ) -> None:
     """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file."""
@@ -191,13 +195,6 @@ def _bus_of_master(endpoint: str, stop: threading.Event) -> ZenohBus | None:
             said = True
             stop.wait(_TRY_AGAIN_S)
     return None
-
-
-def _address(text: str, option: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise PhalanxError(f"{option} {text!r}: expected ADDRESS:PORT, for example 127.0.0.1:47801")
-    return host, int(port)
 
 
 def _say(line: str) -> None:

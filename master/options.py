@@ -1,0 +1,31 @@
+"""Options that several commands of the master share, and what the texts behind them mean."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from common.datagram import Address
+from common.errors import PhalanxError
+
+Rig = Annotated[str, typer.Option(help="Rig: a file of CALIBRATION/rigs, without .json.")]
+Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and hands/.")]
+KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
+BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
+Beacon = Annotated[str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")]
+Bind = Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")]
+
+CALIB_JSON = Path("calib_json")
+HERE_BEACON, HERE_BIND, HERE_BUS = "127.255.255.255:47800", "127.0.0.1:47801", "tcp/127.0.0.1:47802"
+
+
+def address(text: str, option: str) -> Address:
+    """ADDRESS:PORT as a pair.
+
+    Raises:
+        PhalanxError: It is something else.
+    """
+    host, _, port = text.rpartition(":")
+    if not host or not port.isdigit() or int(port) > 65535:
+        raise PhalanxError(f"{option} {text!r}: expected ADDRESS:PORT, for example 127.0.0.1:47801")
+    return host, int(port)
