@@ -5,8 +5,9 @@ from collections.abc import Callable
 import typer
 
 from master.calibrate.depth_commands import depth
+from master.calibrate.verify_command import verify_command
 
-COMMANDS: dict[str, Callable[..., None]] = {"depth": depth}
+COMMANDS: dict[str, Callable[..., None]] = {"depth": depth, "verify": verify_command}
 
 
 def calibrate_app() -> typer.Typer:

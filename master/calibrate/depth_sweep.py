@@ -91,14 +91,23 @@ def checked(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | N
             that disagrees; too few points, too narrow or one-sided a range; disparities that do not fall with the
             distance.
     """
+    merged = _merged(check_places(sweep, cameras, size_px))
+    _check_falls(merged)
+    check_enough(merged)
+    return merged
+
+
+def check_places(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int] | None = None) -> Sweep:
+    """The sweep by distance, nearest first, each place for itself: seen, wholly, and in the right order of cameras.
+
+    Raises:
+        FitError: As `checked`, without what concerns all places together.
+    """
     _check_seen(sweep, cameras)
     _check_signs(sweep, cameras)
     if size_px is not None:
         _check_whole(sweep, cameras, size_px)
-    merged = _merged(sweep)
-    _check_falls(merged)
-    check_enough(merged)
-    return merged
+    return sweep.at(np.argsort(sweep.distance_m, kind="stable"))
 
 
 def check_enough(sweep: Sweep) -> None:
@@ -181,17 +190,15 @@ def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int
 
 
 def _merged(sweep: Sweep) -> Sweep:
-    """By distance, with equal distances averaged.
+    """Equal distances averaged; `sweep` is sorted by distance.
 
     Raises:
         FitError: Equal distances whose disparities differ by more than a ruler and noise explain.
     """
-    order = np.argsort(sweep.distance_m, kind="stable")
-    ordered = sweep.at(order)
-    group = np.concatenate([[0], np.cumsum(np.diff(ordered.distance_m) > SAME_M)]).astype(np.int64)
+    group = np.concatenate([[0], np.cumsum(np.diff(sweep.distance_m) > SAME_M)]).astype(np.int64)
     parts: list[Sweep] = []
-    for g in range(int(group[-1]) + 1 if group.size else 0):
-        same = ordered.at(group == g)
+    for g in range(int(group[-1]) + 1 if sweep.size else 0):
+        same = sweep.at(group == g)
         spread = float(np.ptp(same.disparity_px))
         x, d = float(same.disparity_px.mean()), float(same.distance_m.mean())
         if spread > DISAGREE_PX + x * RULER_M / d:
@@ -203,7 +210,7 @@ def _merged(sweep: Sweep) -> Sweep:
                 f" {1e3 * RULER_M:.0f} mm on the ruler explain; measure it again or leave one out"
             )
         parts.append(same if same.size == 1 else _mean(same))
-    return _joined(parts) if parts else ordered
+    return _joined(parts) if parts else sweep
 
 
 def _mean(same: Sweep) -> Sweep:
