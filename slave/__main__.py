@@ -50,12 +50,14 @@ def _run(options: argparse.Namespace) -> int:
     from slave.app import run, wait_for_start
     from slave.light_report import LightReport
     from slave.markers.blind import BlindDetector
+    from slave.markers.changing import Changeable, ChangingDetector
     from slave.markers.detector import MarkerDetector
     from slave.markers.engine import engine_named
-    from slave.markers.following import FollowingDetector, detector_for
+    from slave.markers.following import detector_for
     from slave.preview import Previews
     from slave.report import Reporter
     from slave.tally import Tally
+    from slave.tuning import CameraFiles, CameraTuning
     from slave.uplink import Uplink
 
     stop = threading.Event()
@@ -68,21 +70,24 @@ def _run(options: argparse.Namespace) -> int:
     engine = engine_named(options.engine)
     source = _source(options, rig, camera, clock, true_clock, stop)
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{options.name} colours")
-    if options.colours == "follow":
-        detector = detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
-    elif options.colours == "none":
-        detector = BlindDetector(len(rig.markers))
-    else:
-        detector = MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
+
+    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
+        if options.colours == "follow":
+            return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
+        return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
+
+    changing = None if options.colours == "none" else ChangingDetector(make(camera, rig))
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
     tally = Tally(rig.markers)
+    files = CameraFiles(*_paths(options), camera, rig)
+    tuning = CameraTuning(files, source, changing, make, lambda: tally.counts()["frames"] > 0)
     previews = Previews(options.name, clock)
     numbers, show = tally, previews.offer
-    if isinstance(detector, FollowingDetector):
-        numbers = LightReport(options.name, detector, tally, rig.markers, previews.offer)
+    if changing is not None and changing.follows:
+        numbers = LightReport(options.name, changing, tally, rig.markers, previews.offer)
         show = numbers.offer
     elif options.colours == "follow":
-        _LOG.warning("%s", NO_REFERENCE.format(options.calibration / "cameras" / f"{options.name}.json"))
+        _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
     reporter = Reporter(
         options.name,
         uplink,
@@ -91,7 +96,9 @@ def _run(options: argparse.Namespace) -> int:
         lambda endpoint: ZenohBus(None, endpoint),
         stop.set,
         shown=previews,
+        camera=tuning,
     )
+    detector = BlindDetector(len(rig.markers)) if changing is None else changing
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
@@ -109,12 +116,19 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _calibration(options: argparse.Namespace) -> tuple[RigCalibration, CameraCalibration]:
-    rig = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
+    camera_path, rig_path = _paths(options)
+    rig = load(rig_path, RigCalibration)
     if options.name not in rig.cameras:
         raise CalibrationError(
             f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}"
         )
-    return rig, load(options.calibration / "cameras" / f"{options.name}.json", CameraCalibration)
+    return rig, load(camera_path, CameraCalibration)
+
+
+def _paths(options: argparse.Namespace) -> tuple[Path, Path]:
+    """The camera file and the rig file."""
+    folder: Path = options.calibration
+    return folder / "cameras" / f"{options.name}.json", folder / "rigs" / f"{options.rig}.json"
 
 
 def _source(

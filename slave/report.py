@@ -67,8 +67,29 @@ class Shown(Protocol):
         ...
 
 
+class Tuned(Protocol):
+    """The camera whose settings can be changed; a `CameraTuning`."""
+
+    def commands(self) -> Mapping[str, Callable[[str], Mapping[str, float]]]:
+        """Verb -> what to do with its body; the gauges of the answer. Each may raise `PhalanxError`."""
+        ...
+
+    def look(self) -> None:
+        """Once a period: apply files that were changed."""
+        ...
+
+    def counts(self) -> Mapping[str, int]:
+        """Event of the camera -> how often."""
+        ...
+
+    def figures(self) -> Mapping[str, float]:
+        """What the camera has now."""
+        ...
+
+
 class Reporter:
-    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview" and "still".
+    """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview" and "still";
+    where the camera can be changed, also its commands. Once a period it lets the camera's files be looked at.
 
     Holds the bus while a master is there, and the gauges of the last period.
     """
@@ -83,6 +104,7 @@ class Reporter:
         stop: Callable[[], None],
         period_s: float = PERIOD_S,
         shown: Shown | None = None,
+        camera: Tuned | None = None,
     ) -> None:
         """Start the thread.
 
@@ -95,6 +117,7 @@ class Reporter:
             stop: Called on the command "stop".
             period_s: Time between reports [s].
             shown: Shows the camera's picture on the command "preview".
+            camera: Changes the settings of the camera.
         """
         self._name = name
         self._link = link
@@ -104,6 +127,8 @@ class Reporter:
         self._stop = stop
         self._period_s = period_s
         self._shown = shown
+        self._camera = camera
+        self._commands = {} if camera is None else dict(camera.commands())
         self._gauges: dict[str, float] = {}
         self._bus: Bus | None = None
         self._endpoint: str | None = None
@@ -111,31 +136,34 @@ class Reporter:
         self._thread = threading.Thread(target=self._work, name=f"{name} health", daemon=True)
         self._thread.start()
 
-    def health(self) -> Health:
-        """The report of this moment, with the gauges of the last period."""
+    def health(self, now: Mapping[str, float] | None = None) -> Health:
+        """The report of this moment, with the gauges of the last period, or `now` in their place."""
         counts = {**self._numbers.counts(), **self._link.counts}
-        return Health(self._name, self._link.session, self._clock.now_ns(), counts, dict(self._gauges))
+        if self._camera is not None:
+            counts |= self._camera.counts()
+        gauges = self._gauges | dict(now or {})
+        return Health(self._name, self._link.session, self._clock.now_ns(), counts, gauges)
 
     def answer(self, command: Command) -> Health:
         """Obey a command.
 
         "report" says how it is, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
-        the slave.
+        the slave; the others are those of the camera.
 
         Raises:
+            PhalanxError: It could not be done.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = ("report", "stop") if self._shown is None else ("report", "stop", "preview", "still")
-        if command.verb not in verbs:
-            raise ValueError(f"{self._name}: no command {command.verb!r}; there are {', '.join(verbs)}")
-        health = self.health()
-        if command.verb == "preview" and self._shown is not None:
-            self._shown.ask()
-        if command.verb == "still" and self._shown is not None:
-            self._shown.ask_still()
-        if command.verb == "stop":
-            self._stop()
-        return health
+        plain: dict[str, Callable[[], None]] = {"report": lambda: None, "stop": self._stop}
+        if self._shown is not None:
+            plain |= {"preview": self._shown.ask, "still": self._shown.ask_still}
+        if command.verb in plain:
+            plain[command.verb]()
+            return self.health()
+        if command.verb in self._commands:
+            return self.health(self._commands[command.verb](command.body))
+        verbs = ", ".join([*plain, *self._commands])
+        raise ValueError(f"{self._name}: no command {command.verb!r}; there are {verbs}")
 
     def close(self) -> None:
         """End the thread and leave the bus. Safe to call twice."""
@@ -147,7 +175,9 @@ class Reporter:
         while not self._closing.wait(self._period_s):
             if count % LOG_EVERY == ALONE_AT and self._link.zenoh_endpoint is None:
                 _LOG.warning("%s", _why_alone(self._link.counts))
-            self._gauges = dict(self._numbers.gauges())
+            if self._camera is not None:
+                self._camera.look()
+            self._gauges = dict(self._numbers.gauges()) | self._figures()
             try:
                 self._follow(self._link.zenoh_endpoint)
                 if self._bus is not None:
@@ -160,6 +190,9 @@ class Reporter:
                 _LOG.info("%s", "  ".join(f"{k} {v:.0f}" for k, v in self._gauges.items()))
             count += 1
         self._leave()
+
+    def _figures(self) -> dict[str, float]:
+        return {} if self._camera is None else dict(self._camera.figures())
 
     def _follow(self, endpoint: str | None) -> None:
         if endpoint is None or endpoint == self._endpoint:

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.camera_settings import figures
+from common.camera_settings import CameraSettings, figures
 from common.clock import Clock
 from common.errors import CameraError, RecordingError
 from common.frame_recording import FrameRow, open_recording
@@ -70,11 +70,13 @@ class ReplayCamera:
         self._next = len(self._rows)
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Refused: what was recorded stays as it was exposed.
+        """What was recorded stays as it was exposed.
 
         Raises:
-            CameraError: Always.
+            CameraError: The settings are not those of the recording.
         """
+        if CameraSettings.of(camera) == CameraSettings.of(self._calibration):
+            return
         raise CameraError(
             f"{self._folder}: its pictures are taken, with exposure_us {self._calibration.exposure_us:g}: a "
             "recording has no exposure or gain to change; only the colours of markers can be loaded"

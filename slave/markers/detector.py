@@ -158,6 +158,14 @@ class MarkerDetector:
         np.round(result, DIGITS, out=result)
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
+    def adopt(self, other: "MarkerDetector") -> None:
+        """Go on with the tracks of a detector of the same markers."""
+        self._tracks, self._turn, self._seeds = other._tracks, other._turn, {}
+
+    def expose(self, exposure_us: float) -> None:
+        """The camera's exposure [us] has changed: motion smears over it."""
+        self._exposure_s = exposure_us * 1e-6
+
     def recolour(self, table: ColourTable) -> None:
         """Go on with another colour table of the same markers, prepared for the engine; tracks go on."""
         self._table = table

@@ -80,6 +80,20 @@ class FollowingDetector:
         """Log gains (3,) of the light against calibration, blue, green, red."""
         return self._light.log_gains
 
+    @property
+    def trusted(self) -> bool:
+        """Whether it may tell markers by their colours: the light is known, and its table made for it."""
+        return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
+
+    def adopt(self, other: "FollowingDetector") -> None:
+        """Go on with the tracks and counts of a detector of the same markers, under the light that this one knows."""
+        self._detector.adopt(other._detector)
+        self.refused, self.tables = other.refused, other.tables + self.tables
+
+    def expose(self, exposure_us: float) -> None:
+        """As of `MarkerDetector`; what it does to the colours is seen as a change of the light."""
+        self._detector.expose(exposure_us)
+
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "FollowingDetector":
         """A detector of the same camera, under the same light, that has seen no marker yet."""
         other = copy(self)
