@@ -22,6 +22,7 @@ SECTIONS = {
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
+    "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "replay": "Recorded frames with exact truth (PHALANX_DATASETS); exact truth, no baseline",
     "live": "Two slaves and the master over real UDP, standard scene; baseline: an idle relay of datagrams",
 }

@@ -14,7 +14,9 @@ from common.camera_model import CameraModel
 from common.hand_model import HandJoints, HandModel
 
 _RINGS, _SPOKES = 8, 16
-_WHOLE_SHARE = 0.6  # seen from its end a whole cap still shows this share of that
+_WHOLE_SHARE = (
+    0.6  # seen from its end a whole cap still shows this share of that; a flat marker, tilted by 53 degrees
+)
 
 
 class CapModel:
@@ -47,24 +49,29 @@ class CapModel:
         self._points, self._normals, self._areas = np.array(points), np.array(normals), np.array(areas)
 
     def doubt_px(self, area_px2: Float, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
-        """Extra centroid noise (C, M) [px] of caps that show less than they must: partly hidden.
+        """Extra centroid noise (C, M) [px] of markers that show less than they must: partly hidden.
 
-        What is missing lies to one side, so the centroid moves by up to a radius. Two cameras see different
-        remains of a hidden cap; without this, a sliver would pass for a point known to a tenth of a pixel.
+        What is missing lies to one side, so the centroid of a cap moves by up to a radius. Two cameras see different
+        remains of a hidden cap; without this, a sliver would pass for a point known to a tenth of a pixel. A flat
+        marker may show little because it is tilted or because skin hides it, which is the same to us: a camera that
+        sees much less of it than the one that sees it best knows it to half of its side only.
 
         Args:
             area_px2: Seen areas (C, M) [px^2].
             points_m: Where the caps were found (M, 3) [m], rig frame.
             cameras: The rig's cameras.
         """
-        doubt = np.zeros(area_px2.shape)
-        if not self._joint:
-            return doubt
-        for c, camera in enumerate(cameras):
-            distance = np.linalg.norm(points_m[self._marker] - camera.centre, axis=1)
-            scale = _project_scale(camera) / distance
-            share = area_px2[c, self._marker] / (2.0 * self._radius * self._painted * scale**2)
-            doubt[c, self._marker] = np.maximum(_WHOLE_SHARE - share, 0.0) * self._radius * scale
+        scale = np.stack(
+            [_project_scale(camera) / np.linalg.norm(points_m - camera.centre, axis=1) for camera in cameras]
+        )
+        size_m2 = area_px2 / scale**2
+        best_m2 = np.fmax.reduce(size_m2, axis=0)
+        share = size_m2 / best_m2
+        doubt = np.where(share < _WHOLE_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
+        if self._joint:
+            share = size_m2[:, self._marker] / (2.0 * self._radius * self._painted)
+            short = np.maximum(_WHOLE_SHARE - share, 0.0)
+            doubt[:, self._marker] = short * self._radius * scale[:, self._marker]
         return np.nan_to_num(doubt)
 
     def bias_px(self, joints: HandJoints, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:

@@ -82,9 +82,7 @@ class MarkerPipeline:
         self._stage, self._volume = stage, volume
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
-        axes = np.array([camera.T_rig_camera[:3, 2] for camera in self._cameras])
-        self._eye = self._centres.mean(axis=0)
-        self._ahead = axes.mean(axis=0) / np.linalg.norm(axes.mean(axis=0))
+        self._on_palm = np.array([model.mount(name).joint is None for name in tracker.markers], np.bool_)
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
@@ -104,7 +102,9 @@ class MarkerPipeline:
         if last is None:
             # The caps' tilt is not known yet: a first solution without correction tells it.
             with self._stage("hand"):
-                first = self._tracker.peek(*self._with_rays(instant, raw, cov, None), self._towards(raw))
+                first = self._tracker.peek(
+                    *self._with_rays(instant, raw, cov, None), self._towards(raw, instant)
+                )
             if first is not None:
                 with self._stage("triangulate"):
                     raw, cov, apart = self._locate(instant, first)
@@ -113,7 +113,7 @@ class MarkerPipeline:
         with self._stage("hand"):
             aims = self._with_rays(instant, markers, cov, last)
             measured = np.isfinite(markers[self._on_hand, 0])
-            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers), measured)
+            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers, instant), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
@@ -131,7 +131,7 @@ class MarkerPipeline:
         in_doubt = np.isfinite(instant.rival_uv[..., 0]).any(axis=0)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
-        hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear)
+        hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear, instant)
         others = self._tracker.peek(*hand, curled=False)
         chosen = self._choose(
             instant.uv,
@@ -210,11 +210,22 @@ class MarkerPipeline:
         points[self._on_hand] = self.model.marker_points(hand.joints, self._tracker.markers)
         return points
 
-    def _towards(self, points: Float) -> Float:
-        """Unit vector (3,) from what is seen of the hand to the cameras."""
-        seen = points[self._on_hand]
-        seen = seen[np.isfinite(seen[:, 0])]
-        if not len(seen):
-            return -self._ahead
-        back = self._eye - seen.mean(axis=0)
-        return back / np.linalg.norm(back)
+    def _towards(self, points: Float, instant: Instant) -> Float:
+        """Unit vector (3,) from what is seen of the hand to the cameras that see the back of it.
+
+        A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras,
+        weighed by what each sees, add up to where it faces, as far as they tell.
+        """
+        found = points[self._on_hand]
+        found = found[np.isfinite(found[:, 0])]
+        if not len(found):
+            return -self._cameras[0].T_rig_camera[:3, 2]
+        back = self._centres - found.mean(axis=0)
+        distance = np.linalg.norm(back, axis=1)
+        shown = (
+            np.nansum(instant.area[:, self._on_hand[self._on_palm]], axis=1)
+            * (distance / self._focal_px) ** 2
+        )
+        towards = (shown if shown.any() else np.ones(len(shown))) @ (back / distance[:, None])
+        length = float(np.linalg.norm(towards))
+        return towards / length if length > 0.0 else back[0] / distance[0]

@@ -100,7 +100,6 @@ def test_a_sliver_of_a_cap_is_doubted_and_a_whole_one_is_not() -> None:
     scale = 500.0 / away
     expected = (0.6 - 0.1 * (away / 0.5) ** 2) * RADIUS_M * scale
     assert doubt[1, 1] == pytest.approx(expected)
-    assert doubt[1, 5] == 0
     np.testing.assert_array_equal(CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS), np.zeros((2, 6)))
 
 
@@ -125,3 +124,16 @@ def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path
     assert len(error_mm["plain"]) >= 3
     assert np.median(error_mm["plain"]) > 2.0
     assert np.median(error_mm["corrected"]) < 1.0
+
+
+def test_a_flat_marker_is_doubted_where_another_camera_sees_much_more_of_it() -> None:
+    points = np.tile([0.0375, 0.0, 0.5], (6, 1))  # as far from one camera as from the other
+    whole = np.full(6, 500.0)
+    alike = CAPS.doubt_px(np.stack([whole, 0.7 * whole]), points, CAMERAS)
+    np.testing.assert_array_equal(
+        alike[:, 5], 0.0
+    )  # side by side: all of a pair's sightings stay as they are
+    aslant = CAPS.doubt_px(np.stack([whole, 0.2 * whole]), points, CAMERAS)
+    np.testing.assert_allclose(aslant[:, 5], [0.0, 0.8 * 0.5 * np.sqrt(500.0)])
+    alone = CAPS.doubt_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, CAMERAS)
+    np.testing.assert_array_equal(alone[:, 5], 0.0)

@@ -1,0 +1,104 @@
+"""A scene played through the whole line in one process: rendered frames, real detector, real pipeline, exact truth.
+
+What the cameras of a rig would deliver live, without clocks and network, so that the same scene gives the same figures.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.messages import HandPose, MarkerDetections
+from common.sim.render import Renderer
+from common.sim.scene import Scene
+from master.rig import RigSetup, build_pipeline
+from master.stages import StageTimes
+from slave.markers.following import detector_for
+from slave.markers.workers import Inline
+
+START_NS = 1_000_000_000  # scene time 0 on the clock of the messages
+_ROWS_S = 0.02  # a marker's row is exposed within this time after row 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Watched:
+    """One camera over T frames of a scene.
+
+    Attributes:
+        messages: What its slave would send, frame by frame.
+        t_s: (T,) scene time of each frame's row 0 [s].
+        shown: (T, M) visible area of each marker, in discs of its cap's radius at its distance; a whole cap shows one
+            or more. For a marker that is no cap: visible share.
+    """
+
+    messages: tuple[MarkerDetections, ...]
+    t_s: Float
+    shown: Float
+
+
+def times_of(scene: Scene, camera: str, seconds: float, rate_hz: float, start_s: float = 0.0) -> Float:
+    """Scene times (T,) [s] of the frames of a camera: it begins as late after the others as the scene says."""
+    return (
+        start_s + scene.timing(camera).start_offset_ns * 1e-9 + np.arange(round(seconds * rate_hz)) / rate_hz
+    )
+
+
+def shown_by(scene: Scene, camera: str, times_s: Float) -> Float:
+    """Exact visibility alone, (T, M) as in `Watched`; nothing is drawn."""
+    renderer = Renderer(scene, camera)
+    return np.array([_shown(scene, camera, renderer, float(t)) for t in times_s])
+
+
+def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
+    """Render and detect the frames of one camera."""
+    renderer = Renderer(scene, camera)
+    detector = detector_for(scene.cameras[camera], scene.rig.markers, Inline(), free=scene.rig.free_markers)
+    messages: list[MarkerDetections] = []
+    for seq, t in enumerate(times_s.tolist()):
+        t_ns = START_NS + round(t * 1e9)
+        found = detector.push(renderer.render(t), t_ns)
+        messages.append(
+            MarkerDetections(
+                camera,
+                1,
+                seq,
+                t_ns,
+                t_ns,
+                found.uv,
+                found.area,
+                found.quality,
+                found.sigma_px,
+                found.rival_uv,
+            )
+        )
+    return Watched(tuple(messages), times_s, shown_by(scene, camera, times_s))
+
+
+def solve(setup: RigSetup, watched: Sequence[Watched]) -> tuple[list[HandPose], dict[str, int]]:
+    """The poses of everything that was watched, in the order of capture, and the pipeline's counts."""
+    pipeline = build_pipeline(setup, StageTimes())
+    messages = sorted((m for one in watched for m in one.messages), key=lambda message: message.t_ns)
+    poses = [solved.pose for message in messages for solved in pipeline.push(message)]
+    return poses, dict(pipeline.counts)
+
+
+def times_of_poses(poses: Sequence[HandPose]) -> Float:
+    """Scene times (T,) [s] of poses."""
+    stamps: Int = np.array([pose.t_ns for pose in poses], np.int64)
+    return np.asarray((stamps - START_NS) * 1e-9, np.float64)
+
+
+def _shown(scene: Scene, camera: str, renderer: Renderer, t_s: float) -> Float:
+    view = renderer.markers(t_s)
+    shown = view.visible.copy()
+    joints = scene.joints((t_s + _ROWS_S / 2,))
+    optics = scene.optics[camera]
+    focal_px = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
+    for m, name in enumerate(scene.rig.markers):
+        mount = scene.model.mount(name)
+        if mount.joint is not None:
+            distance = float(np.linalg.norm(joints.position_m[0, mount.joint] - optics.centre))
+            radius_px = focal_px * float(scene.model.radius_m[mount.joint]) / distance
+            shown[m] = view.area[m] / (np.pi * radius_px**2)
+    return shown
