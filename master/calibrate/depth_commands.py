@@ -104,7 +104,7 @@ def depth(
     else:
         measured = measured_from(source, detections, marker, distances, rig, calibration, fov_deg, outline)
     pair = measured.pair
-    base = rig_to_write(pair.rig, out)
+    base = rig_to_write(pair, out)
     sweep = checked(measured.sweep, pair.cameras, pair.size_px)
     report = fit_depth(sweep, laws_before(pair, base))
     typer.echo(measured.about)

@@ -28,7 +28,7 @@ def draw_errors(
     used: Bool | None = None,
     band: Float | None = None,
 ) -> None:
-    """Write the picture as PNG: all models above, the good ones enlarged below.
+    """Write the picture as PNG: all models above, the good ones enlarged below where there are bad ones.
 
     Args:
         path: The file; replaced only by a complete one.
@@ -44,11 +44,12 @@ def draw_errors(
     figure = Figure(figsize=(9.0, 7.5), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title)
-    above, below = figure.subplots(2, 1, sharex=True)
     largest = {name: 100.0 * float(np.nanmax(np.abs(error))) for name, error in errors.items()}
     near = min(largest.values())
     fine = {name: error for name, error in errors.items() if largest[name] <= max(2.0, 4.0 * near)}
-    for axes, shown in ((above, errors), (below, fine)):
+    panels = [errors] if len(fine) == len(errors) else [errors, fine]
+    drawn = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0].tolist()
+    for axes, shown in zip(drawn, panels, strict=True):
         axes.axhline(0.0, color="black", linewidth=0.8)
         for name, error in shown.items():
             colour, marker = _LOOK.get(name, ("#805ad5", "v"))
@@ -69,9 +70,7 @@ def draw_errors(
         axes.set_ylabel("error of depth [%]")
         axes.grid(visible=True, alpha=0.3)
         axes.legend(loc="best", fontsize=8)
-    limit = 1.15 * max(100.0 * float(np.nanmax(np.abs(error))) for error in fine.values())
-    below.set_ylim(-limit, limit)
-    below.set_xlabel("distance along the first camera's axis [cm]")
+    drawn[-1].set_xlabel("distance along the first camera's axis [cm]")
     try:
         with replacing(path) as file:
             figure.savefig(file, format="png")

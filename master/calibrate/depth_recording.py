@@ -160,7 +160,8 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
 def still_runs(pairs: Pairs) -> list[Int]:
     """The stretches, as indices of pairs, in which the target stands in both images.
 
-    A pair joins the stretch before it while its centroids lie within six standard deviations of the stretch's mean.
+    A pair joins the stretch before it while its centroids lie within six standard deviations of the stretch's mean. A
+    tenth is cut off each end, where the target may still be settling, or be touched again.
     """
     runs: list[Int] = []
     start = 0
@@ -169,7 +170,7 @@ def still_runs(pairs: Pairs) -> list[Int]:
         if i < pairs.t_ns.size and _near(pairs, run, i):
             continue
         if run.size >= STILL_FRAMES and pairs.t_ns[run[-1]] - pairs.t_ns[run[0]] >= STILL_S * 1e9:
-            runs.append(run)
+            runs.append(run[run.size // 10 : run.size - run.size // 10])
         start = i
     return runs
 

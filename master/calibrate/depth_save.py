@@ -16,15 +16,16 @@ from common.calibration import (
 )
 from common.errors import CalibrationError
 from master.calibrate.depth_report import DepthReport
-from master.calibrate.depth_source import Measured
+from master.calibrate.depth_source import Measured, Pair
 
 
-def rig_to_write(rig: RigCalibration | None, out: Path | None) -> RigCalibration | None:
+def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
     """The rig file that gets the new laws: the one in `out` where there is one, else the one in use.
 
     Raises:
         CalibrationError: No rig is known, it has not two cameras, or other ones than the file in `out`.
     """
+    rig = pair.rig
     if out is None:
         return rig
     if rig is None:
@@ -34,7 +35,7 @@ def rig_to_write(rig: RigCalibration | None, out: Path | None) -> RigCalibration
             f"rig {rig.name!r} has {len(rig.cameras)} cameras: laws of disparity are for two; it needs"
             " depth_model 'stereo'"
         )
-    path = out / "rigs" / f"{rig.name}.json"
+    path = out / "rigs" / f"{pair.file_name}.json"
     if not path.exists():
         return rig
     there = load(path, RigCalibration)
@@ -76,7 +77,7 @@ def write_laws(
         depth_model=rig.depth_model if use is None else use,
         provenance=rig.provenance | {name: provenance(name) for name in report.left_out},
     )
-    path = out / "rigs" / f"{rig.name}.json"
+    path = out / "rigs" / f"{measured.pair.file_name}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

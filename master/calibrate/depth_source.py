@@ -27,12 +27,14 @@ class Pair:
 
     Attributes:
         rig: The rig file; None: nothing is known but the numbers of a table.
+        file_name: Of the rig file in a calib_json tree, without .json.
         cameras: Names, first the left one.
         files: Their camera files.
         models: The same as camera models; None: intrinsics are missing.
     """
 
     rig: RigCalibration | None = None
+    file_name: str = ""
     cameras: tuple[str, str] = _LEFT_RIGHT
     files: tuple[CameraCalibration, ...] = ()
     models: tuple[CameraModel, CameraModel] | None = None
@@ -60,7 +62,7 @@ class Measured:
     about: str
 
 
-def pair_of(rig: RigCalibration, files: Mapping[str, CameraCalibration]) -> Pair:
+def pair_of(rig: RigCalibration, files: Mapping[str, CameraCalibration], file_name: str = "") -> Pair:
     """The first two cameras of a rig; without models where one has no intrinsics.
 
     Raises:
@@ -76,7 +78,7 @@ def pair_of(rig: RigCalibration, files: Mapping[str, CameraCalibration]) -> Pair
             CameraModel.of(two[0], rig.camera_pose(first)),
             CameraModel.of(two[1], rig.camera_pose(second)),
         )
-    return Pair(rig, (first, second), two, models)
+    return Pair(rig, file_name or rig.name, (first, second), two, models)
 
 
 def load_pair(
@@ -104,7 +106,7 @@ def load_pair(
             file = load(path, CameraCalibration)
             known = file if known is None or file.intrinsics is not None else known
         files[name] = known
-    return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()})
+    return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()}, rig_name)
 
 
 def from_table(path: Path, pair: Pair, outline: Float) -> Measured:

@@ -176,7 +176,7 @@ def _check_signs(sweep: Sweep, cameras: tuple[str, str]) -> None:
 def _check_whole(sweep: Sweep, cameras: tuple[str, str], size_px: tuple[int, int]) -> None:
     """A target cut by the border of an image is too small for its distance, and its centroid lies inward."""
     nominal = sweep.area_px2 * sweep.distance_m**2
-    if not np.isfinite(nominal).all():
+    if sweep.size == 0 or not np.isfinite(nominal).all():
         return
     usual = np.median(nominal, axis=1, keepdims=True)
     gap = np.minimum(sweep.uv, np.array(size_px) - 1.0 - sweep.uv).min(axis=2)

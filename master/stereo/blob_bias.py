@@ -17,8 +17,8 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 
-_CORNERS: Final = 64  # of the polygon for a round marker; its area is 0.2 % small, which is scaled away
-_ROUNDS: Final = 2  # the outline's centre starts at the centroid, which is off by the shift
+_CORNERS: Final = 64  # of the polygon; that for a circle is 0.2 % small, which is scaled away
+_ROUNDS: Final = 3  # each leaves a few per cent of the shift: the outline starts around the centroid
 
 
 def round_outline() -> Float:
@@ -28,9 +28,11 @@ def round_outline() -> Float:
 
 
 def card_outline(width: float, height: float) -> Float:
-    """An upright rectangle of unit area around the origin with the sides' ratio `width` : `height`, (4, 2)."""
-    half = 0.5 * np.array([width, height]) / np.sqrt(width * height)
-    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * half
+    """An upright rectangle of unit area around the origin with the sides' ratio `width` : `height`, (K, 2)."""
+    corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+    along = np.linspace(0.0, 1.0, _CORNERS // 4, endpoint=False)[:, None]  # the lens bends the sides
+    sides = [a + along * (b - a) for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
+    return np.concatenate(sides) * np.array([width, height]) / np.sqrt(width * height)
 
 
 def centre_of_blob(camera: CameraModel, uv: Float, area_px2: Float, outline: Float) -> Float:
