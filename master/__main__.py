@@ -2,7 +2,6 @@
 
 import logging
 import os
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -37,7 +36,9 @@ from master.options import (
 )
 from master.rig import RigSetup, load_hand, load_setup
 from master.solve import solve
+from master.stopping import stop_on_signals
 from master.summary import read_summary, write_summary
+from master.tuning import RigFiles
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -79,9 +80,15 @@ def run(
     """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file."""
     setup = load_setup(calibration, rig, hand)
     settings = LiveSettings(
-        address(beacon, "--beacon"), address(bind, "--bind"), bus, start_timeout_s, poses, summary
+        address(beacon, "--beacon"),
+        address(bind, "--bind"),
+        bus,
+        start_timeout_s,
+        poses,
+        summary,
+        RigFiles(calibration, rig, hand),
     )
-    run_live(setup, rig_key(os.environ, key_file), settings, _stop_on_signals(), _say)
+    run_live(setup, rig_key(os.environ, key_file), settings, stop_on_signals(), _say)
 
 
 @app.command(name="solve")
@@ -119,7 +126,7 @@ def view(
     from master.outputs.rerun import run_viewer
 
     setup = load_setup(calibration, rig, hand)
-    stop = _stop_on_signals()
+    stop = stop_on_signals()
     connection = _bus_of_master(bus, stop)
     if connection is None:
         return
@@ -172,13 +179,6 @@ def main() -> None:
     except PhalanxError as error:
         print(f"phalanx-master: {error}", file=sys.stderr)
         sys.exit(1)
-
-
-def _stop_on_signals() -> threading.Event:
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda _number, _frame: stop.set())
-    return stop
 
 
 def _bus_of_master(endpoint: str, stop: threading.Event) -> ZenohBus | None:

@@ -17,7 +17,6 @@ import numpy as np
 
 from common.arrays import Image
 from common.bus import Bus, Subscription
-from common.clock import Clock
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Still
 from master.calibrate.live_views import LiveViews, Verdict
@@ -91,9 +90,9 @@ def capture(
 class StillTaker:
     """Asks every camera for its next frame. Holds the bus subscription and the ingest that keeps the clocks."""
 
-    def __init__(self, bus: Bus, ingest: Ingest, cameras: tuple[str, ...], clock: Clock) -> None:
+    def __init__(self, bus: Bus, ingest: Ingest, cameras: tuple[str, ...]) -> None:
         """Listen for stills of `cameras` from now on."""
-        self._bus, self._ingest, self._cameras, self._clock = bus, ingest, cameras, clock
+        self._bus, self._ingest, self._cameras = bus, ingest, cameras
         self._feed: Subscription = bus.subscribe("still", depth=4 * len(cameras))
 
     def take(self) -> Round:
@@ -113,7 +112,11 @@ class StillTaker:
             thread.join()
         while self._ingest.get(0.0) is not None:
             pass  # detections come along; nobody needs them
-        images = {name: image for name, still in stills.items() if (image := _decoded(still)) is not None}
+        images = {
+            name: image
+            for name in self._cameras
+            if name in stills and (image := _decoded(stills[name])) is not None
+        }
         return Round(stills, images, self._spread_ms(stills))
 
     def close(self) -> None:

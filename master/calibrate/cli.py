@@ -4,10 +4,15 @@ from collections.abc import Callable
 
 import typer
 
+from master.calibrate.capture_command import capture_views
 from master.calibrate.depth_commands import depth
 from master.calibrate.verify_command import verify_command
 
-COMMANDS: dict[str, Callable[..., None]] = {"depth": depth, "verify": verify_command}
+COMMANDS: dict[str, Callable[..., None]] = {
+    "capture": capture_views,
+    "depth": depth,
+    "verify": verify_command,
+}
 
 
 def calibrate_app() -> typer.Typer:
