@@ -10,7 +10,7 @@ import numpy as np
 from common.clock import Clock
 from common.messages import Health, MarkerDetections
 from master.outputs.sink import Sink
-from master.stereo.pipeline import MarkerPipeline
+from master.stereo.pipeline import SolvedPose
 
 _KEPT = 200_000  # latencies kept for the quantiles: about an hour at 60 Hz
 
@@ -20,6 +20,14 @@ class Source(Protocol):
 
     def get(self, timeout_s: float) -> MarkerDetections | None:
         """The next message, or None when none came in time."""
+        ...
+
+
+class Solver(Protocol):
+    """What makes poses of detections; a `MarkerPipeline`, or a `LivePipeline`."""
+
+    def push(self, message: MarkerDetections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
         ...
 
 
@@ -54,7 +62,7 @@ class RunFigures:
 
 def run(
     source: Source,
-    pipeline: MarkerPipeline,
+    pipeline: Solver,
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,

@@ -17,10 +17,10 @@ from master.ingest import Ingest
 from master.outputs.bus import BusSink
 from master.outputs.files import PosesFile
 from master.outputs.sink import Sink
-from master.rig import RigSetup, build_pipeline
+from master.rig import RigSetup
 from master.stages import StageTimes
-from master.stereo.pipeline import MarkerPipeline
 from master.summary import write_summary
+from master.tuning import LivePipeline, RigFiles, RigTuning
 
 _REPORT_S = 1.0
 _JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
@@ -37,6 +37,7 @@ class LiveSettings:
         start_timeout_s: How long the first slave waits for the others.
         poses: Where to write poses.npz, or None.
         summary: Where to write the summary, or None.
+        files: Where the setup was read: what changes there is used at once. None: the setup stays as it is.
     """
 
     beacon: tuple[str, int]
@@ -45,6 +46,7 @@ class LiveSettings:
     start_timeout_s: float = 5.0
     poses: Path | None = None
     summary: Path | None = None
+    files: RigFiles | None = None
 
 
 def run_live(
@@ -68,7 +70,8 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    pipeline = build_pipeline(setup, stages)
+    pipeline = LivePipeline(setup, stages)
+    tuning = None if settings.files is None else RigTuning(settings.files, setup, pipeline, say)
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
         stack.callback(bus.close)
@@ -87,7 +90,7 @@ def run_live(
             sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.rig.markers)))
         for sink in sinks:
             stack.callback(sink.close)
-        reporter = _Reporter(setup.rig.cameras, clock, bus, ingest, pipeline, figures, stop, say)
+        reporter = _Reporter(setup.rig.cameras, clock, bus, ingest, pipeline, tuning, figures, stop, say)
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
@@ -118,7 +121,8 @@ class _Reporter:
         clock: Clock,
         bus: Bus,
         ingest: Ingest,
-        pipeline: MarkerPipeline,
+        pipeline: LivePipeline,
+        tuning: RigTuning | None,
         figures: RunFigures,
         stop: threading.Event,
         say: Callable[[str], None],
@@ -127,6 +131,7 @@ class _Reporter:
         self._session = secrets.randbits(63)
         self._cameras, self._clock, self._bus = cameras, clock, bus
         self._ingest, self._pipeline, self._figures = ingest, pipeline, figures
+        self._tuning = tuning
         self._stop, self._say = stop, say
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -135,18 +140,22 @@ class _Reporter:
         """The report of this moment; of what never happened only `received` is told, to keep it short."""
         events = self._ingest.counts.items()
         told = {name: number for name, number in events if number or name.endswith("received")}
-        return health(self._session, self._clock, self._figures, dict(self._pipeline.counts) | told)
+        changes = {} if self._tuning is None else self._tuning.counts()
+        return health(self._session, self._clock, self._figures, dict(self._pipeline.counts) | told | changes)
 
     def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "stop" ends the master.
+        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "stop" ends the master.
 
         Raises:
+            CalibrationError: The files cannot be used; the old ones still are.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        if command.verb not in ("report", "stop"):
-            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are report, stop")
-        if command.verb == "stop":
-            self._stop.set()
+        verbs = {"report": lambda: None, "stop": self._stop.set}
+        if self._tuning is not None:
+            verbs["reload"] = self._tuning.reload
+        if command.verb not in verbs:
+            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
+        verbs[command.verb]()
         return self.health()
 
     def work(self) -> None:
@@ -155,6 +164,8 @@ class _Reporter:
         started = False
         poses = 0
         while not self._stop.wait(_REPORT_S):
+            if self._tuning is not None:
+                self._tuning.look()
             self._bus.publish("health", MASTER, self.health())
             heard = self._ingest.connected
             if heard != connected:

@@ -9,7 +9,6 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from master.filters import OneEuro
 from master.ik.tracker import HandTracker
-from master.stages import StageTimes
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, Stage
@@ -93,7 +92,7 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
         raise CalibrationError(f"{hand_file}: {error}") from error
 
 
-def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = True) -> MarkerPipeline:
+def build_pipeline(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> MarkerPipeline:
     """The pipeline this rig's file describes.
 
     Args:
@@ -106,7 +105,6 @@ def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = Tru
     """
     rates = {name: camera.frame_rate_hz for name, camera in setup.cameras.items()}
     settings = setup.rig.filter
-    timed: Stage = stage
     return MarkerPipeline(
         setup.models,
         setup.hand,
@@ -116,5 +114,5 @@ def build_pipeline(setup: RigSetup, stage: StageTimes, *, continuous: bool = Tru
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
         volume=setup.rig.volume,
-        stage=timed,
+        stage=stage,
     )

@@ -1,0 +1,294 @@
+"""A master that changes its geometry while it tracks: poses follow the new files, and a bad file changes nothing."""
+
+import threading
+import time
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import FilterCalibration, RigCalibration, save
+from common.clock import SystemClock
+from common.errors import BusError, CalibrationError
+from common.keys import new_key
+from common.messages import Command, HandPose, MarkerDetections
+from common.zenoh_bus import ZenohBus
+from master.live import LiveSettings, run_live
+from master.rig import RigSetup, load_setup
+from master.stages import StageTimes
+from master.stereo.caps import CapModel
+from master.tuning import LivePipeline, RigFiles, RigTuning
+from slave.uplink import Uplink
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
+from tests.hand_helpers import detections as seen
+from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
+
+ASIDE_M = 0.1
+
+
+@pytest.fixture(scope="module")
+def exact_run() -> SyntheticRun:
+    return synthetic_run(60)
+
+
+def aside(rig: RigCalibration, dx_m: float = ASIDE_M) -> RigCalibration:
+    """The same rig, its frame `dx_m` further along -x: everything is seen as far along +x."""
+    poses = {name: rig.camera_pose(name) for name in rig.cameras}
+    for T in poses.values():
+        T[0, 3] += dx_m
+    moved = {name: tuple(tuple(float(v) for v in row) for row in T) for name, T in poses.items()}
+    return msgspec.structs.replace(rig, T_rig_camera=moved)
+
+
+def palm_x(pose: HandPose) -> float:
+    return float(pose.position_m[0, 0])
+
+
+def with_change(run: SyntheticRun, setup: RigSetup, at: int) -> tuple[list[HandPose], LivePipeline]:
+    """All poses of the run, the setup changed before message number `at` while messages go on."""
+    pipeline = LivePipeline(run.setup, StageTimes())
+    builder = threading.Thread(target=pipeline.replace, args=(setup,))
+    poses: list[HandPose] = []
+    for number, message in enumerate(run.messages):
+        if number == at:
+            builder.start()
+        if number == at + 10:
+            builder.join()
+        poses += [one.pose for one in pipeline.push(message)]
+    return poses, pipeline
+
+
+def test_poses_go_on_without_a_gap_when_the_pipeline_changes(exact_run: SyntheticRun) -> None:
+    plain = LivePipeline(exact_run.setup, StageTimes())
+    expected = [one.pose for message in exact_run.messages for one in plain.push(message)]
+    same = setup_of(msgspec.structs.replace(exact_run.setup.rig, filter=FilterCalibration(beta=100.0)))
+    poses, pipeline = with_change(exact_run, same, 60)
+    assert [pose.t_ns for pose in poses] == [pose.t_ns for pose in expected], "none is lost, none comes twice"
+    assert pipeline.counts["poses"] == plain.counts["poses"] == len(poses)
+    truth = [hand_at(pose.t_ns * 1e-9).position_m for pose in poses]
+    error_mm = [
+        1e3 * np.linalg.norm(p.position_m - t, axis=1).mean() for p, t in zip(poses, truth, strict=True)
+    ]
+    assert max(error_mm[3:]) < 6.0, "also right after the change"
+
+
+def test_poses_follow_the_new_geometry(exact_run: SyntheticRun) -> None:
+    poses, _ = with_change(exact_run, setup_of(aside(exact_run.setup.rig)), 60)
+    off = np.array([palm_x(pose) - hand_at(pose.t_ns * 1e-9).position_m[0, 0] for pose in poses[3:]])
+    assert abs(off[:20]).max() < 5e-3
+    assert abs(off[-15:] - ASIDE_M).max() < 5e-3
+    assert not ((off > 0.01) & (off < ASIDE_M - 0.01)).any(), "no pose is of both"
+
+
+def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
+    stages, count = StageTimes(), 0
+    pipeline = LivePipeline(exact_run.setup, stages)
+    for message in exact_run.messages[:40]:
+        count += len(pipeline.push(message))
+    before = stages._count["filter"]
+    pipeline.replace(exact_run.setup)
+    assert stages._count["filter"] == before == count
+
+
+def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:
+    """A calib_json tree of the made rig."""
+    for part in ("cameras", "rigs", "hands"):
+        (folder / part).mkdir(parents=True)
+    save(folder / "rigs/bench.json", rig or rig_file())
+    save(folder / "hands/made-right.json", RIGHT.profile)
+    for name in ("left", "right"):
+        save(folder / f"cameras/{name}.json", camera_file(name))
+    return RigFiles(folder, "bench")
+
+
+class Told:
+    """A `RigTuning` on files of its own, and what it said."""
+
+    def __init__(self, folder: Path) -> None:
+        self.files = tree(folder)
+        self.lines: list[str] = []
+        setup = self.files.load()
+        self.pipeline = LivePipeline(setup, StageTimes())
+        self.tuning = RigTuning(self.files, setup, self.pipeline, self.lines.append)
+        self.rig_path = folder / "rigs/bench.json"
+
+    @property
+    def upcoming(self) -> bool:
+        return self.pipeline._next is not None
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Told:
+    return Told(tmp_path)
+
+
+def test_files_that_say_the_same_are_no_change(told: Told) -> None:
+    told.tuning.look()
+    told.tuning.reload()
+    told.rig_path.write_bytes(told.rig_path.read_bytes() + b"\n")
+    told.tuning.look()
+    assert told.lines == []
+    assert told.tuning.counts() == {"reload.applied": 0, "reload.refused": 0}
+
+
+@pytest.mark.parametrize("part", ["rigs/bench.json", "cameras/right.json", "hands/made-right.json"])
+def test_every_file_of_the_rig_is_followed(part: str, told: Told) -> None:
+    told.tuning.look()
+    path = told.files.calibration / part
+    content = msgspec.json.decode(path.read_bytes())
+    match part:
+        case "rigs/bench.json":
+            content["stamp_offset_us"] = {"right": 8000.0}
+        case "cameras/right.json":
+            content["intrinsics"]["fx_px"] = 501.0
+        case _:
+            content["markers"]["thumb"]["painted_m"] = 0.017
+    path.write_bytes(msgspec.json.encode(content))
+    told.tuning.look()
+    assert told.lines == ["changed files are in use"]
+    assert told.upcoming
+    assert told.tuning.counts() == {"reload.applied": 1, "reload.refused": 0}
+
+
+def test_a_broken_file_is_said_once_and_the_old_pipeline_stays(told: Told) -> None:
+    told.tuning.look()
+    told.rig_path.write_text('{"version": 1,')
+    told.tuning.look()
+    told.tuning.look()
+    assert len(told.lines) == 1
+    assert told.lines[0].startswith("changed files are not used: ")
+    assert "bench.json: Input data was truncated" in told.lines[0]
+    assert not told.upcoming
+    assert told.tuning.counts() == {"reload.applied": 0, "reload.refused": 1}
+
+
+@pytest.mark.parametrize(
+    ("part", "key", "value", "says"),
+    [
+        ("rigs/bench.json", "markers", ["thumb", "index", "back"], "markers: thumb, index, .* cannot become"),
+        ("rigs/bench.json", "cameras", ["right", "left"], "cameras: left, right cannot become right, left"),
+        ("rigs/bench.json", "cameras", ["left"], "two or more are needed"),
+        ("rigs/bench.json", "depth_model", "power_law", "the key 'power_law' is missing"),
+        (
+            "cameras/left.json",
+            "width_px",
+            800,
+            "'left': width_px: 640 cannot become 800 .*: restart all processes",
+        ),
+        ("cameras/left.json", "frame_rate_hz", 30.0, "frame_rate_hz: 60.0 cannot become 30.0"),
+        (
+            "hands/made-right.json",
+            "name",
+            "other",
+            "hand: made-right cannot become other .*: restart the master",
+        ),
+    ],
+)
+def test_what_needs_a_restart_is_refused_with_the_reason(
+    part: str, key: str, value: object, says: str, told: Told
+) -> None:
+    path = told.files.calibration / part
+    content = msgspec.json.decode(path.read_bytes())
+    content[key] = value
+    path.write_bytes(msgspec.json.encode(content))
+    with pytest.raises(CalibrationError, match=says):
+        told.tuning.reload()
+    assert not told.upcoming
+
+
+class Master:
+    """A live master on files of its own, two slaves that send a hand at rest, and somebody on the bus."""
+
+    def __init__(self, folder: Path, stop: threading.Event) -> None:
+        self.files = tree(folder / "calib")
+        key, beacon, endpoint = bytes.fromhex(new_key()), free_udp_port(), free_endpoint()
+        setup = load_setup(self.files.calibration, "bench")
+        settings = LiveSettings(
+            ("127.255.255.255", beacon),
+            ("127.0.0.1", 0),
+            endpoint,
+            2.0,
+            folder / "poses.npz",
+            None,
+            self.files,
+        )
+        self.lines: list[str] = []
+        args = (setup, key, settings, stop, self.lines.append)
+        self.thread = threading.Thread(target=run_live, args=args)
+        self.thread.start()
+        self.bus = ZenohBus(None, endpoint)
+        self.poses = self.bus.subscribe("hand")
+        self.slaves = {
+            name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in ("left", "right")
+        }
+        assert all(slave.wait_for_start(20.0) for slave in self.slaves.values())
+        self.sender = threading.Thread(target=self._send, args=(setup, stop))
+        self.sender.start()
+
+    def _send(self, setup: RigSetup, stop: threading.Event) -> None:
+        joints = hand_at(0.0)
+        points = RIGHT.marker_points(joints, MARKERS)
+        bias = CapModel(RIGHT, MARKERS).bias_px(joints, points, tuple(setup.models.values()))
+        seq = 0
+        while not stop.wait(0.015):
+            t_ns = time.monotonic_ns()
+            for c, (name, camera) in enumerate(setup.models.items()):
+                message: MarkerDetections = seen(name, seq, t_ns, camera.project(points) + bias[c])
+                self.slaves[name].send(msgspec.structs.replace(message, session=self.slaves[name].session))
+            seq += 1
+
+    def pose_near(self, x_m: float) -> bool:
+        """Whether poses come whose wrist is within 1 cm of `x_m`."""
+
+        def near() -> bool:
+            pose = self.poses.get(0.5)
+            return (
+                isinstance(pose, HandPose)
+                and bool(np.isfinite(palm_x(pose)))
+                and abs(palm_x(pose) - x_m) < 0.01
+            )
+
+        return until(near, 20.0)
+
+
+@contextmanager
+def master(folder: Path) -> Generator[Master, None, None]:
+    stop = threading.Event()
+    running = Master(folder, stop)
+    try:
+        yield running
+    finally:
+        stop.set()
+        running.sender.join()
+        running.thread.join(10.0)
+        running.bus.close()
+        for slave in running.slaves.values():
+            slave.close()
+
+
+def test_a_running_master_follows_its_files_and_survives_a_broken_one(tmp_path: Path) -> None:
+    home_m: Float = hand_at(0.0).position_m[0]
+    with master(tmp_path) as running:
+        assert running.pose_near(float(home_m[0]))
+        path = running.files.calibration / "rigs/bench.json"
+        save(path, aside(rig_file()))
+        assert running.pose_near(float(home_m[0]) + ASIDE_M)
+        path.write_text("{")
+        assert until(lambda: running.bus.ask(Command("master", "report"), 5.0).counts["reload.refused"] == 1)
+        with pytest.raises(
+            BusError, match=r"'master' refused 'reload': .*bench\.json: Input data was truncated"
+        ):
+            running.bus.ask(Command("master", "reload"), 5.0)
+        assert running.pose_near(float(home_m[0]) + ASIDE_M), "the old geometry stays"
+        save(path, rig_file())
+        report = running.bus.ask(Command("master", "reload"), 10.0)
+        assert report.counts["reload.applied"] == 2
+        assert running.pose_near(float(home_m[0]))
+    with np.load(tmp_path / "poses.npz") as poses:
+        steps_ms = np.diff(poses["t_ns"]) * 1e-6
+    assert (steps_ms > 0).all()
