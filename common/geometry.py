@@ -4,6 +4,10 @@ import numpy as np
 
 from common.arrays import Float
 
+_EYE = np.eye(3)
+_SKEW: Float = np.cross(_EYE[:, None], _EYE[None]).swapaxes(1, 2).reshape(3, 9)
+_UNSKEW: Float = 0.5 * _SKEW.T
+
 
 def quaternion_to_matrix(q_wxyz: Float) -> Float:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), normalised first."""
@@ -45,18 +49,21 @@ def matrix_to_quaternion(rotation: Float) -> Float:
 
 
 def rotation_vector_to_matrix(vector: Float) -> Float:
-    """Rotation matrix (3, 3) of a rotation vector (3,) [rad] (Rodrigues' formula)."""
-    angle = float(np.linalg.norm(vector))
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues' formula)."""
+    # A turn too small to be told from none is taken as this small, not divided by.
+    angle = np.maximum(np.sqrt((vector * vector).sum(axis=-1)), 1e-9)[..., None, None]
     k = skew(vector)
-    if angle < 1e-8:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1 - np.cos(angle)) / angle**2 * (k @ k)
+    return _EYE + np.sin(angle) / angle * k + (1 - np.cos(angle)) / (angle * angle) * (k @ k)
 
 
 def skew(vector: Float) -> Float:
-    """Matrix (3, 3) with `skew(a) @ b == cross(a, b)`."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Matrices (..., 3, 3) with `skew(a) @ b == cross(a, b)`."""
+    return (vector @ _SKEW).reshape(*vector.shape, 3)
+
+
+def unskew(matrix: Float) -> Float:
+    """Vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3): `unskew(skew(a)) == a`."""
+    return matrix.reshape(*matrix.shape[:-2], 9) @ _UNSKEW
 
 
 def cross(a: Float, b: Float) -> Float:

@@ -50,8 +50,6 @@ FINGER_JOINTS = (
 PALM_FRAME = "palm_frame"
 TIPS = CHAINS[:, 3]
 
-_NO_TWIST = np.eye(3)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chains:
@@ -114,7 +112,8 @@ class HandModel:
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
         turn: (5, 3, 3, 3) rest rotation of joint k + 1 in the frame of joint k.
-        before_abduction, after_abduction: (5, 3, 3) what stands on either side of the abduction in the formulas.
+        swing: (3, 5, 4, 3, 3) for each angle a the rotation from the angle before it, its rest turn included, is
+            swing[0] + cos a swing[1] + sin a swing[2].
     """
 
     profile: HandProfile
@@ -128,8 +127,7 @@ class HandModel:
     side_sign: float
     bone_m: Float
     turn: Float
-    before_abduction: Float
-    after_abduction: Float
+    swing: Float
 
     @classmethod
     def of(cls, profile: HandProfile) -> "HandModel":
@@ -149,8 +147,7 @@ class HandModel:
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
         couplings = profile.couplings or Couplings()
-        root = rotation[CHAINS[:, 0]]
-        still = np.broadcast_to(_NO_TWIST, (5, 3, 3))
+        side_sign = 1.0 if profile.side == "right" else -1.0
         return cls(
             profile=profile,
             rest_position_m=position,
@@ -160,43 +157,44 @@ class HandModel:
             dip_per_pip=couplings.dip_per_pip,
             mcp_per_pip=couplings.mcp_per_pip,
             mounts=_mounts(profile, where),
-            side_sign=1.0 if profile.side == "right" else -1.0,
+            side_sign=side_sign,
             bone_m=bone,
             turn=turn,
-            before_abduction=np.concatenate([root[:1], still[1:]]),
-            after_abduction=np.concatenate([still[:1], root[1:]]),
+            swing=_swing(rotation[CHAINS[:, 0]], turn, side_sign),
         )
 
     def forward(self, T_rig_palm: Float, angles_rad: Float) -> HandJoints:
         """Joint poses of a palm pose (..., 4, 4) and angles (..., 5, 4) [rad]; any matching leading axes."""
-        T = np.asarray(T_rig_palm, dtype=np.float64)
         chains = self.chains(np.asarray(angles_rad, dtype=np.float64))
-        lead, R_palm = chains.position_m.shape[:-3], T[..., :3, :3]
+        return self.joints(np.asarray(T_rig_palm, dtype=np.float64), chains)
+
+    def joints(self, T_rig_palm: Float, chains: Chains) -> HandJoints:
+        """All joints of a palm pose (..., 4, 4) whose fingers are bent like `chains`."""
+        lead, R_palm = chains.position_m.shape[:-3], T_rig_palm[..., :3, :3]
         position = np.empty((*lead, 26, 3))
         rotation = np.empty((*lead, 26, 3, 3))
         position[...] = self.rest_position_m
         rotation[...] = self.rest_rotation
         position[..., CHAINS, :] = chains.position_m
         rotation[..., CHAINS, :, :] = chains.rotation
-        position = position @ np.swapaxes(R_palm, -1, -2) + T[..., None, :3, 3]
-        return HandJoints(position, R_palm[..., None, :, :] @ rotation, T)
+        position = position @ np.swapaxes(R_palm, -1, -2) + T_rig_palm[..., None, :3, 3]
+        return HandJoints(position, R_palm[..., None, :, :] @ rotation, T_rig_palm)
 
     def chains(self, angles_rad: Float) -> Chains:
         """The fingers' joints in the palm frame, of angles (..., 5, 4) [rad]."""
-        lead = angles_rad.shape[:-2]
-        position = np.empty((*lead, 5, 4, 3))
-        rotation = np.empty((*lead, 5, 4, 3, 3))
-        bend = _rotate(0, -angles_rad[..., 1:])  # a flexion turns by -a about +x
-        swing = _rotate(1, self.side_sign * angles_rad[..., 0])
-        frame = self.before_abduction @ swing @ self.after_abduction @ bend[..., 0, :, :]
-        position[..., 0, :], rotation[..., 0, :, :] = self.rest_position_m[CHAINS[:, 0]], frame
+        still, with_cosine, with_sine = self.swing
+        angle = angles_rad[..., None, None]
+        local = still + np.cos(angle) * with_cosine + np.sin(angle) * with_sine  # (..., 5, 4, 3, 3)
+        rotation = np.empty(local.shape)
+        rotation[..., 0, :, :] = frame = local[..., 0, :, :] @ local[..., 1, :, :]
+        rotation[..., 1, :, :] = frame = frame @ local[..., 2, :, :]
+        rotation[..., 2, :, :] = frame = frame @ local[..., 3, :, :]
+        rotation[..., 3, :, :] = frame @ self.turn[:, 2]
+        position = np.empty((*local.shape[:-2], 3))
+        position[..., 0, :] = self.rest_position_m[CHAINS[:, 0]]
+        link = (rotation[..., :3, :, :] @ self.bone_m[..., None])[..., 0]
         for k in range(3):
-            link = (frame @ self.bone_m[:, k, :, None])[..., 0]
-            position[..., k + 1, :] = position[..., k, :] + link
-            frame = frame @ self.turn[:, k]
-            if k < 2:
-                frame = frame @ bend[..., k + 1, :, :]
-            rotation[..., k + 1, :, :] = frame
+            position[..., k + 1, :] = position[..., k, :] + link[..., k, :]
         return Chains(position, rotation)
 
     def marker_points(self, joints: HandJoints, names: tuple[str, ...]) -> Float:
@@ -234,15 +232,23 @@ class HandModel:
         return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
 
 
-def _rotate(axis: int, angle: Float) -> Float:
-    """Rotations (..., 3, 3) about coordinate axis 0 or 1."""
-    c, s = np.cos(angle), np.sin(angle)
-    matrix = np.zeros((*angle.shape, 3, 3))
+def _swing(root: Float, turn: Float, side_sign: float) -> Float:
+    """`HandModel.swing` of root rotations (5, 3, 3) and rest turns (5, 3, 3, 3)."""
+    abduct, bend = _about(1, side_sign), _about(0, -1.0)  # a flexion turns by -a about +x
+    out = np.empty((3, 5, 4, 3, 3))
+    out[:, 0, 0], out[:, 1:, 0] = root[0] @ abduct, abduct[:, None] @ root[1:]
+    out[:, :, 1] = bend[:, None]
+    out[:, :, 2:] = turn[:, :2] @ bend[:, None, None]
+    return out
+
+
+def _about(axis: int, sign: float) -> Float:
+    """Rotation by sign * a about coordinate axis 0 or 1 (3, 3, 3): what is constant, times cos a, times sin a."""
+    parts = np.zeros((3, 3, 3))
     i, j = (axis + 1) % 3, (axis + 2) % 3
-    matrix[..., axis, axis] = 1.0
-    matrix[..., i, i] = matrix[..., j, j] = c
-    matrix[..., i, j], matrix[..., j, i] = -s, s
-    return matrix
+    parts[0, axis, axis] = parts[1, i, i] = parts[1, j, j] = 1.0
+    parts[2, i, j], parts[2, j, i] = -sign, sign
+    return parts
 
 
 def _rest(profile: HandProfile, where: str) -> tuple[Float, Float]:

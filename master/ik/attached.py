@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.geometry import cross
+from common.geometry import skew
 from common.hand_model import CHAINS, Chains, HandModel
 from master.ik.parameters import HandParameters
 
-_AXIS_JOINT = [0, 0, 1, 2]  # joint of the chain at which abduction, flexion, PIP, DIP turn
+_AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abduction, flexion, PIP, DIP turn
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,22 +95,16 @@ class Attached:
         )
 
     def place(self, chains: Chains) -> Float:
-        """Where the points are (P, 3) [m], palm frame."""
-        R, p = chains.rotation[self.finger, self.level], chains.position_m[self.finger, self.level]
+        """Where the points are (..., P, 3) [m], palm frame; leading axes as those of the chains."""
+        R = chains.rotation[..., self.finger, self.level, :, :]
+        p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
 
     def jacobian(self, chains: Chains, points_m: Float) -> Float:
-        """Derivatives (P, 3, n) [m/rad] of the points (P, 3), palm frame, by the free angles."""
-        axes = np.concatenate([self.abduction_axis, -chains.rotation[:, :3, :, 0]], axis=1)
-        arm = points_m[:, None] - chains.position_m[:, _AXIS_JOINT][self.finger]
-        return np.swapaxes(cross(axes[self.finger], arm), 1, 2) @ self.moves
-
-
-def minus_skew(vectors: Float) -> Float:
-    """(P, 3, 3) with `m[p] @ w == cross(w, vectors[p])`."""
-    out = np.zeros((len(vectors), 3, 3))
-    x, y, z = vectors[:, 0], vectors[:, 1], vectors[:, 2]
-    out[:, 0, 1], out[:, 0, 2] = z, -y
-    out[:, 1, 0], out[:, 1, 2] = -z, x
-    out[:, 2, 0], out[:, 2, 1] = y, -x
-    return out
+        """Derivatives (..., P, 3, n) [m/rad] of the points (..., P, 3), palm frame, by the free angles."""
+        axes = np.empty((*chains.position_m.shape[:-3], 5, 4, 3))
+        axes[..., :1, :] = self.abduction_axis
+        np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])
+        arm = points_m[..., None, :] - chains.position_m[..., self.finger[:, None], _AXIS_JOINT, :]
+        turned = skew(axes)[..., self.finger, :, :, :] @ arm[..., None]  # (..., P, 4, 3, 1)
+        return np.swapaxes(turned[..., 0], -1, -2) @ self.moves

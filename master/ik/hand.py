@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import fit_rigid
+from common.geometry import fit_rigid, skew
 from common.hand_model import HandJoints, HandModel
-from master.ik.attached import Attached, minus_skew
+from master.ik.attached import Attached
 from master.ik.hand_problem import Facing, HandProblem, Minimum, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
@@ -99,9 +99,8 @@ class HandSolver:
             None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(dt_s)),
             None if facing is None else Facing(facing, 1.0 / self.priors.facing),
         )
-        seeds = self._seeds(points_m, seen, facing) if last is None else [self._seed_of(last)]
-        best = min((problem.minimise(T, x) for T, x in seeds), key=lambda found: found.linear.cost)
-        return self._solution(best, points_m)
+        seeds = self._seeds(points_m, seen, facing) if last is None else self._seed_of(last)
+        return self._solution(problem.minimise(*seeds), points_m)
 
     def _beliefs(
         self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None
@@ -114,10 +113,10 @@ class HandSolver:
         return prior.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, dt_s))
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
-        return last.T_rig_palm, self._parameters.free_of(last.angles_rad)
+        return last.T_rig_palm[None], self._parameters.free_of(last.angles_rad)[None]
 
-    def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> list[tuple[Float, Float]]:
-        """Three hands, open to closed, each laid on the markers as a rigid body."""
+    def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
+        """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
         seeds: list[tuple[Float, Float]] = []
         weight = np.where(self._attached.on_finger[seen, 0], 1.0, 3.0)
         for bend in (0.1, 0.7, 1.3):
@@ -132,20 +131,20 @@ class HandSolver:
                 expected = np.vstack([expected, model[seen].mean(axis=0) + np.array([0.0, 0.05, 0.0])])
                 w = np.append(weight, 0.3)
             seeds.append((fit_rigid(observed, expected, w), x))
-        return seeds
+        return np.array([T for T, _ in seeds]), np.array([x for _, x in seeds])
 
     def _solution(self, best: Minimum, points_m: Float) -> HandSolution:
         T = best.T_rig_palm
         low, high = self.model.limits_rad[..., 0], self.model.limits_rad[..., 1]
         # The bounds hold already; what is cut is the rounding of a coupled angle.
         angles = np.minimum(np.maximum(self._parameters.angles(best.x), low), high)
-        joints = self.model.forward(T, angles)
         chains = self.model.chains(angles)
+        joints = self.model.joints(T, chains)
         marker = self._attached.place(chains) @ T[:3, :3].T + T[:3, 3]
         local = self._joints.place(chains)
         count, n = len(local), 6 + len(best.x)
         J = np.empty((count, 3, n))
-        J[:, :, :3] = minus_skew(local @ T[:3, :3].T)
+        J[:, :, :3] = skew(-local @ T[:3, :3].T)
         J[:, :, 3:6] = np.eye(3)
         J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local)
         cov = (J.reshape(3 * count, n) @ np.linalg.inv(best.linear.normal)).reshape(count, 3, n)
@@ -155,7 +154,7 @@ class HandSolver:
             joints=joints,
             cov_m2=cov @ np.swapaxes(J, 1, 2),
             residual_m=np.asarray(np.linalg.norm(marker - points_m, axis=1), np.float64),
-            cost=best.linear.cost,
+            cost=float(best.linear.cost),
             iterations=best.iterations,
         )
 

@@ -44,8 +44,8 @@ class HandParameters:
         return cls(free, complete, low.reshape(20)[free], high.reshape(20)[free])
 
     def angles(self, x: Float) -> Float:
-        """Angles (5, 4) of the free ones (n,)."""
-        return (self.complete @ x).reshape(5, 4)
+        """Angles (..., 5, 4) of the free ones (..., n)."""
+        return (x @ self.complete.T).reshape(*x.shape[:-1], 5, 4)
 
     def free_of(self, angles_rad: Float) -> Float:
         """The free ones (n,) of angles (5, 4)."""

@@ -61,38 +61,35 @@ class Priors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnglePrior:
-    """Beliefs about the free angles x: |rows x - means|^2 + |weight (x - mean)|^2.
+    """Beliefs about the free angles x, summed up: x normal x / 2 - pull x + constant, half a sum of squares.
 
     Attributes:
-        rows, means: (P, n), (P,) constant rows, each divided by its standard deviation.
-        weight, mean: (K, n) beliefs about single angles.
-        normal: (n, n) their normal matrix, all together.
+        normal: (n, n).
+        pull: (n,).
+        constant: So that the cost is that of the squares.
     """
 
-    rows: Float
-    means: Float
-    weight: Float
-    mean: Float
     normal: Float
+    pull: Float
+    constant: float
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters, priors: Priors) -> "AnglePrior":
         """What holds of every hand in every frame."""
         rows, means = _natural_rows(model, parameters, priors)
-        n = len(parameters.free)
-        return cls(rows, means, np.zeros((0, n)), np.zeros((0, n)), rows.T @ rows)
+        return cls(rows.T @ rows, means @ rows, 0.5 * float(means @ means))
 
     def and_single(self, weight: Float, mean: Float) -> "AnglePrior":
         """With a belief about single angles added: inverse standard deviations and means (n,)."""
-        weights = np.concatenate([self.weight, weight[None]])
-        means = np.concatenate([self.mean, mean[None]])
-        return AnglePrior(self.rows, self.means, weights, means, self.normal + np.diag(weight**2))
+        normal, squared = self.normal.copy(), weight * weight
+        normal.flat[:: len(normal) + 1] += squared
+        pull = squared * mean
+        return AnglePrior(normal, self.pull + pull, self.constant + 0.5 * float(pull @ mean))
 
-    def cost_and_gradient(self, x: Float) -> tuple[float, Float]:
-        """Half the sum of squares at x (n,), and its derivative (n,)."""
-        r = self.rows @ x - self.means
-        d = self.weight * (x - self.mean)
-        return 0.5 * float(r @ r + (d * d).sum()), r @ self.rows + (self.weight * d).sum(axis=0)
+    def cost_and_gradient(self, x: Float) -> tuple[Float, Float]:
+        """Half the sum of squares (...) at x (..., n), and its derivative (..., n)."""
+        pushed = x @ self.normal
+        return np.vecdot(0.5 * pushed - self.pull, x) + self.constant, pushed - self.pull
 
 
 def hidden_belief(

@@ -24,6 +24,8 @@ _COAST_S = 0.12  # a lost finger's motion fades with this time constant
 _DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _BAD_FIT_M = 8e-3
+_MODEL_M = 1e-3  # bones and caps are known to about this
+_EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000: a marker this far off may be noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,10 +141,9 @@ class HandTracker:
             fingers = frozenset(self._finger[seen].tolist())
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, fingers)
         solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing)
-        if solution is not None and last is not None and _worst(solution) > _BAD_FIT_M:
-            # The last pose may have led into the wrong valley: look once without it.
-            fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
-            if fresh is not None and _worst(fresh) < 0.5 * _worst(solution):
+        if solution is not None and last is not None:
+            fresh = self._afresh(solution, points_m, cov_m2, hidden, facing)
+            if fresh is not None:
                 solution, last, self._memory = fresh, None, _Memory(self.model)  # the leap was no motion
         if solution is not None:
             solution = self._refine(solution, points_m, cov_m2)
@@ -155,6 +156,36 @@ class HandTracker:
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
+
+    def _afresh(
+        self,
+        found: HandSolution,
+        points_m: Float,
+        cov_m2: Float,
+        hidden: tuple[Float, Float] | None,
+        facing: Float | None,
+    ) -> HandSolution | None:
+        """The hand without the last pose, which may have led into the wrong valley; None: `found` is no worse.
+
+        Asked only where a marker is farther off than its noise explains: half a cap seen may be centimetres off.
+        """
+        worst_m = self._unexplained_m(found, points_m, cov_m2)
+        if worst_m <= _BAD_FIT_M:
+            return None
+        fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
+        if fresh is None or self._unexplained_m(fresh, points_m, cov_m2) >= 0.5 * worst_m:
+            return None
+        return fresh
+
+    def _unexplained_m(self, solution: HandSolution, points_m: Float, cov_m2: Float) -> float:
+        """The largest distance [m] of a marker from its place on the hand that its noise does not explain."""
+        far = np.flatnonzero(solution.residual_m > _BAD_FIT_M)
+        if not len(far):
+            return 0.0
+        off = points_m[far] - self.model.marker_points(solution.joints, self.markers)[far]
+        noise = cov_m2[far] + _MODEL_M**2 * np.eye(3)
+        surprise = np.vecdot(off, np.linalg.solve(noise, off[..., None])[..., 0])
+        return float(np.max(solution.residual_m[far], where=surprise > _EXPLAINED, initial=0.0))
 
     def peek(
         self, points_m: Float, cov_m2: Float, towards_cameras: Float, *, curled: bool = True
@@ -228,8 +259,3 @@ def pose_of(
         markers_cov_m2=markers_cov_m2,
         inside_volume=inside(volume, position),
     )
-
-
-def _worst(solution: HandSolution) -> float:
-    residual = solution.residual_m[np.isfinite(solution.residual_m)]
-    return float(residual.max()) if len(residual) else 0.0
