@@ -1,5 +1,6 @@
 """A live master: opens bus, ingest and sinks, runs the loop, reports once a second, writes the summary."""
 
+import gc
 import secrets
 import threading
 from collections.abc import Callable
@@ -94,6 +95,8 @@ def run_live(
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
+        gc.collect()
+        gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         run(ingest, pipeline, sinks, clock, figures, stop)
         stop.set()
         thread.join(_JOIN_S)
