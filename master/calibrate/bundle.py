@@ -1,0 +1,315 @@
+"""Least squares over lenses, places of cameras, places of the board and the board's own shape, all at once.
+
+Every image sees corners i of the board through  X_rig = T_rig_board (c_i + s_i),  X = T_camera_rig X_rig,  pixel =
+lens(X), where c_i is the drawn corner and s_i how far it lies from there on the real, never quite flat board. Poses of
+the board touch only their own view, so they are eliminated view by view (Schur complement; Triggs et al., Bundle
+adjustment - a modern synthesis, 2000, section 6) and the step is solved in what all views share. Damping by
+Marquardt. The shape has a prior of standard deviation `SHAPE_SD_M` about the drawn one, which also settles where the
+board's frame lies and how large it is: few views leave it as drawn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import cv2
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import FitError
+from common.geometry import rigid, rotation_vector_to_matrix, transform
+
+LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
+SHAPE_SD_M = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
+_MOST_STEPS = 100
+_STOP = 1e-9  # relative gain of a step
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """Corners of one image.
+
+    Attributes:
+        camera, view: Indices into the bundle.
+        corners: Numbers (n,) of the corners seen.
+        uv: Where (n, 2) [px].
+    """
+
+    camera: int
+    view: int
+    corners: Int
+    uv: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """What is estimated.
+
+    Attributes:
+        lenses: (C, 9) in the order `LENS`.
+        T_camera_rig: (C, 4, 4) [m].
+        T_rig_board: (V, 4, 4) [m].
+        drawn_m: Corners of the board as drawn (N, 3) [m].
+        shape_m: How far the real ones lie from there (N, 3) [m].
+    """
+
+    lenses: Float
+    T_camera_rig: Float
+    T_rig_board: Float
+    drawn_m: Float
+    shape_m: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Free:
+    """Which of the shared numbers are estimated; poses of the board always are.
+
+    Attributes:
+        lenses: (C, 9).
+        cameras: (C,): the camera's place.
+        shape: The board's shape.
+    """
+
+    lenses: Bool
+    cameras: Bool
+    shape: bool
+
+    def mask(self, corners: int) -> Bool:
+        """The shared numbers in a row: lenses, places, shape."""
+        parts = (self.lenses.ravel(), np.repeat(self.cameras, 6), np.full(3 * corners, self.shape))
+        return np.concatenate(parts)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """A bundle at its optimum.
+
+    Attributes:
+        bundle: The estimate.
+        residuals: Measured less predicted corners (n, 2) [px] of each observation.
+        sigma_px: Standard deviation of one coordinate, from the residuals and what was spent on the estimate.
+        covariance: (S, S) of the shared numbers, zero where not free.
+    """
+
+    bundle: Bundle
+    residuals: tuple[Float, ...]
+    sigma_px: float
+    covariance: Float
+
+    def lens_sd(self, camera: int) -> Float:
+        """Standard deviations (9,) of a lens; 0: held."""
+        return np.sqrt(np.diag(self.covariance)[9 * camera : 9 * camera + 9])
+
+    def place_sd(self, camera: int) -> Float:
+        """Standard deviations (6,) of a camera's place: rotation vector [rad], translation [m]; 0: held."""
+        at = 9 * len(self.bundle.lenses) + 6 * camera
+        return np.sqrt(np.diag(self.covariance)[at : at + 6])
+
+
+def solve(
+    observations: Sequence[Observation],
+    start: Bundle,
+    free: Free,
+    cauchy_px: float | None = None,
+    sigma_px: float = 0.2,
+) -> Solution:
+    """Minimise the sum of squared residuals, or with `cauchy_px` the sum of Cauchy losses per corner.
+
+    Args:
+        observations: At least one; every view of `start` is in one of them.
+        start: Near the optimum.
+        free: What to estimate.
+        cauchy_px: Residual [px] at which a corner begins to lose its say; None: plain least squares.
+        sigma_px: Standard deviation of a corner [px], against which the prior of the shape is weighed.
+
+    Raises:
+        FitError: The observations do not determine what is free.
+    """
+    mask = free.mask(len(start.drawn_m))
+    prior = (sigma_px / SHAPE_SD_M) ** 2 if free.shape else 0.0
+    now, damping = start, 1e-3
+    cost, normal = _normal_equations(observations, now, prior, cauchy_px)
+    for _ in range(_MOST_STEPS):
+        step = _step(normal, mask, damping)
+        tried = now if step is None else _moved(now, *step)
+        new_cost, new_normal = _normal_equations(observations, tried, prior, cauchy_px)
+        if step is not None and new_cost <= cost:  # False where it is NaN: a board went through a camera
+            gain = cost - new_cost
+            now, cost, normal = tried, new_cost, new_normal
+            damping = max(damping / 10, 1e-10)
+            if gain <= _STOP * cost:
+                break
+        else:
+            damping *= 10
+            if damping > 1e8:
+                break
+    residuals = tuple(_residual(seen, now) for seen in observations)
+    return _solution(now, residuals, normal, mask, free)
+
+
+def predict(bundle: Bundle, seen: Observation) -> Float:
+    """Pixels (n, 2) where the corners of an observation should be."""
+    points = _camera_points(bundle, seen)[2]
+    lens = bundle.lenses[seen.camera]
+    uv, _ = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
+    return np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+
+
+def rms(residuals: Sequence[Float]) -> float:
+    """Root mean square distance [px] of corners (OpenCV's measure: both coordinates under one root)."""
+    return float(np.sqrt(np.mean(np.concatenate([(r**2).sum(axis=1) for r in residuals]))))
+
+
+_ZERO = np.zeros(3)
+Normal = tuple[Float, Float, Float, Float, Float]
+"""Shared (S, S), shared x view (V, S, 6), view (V, 6, 6), right sides (S,) and (V, 6)."""
+
+
+def _matrix(lens: Float) -> Float:
+    return np.array([[lens[0], 0.0, lens[2]], [0.0, lens[1], lens[3]], [0.0, 0.0, 1.0]])
+
+
+def _camera_points(bundle: Bundle, seen: Observation) -> tuple[Float, Float, Float]:
+    """Corners (n, 3) on the board, in the rig's frame, and in the camera's."""
+    on_board = bundle.drawn_m[seen.corners] + bundle.shape_m[seen.corners]
+    in_rig = transform(bundle.T_rig_board[seen.view], on_board)
+    return on_board, in_rig, transform(bundle.T_camera_rig[seen.camera], in_rig)
+
+
+def _residual(seen: Observation, bundle: Bundle) -> Float:
+    return seen.uv - predict(bundle, seen)
+
+
+def _skews(vectors: Float) -> Float:
+    """Matrices (n, 3, 3) with `_skews(a)[i] @ b == cross(a[i], b)`."""
+    out = np.zeros((len(vectors), 3, 3))
+    x, y, z = vectors.T
+    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -z, y, -x
+    return out - out.transpose(0, 2, 1)
+
+
+def _jacobian(seen: Observation, bundle: Bundle) -> tuple[Float, Float, Float, Float, Float]:
+    """Residuals (n, 2) and the derivatives of the prediction: lens (n, 2, 9), place of the camera and of the board
+    (n, 2, 6) each, shape (n, 2, 3). A place turns by exp(w) on its left and moves by t.
+    """
+    on_board, in_rig, points = _camera_points(bundle, seen)
+    lens = bundle.lenses[seen.camera]
+    projected, derivatives = cv2.projectPoints(points, _ZERO, _ZERO, _matrix(lens), lens[4:])
+    uv = np.asarray(projected, dtype=np.float64).reshape(-1, 2)
+    by_all = np.asarray(derivatives, dtype=np.float64).reshape(len(points), 2, -1)
+    by_point, by_lens = by_all[:, :, 3:6], by_all[:, :, 6:15]
+    rotation_c = bundle.T_camera_rig[seen.camera][:3, :3]
+    rotation_v = bundle.T_rig_board[seen.view][:3, :3]
+    by_camera = np.concatenate([-by_point @ _skews(in_rig @ rotation_c.T), by_point], axis=2)
+    by_rig = by_point @ rotation_c
+    by_view = np.concatenate([-by_rig @ _skews(on_board @ rotation_v.T), by_rig], axis=2)
+    return seen.uv - uv, by_lens, by_camera, by_view, by_rig @ rotation_v
+
+
+def _normal_equations(
+    observations: Sequence[Observation], bundle: Bundle, prior: float, cauchy_px: float | None
+) -> tuple[float, Normal]:
+    """Cost and the Gauss-Newton equations at a bundle."""
+    cameras, views, corners = len(bundle.lenses), len(bundle.T_rig_board), len(bundle.drawn_m)
+    size, shape_at = 15 * cameras + 3 * corners, 15 * cameras
+    shared, right = np.zeros((size, size)), np.zeros(size)
+    mixed, own, right_own = np.zeros((views, size, 6)), np.zeros((views, 6, 6)), np.zeros((views, 6))
+    cost = 0.0
+    for seen in observations:
+        residual, by_lens, by_camera, by_view, by_shape = _jacobian(seen, bundle)
+        square = (residual**2).sum(axis=1)
+        if cauchy_px is None:
+            weight = np.ones(len(square))
+            cost += float(square.sum())
+        else:
+            weight = 1.0 / (1.0 + square / cauchy_px**2)
+            cost += float(cauchy_px**2 * np.log1p(square / cauchy_px**2).sum())
+        c, v = seen.camera, seen.view
+        at = np.r_[9 * c : 9 * c + 9, 9 * cameras + 6 * c : 9 * cameras + 6 * c + 6]
+        by_both = np.concatenate([by_lens, by_camera], axis=2)
+        heavy = by_both * weight[:, None, None]
+        shared[np.ix_(at, at)] += np.einsum("nij,nik->jk", heavy, by_both)
+        right[at] += np.einsum("nij,ni->j", heavy, residual)
+        mixed[v, at] += np.einsum("nij,nik->jk", heavy, by_view)
+        heavy_view = by_view * weight[:, None, None]
+        own[v] += np.einsum("nij,nik->jk", heavy_view, by_view)
+        right_own[v] += np.einsum("nij,ni->j", heavy_view, residual)
+        if prior > 0.0:
+            to = shape_at + 3 * seen.corners[:, None] + np.arange(3)
+            heavy_shape = by_shape * weight[:, None, None]
+            shared[to[:, :, None], to[:, None, :]] += np.einsum("nij,nik->njk", heavy_shape, by_shape)
+            cross = np.einsum("nij,nik->njk", heavy_shape, by_both)
+            shared[to[:, :, None], at] += cross
+            shared[at[:, None], to.ravel()] += cross.reshape(-1, len(at)).T
+            right[to] += np.einsum("nij,ni->nj", heavy_shape, residual)
+            mixed[v, to] += np.einsum("nij,nik->njk", heavy_shape, by_view)
+    if prior > 0.0:
+        shape = bundle.shape_m.ravel()
+        cost += prior * float(shape @ shape)
+        shared[np.arange(shape_at, size), np.arange(shape_at, size)] += prior
+        right[shape_at:] -= prior * shape
+    return cost, (shared, mixed, own, right, right_own)
+
+
+def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, Float, Float]:
+    """The equations of what is free and shared, and what leads back to the views' own."""
+    shared, mixed, own, right, right_own = normal
+    shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
+    damped: Float = own * (1.0 + damping * np.eye(6))
+    sides: Float = np.concatenate([mixed.transpose(0, 2, 1), right_own[:, :, None]], axis=2)
+    try:
+        back = cast(Float, np.linalg.solve(damped, sides))
+    except np.linalg.LinAlgError as error:
+        raise FitError("a view has too few corners to place the board") from error
+    by_shared, by_right = back[:, :, :-1], back[:, :, -1]
+    schur = shared + damping * np.diag(np.diag(shared)) - np.tensordot(mixed, by_shared, ((0, 2), (0, 1)))
+    return schur, right - np.einsum("vsi,vi->s", mixed, by_right), by_shared, by_right
+
+
+def _step(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float] | None:
+    """Marquardt's step: shared (S,) and per view (V, 6); None: not determined, more damping is needed."""
+    schur, right, by_shared, by_right = _reduced(normal, mask, damping)
+    step = np.zeros(len(mask))
+    if mask.any():
+        # Scaled to a unit diagonal: pixels, radians and metres differ by orders of magnitude.
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(normal[0])[mask], 1e-300))
+        try:
+            step[mask] = scale * np.linalg.solve(schur * scale[:, None] * scale, right * scale)
+        except np.linalg.LinAlgError:
+            return None
+    return step, by_right - by_shared @ step[mask]
+
+
+def _moved(bundle: Bundle, shared: Float, own: Float) -> Bundle:
+    cameras = len(bundle.lenses)
+    places = shared[9 * cameras : 15 * cameras].reshape(cameras, 6)
+    return replace(
+        bundle,
+        lenses=bundle.lenses + shared[: 9 * cameras].reshape(cameras, 9),
+        T_camera_rig=np.stack([_turned(T, s) for T, s in zip(bundle.T_camera_rig, places, strict=True)]),
+        T_rig_board=np.stack([_turned(T, s) for T, s in zip(bundle.T_rig_board, own, strict=True)]),
+        shape_m=bundle.shape_m + shared[15 * cameras :].reshape(-1, 3),
+    )
+
+
+def _turned(T: Float, step: Float) -> Float:
+    return rigid(rotation_vector_to_matrix(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:])
+
+
+def _solution(
+    bundle: Bundle, residuals: tuple[Float, ...], normal: Normal, mask: Bool, free: Free
+) -> Solution:
+    schur, *_ = _reduced(normal, mask, 0.0)
+    numbers = 2 * sum(len(r) for r in residuals)
+    # The prior takes the place of measurements for what the shape cannot learn: seven numbers of its frame and size.
+    spent = int(mask[: 15 * len(bundle.lenses)].sum()) + 6 * len(bundle.T_rig_board)
+    spent += 3 * len(bundle.drawn_m) - 7 if free.shape else 0
+    sigma = float(np.sqrt(sum(float((r**2).sum()) for r in residuals) / max(numbers - spent, 1)))
+    covariance = np.zeros((len(mask), len(mask)))
+    if mask.any():
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(schur), 1e-300))
+        values, vectors = np.linalg.eigh(schur * scale[:, None] * scale)
+        # A direction that nothing determines has a variance without bound; this one is large enough to be refused.
+        inverse = (vectors / np.maximum(values, 1e-12)) @ vectors.T
+        covariance[np.ix_(mask, mask)] = sigma**2 * inverse * scale[:, None] * scale
+    return Solution(bundle, residuals, sigma, covariance)

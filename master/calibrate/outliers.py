@@ -1,0 +1,32 @@
+"""Which views are wrong, judged by the others."""
+
+import numpy as np
+from scipy import stats
+
+from common.arrays import Float
+
+FALSE_ALARM = 0.01  # chance that any good view of a set is rejected, were their errors log-normal
+_LEAST_SPREAD = 0.1  # of log rms: below it, views of one camera hardly ever agree
+
+
+def limit(errors: Float, dof: Float) -> float:
+    """The error above which a view does not belong to the others; infinite below four views.
+
+    The logarithms of good views' rms errors scatter about a common middle, more than chi-square alone would have it
+    (light, blur and tilt differ). Middle and spread are the median and the median absolute deviation of all views, so
+    up to half of them may be wrong; the quantile is Student's for as many views, at the level of `FALSE_ALARM`
+    for the whole set.
+
+    Args:
+        errors: Rms error (V,) of each view.
+        dof: Degrees of freedom (V,) of each error.
+    """
+    if len(errors) < 4:
+        return float("inf")
+    logs = np.log(np.maximum(errors, 1e-6))
+    middle = float(np.median(logs))
+    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    # The logarithm of an rms of n normal numbers has the standard deviation 1 / sqrt(2 n).
+    spread = max(spread, _LEAST_SPREAD, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
+    quantile = float(stats.t.ppf(1.0 - FALSE_ALARM / len(errors), len(errors) - 1))
+    return float(np.exp(middle + quantile * spread))
