@@ -1,4 +1,4 @@
-"""Command line of the master: `phalanx-master run | solve | view | report | calibrate`."""
+"""Command line of the master: `phalanx-master run | solve | view | report | camera | calibrate`."""
 
 import logging
 import os
@@ -20,6 +20,7 @@ from common.keys import rig_key
 from common.sim.scenes import NAMES, scene_by_name
 from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
+from master.camera_command import camera
 from master.live import LiveSettings, run_live
 from master.options import (
     CALIB_JSON,
@@ -174,6 +175,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     app.add_typer(calibrate_app(), name="calibrate")
+    app.command()(camera)
     try:
         app()
     except PhalanxError as error:

@@ -1,0 +1,158 @@
+"""`phalanx-master camera`: see how a running camera is set, and set it otherwise, over the bus. No restart."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from common.bus import Bus
+from common.calibration import CameraCalibration, load
+from common.camera_settings import WANTED, CameraSettings
+from common.errors import BusError, CalibrationError, PhalanxError
+from common.messages import Command, Health
+from common.streams import MASTER
+from common.zenoh_bus import ZenohBus
+from master.options import HERE_BUS, BusEnd
+
+ANSWER_S = (
+    15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table
+)
+APPEAR_S = 2.0  # whoever has just connected is not known everywhere yet
+STEP_S = 0.1
+_ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us")
+
+
+def camera(
+    name: Annotated[str, typer.Argument(help="Name of a camera whose slave is running.")],
+    exposure_us: Annotated[float | None, typer.Option(help="Exposure in microseconds.")] = None,
+    gain: Annotated[float | None, typer.Option(help="Analogue gain.")] = None,
+    colour_gains: Annotated[
+        str | None, typer.Option(metavar="RED,BLUE", help="Gains of red and blue relative to green.")
+    ] = None,
+    load_file: Annotated[
+        Path | None, typer.Option("--load", help="Camera file to use in place of the present content.")
+    ] = None,
+    save: Annotated[
+        bool, typer.Option("--save", help="Write what is in use to the slave's camera file.")
+    ] = False,
+    bus: BusEnd = HERE_BUS,
+) -> None:
+    """Show how a running camera is set, or set it otherwise: at once, read back, compared.
+
+    What the camera does not take is refused by name, and it goes back to what it had.
+
+    Examples:
+
+      phalanx-master camera left
+
+      phalanx-master camera left --exposure-us 4000 --gain 2
+
+      phalanx-master camera left --colour-gains 1.1,1.6 --save
+
+      phalanx-master camera left --load new/left.json --save
+    """
+    steps = commands(name, exposure_us, gain, colour_gains, load_file, save)
+    connection = ZenohBus(None, bus, beyond=True)
+    try:
+        health = tell(connection, steps)
+    finally:
+        connection.close()
+    typer.echo("\n".join(table(health)))
+
+
+def commands(
+    name: str,
+    exposure_us: float | None,
+    gain: float | None,
+    colour_gains: str | None,
+    load_file: Path | None,
+    save: bool,
+) -> list[Command]:
+    """What to tell the slave, one after the other; the last answer says how the camera is set then.
+
+    Raises:
+        CalibrationError: The file is broken or of another camera, or a value is none.
+    """
+    steps: list[Command] = []
+    if load_file is not None:
+        file = load(load_file, CameraCalibration)
+        if file.name != name:
+            raise CalibrationError(
+                f"{load_file}: name: it is the file of camera {file.name!r}, not of {name!r}"
+            )
+        steps.append(Command(name, "load", msgspec.json.encode(file).decode()))
+    settings = CameraSettings(
+        exposure_us=_positive(exposure_us, "--exposure-us"),
+        analogue_gain=_positive(gain, "--gain"),
+        colour_gains=_pair(colour_gains),
+    )
+    if settings != CameraSettings():
+        steps.append(Command(name, "set", msgspec.json.encode(settings).decode()))
+    if save:
+        steps.append(Command(name, "save"))
+    return steps or [Command(name, "settings")]
+
+
+def tell(bus: Bus, steps: list[Command]) -> Health:
+    """Ask one after the other; the last answer.
+
+    Raises:
+        BusError: No such camera is on the bus, or it refused; what was told before stays.
+    """
+    _appear(bus, steps[0].target)
+    health: Health | None = None
+    for step in steps:
+        health = bus.ask(step, ANSWER_S)
+    assert health is not None  # there is at least one step
+    return health
+
+
+def table(health: Health) -> list[str]:
+    """Lines for a person: each setting, what is wanted, what was read back; then what else the camera says."""
+    rows = [("setting", "wanted", "read back")]
+    for gauge, value in health.gauges.items():
+        if gauge.startswith(WANTED):
+            setting = gauge.removeprefix(WANTED)
+            got = health.gauges.get(setting)
+            rows.append((setting, f"{value:.6g}", "-" if got is None else f"{got:.6g}"))
+    also = [gauge for gauge in health.gauges if gauge in _ALSO or gauge.startswith("control.")]
+    rows += [(gauge, "", f"{health.gauges[gauge]:.6g}") for gauge in also]
+    rows += [(event, "", str(n)) for event, n in health.counts.items() if event.startswith("camera.")]
+    return [f"{name:<22} {wanted:>10} {got:>10}".rstrip() for name, wanted, got in rows]
+
+
+def _appear(bus: Bus, name: str) -> None:
+    """Wait a moment for the camera.
+
+    Raises:
+        BusError: It is not there; the text names those that are.
+    """
+    for _ in range(round(APPEAR_S / STEP_S)):
+        if name in bus.alive():
+            return
+        time.sleep(STEP_S)
+    there = ", ".join(sorted(bus.alive() - {MASTER})) or "none"
+    raise BusError(
+        f"no camera {name!r} is on the bus; there are: {there}. Is its slave running, and named so?"
+    )
+
+
+def _positive(value: float | None, option: str) -> float | None:
+    if value is not None and not 0.0 < value <= 1e9:
+        raise PhalanxError(f"{option} {value:g}: must be positive")
+    return value
+
+
+def _pair(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    parts = text.split(",")
+    try:
+        red, blue = (float(part) for part in parts)
+    except ValueError as error:
+        raise PhalanxError(f"--colour-gains {text}: write RED,BLUE, for example 1.1,1.6") from error
+    for value in (red, blue):
+        _positive(value, "--colour-gains")
+    return red, blue
