@@ -27,6 +27,7 @@ from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RG
 from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
+from master.volume import edges
 
 WIDTH_PX, HEIGHT_PX = 1600, 900
 _DPI = 100
@@ -203,7 +204,7 @@ def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None) -> None:
 
 
 def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
-    """Small view of the whole rig from the side: cameras, rays to the caps, hand."""
+    """Small view of the whole rig from the side: cameras, rays to the caps, hand, and the volume it states."""
     axes = figure.add_axes((0.012, 0.02, 0.215, 0.33))
     style(axes, "Rig, seen from the side")
     axes.set_xticks([])
@@ -215,6 +216,9 @@ def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
         axes.plot(at[list(strip), 0], at[list(strip), 1], color=unit((237, 184, 153)), lw=1.8)
     caps = poses.markers_m[row] @ rotation.T
     middle = np.mean([rig.camera_pose(name)[:3, 3] for name in rig.cameras], axis=0) @ rotation.T
+    if rig.volume is not None:
+        for edge in edges(rig.volume) @ rotation.T:
+            axes.plot(edge[:, 0], edge[:, 1], color=INK, lw=0.7, alpha=0.35)
     for name in rig.cameras:
         pose = rig.camera_pose(name)
         centre = pose[:3, 3] @ rotation.T
@@ -226,7 +230,7 @@ def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
         axes.annotate(name, (float(centre[0]), float(centre[1])), (float(away[0]), float(away[1])),
                       textcoords="offset points", color=INK, size=10, ha="center", va="center")  # fmt: skip
     axes.invert_yaxis()
-    axes.margins(0.12)
+    axes.margins(0.2)  # room for the names
 
 
 def _frustum(axes: Axes, pose: Float, rotation: Float) -> None:

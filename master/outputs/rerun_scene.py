@@ -6,6 +6,7 @@ The scene holds the times of the last second (rate), the images' state, and whic
 style.
 
     about                                text: what the colours mean
+    world/volume                         box that the rig states
     world/cameras/CAM                    place, pinhole; /image; /markers: the raw caps as this camera should see them;
                                          /detections: centroids as it saw them, where they are known
     world/hand/HAND/skeleton             5 finger strips and the palm, coloured by source
@@ -25,7 +26,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from common.arrays import Bool, Float, Image, Int
-from common.calibration import CameraCalibration, RigCalibration
+from common.calibration import CameraCalibration, RigCalibration, Volume
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
@@ -75,6 +76,8 @@ class RerunScene:
         self._images = CameraImages(recording, self._models)
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
         recording.log("about", rr.TextDocument(legend(), media_type="text/markdown"), static=True)
+        if rig.volume is not None:
+            self._log_volume(rig.volume)
         for name, model in self._models.items():
             self._log_camera(name, model)
         for i, name in enumerate(rig.markers):
@@ -122,6 +125,16 @@ class RerunScene:
         for name, value in [*health.counts.items(), *health.gauges.items()]:
             path = rr.new_entity_path(["plots", "health", health.source, name])
             self._scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
+
+    def _log_volume(self, volume: Volume) -> None:
+        low, high = np.array(volume.low_m), np.array(volume.high_m)
+        box = rr.Boxes3D(
+            centers=[(low + high) / 2.0],
+            half_sizes=[(high - low) / 2.0],
+            colors=[TRUTH_RGB],
+            radii=_FRUSTUM_LINE_M,
+        )
+        self._rec.log(f"{WORLD}/volume", box, static=True)
 
     def _log_camera(self, name: str, model: CameraModel) -> None:
         pose, path = model.T_rig_camera, camera_path(name)

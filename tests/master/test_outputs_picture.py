@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from msgspec.structs import replace
 
-from common.calibration import RigCalibration
+from common.calibration import RigCalibration, Volume
 from common.errors import RecordingError
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import TIPS, WRIST, HandModel
@@ -196,3 +196,22 @@ def test_a_full_disk_is_a_clear_error_and_the_older_picture_stays(
         draw_summary(path, Poses.of([pose()]), RIG, MODEL, {})
     assert path.read_bytes() == b"older"
     assert [p.name for p in tmp_path.iterdir()] == ["hand.png"]
+
+
+def test_the_small_view_holds_every_camera_of_a_large_rig_and_its_volume(tmp_path: Path) -> None:
+    aside = ((0.0, 0.0, -1.0, 0.55), (1.0, 0.0, 0.0, 0.0), (0.0, -1.0, 0.0, 0.42), EYE[3])
+    volume = Volume(low_m=(-0.2, -0.2, 0.4), high_m=(0.2, 0.2, 0.8))
+    four = replace(
+        RIG, cameras=(*RIG.cameras, "aside"), T_rig_camera=RIG.T_rig_camera | {"aside": aside}, volume=volume
+    )
+    poses = Poses.of([pose(0)])
+    images: list[npt.NDArray[np.uint8]] = []
+    for name, rig in (("four", four), ("open", replace(four, volume=None)), ("pair", RIG)):
+        draw_summary(tmp_path / f"{name}.png", poses, rig, MODEL, {})
+        image = cv2.imread(str(tmp_path / f"{name}.png"))
+        assert image is not None
+        images.append(np.asarray(image, np.uint8))
+    with_box, without_box, pair = (image[575:890, 10:370] for image in images)
+    assert np.abs(with_box.astype(int) - without_box).max() > 20
+    assert np.abs(without_box.astype(int) - pair).max() > 100
+    np.testing.assert_array_equal(images[0][:570], images[1][:570])  # nothing of it beyond its panel

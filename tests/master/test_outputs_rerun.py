@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from common.arrays import Image
 from common.bus import LoopbackBus
-from common.calibration import CameraCalibration, Intrinsics, RigCalibration
+from common.calibration import CameraCalibration, Intrinsics, RigCalibration, Volume
 from common.errors import PhalanxError, RecordingError
 from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import JOINTS, TIPS, HandModel
@@ -441,3 +441,23 @@ def test_the_web_viewer_takes_poses_is_closed_to_other_addresses_and_ends_on_sto
     with socket.socket() as client:
         assert client.connect_ex(("127.0.0.1", port)) != 0  # nothing is left running
     bus.close()
+
+
+def boxes_of(path: Path) -> list[list[float]]:
+    """Half sizes [m] of the boxes of the stated volume."""
+    return [
+        half
+        for chunk in rr.chunk.RrdReader(path).stream()
+        if chunk.entity_path == "/world/volume" and chunk.is_static
+        for row in chunk.to_record_batch().column("Boxes3D:half_sizes").to_pylist()
+        for half in row
+    ]
+
+
+def test_the_stated_volume_is_a_box_and_there_is_none_without(tmp_path: Path) -> None:
+    poses = Poses.of(moving_hand(2))
+    volume = Volume(low_m=(-0.2, -0.1, 0.4), high_m=(0.2, 0.3, 0.9))
+    write_rrd(tmp_path / "with.rrd", poses, replace(RIG, volume=volume), CAMERAS, MODEL)
+    write_rrd(tmp_path / "without.rrd", poses, RIG, CAMERAS, MODEL)
+    np.testing.assert_allclose(boxes_of(tmp_path / "with.rrd"), [[0.2, 0.2, 0.25]], rtol=1e-6)
+    assert boxes_of(tmp_path / "without.rrd") == []
