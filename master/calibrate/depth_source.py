@@ -31,6 +31,7 @@ class Pair:
         cameras: Names, first the left one.
         files: Their camera files.
         models: The same as camera models; None: intrinsics are missing.
+        origin: Where the camera files come from.
     """
 
     rig: RigCalibration | None = None
@@ -38,6 +39,7 @@ class Pair:
     cameras: tuple[str, str] = _LEFT_RIGHT
     files: tuple[CameraCalibration, ...] = ()
     models: tuple[CameraModel, CameraModel] | None = None
+    origin: str = "the recording"
 
     @property
     def size_px(self) -> tuple[int, int] | None:
@@ -62,7 +64,12 @@ class Measured:
     about: str
 
 
-def pair_of(rig: RigCalibration, files: Mapping[str, CameraCalibration], file_name: str = "") -> Pair:
+def pair_of(
+    rig: RigCalibration,
+    files: Mapping[str, CameraCalibration],
+    file_name: str = "",
+    origin: str = "the recording",
+) -> Pair:
     """The first two cameras of a rig; without models where one has no intrinsics.
 
     Raises:
@@ -78,7 +85,7 @@ def pair_of(rig: RigCalibration, files: Mapping[str, CameraCalibration], file_na
             CameraModel.of(two[0], rig.camera_pose(first)),
             CameraModel.of(two[1], rig.camera_pose(second)),
         )
-    return Pair(rig, file_name or rig.name, (first, second), two, models)
+    return Pair(rig, file_name or rig.name, (first, second), two, models, origin)
 
 
 def load_pair(
@@ -93,20 +100,22 @@ def load_pair(
         calibration: calib_json tree.
         rig_name: Rig.
         fov_deg: Nominal horizontal field of view, for camera files without intrinsics.
-        recorded: Camera files to take where the tree has none with intrinsics.
+        recorded: Camera files of a recording; the tree's are taken where they carry the provenance of a measurement.
 
     Raises:
         CalibrationError: A file is missing or broken.
     """
     rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
-    files: dict[str, CameraCalibration] = {}
-    for name in rig.cameras:
-        path, known = calibration / "cameras" / f"{name}.json", (recorded or {}).get(name)
-        if known is None or path.exists():
-            file = load(path, CameraCalibration)
-            known = file if known is None or file.intrinsics is not None else known
-        files[name] = known
-    return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()}, rig_name)
+    paths = {name: calibration / "cameras" / f"{name}.json" for name in rig.cameras}
+    there = recorded is None or all(path.exists() for path in paths.values())
+    files = {name: load(path, CameraCalibration) for name, path in paths.items()} if there else {}
+    origin = str(calibration)
+    # Files made for their colours may carry the lens of another recording: only measured ones are the better ones.
+    if recorded is not None and not (files and all("intrinsics" in f.provenance for f in files.values())):
+        if missing := [name for name in rig.cameras if name not in recorded]:
+            raise CalibrationError(f"rig {rig_name!r} has the camera {missing[0]!r}, the recording has not")
+        files, origin = dict(recorded), "the recording"
+    return pair_of(rig, {name: _with_view(file, fov_deg) for name, file in files.items()}, rig_name, origin)
 
 
 def from_table(path: Path, pair: Pair, outline: Float) -> Measured:

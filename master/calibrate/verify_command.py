@@ -136,7 +136,9 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[s
     expected = budget(pair.models, distance, noise)
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
     baseline_mm = 1e3 * float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
-    typer.echo(f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {baseline_mm:.1f} mm")
+    typer.echo(
+        f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {baseline_mm:.1f} mm (lenses of {pair.origin})"
+    )
     for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
         typer.echo(line)
     return expected_json(distance, expected, noise, angle, errors)

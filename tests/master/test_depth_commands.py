@@ -3,15 +3,17 @@
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from common.calibration import CameraCalibration, RigCalibration, load, save
+from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError
 from common.geometry import axis_rotation, rigid
 from master.calibrate.cli import calibrate_app
+from master.calibrate.depth_source import load_pair
 from master.stereo.depth import AffineDisparity
 from tests.hand_helpers import camera_file, rig_file
 
@@ -221,3 +223,17 @@ def test_a_nominal_view_stands_in_for_intrinsics(tmp_path: Path) -> None:
     # Row I4: one pixel of disparity is 2.53 cm at 1 m and 0.63 cm at 50 cm.
     assert rows[-1]["one_pixel_mm"] == pytest.approx(25.3, abs=0.05)
     assert rows[3]["one_pixel_mm"] == pytest.approx(6.3, abs=0.05)
+
+
+def test_a_camera_file_made_for_its_colours_does_not_replace_the_recorded_lens(tmp_path: Path) -> None:
+    calib = tree(tmp_path)
+    measured = Provenance(date="2026-01-01T00:00:00Z", tool="calibrate intrinsics", data=(), residual={})
+    files = {name: camera_file(name) for name in ("left", "right")}
+    recorded = {name: msgspec.structs.replace(file, exposure_us=1.0) for name, file in files.items()}
+    for name, expected in (("left", 1.0), ("right", 4000.0)):  # one measured lens is not a pair
+        new = msgspec.structs.replace(files[name], provenance={"intrinsics": measured})
+        save(calib / "cameras" / f"{name}.json", new)
+        assert load_pair(calib, "desk", recorded=recorded).files[0].exposure_us == expected
+    (calib / "cameras" / "left.json").unlink()
+    with pytest.raises(CalibrationError, match="camera 'right', the recording has not"):
+        load_pair(calib, "desk", recorded={"left": recorded["left"]})
