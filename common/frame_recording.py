@@ -11,7 +11,7 @@ import logging
 import re
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Literal
 
 from msgspec import Struct
@@ -184,4 +184,6 @@ def _row(path: Path, number: int, line: list[str]) -> FrameRow:
             raise RecordingError(f"{where}: {column}: {text!r} is not an integer")
     if illumination not in set(Illumination):
         raise RecordingError(f"{where}: illumination: {illumination!r} is none of {', '.join(Illumination)}")
+    if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
+        raise RecordingError(f"{where}: file: {file!r} is outside the recording's folder")
     return FrameRow(camera, int(seq), int(t_ns), Illumination(illumination), file)

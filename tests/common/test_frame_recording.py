@@ -75,6 +75,9 @@ def test_a_recording_without_frames_is_empty_not_broken(tmp_path: Path) -> None:
         ("left,0,1.5,none,x.png", "t_ns: '1.5'"),
         ("left,0,nan,none,x.png", "t_ns: 'nan'"),
         ("left,0,99999999999999999999,none,x.png", "t_ns"),
+        ("left,0,5,none,../x.png", "file: '../x.png' is outside"),
+        ("left,0,5,none,left/../../x.png", "is outside the recording's folder"),
+        ("left,0,5,none,/etc/x.png", "is outside the recording's folder"),
         ("left,0,5,dark,x.png", "illumination: 'dark' is none of none, ambient, laser, led"),
     ],
 )
