@@ -1,7 +1,7 @@
 """A camera as geometry: point -> pixel and pixel -> ray, with OpenCV's distortion k1, k2, p1, p2, k3."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import cast
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration
 from common.errors import CalibrationError
-from common.geometry import invert, transform
+from common.geometry import invert
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
 
@@ -25,6 +25,7 @@ class CameraModel:
         T_rig_camera: Camera frame -> rig frame (4, 4) [m].
         width_px, height_px: Image size.
         row_time_ns: Time from one row to the next [ns] (rolling shutter; 0: global).
+        T_camera_rig: The inverse of `T_rig_camera`.
     """
 
     matrix: Float
@@ -33,6 +34,10 @@ class CameraModel:
     width_px: int
     height_px: int
     row_time_ns: float
+    T_camera_rig: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "T_camera_rig", invert(self.T_rig_camera))
 
     @classmethod
     def of(cls, camera: CameraCalibration, T_rig_camera: Float) -> "CameraModel":
@@ -66,21 +71,22 @@ class CameraModel:
 
         NaN where the point is NaN or not in front of the camera.
         """
-        camera = transform(invert(self.T_rig_camera), np.asarray(points, dtype=np.float64))
-        z = np.where(camera[..., 2] > 1e-9, camera[..., 2], np.nan)
-        return self.distort(camera[..., :2] / z[..., None])
+        camera = np.asarray(points, dtype=np.float64) @ self.T_camera_rig[:3, :3].T + self.T_camera_rig[:3, 3]
+        z = np.where(camera[..., 2:] > 1e-9, camera[..., 2:], np.nan)
+        return self.distort(camera[..., :2] / z)
 
     def distort(self, normalized: Float) -> Float:
         """Pixels (..., 2) of normalized image points (..., 2) (x/z, y/z)."""
-        k1, k2, p1, p2, k3 = self.distortion
+        k1, k2, p1, p2, k3 = self.distortion.tolist()
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
         x, y = normalized[..., 0], normalized[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        u = self.matrix[0, 0] * xd + self.matrix[0, 2]
-        v = self.matrix[1, 1] * yd + self.matrix[1, 2]
-        return np.stack([u, v], axis=-1)
+        xx, yy, xy = x * x, y * y, 2.0 * x * y
+        r2 = xx + yy
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        out = np.empty(normalized.shape)
+        out[..., 0] = fx * (x * radial + p1 * xy + p2 * (r2 + 2.0 * xx)) + cx
+        out[..., 1] = fy * (y * radial + p1 * (r2 + 2.0 * yy) + p2 * xy) + cy
+        return out
 
     def undistort(self, uv: Float) -> Float:
         """Normalized image points (..., 2) (x/z, y/z) of pixels (..., 2); NaN stays NaN."""

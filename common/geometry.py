@@ -9,6 +9,22 @@ _SKEW: Float = np.cross(_EYE[:, None], _EYE[None]).swapaxes(1, 2).reshape(3, 9)
 _UNSKEW: Float = 0.5 * _SKEW.T
 
 
+def _shepperd() -> Float:
+    """Linear map (9, 16) from a rotation's elements to Shepperd's four forms of its quaternion, each times 4 q[k] q."""
+    out = np.zeros((3, 3, 4, 4))
+    for i, signs in enumerate(((1, 1, -1, -1), (1, -1, 1, -1), (1, -1, -1, 1))):
+        out[i, i] = np.diag(signs)
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[k, j, 0, i + 1] = out[k, j, i + 1, 0] = 1.0
+        out[j, k, 0, i + 1] = out[j, k, i + 1, 0] = -1.0
+        for a, b in ((j, k), (k, j)):
+            out[a, b, j + 1, k + 1] = out[a, b, k + 1, j + 1] = 1.0
+    return out.reshape(9, 16)
+
+
+_FORMS, _FORMS_OFFSET = _shepperd(), np.eye(4).ravel()
+
+
 def quaternion_to_matrix(q_wxyz: Float) -> Float:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), normalised first."""
     q = np.asarray(q_wxyz, dtype=np.float64)
@@ -27,24 +43,12 @@ def matrix_to_quaternion(rotation: Float) -> Float:
     Takes the numerically largest of the four classic forms (Shepperd, 1978), so it is
     exact also near half turns.
     """
-    m = np.asarray(rotation, dtype=np.float64)
-    trace = np.trace(m, axis1=-2, axis2=-1)
-    d = np.diagonal(m, axis1=-2, axis2=-1)
-    squares = np.concatenate([(1 + trace)[..., None], 1 + 2 * d - trace[..., None]], axis=-1)
-    s = [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]]
-    p = [m[..., 2, 1] + m[..., 1, 2], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 0] + m[..., 0, 1]]
-    forms = np.stack(
-        [
-            np.stack([squares[..., 0], s[0], s[1], s[2]], -1),
-            np.stack([s[0], squares[..., 1], p[2], p[1]], -1),
-            np.stack([s[1], p[2], squares[..., 2], p[0]], -1),
-            np.stack([s[2], p[1], p[0], squares[..., 3]], -1),
-        ],
-        axis=-2,
-    )
-    best = np.argmax(squares, axis=-1)[..., None, None]
-    q: Float = np.take_along_axis(forms, np.broadcast_to(best, (*best.shape[:-1], 4)), axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    m = np.asarray(rotation, dtype=np.float64).reshape(*np.shape(rotation)[:-2], 9)
+    # A quarter of each of the four forms is a row of a symmetric matrix that is linear in the rotation's elements.
+    forms = (m @ _FORMS + _FORMS_OFFSET).reshape(*m.shape[:-1], 4, 4)
+    best = np.argmax(np.diagonal(forms, axis1=-2, axis2=-1), axis=-1)[..., None, None]
+    q: Float = np.take_along_axis(forms, best, axis=-2)[..., 0, :]
+    q = q / np.sqrt(np.vecdot(q, q))[..., None]
     return np.where(q[..., :1] < 0, -q, q)
 
 

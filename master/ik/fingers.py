@@ -20,8 +20,8 @@ from master.ik.finger import FingerSolver
 from master.ik.hand import HandSolution
 from master.ik.joints import Vector
 
-_MODEL_M = 1e-3  # bones and caps are known to about this
-_EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
+MODEL_M = 1e-3  # bones and caps are known to about this
+EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _ON_CAP_M = 1e-4  # residual below which a finger is on its cap
 _ITERATIONS = 10  # the seed is the answer; what it cannot reach, iterations improve little
 
@@ -55,14 +55,10 @@ class FingerRefiner:
             points_m: Cap centroids (M, 3) [m], rig frame; NaN: not seen.
             cov_m2: (M, 3, 3) [m^2].
         """
-        T_palm_rig = invert(hand.T_rig_palm)
-        fitted = self._model.marker_points(hand.joints, self._markers)
-        angles = hand.angles_rad.copy()
+        surprise = surprise_of(points_m - self._model.marker_points(hand.joints, self._markers), cov_m2)
+        T_palm_rig, angles = invert(hand.T_rig_palm), hand.angles_rad.copy()
         for finger, (marker, closed_form, fabrik) in self._fingers.items():
-            if not (np.isfinite(points_m[marker]).all() and np.isfinite(cov_m2[marker]).all()):
-                continue
-            off = points_m[marker] - fitted[marker]
-            if off @ np.linalg.solve(cov_m2[marker] + _MODEL_M**2 * np.eye(3), off) < _EXPLAINED:
+            if not surprise[marker] >= EXPLAINED:  # NaN: not seen
                 continue
             x, y, z = (float(value) for value in transform(T_palm_rig, points_m[marker]))
             found = _solve(closed_form, fabrik, (x, y, z), angles[finger] if finger == THUMB else None)
@@ -75,6 +71,12 @@ class FingerRefiner:
         joints = self._model.forward(hand.T_rig_palm, angles)
         residual = np.linalg.norm(self._model.marker_points(joints, self._markers) - points_m, axis=1)
         return replace(hand, angles_rad=angles, joints=joints, residual_m=residual)
+
+
+def surprise_of(off_m: Float, cov_m2: Float) -> Float:
+    """Chi square (M,) of markers that are off their places by (M, 3) [m], of covariances (M, 3, 3); NaN: not seen."""
+    solved = np.linalg.solve(cov_m2 + MODEL_M**2 * np.eye(3), off_m[..., None])
+    return np.asarray(np.vecdot(off_m, solved[..., 0]), np.float64)
 
 
 def _solve(

@@ -15,7 +15,7 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
-from master.ik.fingers import FingerRefiner
+from master.ik.fingers import EXPLAINED, FingerRefiner, surprise_of
 from master.ik.hand import HandSolution, HandSolver, seen_markers
 from master.ik.priors import Priors
 from master.volume import inside
@@ -24,8 +24,6 @@ _COAST_S = 0.12  # a lost finger's motion fades with this time constant
 _DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _BAD_FIT_M = 8e-3
-_MODEL_M = 1e-3  # bones and caps are known to about this
-_EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000: a marker this far off may be noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -183,9 +181,8 @@ class HandTracker:
         if not len(far):
             return 0.0
         off = points_m[far] - self.model.marker_points(solution.joints, self.markers)[far]
-        noise = cov_m2[far] + _MODEL_M**2 * np.eye(3)
-        surprise = np.vecdot(off, np.linalg.solve(noise, off[..., None])[..., 0])
-        return float(np.max(solution.residual_m[far], where=surprise > _EXPLAINED, initial=0.0))
+        surprise = surprise_of(off, cov_m2[far])
+        return float(np.max(solution.residual_m[far], where=surprise > EXPLAINED, initial=0.0))
 
     def peek(
         self, points_m: Float, cov_m2: Float, towards_cameras: Float, *, curled: bool = True

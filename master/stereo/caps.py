@@ -86,16 +86,17 @@ class CapModel:
         bias = np.zeros((len(cameras), len(points_m), 2))
         if not self._joint:
             return bias
-        R = joints.rotation[self._joint]
+        R = joints.rotation[self._joint]  # (K, 3, 3)
         middle = points_m[self._marker]
+        sight = middle - np.array([camera.centre for camera in cameras])[:, None]  # (C, K, 3)
+        sight /= np.sqrt(np.vecdot(sight, sight))[..., None]
+        local = sight.swapaxes(0, 1) @ R  # (K, C, 3)
+        facing = np.maximum(-local @ self._normals.swapaxes(1, 2), 0.0) * self._areas[:, None]  # (K, C, N)
+        seen = facing @ self._points / facing.sum(axis=2, keepdims=True)
+        shift = (seen - self._offset[self._marker][:, None]) @ R.swapaxes(1, 2)
         for c, camera in enumerate(cameras):
-            sight = middle - camera.centre
-            sight = sight / np.linalg.norm(sight, axis=1, keepdims=True)
-            local = np.einsum("kij,ki->kj", R, sight)
-            facing = np.maximum(-np.einsum("knj,kj->kn", self._normals, local), 0.0) * self._areas
-            seen = np.einsum("kn,knj->kj", facing, self._points) / facing.sum(axis=1, keepdims=True)
-            shift = np.einsum("kij,kj->ki", R, seen - self._offset[self._marker])
-            bias[c, self._marker] = camera.project(middle + shift) - camera.project(middle)
+            there, here = camera.project(np.stack([middle + shift[:, c], middle]))
+            bias[c, self._marker] = there - here
         return np.nan_to_num(bias)
 
 
