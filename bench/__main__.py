@@ -21,6 +21,7 @@ SECTIONS = {
     "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
+    "depth": "Depth at rest, by fitted laws, and on recorded sweeps; baseline: the error budget",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "volume": "A finger tip in 27 places of the volume that the rig desk states; exact truth, no baseline",
