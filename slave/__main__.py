@@ -1,14 +1,12 @@
 """The slave's command line; the only place that names concrete drivers."""
 
 import argparse
-import gc
 import logging
 import os
 import signal
 import sys
 import threading
 from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -22,11 +20,6 @@ from slave.cameras import real
 from slave.cameras.source import FrameSource
 
 PROGRESS_EVERY = 500  # frames
-NO_REFERENCE = (
-    "{}: markers: no reference_bgr_linear, so the colours do not follow the light; calibrate again with "
-    "`phalanx-slave colours`, or say --colours fixed"
-)
-_LOG = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -46,72 +39,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     # Imported here: `detect` and `colours` need neither sockets nor zenoh, and start twice as fast.
     from common.keys import rig_key
-    from common.zenoh_bus import ZenohBus
-    from slave.app import run, wait_for_start
-    from slave.light_report import LightReport
-    from slave.markers.blind import BlindDetector
-    from slave.markers.changing import Changeable, ChangingDetector
-    from slave.markers.detector import MarkerDetector
+    from slave.live import run_live
     from slave.markers.engine import engine_named
-    from slave.markers.following import detector_for
-    from slave.preview import Previews
-    from slave.report import Reporter
-    from slave.tally import Tally
-    from slave.tuning import CameraFiles, CameraTuning
+    from slave.tuning import CameraFiles
     from slave.uplink import Uplink
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     rig, camera = _calibration(options)
+    files = CameraFiles(*_paths(options), camera, rig)
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
     engine = engine_named(options.engine)
     source = _source(options, rig, camera, clock, true_clock, stop)
-    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{options.name} colours")
-
-    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
-        if options.colours == "follow":
-            return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
-        return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
-
-    changing = None if options.colours == "none" else ChangingDetector(make(camera, rig))
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-    tally = Tally(rig.markers)
-    files = CameraFiles(*_paths(options), camera, rig)
-    tuning = CameraTuning(files, source, changing, make, lambda: tally.counts()["frames"] > 0)
-    previews = Previews(options.name, clock)
-    numbers, show = tally, previews.offer
-    if changing is not None and changing.follows:
-        numbers = LightReport(options.name, changing, tally, rig.markers, previews.offer)
-        show = numbers.offer
-    elif options.colours == "follow":
-        _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
-    reporter = Reporter(
-        options.name,
-        uplink,
-        numbers,
-        clock,
-        lambda endpoint: ZenohBus(None, endpoint),
-        stop.set,
-        shown=previews,
-        camera=tuning,
-    )
-    detector = BlindDetector(len(rig.markers)) if changing is None else changing
-    try:
-        gc.collect()
-        gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        print(f"{options.name}: ready, waiting for the master", flush=True)
-        if wait_for_start(uplink, stop):
-            run(source, detector, uplink, options.name, tally, stop, show)
-    finally:
-        reporter.close()
-        previews.close()
-        uplink.close()
-        source.close()
-        workers.shutdown(cancel_futures=True)
-    print(f"{options.name}: {tally.counts()['frames']} frames, sent {uplink.counts['sent']}", flush=True)
+
+    def say(line: str) -> None:
+        print(f"{options.name}: {line}", flush=True)
+
+    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say)
     return 0
 
 
