@@ -1,10 +1,11 @@
 """All cameras brought to one instant: which frames belong together, and where each marker was then.
 
 An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
-delivered a dozen frames since its last). It is
-*complete* when every other camera has delivered a frame at or after it, so that tracks can be interpolated; it
-is emitted then, or when the message time has passed its deadline, with whatever there is. Message time is the
-newest capture time seen: no clock is read here, so a replay pairs exactly as the live run did.
+delivered a dozen frames since its last). It is *complete* when every other camera has delivered a frame at or after
+it, so that tracks can be interpolated; `predict` waits only for those whose next frame is nearer to the instant than
+their last, and carries the others forward, half a period at most. An instant is emitted when it is complete, or when
+the message time has passed its deadline, with whatever there is. Message time is the newest capture time seen: no clock
+is read here, so a replay pairs exactly as the live run did.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
 than the back of the hand. `master.stereo.tracks` carries each to the instant; a sideways error Dt v would turn into a
@@ -20,10 +21,11 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.stereo.tracks import Carried, Sighting, carry
+from master.stereo.tracks import SIGHTINGS, Sighting, carry
 
 HISTORY = 8
 SILENT_FRAMES = 12
+_REACH_M = 0.5  # where hands are, for what a camera makes of their motion
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,14 +68,17 @@ class Pairing:
         Args:
             cameras: Camera name -> model.
             frame_rate_hz: Nominal rates; the slowest sets deadline and largest bridgeable gap.
-            policy: Wait for the other cameras and interpolate, or predict at once.
+            policy: Wait for the other cameras' next frames and interpolate, or for those alone that are nearer to the
+                instant than the last ones, and predict.
             continuous: False: frames are unrelated poses, nothing is carried from one to another.
         """
         self._names = tuple(cameras)
         self._cameras = tuple(cameras.values())
         period_ns = int(1e9 / min(frame_rate_hz[name] for name in self._names))
         self._deadline_ns = int(1.25 * period_ns)
-        self._gap_ns = int(2.5 * period_ns)
+        self._gap_ns = int((SIGHTINGS + 0.25) * period_ns)
+        self._half_ns = [int(0.5e9 / frame_rate_hz[name]) for name in self._names]
+        self._scale_px_m = np.array([camera.matrix[0, 0] / _REACH_M for camera in self._cameras])
         self._patience = SILENT_FRAMES * len(cameras)
         self._policy, self._continuous = policy, continuous
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
@@ -101,17 +106,15 @@ class Pairing:
         centre_ns = message.t_ns + round(half)
         if self._seen[index] and centre_ns <= self._seen[index][-1].centre_ns:
             return []  # a restarted slave's first clock estimate may step back: wait until time goes on
-        rivals = not np.isnan(message.rival_uv).all()
+        rivals = None if np.isnan(message.rival_uv).all() else message.rival_uv
         self._seen[index].append(
             Sighting(
                 centre_ns=centre_ns,
-                t_ns=self._row_times(message.t_ns, camera, message.uv),
-                uv=message.uv,
-                sigma_px=message.sigma_px,
+                marks=self._marks(message, camera, message.uv),
                 area=message.area,
                 ready_t_ns=message.ready_t_ns,
-                rival_uv=message.rival_uv if rivals else None,
-                rival_t_ns=self._row_times(message.t_ns, camera, message.rival_uv) if rivals else None,
+                rivals=None if rivals is None else self._marks(message, camera, rivals),
+                t_sigma_ns=message.t_sigma_ns,
             )
         )
         self._newest_ns = max(self._newest_ns, centre_ns)
@@ -125,11 +128,13 @@ class Pairing:
         """At the end of a recording: emit what is still waiting."""
         return self._emit(flush=True)
 
-    def _row_times(self, t_ns: int, camera: CameraModel, uv: Float) -> Float:
-        """When the rows of places (M, 2) were exposed (M,) [ns since the first frame of all]."""
+    def _marks(self, message: MarkerDetections, camera: CameraModel, uv: Float) -> Float:
+        """Places (M, 2) with the times of their rows and their sigmas, as `Sighting.marks`."""
         assert self._origin_ns is not None
-        rows = np.where(np.isnan(uv[:, 1]), 0.5 * (camera.height_px - 1), uv[:, 1])
-        return (t_ns - self._origin_ns) + camera.row_time_ns * rows
+        marks = np.empty((len(uv), 4))
+        marks[:, :2], marks[:, 3] = uv, message.sigma_px
+        marks[:, 2] = (message.t_ns - self._origin_ns) + camera.row_time_ns * uv[:, 1]
+        return marks
 
     def _leader(self) -> int:
         speaking = (c for c, seen in enumerate(self._seen) if seen and self._waiting[c] < self._patience)
@@ -159,37 +164,28 @@ class Pairing:
                 if not self._continuous or len(seen) > 1:
                     continue
                 return False
-            if self._policy == "interpolate" or t_ns - newest > self._deadline_ns:
+            if self._policy == "interpolate" or t_ns - newest > self._half_ns[camera]:
                 return False
         return True
 
     def _at(self, t_ns: int) -> Instant:
-        count, markers = len(self._names), len(self._seen[self._leader()][-1].area)
-        uv = np.full((count, markers, 2), np.nan)
-        sigma = np.full((count, markers), np.nan)
-        area = np.full((count, markers), np.nan)
-        rivals: list[tuple[int, Carried]] = []
-        missing = np.ones(count, dtype=bool)
-        ready = 0
         assert self._origin_ns is not None
-        for c in range(count):
-            near = self._neighbours(c, t_ns)
-            if near:
-                missing[c] = False
-                carried = carry(near, float(t_ns - self._origin_ns))
-                uv[c], sigma[c], area[c] = carried.uv, carried.sigma_px, near[0].area
-                ready = max(ready, *(s.ready_t_ns for s in near))
-                if carried.rival_uv is not None:
-                    rivals.append((c, carried))
-        if not rivals:
-            return Instant(t_ns, uv, sigma, area, ready, missing)
-        rival_uv, rival_sigma = np.full_like(uv, np.nan), np.full_like(sigma, np.nan)
-        for c, carried in rivals:
-            rival_uv[c], rival_sigma[c] = carried.rival_uv, carried.rival_sigma_px
-        return Instant(t_ns, uv, sigma, area, ready, missing, rival_uv, rival_sigma)
+        views = [self._neighbours(c, t_ns) for c in range(len(self._names))]
+        carried = carry(views, float(t_ns - self._origin_ns), self._scale_px_m)
+        unseen = np.full(carried.sigma_px.shape[1], np.nan)
+        return Instant(
+            t_ns,
+            carried.uv,
+            carried.sigma_px,
+            area=np.array([view[0].area if view else unseen for view in views]),
+            ready_t_ns=max(sighting.ready_t_ns for view in views for sighting in view),
+            missing=np.array([not view for view in views]),
+            rival_uv=carried.rival_uv,
+            rival_sigma_px=carried.rival_sigma_px,
+        )
 
     def _neighbours(self, camera: int, t_ns: int) -> list[Sighting]:
-        """Up to three sightings around the instant, nearest first, none farther away than a gap.
+        """Up to four sightings around the instant, nearest first, none farther away than a gap.
 
         None at all where even the nearest is farther than the deadline: a track carried over two frames into
         the unknown is a guess of decimetres in depth, and the ray of the camera that does see is worth more.
@@ -198,9 +194,12 @@ class Pairing:
         """
         known = list(self._seen[camera])
         before = sum(s.centre_ns < t_ns for s in known)
-        seen = sorted(known[: max(before + 1, 2)], key=lambda s: abs(s.centre_ns - t_ns))
+        by_distance = sorted(
+            (abs(s.centre_ns - t_ns), k, s)
+            for k, s in enumerate(known[max(before - SIGHTINGS, 0) : max(before + 1, 2)])
+        )
         reach = self._gap_ns if self._continuous else self._deadline_ns // 2
-        near = [s for s in seen if abs(s.centre_ns - t_ns) <= reach]
-        if near and abs(near[0].centre_ns - t_ns) > self._deadline_ns:
+        near = [s for away, _, s in by_distance[:SIGHTINGS] if away <= reach]
+        if near and by_distance[0][0] > self._deadline_ns:
             return []
-        return near[:3] if self._continuous else near[:1]
+        return near if self._continuous else near[:1]

@@ -1,7 +1,17 @@
-"""Where the markers of one camera were at an instant, from its sightings around it.
+"""Where the markers of every camera were at an instant, from their sightings around it.
 
-A track is carried by the polynomial through up to three neighbouring sightings (Lagrange's weights): three are a
-parabola, two a line, one is held where it was. The error this leaves is added to the sigma that the slave gave.
+A hand's way is known by what hands can do: about the instant it is a Taylor series whose speed, acceleration, jerk and
+snap are drawn at random, with the sizes of real hands. Given up to four sightings with their noise, the best linear
+estimate of the place and its variance follow (Gaussian process regression with an unknown constant: Rasmussen,
+Williams 2006, 2.7; "universal kriging"):
+
+    S_ij = V^2 tt + A^2 (tt^2 / 2!^2 + w^2 tt^3 / 3!^2 + w^4 tt^4 / 4!^2) + sigma_i^2 [i = j],    tt = t_i t_j
+    x = 1' S^-1 y / c,    var = 1 / c,    c = 1' S^-1 1                     (t: times from the instant)
+
+Without noise this is the polynomial through the sightings; a hand at rest is averaged, and a step into the future does
+not blow its noise up. How hard the hand moves (A) is not known, so every degree of vigour is tried at once, from a hand
+laid down to a brisk wave; each counts by the probability of what was seen, and where they disagree the variance grows.
+What time itself is uncertain by adds in proportion to the marker's speed in the image.
 
 Where a slave named two places of a colour, the marker and its *rival*, it may have taken them for each other from
 one frame to the next, and a line from one thing to another is nowhere. So the sightings of such a marker are first
@@ -16,12 +26,24 @@ import numpy as np
 
 from common.arrays import Float
 
-# What a hand can do that a polynomial does not know, at half a metre from a 500 px lens.
-_SPEED_PX_S = 500.0
-_ACCELERATION_PX_S2 = 1.0e4
-_JERK_PX_S3 = 2.0e5
-_LEAP_PX_S, _LEAP_PX = 5000.0, 5.0  # 5 m/s there: what is farther away a frame later is another thing
+SIGHTINGS = 4  # of one marker that are used: a fifth is too long ago to tell anything
+# What hands do, per axis, as measured on recorded hands (docs/sync.md): laid down, gentle, brisk.
+_SPEED_M_S: Float = np.array([0.01, 1.0, 1.0])
+_ACCELERATION_M_S2: Float = np.array([0.3, 1.5, 15.0])
+_W_PER_S = 18.0  # jerk by acceleration, and snap by jerk
+_V2, _A2 = (x.reshape(-1, 1, 1, 1, 1) ** 2 for x in (_SPEED_M_S, _ACCELERATION_M_S2))
+_LEAP_M_S, _LEAP_PX = 5.0, 5.0  # what is farther away a frame later is another thing
 _SWAPPED = 3.0  # times nearer to the other track: a slave's names are contradicted
+# Sightings see the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
+# no mean over them removes it. New in each is at most this part of the variance that the slave claims, and this much.
+_FRESH, _FRESH_PX = 0.5, 0.1
+# So they also tell less of the motion than as many independent ones.
+_EVIDENCE = 0.5
+# An error in time lies along the motion. One number for both axes cannot say so: all of it covers too much (98-99 %),
+# half, which keeps the sum of the axes, too little where the motion is along the baseline (87 %); this 93-97 %.
+_ALONG = 0.75
+_LEAST_SIGMA_PX = 0.01
+_UNSEEN_PX2 = 1e12  # variance of a sighting that is none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,32 +52,29 @@ class Sighting:
 
     Attributes:
         centre_ns: When its centre row was exposed.
-        t_ns: (M,) when each marker's row was, since the first frame of all: float64 is exact to 1 ns.
-        uv: (M, 2) [px]; NaN: not seen.
-        sigma_px: (M,) standard deviation per axis.
+        marks: (M, 4) of each marker u, v [px], when its row was exposed [ns since the first frame of all: float64 is
+            exact to 1 ns] and the standard deviation of u and of v [px]; NaN: not seen.
         area: (M,) [px^2].
         ready_t_ns: When the frame was handed to its slave.
-        rival_uv, rival_t_ns: As `uv` and `t_ns` of the second place, NaN where there is none; None where no marker
-            has one.
+        rivals: As `marks`, of the second places; None where no marker has one.
+        t_sigma_ns: Standard deviation of the times, the same error for all sightings of a camera.
     """
 
     centre_ns: int
-    t_ns: Float
-    uv: Float
-    sigma_px: Float
+    marks: Float
     area: Float
     ready_t_ns: int
-    rival_uv: Float | None = None
-    rival_t_ns: Float | None = None
+    rivals: Float | None = None
+    t_sigma_ns: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Carried:
-    """The markers of one camera at one instant.
+    """The markers of C cameras at one instant.
 
     Attributes:
-        uv: (M, 2) [px]; NaN: not seen.
-        sigma_px: (M,) time error included.
+        uv: (C, M, 2) [px]; NaN: not seen.
+        sigma_px: (C, M) per axis, time error included.
         rival_uv, rival_sigma_px: The same of the second places; None where no marker has one.
     """
 
@@ -65,84 +84,125 @@ class Carried:
     rival_sigma_px: Float | None
 
 
-def carry(near: Sequence[Sighting], t_ns: float) -> Carried:
-    """The markers at `t_ns` [ns since the first frame of all], from sightings with the nearest first.
+def carry(views: Sequence[Sequence[Sighting]], t_ns: float, scale_px_m: Float) -> Carried:
+    """The markers at `t_ns` [ns since the first frame of all]; one that the nearest sighting does not hold is not seen.
 
-    A marker the nearest sighting does not hold is not seen.
+    Args:
+        views: Of each camera up to SIGHTINGS, the nearest first; none: the camera sees nothing. One camera has some.
+        t_ns: The instant.
+        scale_px_m: (C,) pixels that a metre across the sight takes where hands are [px/m].
     """
-    uv, times = np.stack([s.uv for s in near]), np.stack([s.t_ns for s in near])
-    sigma = np.stack([s.sigma_px for s in near])
-    if all(s.rival_uv is None for s in near):
-        return Carried(*_carry(uv, times, sigma, t_ns), None, None)
-    rival_uv, rival_times = _sort(near, uv, times)
-    rivals = _carry(rival_uv, rival_times, sigma, t_ns)
-    return Carried(*_carry(uv, times, sigma, t_ns), *rivals)
+    nothing = np.full_like(next(view[0].marks for view in views if view), np.nan)
+    marks = np.array([[s.marks for s in view] + [nothing] * (SIGHTINGS - len(view)) for view in views])
+    t_sigma_s = np.array([view[0].t_sigma_ns if view else 0.0 for view in views]) * 1e-9
+    doubtful = [c for c, view in enumerate(views) if any(s.rivals is not None for s in view)]
+    rivals = [_sort(views[c], marks[c], _LEAP_M_S * float(scale_px_m[c])) for c in doubtful]
+    uv, sigma = _at(marks, t_ns, scale_px_m, t_sigma_s)
+    if not doubtful:
+        return Carried(uv, sigma, None, None)
+    rival_uv, rival_sigma = np.full_like(uv, np.nan), np.full_like(sigma, np.nan)
+    rival_uv[doubtful], rival_sigma[doubtful] = _at(
+        np.array(rivals), t_ns, scale_px_m[doubtful], t_sigma_s[doubtful]
+    )
+    return Carried(uv, sigma, rival_uv, rival_sigma)
 
 
-def _carry(uv: Float, times: Float, sigma_px: Float, t_ns: float) -> tuple[Float, Float]:
-    """Places (M, 2) and sigmas (M,) at `t_ns` of tracks (N, M, 2), (N, M), (N, M), the nearest sighting first."""
-    out, sigma = np.full_like(uv[0], np.nan), np.full_like(sigma_px[0], np.nan)
-    seen = np.isfinite(uv[..., 0]) & np.isfinite(uv[..., 1])
-    order = np.cumprod(seen, axis=0).sum(axis=0)  # sightings in a row, from the nearest on
-    for n in range(1, len(uv) + 1):
-        use = order == n
-        if not use.any():
-            continue
-        tn = times[:n, use]
-        away = np.abs(t_ns - tn) * 1e-9
-        weights = np.ones_like(tn)
-        for i in range(n):
-            for j in range(n):
-                if i != j:
-                    weights[i] *= (t_ns - tn[j]) / (tn[i] - tn[j])
-        out[use] = sum(weights[i][:, None] * uv[i, use] for i in range(n))
-        noise = sum((weights[i] * sigma_px[i, use]) ** 2 for i in range(n))
-        unknown = (_SPEED_PX_S, _ACCELERATION_PX_S2 / 2, _JERK_PX_S3 / 6)[n - 1] * np.prod(away, axis=0)
-        sigma[use] = np.sqrt(noise + unknown**2)
-    return out, sigma
+def _at(marks: Float, t_ns: float, scale: Float, t_sigma_s: Float) -> tuple[Float, Float]:
+    """Places (C, M, 2) and sigmas (C, M) at an instant of tracks (C, N, M, 4), the nearest sighting first."""
+    marks = marks.swapaxes(1, 2)  # (C, M, N, 4)
+    nearest = marks[..., 0, :2]
+    y, t = marks[..., :2] - nearest[..., None, :], (marks[..., 2] - t_ns) * 1e-9
+    leap = _LEAP_PX + _LEAP_M_S * scale[:, None, None] * np.abs(t - t[..., :1])
+    near = (y * y).sum(axis=-1) <= leap * leap  # false for NaN
+    t, y = np.where(near, t, 0.0), np.where(near[..., None], y, 0.0)
+    variance = np.maximum(marks[..., 3], _LEAST_SIGMA_PX) ** 2
+    fresh = np.minimum(_FRESH * variance, _FRESH_PX**2)
+    way, vary, speed, gain = _mix(t, y, np.where(near, fresh, _UNSEEN_PX2), scale)
+    vary += (variance - fresh)[..., 0] * np.maximum(gain, 1.0)
+    if t_sigma_s.any():
+        vary += _ALONG * (speed * speed).sum(axis=-1) * (t_sigma_s * t_sigma_s)[:, None]
+    return nearest + way, np.where(near[..., 0], np.sqrt(vary), np.nan)
 
 
-def _sort(near: Sequence[Sighting], uv: Float, times: Float) -> tuple[Float, Float]:
-    """Give every place to the track it continues: `uv` and `times` are changed, those of the rivals returned."""
-    rival_uv, rival_times = np.full_like(uv, np.nan), np.full_like(times, np.nan)
-    for n, sighting in enumerate(near):
-        if sighting.rival_uv is not None and sighting.rival_t_ns is not None:
-            rival_uv[n], rival_times[n] = sighting.rival_uv, sighting.rival_t_ns
-    for m in np.flatnonzero(np.isfinite(rival_uv[..., 0]).any(axis=0)):
-        places = np.stack([uv[:, m], rival_uv[:, m]], axis=1)  # (N, 2, 2): sighting, which of the two, u v
-        moments = np.stack([times[:, m], rival_times[:, m]], axis=1)
-        for n in range(1, len(near)):
-            order = [1, 0] if _swapped(places[:n], moments[:n], places[n], moments[n]) else [0, 1]
-            places[n], moments[n] = places[n, order], moments[n, order]
+def _mix(t: Float, y: Float, noise: Float, scale: Float) -> tuple[Float, Float, Float, Float]:
+    """Mean (C, M, 2), variance (C, M), speed (C, M, 2) and gain (C, M) at time 0, over all degrees of vigour.
+
+    The gain is by how much the variance of independent sightings would be multiplied.
+
+    Args:
+        t: (C, M, N) times [s].
+        y: (C, M, N, 2) places [px].
+        noise: (C, M, N) their variances [px^2].
+        scale: (C,) [px/m].
+    """
+    tt = t[..., :, None] * t[..., None, :]
+    w2tt = _W_PER_S**2 * tt
+    square = (scale * scale)[:, None, None, None]
+    going_px2 = square * tt
+    turning_px2 = going_px2 * tt * (1.0 / 4.0 + w2tt * (1.0 / 36.0 + w2tt / 576.0))
+    S = _V2 * going_px2 + _A2 * turning_px2  # (L, C, M, N, N)
+    S.reshape(*S.shape[:-2], -1)[..., :: t.shape[-1] + 1] += noise
+    known = np.empty((*t.shape, 4))
+    known[..., 0], known[..., 1:3], known[..., 3] = 1.0, y, t
+    # Products x' S^-1 y of all pairs of 1, u, v, t (L, C, M, 4, 4).
+    solved = np.linalg.solve(S, known)
+    products = known.swapaxes(-1, -2) @ solved
+    c = products[..., 0, 0]
+    x = products[..., 0, 1:3] / c[..., None]
+    misfit = products[..., 1, 1] + products[..., 2, 2] - c * (x * x).sum(axis=-1)
+    # Two axes: twice the logarithm of each determinant's root.
+    evidence = -_EVIDENCE * (np.linalg.slogdet(S)[1] + np.log(c) + 0.5 * misfit)
+    share = np.exp(evidence - evidence.max(axis=0))
+    share /= share.sum(axis=0)
+    mean = (share[..., None] * x).sum(axis=0)
+    off = x - mean
+    vary = (share * (1.0 / c + 0.5 * (off * off).sum(axis=-1))).sum(axis=0)
+    pull = products[..., 3, 1:3] - products[..., 3, :1] * x
+    speed = (share[..., None] * _V2[..., 0] * pull).sum(axis=0) * square[..., 0]
+    weights = ((share / c)[..., None] * solved[..., 0]).sum(axis=0)
+    return mean, vary, speed, (weights * weights).sum(axis=-1)
+
+
+def _sort(view: Sequence[Sighting], marks: Float, leap_px_s: float) -> Float:
+    """Give every place to the track it continues: `marks` (N, M, 4) is changed, that of the rivals returned."""
+    rivals = np.full_like(marks, np.nan)
+    for n, sighting in enumerate(view):
+        if sighting.rivals is not None:
+            rivals[n] = sighting.rivals
+    for m in np.flatnonzero(np.isfinite(rivals[..., 0]).any(axis=0)):
+        tracks = np.stack([marks[:, m], rivals[:, m]], axis=1)  # (N, 2, 4): sighting, which of the two
+        for n in range(1, len(view)):
+            if _swapped(tracks[:n], tracks[n], leap_px_s):
+                tracks[n] = tracks[n, ::-1]
             for i in range(2):
-                if _away(places[:n, i], moments[:n, i], places[n, i], moments[n, i]) == np.inf:
-                    places[n, i] = np.nan  # another thing: the track ends
-        uv[:, m], rival_uv[:, m] = places[:, 0], places[:, 1]
-        times[:, m], rival_times[:, m] = moments[:, 0], moments[:, 1]
-    return rival_uv, rival_times
+                if _away(tracks[:n, i], tracks[n, i], leap_px_s) == np.inf:
+                    tracks[n, i] = np.nan  # another thing: the track ends
+        marks[:, m], rivals[:, m] = tracks[:, 0], tracks[:, 1]
+    return rivals
 
 
-def _swapped(tracks: Float, moments: Float, found: Float, found_ns: Float) -> bool:
+def _swapped(tracks: Float, found: Float, leap_px_s: float) -> bool:
     """Whether the slave called the marker and its rival by each other's name.
 
     It is contradicted only where the places are so much nearer to the other track: it has a track of its own.
 
     Args:
-        tracks, moments: The marker's track and the rival's (n, 2, 2) [px], (n, 2) [ns].
-        found, found_ns: The two places of the next sighting (2, 2), (2,); NaN: there is none.
+        tracks: The marker's track and the rival's (n, 2, 4).
+        found: The two places of the next sighting (2, 4); NaN: there is none.
+        leap_px_s: What is faster is another thing [px/s].
     """
-    away = [[_away(tracks[:, i], moments[:, i], found[k], found_ns[k]) for k in range(2)] for i in range(2)]
+    away = [[_away(tracks[:, i], found[k], leap_px_s) for k in range(2)] for i in range(2)]
     straight = [x for x in (away[0][0], away[1][1]) if x is not None]
     crossed = [x for x in (away[0][1], away[1][0]) if x is not None]
     return bool(crossed) and _SWAPPED * sum(crossed) < sum(straight)
 
 
-def _away(track: Float, moments: Float, place: Float, place_ns: float) -> float | None:
-    """Distance [px] of a place from the member of a track that is nearest in time; inf: a leap; None: no such two."""
-    members = np.flatnonzero(np.isfinite(track[:, 0]))
+def _away(track: Float, place: Float, leap_px_s: float) -> float | None:
+    """Distance [px] of a place (4,) from the member of a track (n, 4) nearest in time; inf: a leap; None: no two."""
+    members = track[np.isfinite(track[:, 0])]
     if not len(members) or not np.isfinite(place[0]):
         return None
-    j = members[np.argmin(np.abs(moments[members] - place_ns))]
-    distance = float(np.hypot(*(track[j] - place)))
-    leap_px = _LEAP_PX + _LEAP_PX_S * 1e-9 * float(abs(moments[j] - place_ns))
+    nearest = members[np.argmin(np.abs(members[:, 2] - place[2]))]
+    distance = float(np.hypot(*(nearest[:2] - place[:2])))
+    leap_px = _LEAP_PX + leap_px_s * 1e-9 * float(abs(nearest[2] - place[2]))
     return distance if distance <= leap_px else np.inf

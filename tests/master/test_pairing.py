@@ -95,28 +95,32 @@ def test_flush_emits_the_rest_once() -> None:
     assert machine.flush() == []
 
 
-def test_predict_does_not_wait() -> None:
+@pytest.mark.parametrize(("late_ms", "waits"), [(5, True), (7, True), (9, False), (15, False)])
+def test_predict_waits_only_for_a_frame_that_is_nearer_than_the_last(late_ms: int, waits: bool) -> None:
     machine = pairing(policy="predict")
-    messages = interleaved(stream("left", 6), stream("right", 6, 5 * MS))
-    early = {i.t_ns: m.t_ns for m in messages for i in machine.push(m)}
-    # From the third frame on, the instant comes with the leader's own message.
-    assert all(early[k * PERIOD] == k * PERIOD for k in range(2, 6))
+    messages = interleaved(stream("left", 6), stream("right", 6, late_ms * MS))
+    emitted = {i.t_ns: m.t_ns for m in messages for i in machine.push(m)}
+    # From the third frame on: with the leader's own message, or with the other's that comes within half a period.
+    assert all(emitted[k * PERIOD] == k * PERIOD + waits * late_ms * MS for k in range(2, 6))
 
 
 def test_predicted_tracks_follow_the_motion() -> None:
     machine = pairing(policy="predict")
     instants = push_all(machine, interleaved(stream("left", 8), stream("right", 8, 12 * MS)))
     last = instants[-1]
-    np.testing.assert_allclose(last.uv[1], path(np.array(last.t_ns * 1e-9)), atol=1e-6)
+    np.testing.assert_allclose(last.uv[1], path(np.array(last.t_ns * 1e-9)), atol=0.1)
     waited = push_all(pairing(), interleaved(stream("left", 8), stream("right", 8, 12 * MS)))[-1]
     assert (last.sigma_px[1] > waited.sigma_px[1]).all()  # and is less sure than an interpolated one
 
 
+@pytest.mark.parametrize(("policy", "late_ms"), [("interpolate", 5), ("predict", 5)])
 @given(st.lists(st.booleans(), min_size=60, max_size=60))
 @settings(max_examples=30)
-def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(choices: list[bool]) -> None:
-    streams = stream("left", 20, row_time_us=20.0), stream("right", 20, 5 * MS, row_time_us=20.0)
-    expected = push_all(pairing(20.0), interleaved(*streams))
+def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(
+    policy: str, late_ms: int, choices: list[bool]
+) -> None:
+    streams = stream("left", 20, row_time_us=20.0), stream("right", 20, late_ms * MS, row_time_us=20.0)
+    expected = push_all(pairing(20.0, policy=policy), interleaved(*streams))
     sent, order = [0, 0], [streams[0][0]]
     sent[0] = 1
     for left in choices:
@@ -127,7 +131,7 @@ def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(choices: 
         if sent[c] < 20:
             order.append(streams[c][sent[c]])
             sent[c] += 1
-    found = push_all(pairing(20.0), order)
+    found = push_all(pairing(20.0, policy=policy), order)
     complete = min(sent[0], sent[1] - 1)
     assert [i.t_ns for i in found[:complete]] == [i.t_ns for i in expected[:complete]]
     # The very first may be due before its cameras have tracks.
@@ -155,7 +159,7 @@ def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, ro
         if k < 2:
             continue  # the first two have no three sightings
         truth = path(np.array(instant.t_ns * 1e-9))
-        np.testing.assert_allclose(instant.uv, [truth, truth], atol=1e-5)
+        np.testing.assert_allclose(instant.uv, [truth, truth], atol=0.05)  # half of a centroid's noise
 
 
 def test_a_single_sighting_is_held_and_its_doubt_is_a_hand_speed_times_the_time() -> None:
@@ -165,7 +169,8 @@ def test_a_single_sighting_is_held_and_its_doubt_is_a_hand_speed_times_the_time(
     [instant] = machine.flush()
     np.testing.assert_allclose(instant.uv[1], path(np.array(0.004)))
     np.testing.assert_allclose(instant.sigma_px[0], 0.1)  # the floor: a whole marker at its own time
-    np.testing.assert_allclose(instant.sigma_px[1], np.hypot(0.1, 500.0 * 0.004))  # 500 px/s for 4 ms
+    held_px_s = 500.0 / 0.5 * np.sqrt((2 * 1.0**2 + 0.01**2) / 3)  # of a 500 px lens at half a metre
+    np.testing.assert_allclose(instant.sigma_px[1], np.hypot(0.1, held_px_s * 0.004), rtol=1e-3)
 
 
 def test_a_marker_is_as_sure_as_its_slave_says() -> None:
@@ -214,7 +219,7 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
             places = np.stack([instant.uv[c, 0], instant.rival_uv[c, 0]])
             if np.linalg.norm(places[0] - truth[0]) > 1.0:
                 places = places[::-1]
-            np.testing.assert_allclose(places, truth, atol=1e-4)
+            np.testing.assert_allclose(places, truth, atol=0.1)
         assert np.isnan(instant.rival_uv[:, 1]).all()
 
 
@@ -283,7 +288,7 @@ def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
     assert len(instants) == 10
     for instant in instants[2:]:
         assert instant.uv.shape == (3, 2, 2)
-        np.testing.assert_allclose(instant.uv, [path(np.array(instant.t_ns * 1e-9))] * 3, atol=1e-6)
+        np.testing.assert_allclose(instant.uv, [path(np.array(instant.t_ns * 1e-9))] * 3, atol=0.05)
 
 
 def test_unrelated_frames_are_never_mixed() -> None:
