@@ -10,8 +10,10 @@ import numpy as np
 from common.clock import Clock
 from common.messages import Health, MarkerDetections
 from master.outputs.sink import Sink
+from master.rates import CameraRates
 from master.stereo.pipeline import SolvedPose
 
+_NAME = 64  # characters of a name in `Health`
 _KEPT = 200_000  # latencies kept for the quantiles: about an hour at 60 Hz
 
 
@@ -36,6 +38,7 @@ class RunFigures:
 
     def __init__(self) -> None:
         self.poses = 0
+        self.rates = CameraRates()
         # A ring of fixed size: the report of every second reads it in one copy, however long the run.
         self._latency_ms = np.zeros(_KEPT)
         self._first_ns = self._last_ns = 0
@@ -73,6 +76,7 @@ def run(
         message = source.get(timeout_s=0.1)
         if message is None:
             continue
+        figures.rates.push(message)
         for solved in pipeline.push(message):
             now = clock.now_ns()
             pose = msgspec.structs.replace(solved.pose, latency_ns=now - solved.ready_t_ns)
@@ -82,6 +86,7 @@ def run(
 
 
 def health(session: int, clock: Clock, figures: RunFigures, counts: dict[str, int]) -> Health:
-    """The master's report."""
+    """The master's report; gauges keep apart what a camera runs at, camera_hz.NAME, and what comes of it, poses_per_s."""
     gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
+    gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     return Health("master", session, clock.now_ns(), {"poses": figures.poses} | counts, gauges)

@@ -102,6 +102,8 @@ def run_live(
         thread.join(_JOIN_S)
         summary: dict[str, object] = {
             **figures.summary(),
+            "camera_hz": figures.rates.camera_hz,
+            "received_hz": figures.rates.received_hz,
             "lost": ingest.lost,
             "skipped": ingest.skipped,
             "counts": reporter.health().counts,

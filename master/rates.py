@@ -44,13 +44,17 @@ class CameraRates:
     @property
     def camera_hz(self) -> dict[str, float]:
         """Camera -> frames it took per second; only cameras of which two frames came."""
-        return {
-            name: round(s.frames * 1e9 / s.span_ns, 2) for name, s in self._spans.items() if s.span_ns > 0
-        }
+        return {name: _hz(span.frames, span.span_ns) for name, span in self._running()}
 
     @property
     def received_hz(self) -> dict[str, float]:
         """Camera -> frames that were searched for markers and arrived, per second."""
-        return {
-            name: round(s.received * 1e9 / s.span_ns, 2) for name, s in self._spans.items() if s.span_ns > 0
-        }
+        return {name: _hz(span.received, span.span_ns) for name, span in self._running()}
+
+    def _running(self) -> list[tuple[str, _Span]]:
+        # A copy at once: the loop pushes while a report is made.
+        return [(name, span) for name, span in dict(self._spans).items() if span.span_ns > 0]
+
+
+def _hz(frames: int, span_ns: int) -> float:
+    return round(frames * 1e9 / span_ns, 2)

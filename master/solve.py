@@ -16,6 +16,7 @@ from common.messages import HandPose, MarkerDetections
 from common.npz import read_npz
 from master.outputs.files import PosesFile
 from master.outputs.poses import Poses
+from master.rates import CameraRates
 from master.rig import RigSetup, build_pipeline
 from master.score import load_truth, score
 from master.stages import StageTimes
@@ -54,15 +55,18 @@ def solve(
     pipeline = build_pipeline(setup, stages, continuous=recording.manifest.continuous)
     messages = _messages(setup, detections)
     poses: list[HandPose] = []
+    rates = CameraRates()
     sink = PosesFile(out / "poses.npz", setup.hand.profile.name, len(setup.rig.markers))
     for number, message in enumerate(messages, 1):
         poses += [solved.pose for solved in pipeline.push(message)]
+        rates.push(message)
         progress(number, len(messages))
     poses += [solved.pose for solved in pipeline.flush()]
     for pose in poses:
         sink.write(pose)
     sink.close()
     summary = summarise(recording, setup, poses) | {
+        "camera_hz": rates.camera_hz,
         "lost": _gaps(messages),
         "counts": dict(sorted(pipeline.counts.items())),
         "stage_us": stages.mean_us(),

@@ -1,5 +1,6 @@
 """How the viewer is laid out when it opens: the scene on the left, cameras below it, plots on the right."""
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
@@ -25,6 +26,8 @@ _TABS = 4  # the last so many share one place
 _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
 _EYE_M, _TARGET_M = (0.21, -0.12, 0.0), (0.012, 0.018, 0.36)
+_BESIDE_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
+_CAMERAS_A_ROW = 4
 _PLOT_SPAN_S = 10.0
 
 
@@ -47,7 +50,7 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SPAN_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    eye = rrb.EyeControls3D(position=_EYE_M, look_target=_TARGET_M, eye_up=(0.0, -1.0, 0.0))
+    eye = rrb.EyeControls3D(position=_eye_of(rig), look_target=_TARGET_M, eye_up=(0.0, -1.0, 0.0))
     scene = rrb.Spatial3DView(
         origin=WORLD,
         name="Hand and rig",
@@ -80,7 +83,9 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
     tabs = rrb.Tabs(*plots[-_TABS:], legend_view, active_tab=0)
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Vertical(scene, rrb.Horizontal(*cameras), row_shares=[3, 2]),
+            rrb.Vertical(
+                scene, rrb.Grid(*cameras, grid_columns=min(len(cameras), _CAMERAS_A_ROW)), row_shares=[3, 2]
+            ),
             rrb.Vertical(tabs, *plots[:-_TABS], row_shares=[1.5] + [1] * (len(plots) - _TABS)),
             column_shares=[3, 2],
         ),
@@ -88,6 +93,16 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
         rrb.SelectionPanel(state="collapsed"),
         rrb.BlueprintPanel(state="collapsed"),
     )
+
+
+def _eye_of(rig: RigCalibration) -> tuple[float, float, float]:
+    """Where the scene is looked at from [m], so that every camera of the rig is in the picture."""
+    target, eye = np.array(_TARGET_M), np.array(_EYE_M)
+    reach = max(float(np.linalg.norm(rig.camera_pose(name)[:3, 3] - target)) for name in rig.cameras)
+    if reach > _BESIDE_M:
+        eye = target + 1.5 * reach * (eye - target) / np.linalg.norm(eye - target)
+    x, y, z = (float(value) for value in eye)
+    return x, y, z
 
 
 def legend() -> str:
@@ -100,5 +115,6 @@ def legend() -> str:
         + "\n- **red joint**: an angle is at its limit\n- **thin grey hand**: the truth, where it is known\n"
         "- **small dim / large bright markers**: before / after the filter\n"
         "- **ellipsoids**: 2 sigma of the finger tips, where that is less than 3 cm\n"
+        "- **grey box**: the volume that the rig states; outside it, accuracy was not tested\n"
         "- camera views: dots are the markers as triangulated, the hand is drawn without lens distortion"
     )

@@ -18,7 +18,7 @@ from master.outputs.files import load_poses
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def _demo(out: Path, seconds: float) -> subprocess.Popen[str]:
+def _demo(out: Path, seconds: float, *more: str) -> subprocess.Popen[str]:
     command = [
         sys.executable,
         "-m",
@@ -29,6 +29,7 @@ def _demo(out: Path, seconds: float) -> subprocess.Popen[str]:
         str(seconds),
         "--out",
         str(out),
+        *more,
     ]
     return subprocess.Popen(
         [*command, "--json", str(out / "copy.json")],
@@ -66,6 +67,8 @@ def test_demo_tracks_scores_and_leaves_its_results(tmp_path: Path) -> None:
     assert summary["marker_mm"] < 4.0
     for key in ("latency_p50_ms", "latency_p99_ms", "lost", "joint_mm", "pip_deg", "poses_per_s"):
         assert np.isfinite(summary[key]), key
+    assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0}, rel=2e-3)
+    assert set(summary["received_hz"]) == {"left", "right"}
     assert set(summary["stage_us"]) == {"pairing", "triangulate", "filter", "hand"}
     for name in ("hand.png", "run.rrd", "poses.npz", "left.log", "right.log", "master.log"):
         assert (tmp_path / name).stat().st_size > 0, name
@@ -98,6 +101,35 @@ def test_a_killed_process_is_back_within_two_seconds_and_nobody_else_is_touched(
     assert len(after) > 30
     # Two seconds are the promise; a loaded test machine gets one more to start a Python process.
     assert (after[0] - killed_ns) * 1e-9 < 3.0
+
+
+def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_path: Path) -> None:
+    demo = _demo(tmp_path, 8.0, "--rig", "desk4", "--scene", "poses")
+    heard: list[str] = []
+    killed_ns = 0
+    pids: dict[str, int] = {}
+    for line in _lines(demo):
+        heard.append(line)
+        pids = pids or _pids(line)
+        if "3 of 8 s" in line and not killed_ns:
+            killed_ns = time.monotonic_ns()
+            for name in ("left2", "right2"):
+                os.kill(pids[name], signal.SIGKILL)
+    assert demo.wait(90) == 0, "\n".join(heard)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["restarts"] == {"left2": 1, "right2": 1}
+    # From the stamps, so it does not matter how many frames a busy machine had no time for.
+    rates = {"left": 60.0, "right": 60.0, "left2": 30.0, "right2": 30.0}
+    assert summary["camera_hz"] == pytest.approx(rates, rel=2e-3)
+    assert summary["joint_mm"] < 8.0
+    poses = load_poses(tmp_path / "poses.npz")
+    alone = (poses.t_ns > killed_ns) & (
+        poses.t_ns < killed_ns + 500_000_000
+    )  # a process needs longer to be back
+    assert alone.any()
+    assert poses.valid[alone].all()
+    assert poses.valid[len(poses) // 2 :].all()
+    assert _gone(pids)
 
 
 def test_ctrl_c_ends_every_process_and_still_sums_up(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import threading
 
+import numpy as np
 import pytest
 
 from common.messages import HandPose, MarkerDetections
@@ -9,6 +10,7 @@ from master.app import RunFigures, health, run
 from master.live import cameras_line
 from master.rig import build_pipeline
 from master.stages import StageTimes
+from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, synthetic_run
 
 
@@ -99,10 +101,12 @@ def test_health_carries_counts_and_gauges() -> None:
     figures, clock = RunFigures(), ScriptedClock()
     figures.add(0, 4_000_000)
     clock.t_ns = 77
+    for seq in (3, 6):  # two of three frames were not searched
+        figures.rates.push(detections("left", seq, 1_000_000_000 + seq * 20_000_000, np.full((6, 2), 100.0)))
     report = health(5, clock, figures, {"left received": 9})
     assert (report.source, report.session, report.t_ns) == ("master", 5, 77)
     assert report.counts == {"poses": 1, "left received": 9}
-    assert report.gauges == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0}
+    assert report.gauges == {"latency_p50_ms": 4.0, "latency_p99_ms": 4.0, "camera_hz.left": 50.0}
 
 
 def test_stages_are_means_and_survive_an_error() -> None:
