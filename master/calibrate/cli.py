@@ -4,11 +4,14 @@ from collections.abc import Callable
 
 import typer
 
+from master.calibrate.camera_commands import intrinsics, stereo
 from master.calibrate.capture_command import capture_views
 from master.calibrate.depth_commands import depth
 from master.calibrate.verify_command import verify_command
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "intrinsics": intrinsics,
+    "stereo": stereo,
     "capture": capture_views,
     "depth": depth,
     "verify": verify_command,

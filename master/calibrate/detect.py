@@ -128,7 +128,7 @@ def _windows(board: Board, corners: Float) -> Float:
             np.fmin(part, height, out=part)
     share = np.full((rows, columns), _OUTER_WINDOW)
     share[1:-1, 1:-1] = _INNER_WINDOW
-    half: Float = np.clip(np.round(share * reach), *_WINDOW_PX)
+    half = np.minimum(np.maximum(np.round(share * reach), _WINDOW_PX[0]), _WINDOW_PX[1])
     half[np.isinf(reach) | np.isnan(grid[..., 0])] = np.nan
     return half.ravel()
 

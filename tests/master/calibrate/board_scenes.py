@@ -1,4 +1,4 @@
-"""Cameras that look at a board, with truth: corners with noise, or whole images, and views that are wrong on purpose."""
+"""Cameras that look at a board, with truth: corners with noise, or images, and views wrong on purpose."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
