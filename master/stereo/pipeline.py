@@ -163,7 +163,7 @@ class MarkerPipeline:
         Those whose rays do not meet are NaN, and told by the third array (M,).
         """
         uv, sigma = instant.uv, instant.sigma_px
-        points = self._place(uv, sigma).points
+        points = self._place.roughly(uv, sigma)
         sigma = np.hypot(sigma, self._caps.doubt_px(instant.area, points, self._cameras))
         if hand is not None:
             uv = uv - self._caps.bias_px(hand.joints, points, self._cameras)

@@ -54,6 +54,12 @@ class Placement:
         misfit = misfit_of_rays(found.error_px2, sigma_px)
         return Placed(found.points, found.covariance, misfit, self._limits[found.views])
 
+    def roughly(self, uv: Float, sigma_px: Float) -> Float:
+        """Points (M, 3) [m], good enough to tell from which side each camera looks at them; as `__call__`."""
+        if self._law is not None:
+            return position_at_depth(self._cameras[0], uv[0], self._law.depth(uv[0, :, 0] - uv[1, :, 0]))
+        return self._triangulator.roughly(uv, sigma_px)
+
     def _by_law(self, law: DepthLaw, uv: Float, sigma_px: Float) -> Placed:
         camera = self._cameras[0]
         depth = law.depth(uv[0, :, 0] - uv[1, :, 0])
