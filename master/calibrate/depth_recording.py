@@ -99,6 +99,11 @@ def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
     if depth.shape != (len(frames),):
         raise RecordingError(f"{path}: depth has shape {depth.shape}, frames.csv {len(frames)} frames")
     number = {row.seq: i for i, row in enumerate(frames)}
+    if strange := [int(seq) for seq in pairs.seq if int(seq) not in number]:
+        raise RecordingError(
+            f"{recording.folder}: the detections have a frame {strange[0]}, frames.csv has not: they are of another"
+            " recording; run `phalanx-slave detect` again"
+        )
     index = np.array([number[int(seq)] for seq in pairs.seq], np.int64)
     return _single(pairs, depth[index])
 

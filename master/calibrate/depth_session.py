@@ -14,7 +14,7 @@ from common.clock import Clock
 from common.errors import FitError
 from common.messages import MarkerDetections
 from master.app import Source
-from master.calibrate.depth_sweep import Sweep
+from master.calibrate.depth_sweep import FARTHEST_M, Sweep
 
 STILL_PX = 0.2  # drift over the reading, five times the noise of a quarter's mean; 0.5 % of the depth at 1 m
 SHAKE_PX = 0.5  # standard deviation of single frames, five times the noise of a good centroid
@@ -189,7 +189,7 @@ def _number(text: str) -> float | None:
         value = float(text)
     except ValueError:
         return None
-    return value if np.isfinite(value) and value > 0.0 else None
+    return value if 0.0 < value < FARTHEST_M else None
 
 
 def _told(distance: float, reading: Reading, cameras: tuple[str, str]) -> str:

@@ -15,6 +15,7 @@ from common.errors import FitError
 POINTS = 8  # two constants, and enough points to tell a wrong one from the others; the paper has 17
 RANGE = 2.5  # farthest over nearest distance; the paper has 5
 IN_EACH_HALF = 2  # points nearer, and farther, than the geometric middle of the range
+FARTHEST_M = 10.0  # beyond it, 75 mm of baseline give less than 4 px: these are centimetres
 SAME_M = 0.0005  # distances that a ruler does not tell apart
 RULER_M = 0.002  # to which a target can be put back to a mark
 DISAGREE_PX = 0.5  # five standard deviations of a disparity from two centroids of 0.07 px
@@ -141,10 +142,10 @@ def check_enough(sweep: Sweep) -> None:
 
 
 def _check_seen(sweep: Sweep, cameras: tuple[str, str]) -> None:
-    bad = ~(np.isfinite(sweep.distance_m) & (sweep.distance_m > 0.0))
+    bad = ~((sweep.distance_m > 0.0) & (sweep.distance_m < FARTHEST_M))  # NaN too
     if bad.any():
         places = ", ".join(sweep.place[i] for i in np.flatnonzero(bad).tolist())
-        raise FitError(f"{places}: distance_m must be a positive number of metres")
+        raise FitError(f"{places}: distance_m must be metres, above 0 and below {FARTHEST_M:g}")
     lost = np.isnan(sweep.disparity_px)
     if not lost.any():
         return

@@ -3,6 +3,7 @@
 import csv
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -195,6 +196,9 @@ def test_a_rendered_recording_brings_its_distances(tmp_path: Path) -> None:
     write_npz(tmp_path / "r" / "truth.npz", {"depth": np.ones(7)})
     with pytest.raises(RecordingError, match="7"):
         by_truth(opened, pairs)
+    write_npz(tmp_path / "r" / "truth.npz", {"depth": np.ones(3)})
+    with pytest.raises(RecordingError, match="have a frame 9"):
+        by_truth(opened, replace(pairs, seq=np.array([0, 1, 9])))
 
 
 def test_a_table_comes_back_as_it_was_written(tmp_path: Path) -> None:
