@@ -86,7 +86,7 @@ def run(
 
 
 def health(session: int, clock: Clock, figures: RunFigures, counts: dict[str, int]) -> Health:
-    """The master's report; gauges keep apart what a camera runs at, camera_hz.NAME, and what comes of it, poses_per_s."""
+    """The master's report; gauges tell what a camera runs at (camera_hz.NAME) from what is solved (poses_per_s)."""
     gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
     gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     return Health("master", session, clock.now_ns(), {"poses": figures.poses} | counts, gauges)
