@@ -1,28 +1,45 @@
 """Time: the monotonic clock, a loop tick that never drifts, and the offset of a foreign clock.
 
 Every time in Phalanx is an integer of nanoseconds on a monotonic clock; the wall clock is never
-asked. Each machine has its own monotonic clock, so the master measures how each slave's clock
-runs against its own, by the four-timestamp echo of NTP (RFC 5905, section 8):
+asked, and setting it moves nothing. Each machine has its own monotonic clock, so the master measures
+how each slave's clock runs against its own, by the four time stamps of NTP (RFC 5905, section 8):
 
     t1 master sends, t2 slave receives, t3 slave answers, t4 master receives
-    offset = ((t2 - t1) + (t3 - t4)) / 2        round trip = (t4 - t1) - (t3 - t2)
+    there = t2 - t1 = offset + delay          back = t4 - t3 = delay - offset
 
-The true offset lies within half a round trip of that value, whatever the two ways cost. Hence
-two rules: samples count by how near their round trip is to the shortest one, and a sample that
-contradicts the line by more than its half round trip proves that the remote clock was stepped.
+A network only ever adds delay. So in a plot over time the offset is a line below all `there` and above
+all `-back`, and the best one is the middle of the widest corridor between the two clouds. For delays
+with an exponential tail that is the maximum likelihood (Jeske, "On maximum-likelihood estimation of
+clock offset", IEEE Trans. Commun. 53, 2005; the corridor's slope: Moon, Skelly & Towsley, "Estimation
+and removal of clock skew from network delay measurements", INFOCOM 1999). Each way has its own fastest
+echo: one way may queue as much as it likes, and no echo need be fast both ways, as NTP's filter wants.
+
+What no echo can see is a constant difference of the two ways. The offset is off by half of it, which
+is at most half of the corridor's width; where in there is unknown. An echo that leaves the corridor by
+more than its width would have arrived before it was sent: the remote clock was stepped, or a machine slept.
 """
 
-import heapq
 import time
 from collections import deque
 from dataclasses import dataclass
+from math import hypot, sqrt
 from typing import NamedTuple, Protocol
 
-BEST_FRACTION = 10  # one in ten: the best 10 % by round trip carry the estimate
-BEST_AT_LEAST = 5  # while there are few samples
-FLOOR_NS = 5_000.0  # scatter of a sample without queueing: scheduling of two threads [ns]
+import numpy as np
+
+from common.arrays import Float
+
+AT_LEAST = 5  # echoes before the offset is used
 DRIFT_PRIOR = 200e-6  # two crystals differ by less than this (Raspberry Pi: +-100 ppm each)
-STEPS_TO_RESTART = 3  # contradicting echoes in a row: one may be a freak of the network
+WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
+SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
+SUSPECTS_AMONG = 20  # so many echoes
+_FLOOR_NS = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
+_EDGE_SHARE = 8  # one echo in so many tells how sharp the edge of a cloud is
+_SOFT_EDGE = 1.5  # few delays are quite as short as an exponential law would have it
+_WIDEST_DRIFT = 800e-6  # a clock that is slewed by its time service: 500 ppm
+_GRID: Float = np.linspace(-1.0, 1.0, 33)
+_ZOOMS = 6
 
 
 def now_ns() -> int:
@@ -119,9 +136,10 @@ class ClockEstimate:
         t_ns: Local time at which `offset_ns` holds [ns]: the newest echo.
         offset_ns: Remote minus local time [ns].
         drift_ppm: Rate of the remote clock minus that of the local one [1e-6].
-        sigma_ns: Standard deviation of the offset from scatter [ns]. A constant difference
-            between the two ways of the network is invisible to any echo and not in it.
-        bound_ns: Half of the shortest round trip [ns]: the offset cannot be further off than that.
+        sigma_ns: Standard deviation of the offset from scatter [ns], if both ways of the network cost the same.
+        bound_ns: Half of the corridor's width, that is of the shortest round trip [ns]: however much the two
+            ways differ, the offset cannot be further off than that.
+        drift_sigma_ppm: Standard deviation of the drift.
     """
 
     t_ns: int
@@ -129,6 +147,7 @@ class ClockEstimate:
     drift_ppm: float
     sigma_ns: float
     bound_ns: int
+    drift_sigma_ppm: float = 0.0
 
     def to_local(self, t_remote_ns: int) -> int:
         """Return the local time [ns] at which the remote clock shows `t_remote_ns`."""
@@ -140,29 +159,43 @@ class ClockEstimate:
         """Return what the remote clock shows [ns] at the local time `t_local_ns`."""
         return t_local_ns + self.offset_ns + round((t_local_ns - self.t_ns) * (self.drift_ppm * 1e-6))
 
+    def scatter_at(self, t_local_ns: int) -> float:
+        """Standard deviation [ns] of the offset at a local time, if both ways cost the same.
+
+        It grows with the time since the newest echo, as the drift is known and as a crystal wanders.
+        """
+        drift = 1e-6 * hypot(self.drift_sigma_ppm, WANDER_PPM) * (t_local_ns - self.t_ns)
+        return hypot(self.sigma_ns, drift)
+
+    def sigma_at(self, t_local_ns: int) -> float:
+        """Standard deviation [ns] of a converted time, with what no echo can see.
+
+        Of the difference of the two ways only the bound is known, so any value within it is as likely as another.
+        """
+        return hypot(self.scatter_at(t_local_ns), self.bound_ns / sqrt(3.0))
+
 
 class _Echo(NamedTuple):
-    round_trip_ns: int
     t_ns: int  # middle of the round trip, local clock
-    offset_ns: int
+    there_ns: int  # offset + delay
+    back_ns: int  # delay - offset
 
 
 class OffsetEstimator:
-    """Line through the best echoes of a sliding window: offset, drift and their uncertainty.
+    """Widest corridor between the echoes of a sliding window: offset, drift and their uncertainty.
 
-    Holds the echoes of the window, the line through the best of them, and the newest echoes that
-    contradict it; three of those in a row are a stepped clock and start the estimate afresh.
-    `steps` counts such restarts, `refused` impossible echoes.
+    Holds the echoes of the window and the estimate from them; after an echo that contradicts it, also those since.
+    Three such echoes among twenty are a stepped clock and start the estimate afresh from these. `steps` counts such
+    restarts, `refused` impossible echoes.
     """
 
-    def __init__(
-        self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 1_000_000
-    ) -> None:
-        """Keep at most `capacity` echoes of `window_ns`; a jump above `step_ns` is a step."""
+    def __init__(self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 200_000) -> None:
+        """Keep at most `capacity` echoes of `window_ns`; a jump above `step_ns` can be a step."""
         self._window_ns = window_ns
         self._step_ns = step_ns
         self._echoes: deque[_Echo] = deque(maxlen=capacity)
-        self._suspects: list[_Echo] = []
+        self._since: list[_Echo] = []
+        self._suspects = 0
         self._estimate: ClockEstimate | None = None
         self.steps = 0
         self.refused = 0
@@ -170,69 +203,124 @@ class OffsetEstimator:
     @property
     def ready(self) -> bool:
         """Whether there are enough echoes for a usable estimate."""
-        return len(self._echoes) >= BEST_AT_LEAST
+        return len(self._echoes) >= AT_LEAST
 
     @property
     def settled(self) -> bool:
         """Whether there are enough echoes, and none that contradict: no need to hurry."""
-        return len(self._echoes) >= 2 * BEST_AT_LEAST and not self._suspects
+        return len(self._echoes) >= 2 * AT_LEAST and not self._suspects
 
     def push(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
         """Take one echo: t1, t4 on the local clock, t2, t3 on the remote clock [ns]."""
-        round_trip = (t4_ns - t1_ns) - (t3_ns - t2_ns)
-        if round_trip < 0 or t4_ns < t1_ns or t3_ns < t2_ns:
+        if (t4_ns - t1_ns) - (t3_ns - t2_ns) < 0 or t4_ns < t1_ns or t3_ns < t2_ns:
             self.refused += 1
             return
-        offset = ((t2_ns - t1_ns) + (t3_ns - t4_ns)) // 2
-        echo = _Echo(round_trip, (t1_ns + t4_ns) // 2, offset)
-        if self._contradicts(echo):
-            self._suspects.append(echo)
-            if len(self._suspects) < STEPS_TO_RESTART:
-                return
-            self.steps += 1
-            self._echoes.clear()
-            self._echoes.extend(self._suspects)
-        else:
-            self._echoes.append(echo)
-        self._suspects = []
+        echo = _Echo((t1_ns + t4_ns) // 2, t2_ns - t1_ns, t4_ns - t3_ns)
+        if self._doubted(echo):
+            return
+        self._echoes.append(echo)
         while echo.t_ns - self._echoes[0].t_ns > self._window_ns:
             self._echoes.popleft()
-        self._estimate = _fit(self._echoes, echo.t_ns)
+        self._estimate = _fit(self._echoes)
 
     def estimate(self) -> ClockEstimate | None:
         """Return the estimate at the newest echo, or None before the first."""
         return self._estimate
 
+    def _doubted(self, echo: _Echo) -> bool:
+        """Whether this echo is not to be used yet; starts afresh where too many contradict."""
+        wrong = self._contradicts(echo)
+        if wrong or self._suspects:
+            self._since.append(echo)
+            self._suspects += wrong
+        if self._suspects >= SUSPECTS_TO_RESTART:
+            self.steps += 1
+            self._echoes.clear()
+            self._echoes.extend(self._since[:-1])
+            wrong = False
+        if self._suspects >= SUSPECTS_TO_RESTART or len(self._since) >= SUSPECTS_AMONG:
+            self._since, self._suspects = [], 0
+        return wrong
+
     def _contradicts(self, echo: _Echo) -> bool:
         """Whether no delay of the network explains this echo (see the theory above)."""
-        if self._estimate is None:
+        known = self._estimate
+        if known is None:
             return False
-        expected = self._estimate.to_remote(echo.t_ns) - echo.t_ns
-        allowed = echo.round_trip_ns // 2 + self._estimate.bound_ns + self._step_ns
-        return abs(echo.offset_ns - expected) > allowed
+        expected = known.to_remote(echo.t_ns) - echo.t_ns
+        least = min(echo.there_ns - expected, echo.back_ns + expected)
+        return least < -(known.bound_ns + self._step_ns + 3.0 * known.scatter_at(echo.t_ns))
 
 
-def _fit(echoes: deque[_Echo], t_ns: int) -> ClockEstimate:
-    """Weighted least squares line through the best tenth of `echoes`, evaluated at `t_ns`.
+@dataclass(frozen=True, slots=True)
+class _Corridor:
+    """What the echoes say of a range of drifts; all in ns and ns/s, at the newest echo."""
 
-    A sample that queued for e longer than the fastest is off by up to e/2, so it weighs
-    1 / (FLOOR^2 + (e/2)^2). The drift has a Gaussian prior (ridge), so that a line through
-    samples close in time stays flat: d = Sxy / (Sxx + 1/prior^2).
-    """
-    best = heapq.nsmallest(max(BEST_AT_LEAST, len(echoes) // BEST_FRACTION), echoes)
-    shortest = best[0].round_trip_ns
-    base = best[0].offset_ns
-    weights = [1.0 / (FLOOR_NS**2 + (0.5 * (echo.round_trip_ns - shortest)) ** 2) for echo in best]
-    x = [float(echo.t_ns - t_ns) for echo in best]
-    y = [float(echo.offset_ns - base) for echo in best]
-    total = sum(weights)
-    x_mean = sum(w * a for w, a in zip(weights, x, strict=True)) / total
-    y_mean = sum(w * b for w, b in zip(weights, y, strict=True)) / total
-    sxx = sum(w * (a - x_mean) ** 2 for w, a in zip(weights, x, strict=True)) + DRIFT_PRIOR**-2
-    sxy = sum(w * (a - x_mean) * (b - y_mean) for w, a, b in zip(weights, x, y, strict=True))
-    drift = sxy / sxx
-    residual = [b - y_mean - drift * (a - x_mean) for a, b in zip(x, y, strict=True)]
-    chi2 = sum(w * r * r for w, r in zip(weights, residual, strict=True)) / max(1, len(best) - 2)
-    variance = (1.0 / total + x_mean**2 / sxx) * max(1.0, chi2)
-    offset = base + round(y_mean - drift * x_mean)
-    return ClockEstimate(t_ns, offset, drift * 1e6, variance**0.5, (shortest + 1) // 2)
+    offset: float
+    sigma: float
+    width: float
+    drift: float
+    drift_sigma: float
+    step: float  # between neighbouring drifts
+
+    @classmethod
+    def of(cls, t_s: Float, there: Float, back: Float, centre: float, half: float) -> "_Corridor":
+        """Posterior mean and spread, for drifts within `half` of `centre`.
+
+        Given the drift, the distances of the walls from the shortest possible delays are exponential, with the spacing
+        of the shortest delays as their scale. The drift's own posterior has a Gaussian prior, and the heights of the
+        walls at the mean time, in units of their scales: minus the sum of all delays above them.
+        """
+        drift = centre + half * _GRID
+        shift = drift[:, None] * t_s
+        wall, other = (there - shift).min(axis=1), (back + shift).min(axis=1)
+        widest = int(np.argmax(wall + other))
+        gap, other_gap = _spacing(there - shift[widest]), _spacing(back + shift[widest])
+        middle_time = drift * t_s.mean()
+        log = (wall + middle_time) / gap + (other - middle_time) / other_gap
+        log -= 0.5 * (drift * (1e-9 / DRIFT_PRIOR)) ** 2
+        share = np.exp(log - log.max())
+        share /= share.sum()
+        middle = 0.5 * ((wall - gap) - (other - other_gap))
+        offset, mean = float(share @ middle), float(share @ drift)
+        variance = float(share @ (middle - offset) ** 2) + 0.25 * (gap * gap + other_gap * other_gap)
+        return cls(
+            offset=offset,
+            sigma=variance**0.5,
+            width=float(share @ (wall + other)),
+            drift=mean,
+            drift_sigma=float(share @ (drift - mean) ** 2) ** 0.5,
+            step=float(drift[1] - drift[0]),
+        )
+
+
+def _fit(echoes: deque[_Echo]) -> ClockEstimate:
+    """The corridor at the newest echo; the grid of drifts closes in on it until it is fine enough."""
+    table = np.array(echoes, dtype=np.int64)
+    newest = int(table[-1, 0])
+    base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
+    t_s = (table[:, 0] - newest).astype(np.float64) * 1e-9
+    there, back = (table[:, 1] - base).astype(np.float64), (table[:, 2] + base).astype(np.float64)
+    found = _Corridor.of(t_s, there, back, 0.0, _WIDEST_DRIFT * 1e9)
+    for _ in range(_ZOOMS):
+        if found.drift_sigma > 2.0 * found.step:
+            break
+        found = _Corridor.of(t_s, there, back, found.drift, 4.0 * max(found.drift_sigma, found.step))
+    return ClockEstimate(
+        t_ns=newest,
+        offset_ns=base + round(found.offset),
+        drift_ppm=found.drift * 1e-3,
+        sigma_ns=found.sigma,
+        bound_ns=max(0, round(0.5 * found.width)),
+        drift_sigma_ppm=max(found.drift_sigma, found.step) * 1e-3,
+    )
+
+
+def _spacing(delay_ns: Float) -> float:
+    """How far apart the shortest delays lie (n,) [ns]: as far as the shortest is from the shortest possible one."""
+    n = len(delay_ns)
+    if n < AT_LEAST:
+        return max(_FLOOR_NS, float(delay_ns.max() - delay_ns.min()))
+    count = max(AT_LEAST - 1, n // _EDGE_SHARE)
+    shortest = np.partition(delay_ns, count)[: count + 1]
+    return max(_FLOOR_NS, _SOFT_EDGE * float(shortest.max() - shortest.min()) / count)

@@ -114,6 +114,8 @@ class Ingest:
         for camera in self._cameras:
             of = asdict(self.counts_of(camera))
             counts |= {f"{camera}.{event}": number for event, number in of.items()}
+            with self._lock:
+                counts[f"{camera}.clock_steps"] = self._link.clock_steps_of(camera)
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def counts_of(self, camera: str) -> CameraCounts:

@@ -11,6 +11,7 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
+from math import hypot
 
 import msgspec
 
@@ -37,7 +38,8 @@ from common.session import (
 from master.sequence import CameraCounts, Sequence
 
 BEACON_NS = 100_000_000
-ECHO_FAST_NS = 10_000_000  # until the clock is settled
+ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
+FAST_NS = 2_000_000_000
 ECHO_EARLY_NS = 50_000_000
 ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
@@ -76,6 +78,7 @@ class _Camera:
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
     sequence: Sequence = field(default_factory=Sequence)
     missing_before: int = 0  # datagrams lost in sessions that are over
+    steps_before: int = 0  # and steps of the clock
 
 
 class MasterLink:
@@ -171,6 +174,11 @@ class MasterLink:
         live = self._cameras[camera].live
         return None if live is None else live.clock.estimate()
 
+    def clock_steps_of(self, camera: str) -> int:
+        """Return how often the clock of `camera` was seen to jump since this master began."""
+        of = self._cameras[camera]
+        return of.steps_before + (0 if of.live is None else of.live.clock.steps)
+
     def counts_of(self, camera: str) -> CameraCounts:
         """Return what was counted of `camera` since this master began."""
         of = self._cameras[camera]
@@ -248,6 +256,7 @@ class MasterLink:
     def _confirm(self, camera: _Camera, session: _Session, t_ns: int) -> None:
         if camera.live is not None:
             camera.missing_before += camera.live.opener.missing
+            camera.steps_before += camera.live.clock.steps
             del self._sessions[camera.live.key_id]
         camera.live, camera.pending = session, None
         camera.old_nonces.append(session.hello.slave_nonce)
@@ -273,7 +282,12 @@ class MasterLink:
             self.unsynchronised += 1
             return None
         t_ns, ready_t_ns = clock.to_local(message.t_ns), clock.to_local(message.ready_t_ns)
-        return msgspec.structs.replace(message, t_ns=t_ns, ready_t_ns=ready_t_ns)
+        return msgspec.structs.replace(
+            message,
+            t_ns=t_ns,
+            ready_t_ns=ready_t_ns,
+            t_sigma_ns=hypot(message.t_sigma_ns, clock.sigma_at(t_ns)),
+        )
 
     def _ask_clock(self, session: _Session) -> None:
         t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
@@ -281,7 +295,7 @@ class MasterLink:
             return
         if t_ns - session.heard_ns > SILENT_NS:
             period = ECHO_NS
-        elif not session.clock.settled:
+        elif not session.clock.settled or t_ns - session.since_ns < FAST_NS:
             period = ECHO_FAST_NS
         else:
             period = ECHO_EARLY_NS if t_ns - session.since_ns < EARLY_NS else ECHO_NS

@@ -113,6 +113,7 @@ def build_pipeline(setup: RigSetup, stage: Stage, *, continuous: bool = True) ->
         law=depth_law(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
+        stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
         stage=stage,
     )

@@ -83,6 +83,7 @@ def run(
             found.quality,
             found.sigma_px,
             found.rival_uv,
+            frame.t_sigma_ns,
         )
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)

@@ -5,10 +5,11 @@ and get the same poses. It is built from calibration by `master.rig`.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 
 from common.arrays import Bool, Float
@@ -54,6 +55,7 @@ class MarkerPipeline:
         law: DepthLaw | None = None,
         smooth: OneEuro | None = None,
         tracker: HandTracker,
+        stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
@@ -67,6 +69,7 @@ class MarkerPipeline:
             law: Depth from disparity of the first two cameras; None: triangulate all cameras.
             smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
             tracker: Solves the hand from its own markers, some or all of these.
+            stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
             stage: Opens a timer by stage name.
         """
@@ -80,12 +83,15 @@ class MarkerPipeline:
         self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
         self._stage, self._volume = stage, volume
+        self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
         self._on_palm = np.array([model.mount(name).joint is None for name in tracker.markers], np.bool_)
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
+        if late_ns := self._late_ns.get(message.camera):
+            message = msgspec.structs.replace(message, t_ns=message.t_ns + late_ns)
         with self._stage("pairing"):
             instants = self._pairing.push(message)
         return [self._solve(instant) for instant in instants]

@@ -112,7 +112,7 @@ class Picamera2Camera:
             if place is None:
                 continue
             self._lores = lores
-            return Frame(*place, self._clock.now_ns(), image)
+            return Frame(*place, self._clock.now_ns(), image, t_sigma_ns=self._timeline.sigma_ns)
         return None
 
     def close(self) -> None:

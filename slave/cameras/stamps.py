@@ -12,6 +12,7 @@ hand-over as its predecessors were. So a step moves no `t_ns`.
 
 import time
 from collections.abc import Callable
+from math import sqrt
 
 from common.clock import Clock
 
@@ -31,8 +32,8 @@ CLOCKS: dict[str, int] = {
 class ForeignClock:
     """Converts the stamps of one driver.
 
-    Holds the last difference between the clocks, the age of the last frame when it was converted, and in `steps`
-    how often the foreign clock was set.
+    Holds the last difference between the clocks and how well it was read, the age of the last frame when it was
+    converted, and in `steps` how often the foreign clock was set.
     """
 
     def __init__(self, own: Clock, read_ns: Callable[[], int]) -> None:
@@ -41,7 +42,13 @@ class ForeignClock:
         self._read_ns = read_ns
         self._offset_ns: int | None = None
         self._age_ns: int | None = None
+        self._width_ns = 0
         self.steps = 0
+
+    @property
+    def sigma_ns(self) -> float:
+        """Standard deviation of the last conversion [ns]: anywhere in its sandwich is as likely."""
+        return self._width_ns / sqrt(12.0)
 
     def to_own(self, stamp_ns: int) -> int:
         """Time on the slave's clock [ns] of a stamp taken a short while ago [ns]."""
@@ -69,6 +76,7 @@ class ForeignClock:
             if width_ns < NARROW_NS:
                 break
         assert best is not None, "TRIES is positive"
+        self._width_ns = best[0]
         return best[1], best[2]
 
 

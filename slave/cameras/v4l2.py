@@ -9,6 +9,12 @@ exposure (USB: reckoned from the camera's own clock where it has one), or the en
 read-out. From there it is half an exposure forward, or all rows and half an exposure back. `sequence` counts every
 frame of the camera, so a gap in it is a dropped one; a frame that arrived damaged is one, too.
 
+How far a stamp scatters. A driver that stamps in its interrupt: 50 us, the latency of an interrupt under load. uvcvideo
+reads the clock when it sees the first packet, and it sees packets when their transfer is over: of up to 32 microframes
+of 125 us, so anywhere within 4 ms, 1.2 ms as standard deviation. With `hwtimestamps=1` it follows the camera's own
+clock by USB's frame numbers, one per ms: 0.3 ms. How late *all* frames are, by exposure and by what the camera keeps,
+is no scatter and unknown here: `phalanx-master calibrate time` measures it.
+
 Its settings, which another thread may change while frames are read, are in `v4l2_settings`.
 """
 
@@ -36,6 +42,8 @@ BUFFERS = 4
 RATE_SHARE = (
     0.1  # a camera that halves its rate for the light is out by 1/2; USB jitter of a median is far below
 )
+INTERRUPT_SIGMA_NS, USB_SIGMA_NS, USB_CLOCK_SIGMA_NS = 50e3, 1.2e6, 0.3e6  # see above
+USB_CLOCK = Path("/sys/module/uvcvideo/parameters/hwtimestamps")
 NOT_INCREASING = 2**31  # steps of a 32-bit frame number beyond this run backwards
 _LOG = logging.getLogger(__name__)
 
@@ -79,6 +87,7 @@ class V4l2Camera:
         self._calibration, self._options, self._clock = calibration, options, clock
         self._where = f"camera {calibration.name!r} (v4l2:{options.path})"
         self._foreign: ForeignClock | None = None
+        self._sigma_ns = INTERRUPT_SIGMA_NS
         self._buffers: list[memoryview] = []
         self._seq = -1
         self._sequence: int | None = None
@@ -117,7 +126,7 @@ class V4l2Camera:
             if image is None:
                 self.broken += 1
                 continue
-            return Frame(self._seq, t_ns, self._clock.now_ns(), image)
+            return Frame(self._seq, t_ns, self._clock.now_ns(), image, t_sigma_ns=self._sigma_ns)
         return None
 
     def close(self) -> None:
@@ -187,6 +196,8 @@ class V4l2Camera:
         device.ioctl(abi.QUERYCAP, found)
         has = int(found.device_caps if found.capabilities & abi.CAP_DEVICE_CAPS else found.capabilities)
         name = found.card.decode("utf-8", "replace")
+        if found.driver == b"uvcvideo":
+            self._sigma_ns = USB_CLOCK_SIGMA_NS if _usb_clock_is_used() else USB_SIGMA_NS
         if not (has & abi.CAP_CAPTURE and has & abi.CAP_STREAMING):
             raise CameraError(
                 f"{name} is no single-planar capture device (a USB camera has a second device for metadata; a Pi "
@@ -295,6 +306,14 @@ class V4l2Camera:
         if buffer.flags & abi.STAMP_SOURCE == abi.STAMP_START_OF_EXPOSURE:
             return t_ns + half_ns
         return t_ns - round(self._calibration.height_px * self._calibration.row_time_us * 1e3) - half_ns
+
+
+def _usb_clock_is_used() -> bool:
+    """Whether uvcvideo reckons its stamps from the cameras' own clocks; it does not unless told to."""
+    try:
+        return int(USB_CLOCK.read_text()) != 0
+    except (OSError, ValueError):
+        return False
 
 
 def _take(device: abi.Device) -> abi.Buffer | None:

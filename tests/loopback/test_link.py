@@ -104,6 +104,13 @@ def test_a_clean_network_loses_nothing(rig: Rig) -> None:
     got, errors = stream(rig, slaves, ingest, 1.0)
     assert got == {"left": 100, "right": 100}
     assert max(map(abs, errors)) < CLOCK_NS
+    rig.send("right", slaves["right"])
+    last = ingest.get(1.0)
+    estimate = ingest.clock_of("right")
+    assert last is not None
+    assert estimate is not None
+    assert last.t_sigma_ns == pytest.approx(estimate.sigma_at(last.t_ns), rel=0.5)  # their stamps are exact
+    assert ingest.counts["right.clock_steps"] == 0
     assert ingest.lost == 0
     assert not ingest.refused
     assert slaves["left"].counts["sent"] == 100

@@ -1,5 +1,7 @@
 """Tests of the straight line from detections to poses, on exact detections of a moving hand."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from common.arrays import Float
 from common.calibration import AffineDisparityCalibration, PowerLawCalibration
 from common.hand_model import CHAINS
 from common.messages import HandPose, MarkerDetections, Source
-from master.rig import build_pipeline
+from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
 from master.stereo.pipeline import MarkerPipeline
 from tests.hand_helpers import MARKERS, RIGHT, detections
@@ -254,3 +256,21 @@ def test_when_the_last_frame_was_handed_over_is_passed_on(exact_run: SyntheticRu
     for one in solved[2:]:
         k = (one.pose.t_ns - 1_000_000_000) // PERIOD_NS
         assert one.ready_t_ns == 1_000_000_000 + k * PERIOD_NS + 5_000_000 + 2_000_000
+
+
+def test_stamps_that_lie_are_corrected_by_the_rig_file(exact_run: SyntheticRun) -> None:
+    lying = [
+        msgspec.structs.replace(message, t_ns=message.t_ns - 8_000_000)
+        if message.camera == "right"
+        else message
+        for message in exact_run.messages
+    ]
+    lying.sort(key=lambda message: message.t_ns)
+
+    def error_mm(setup: RigSetup) -> float:
+        poses = solve_all(build_pipeline(setup, StageTimes()), lying)
+        return float(np.nanmax([marker_mm(pose) for pose in poses[4:-4]]))
+
+    rig = msgspec.structs.replace(exact_run.setup.rig, stamp_offset_us={"right": 8000.0})
+    assert error_mm(exact_run.setup) > 10.0
+    assert error_mm(replace(exact_run.setup, rig=rig)) < 2.0

@@ -1,4 +1,5 @@
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,6 +58,13 @@ class Wire:
 
 def frame(seq: int, image: np.ndarray) -> Frame:
     return Frame(seq, 16_000_000 * seq, 16_000_000 * seq + 5, image)
+
+
+def test_the_scatter_of_a_stamp_travels_with_it() -> None:
+    wire = Wire()
+    source = Source([replace(frame(3, HAND), t_sigma_ns=1.2e6), frame(4, HAND)])
+    run(source, DETECTOR.fresh(), wire, "left", Tally(NAMES), threading.Event())
+    assert [m.t_sigma_ns for m in wire.sent] == [1.2e6, 0.0]
 
 
 def test_every_frame_is_sent_with_its_times_the_empty_ones_too() -> None:

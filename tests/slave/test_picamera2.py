@@ -377,3 +377,9 @@ def test_the_stand_in_has_the_signatures_of_the_real_library() -> None:
         assert parameters(getattr(CompletedRequest, name)) == parameters(
             getattr(request.CompletedRequest, name)
         ), name
+
+
+def test_a_stamp_scatters_by_the_latency_of_an_interrupt(monkeypatch: pytest.MonkeyPatch) -> None:
+    frame = opened(monkeypatch, Sensor()).read()
+    assert frame is not None
+    assert 50e3 <= frame.t_sigma_ns < 100e3  # and a little of the conversion between clocks

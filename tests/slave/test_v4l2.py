@@ -469,3 +469,16 @@ def test_a_real_camera_delivers_frames_with_all_settings_checked() -> None:
     )
     assert again.read() is not None, "given back, and opened again"
     again.close()
+
+
+@pytest.mark.parametrize(("parameter", "sigma_ns"), [("0\n", 1.2e6), ("1\n", 0.3e6), (None, 1.2e6)])
+def test_a_usb_stamp_says_how_far_it_scatters(
+    parameter: str | None, sigma_ns: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "hwtimestamps"
+    if parameter is not None:
+        path.write_text(parameter)
+    monkeypatch.setattr("slave.cameras.v4l2.USB_CLOCK", path)
+    frame = opened(Camera()).read()
+    assert frame is not None
+    assert frame.t_sigma_ns == sigma_ns
