@@ -53,6 +53,20 @@ Picture = Annotated[Path | None, typer.Option(help="Write a picture of the error
 FovDeg = Annotated[
     float | None, typer.Option(help="Nominal horizontal field of view, for cameras without intrinsics.")
 ]
+Out = Annotated[Path | None, typer.Option(help="Tree to write rigs/<rig>.json into.")]
+Use = Annotated[
+    Literal["power_law", "affine_disparity", "stereo"] | None,
+    typer.Option(help="Also make this the rig's depth_model."),
+]
+Live = Annotated[bool, typer.Option("--live", help="Measure now, with the running slaves.")]
+SaveTable = Annotated[
+    Path | None, typer.Option("--save", help="With --live: keep the readings in this .csv.")
+]
+Frames = Annotated[int, typer.Option(min=8, help="With --live: frames to average, at least.")]
+Seconds = Annotated[float, typer.Option(min=1.0, max=60.0, help="With --live: time to average.")]
+Beacon = Annotated[str, typer.Option(help="With --live: ADDRESS:PORT of the slaves.")]
+Bind = Annotated[str, typer.Option(help="With --live: own ADDRESS:PORT.")]
+KeyFile = Annotated[Path | None, typer.Option(help="With --live: rig key.")]
 
 CALIB_JSON = Path("calib_json")
 _SWEEP = "1.00:0.20:-0.05"  # the published one
@@ -67,24 +81,17 @@ def depth(
     calibration: Calibration = CALIB_JSON,
     target: Target = "75x50",
     fov_deg: FovDeg = None,
-    out: Annotated[Path | None, typer.Option(help="Tree to write rigs/<rig>.json into.")] = None,
-    use: Annotated[
-        Literal["power_law", "affine_disparity", "stereo"] | None,
-        typer.Option(help="Also make this the rig's depth_model."),
-    ] = None,
+    out: Out = None,
+    use: Use = None,
     json_file: JsonFile = None,
     picture: Picture = None,
-    live: Annotated[bool, typer.Option("--live", help="Measure now, with the running slaves.")] = False,
-    save_table: Annotated[
-        Path | None, typer.Option("--save", help="With --live: keep the readings in this .csv.")
-    ] = None,
-    frames: Annotated[int, typer.Option(min=8, help="With --live: frames to average, at least.")] = 30,
-    seconds: Annotated[float, typer.Option(min=1.0, max=60.0, help="With --live: time to average.")] = 1.0,
-    beacon: Annotated[
-        str, typer.Option(help="With --live: ADDRESS:PORT of the slaves.")
-    ] = "127.255.255.255:47800",
-    bind: Annotated[str, typer.Option(help="With --live: own ADDRESS:PORT.")] = "127.0.0.1:47801",
-    key_file: Annotated[Path | None, typer.Option(help="With --live: rig key.")] = None,
+    live: Live = False,
+    save_table: SaveTable = None,
+    frames: Frames = 30,
+    seconds: Seconds = 1.0,
+    beacon: Beacon = "127.255.255.255:47800",
+    bind: Bind = "127.0.0.1:47801",
+    key_file: KeyFile = None,
 ) -> None:
     """Fit depth to disparity from a target at known distances: the power law D = k x^z, and x = a/D + x0.
 

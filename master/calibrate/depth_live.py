@@ -54,7 +54,7 @@ def sweep_live(
             seconds=seconds,
             clock=clock,
             ask=_ask,
-            say=typer.echo,
+            say=_say,
             progress=_progress,
             keep=keep,
         )
@@ -70,6 +70,12 @@ def _ask(prompt: str) -> str | None:
     typer.echo(prompt, nl=False)
     line = sys.stdin.readline()
     return line.rstrip("\n") if line else None
+
+
+def _say(line: str) -> None:
+    if sys.stderr.isatty():
+        typer.echo("\r\033[K", nl=False, err=True)  # the progress goes
+    typer.echo(line)
 
 
 def _progress(share: float) -> None:

@@ -34,6 +34,7 @@ from master.calibrate.verify_report import (
 )
 from master.summary import write_summary
 
+_WANTED = 0.02  # of the depth, as the published rig
 _TABLE = "0.20:1.00:0.10"  # where the budget is printed
 
 

@@ -180,3 +180,8 @@ def error_budget(
         centroid_m=2.0**0.5 * sigma_px * step,
         sync_m=depth_m * speed_m_s * abs(skew_s) / baseline_m,
     )
+
+
+def tolerable_skew_s(share: float, baseline_m: float, speed_m_s: float) -> float:
+    """Time between the two exposures [s] that costs `share` of the depth at a sideways speed: share B / v, any D."""
+    return share * baseline_m / speed_m_s

@@ -17,6 +17,7 @@ from master.stereo.depth import (
     error_budget,
     ideal_law,
     position_at_depth,
+    tolerable_skew_s,
 )
 
 KALBFLEISCH = PowerLaw(k_m=45.433, z=-1.035)
@@ -49,6 +50,15 @@ def test_one_pixel_costs_what_i4_says() -> None:
     assert at_half.centroid_m < 0.001  # 0.1 px stays under 1 mm at 50 cm
     assert at_half.sync_m == pytest.approx(0.11, abs=0.002)  # 11 cm
     assert at_one.sync_m == 0.0
+
+
+def test_two_per_cent_at_a_metre_per_second_needs_a_millisecond_and_a_half() -> None:
+    skew = tolerable_skew_s(0.02, 0.075, 1.0)
+    assert skew == pytest.approx(1.5e-3)
+    for depth in (0.2, 1.0):
+        law = ideal_law(0.075, FOV_RAD, 640)
+        budget = error_budget(law, depth, 0.075, sigma_px=0.1, speed_m_s=1.0, skew_s=skew)
+        assert budget.sync_m == pytest.approx(0.02 * depth)
 
 
 @pytest.mark.parametrize("law", LAWS)
