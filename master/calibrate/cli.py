@@ -4,12 +4,14 @@ from collections.abc import Callable
 
 import typer
 
+from master.calibrate.board_command import board
 from master.calibrate.camera_commands import intrinsics, stereo
 from master.calibrate.capture_command import capture_views
 from master.calibrate.depth_commands import depth
 from master.calibrate.verify_command import verify_command
 
 COMMANDS: dict[str, Callable[..., None]] = {
+    "board": board,
     "intrinsics": intrinsics,
     "stereo": stereo,
     "capture": capture_views,

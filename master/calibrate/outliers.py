@@ -5,7 +5,7 @@ from scipy import stats
 
 from common.arrays import Float
 
-FALSE_ALARM = 0.05  # chance that a set of good views loses one, were their errors log-normal: a good view less costs little
+FALSE_ALARM = 0.05  # chance that a set of good views loses one; one view less costs little, a wrong one much
 _LEAST_SPREAD = 0.1  # of log rms: below it, views of one camera hardly ever agree
 
 
