@@ -32,6 +32,7 @@ from master.calibrate.verify_report import (
     off_axis_lines,
     verified_json,
 )
+from master.stereo.depth import tolerable_skew_s
 from master.summary import write_summary
 
 _WANTED = 0.02  # of the depth, as the published rig
@@ -136,9 +137,11 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[s
         return {}
     expected = budget(pair.models, distance, noise)
     errors = {name: off_axis(law, pair.models, distance, angle) for name, law in laws_of(pair.rig).items()}
-    baseline_mm = 1e3 * float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
+    baseline_m = float(np.linalg.norm(pair.models[1].centre - pair.models[0].centre))
+    apart_ms = 1e3 * tolerable_skew_s(_WANTED, baseline_m, 1.0)
     typer.echo(
-        f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {baseline_mm:.1f} mm (lenses of {pair.origin})"
+        f"f = {pair.models[0].matrix[0, 0]:.1f} px, B = {1e3 * baseline_m:.1f} mm (lenses of {pair.origin});"
+        f" {100 * _WANTED:g} % at 1 m/s sideways needs exposures within {apart_ms:.2f} ms of each other"
     )
     for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
         typer.echo(line)

@@ -162,6 +162,7 @@ def test_verify_measures_every_model_of_the_rig(tmp_path: Path) -> None:
     out = run("verify", csv, "--calibration", calib, "--rig", "desk", "--json", numbers, "--picture", picture)
     assert "fitted to this very sweep" in out
     assert "camera rate: left 60 Hz" in out
+    assert "2 % at 1 m/s sideways needs exposures within 1.50 ms" in out
     found = json.loads(numbers.read_text())
     assert found["models"]["stereo"]["max_percent"] < 0.001
     assert found["models"]["affine_disparity"]["max_percent"] < 0.05
