@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from common.arrays import Image
+from common.arrays import Float, Image
 from common.errors import CalibrationError
 from master.calibrate.board_print import page_for, print_board
 from master.calibrate.boards import Board, Charuco, Checkerboard, board_corners, grid_edges
@@ -23,22 +23,30 @@ BOARDS = [
 ]
 
 
-def painted(pdf: bytes) -> Image:
-    """The black outlines of a PDF's page as an image; anything but plain polygons is left out."""
+def outlines(pdf: bytes) -> tuple[tuple[float, float], list[Float]]:
+    """Size of a PDF's page and its black polygons (n, 2), both in mm from the top left corner."""
     box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", pdf)
     assert box is not None
-    scale = PX_PER_MM * 25.4 / 72.0
-    width, height = float(box[1]) * scale, float(box[2]) * scale
-    page = np.full((round(height), round(width)), 255, np.uint8)
+    width, height = float(box[1]) * 25.4 / 72.0, float(box[2]) * 25.4 / 72.0
     stream = next(
         zlib.decompress(found[1]) for found in re.finditer(rb"stream\r?\n(.*?)\r?\nendstream", pdf, re.DOTALL)
     )
+    polygons: list[Float] = []
     for part in re.findall(rb"0 g\n+((?:[-\d.]+ [-\d.]+ [ml]\n|h\n)+)", stream):
         for one in part.split(b"h\n"):
             points = np.array([[float(n) for n in line.split()[:2]] for line in one.splitlines()])
             if len(points) >= 3:
-                fixed = np.stack([points[:, 0], height / scale - points[:, 1]], axis=1) * scale * 16 - 8
-                cv2.fillPoly(page, [fixed.round().astype(np.int32)], 0, lineType=cv2.LINE_AA, shift=4)
+                polygons.append(points * [1, -1] * 25.4 / 72.0 + [0.0, height])
+    return (width, height), polygons
+
+
+def painted(pdf: bytes) -> Image:
+    """The black polygons of a PDF's page as an image."""
+    (width, height), polygons = outlines(pdf)
+    page = np.full((round(height * PX_PER_MM), round(width * PX_PER_MM)), 255, np.uint8)
+    for polygon in polygons:
+        fixed = (polygon * PX_PER_MM * 16 - 8).round().astype(np.int32)
+        cv2.fillPoly(page, [fixed], 0, lineType=cv2.LINE_AA, shift=4)
     return page
 
 
@@ -59,14 +67,12 @@ def test_the_ruler_is_100_mm_and_the_same_board_is_the_same_file(tmp_path: Path)
         print_board(tmp_path / name, BOARDS[0], "A4")
     pdf = (tmp_path / "a.pdf").read_bytes()
     assert pdf == (tmp_path / "b.pdf").read_bytes()
-    page = painted(pdf)
-    foot = page[-int(16 * PX_PER_MM) :]
-    longest = max(
-        int(run.max()) if len(run) else 0
-        for row in foot < 128
-        for run in [np.diff(np.flatnonzero(np.diff(np.pad(row.astype(int), 1))))[::2]]
-    )
-    assert longest / PX_PER_MM == pytest.approx(100.0, abs=0.3)
+    (width, height), polygons = outlines(pdf)
+    assert (width, height) == pytest.approx((297.0, 210.0), abs=1e-6)
+    ruler = max((np.ptp(p[:, 0]) for p in polygons if np.ptp(p[:, 1]) < 1.0), default=0.0)
+    assert ruler == pytest.approx(100.0, abs=1e-3)
+    ends = [p[:, 0] for p in polygons if 2.0 < np.ptp(p[:, 1]) < 4.0]
+    assert max(x.max() for x in ends) - min(x.min() for x in ends) == pytest.approx(100.0, abs=1e-3)
 
 
 def test_a_board_that_is_too_large_is_refused_with_what_would_fit() -> None:
