@@ -92,13 +92,16 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
         raise CalibrationError(f"{hand_file}: {error}") from error
 
 
-def build_pipeline(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> MarkerPipeline:
+def build_pipeline(
+    setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
+) -> MarkerPipeline:
     """The pipeline this rig's file describes.
 
     Args:
         setup: The rig.
         stage: Measures the stages.
         continuous: False: every frame is an unrelated pose; no filter, no memory.
+        tracker: Tracks the hand; None: a new one, which takes most of the time.
 
     Raises:
         CalibrationError: The depth model does not fit the rig.
@@ -112,7 +115,7 @@ def build_pipeline(setup: RigSetup, stage: Stage, *, continuous: bool = True) ->
         pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
         law=depth_law(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
-        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
+        tracker=tracker or HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
         stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
         stage=stage,

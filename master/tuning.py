@@ -8,16 +8,17 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from common.errors import CalibrationError, PhalanxError
 from common.messages import MarkerDetections
 from common.watching import WatchedFiles
+from master.ik.tracker import HandTracker
 from master.rig import RigSetup, build_pipeline, load_setup
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 
-_WARM_FRAMES = 12  # of each camera, a fifth of a second: the 1 € filter has settled by then
+_WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (6 Hz at rest) has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
 _NEEDS_RESTART = ("width_px", "height_px", "frame_rate_hz")
@@ -58,7 +59,7 @@ class _WhenOpen:
 
 
 class LivePipeline:
-    """The pipeline in use. Holds it, the one that takes over with the next message, and the last messages."""
+    """The pipeline in use. Holds it, its setup, the last messages, and the one that is to take over with the next."""
 
     def __init__(self, setup: RigSetup, stage: Stage) -> None:
         """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use.
@@ -67,7 +68,9 @@ class LivePipeline:
             CalibrationError: The depth model does not fit the rig.
         """
         self._stage = stage
-        self._now = build_pipeline(setup, stage)
+        self._setup: RigSetup = setup
+        self._tracker = HandTracker(setup.hand, setup.hand_markers)
+        self._now = build_pipeline(setup, stage, tracker=self._tracker)
         cameras = len(setup.rig.cameras)
         self._close = _CLOSE_FRAMES * cameras
         self._recent: deque[tuple[int, MarkerDetections]] = deque(maxlen=_WARM_FRAMES * cameras)
@@ -90,14 +93,19 @@ class LivePipeline:
             self._last_ns = solved[-1].pose.t_ns
         return solved
 
-    def replace(self, setup: RigSetup) -> None:
+    def change(self, setup: RigSetup) -> None:
         """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.
 
         Raises:
             CalibrationError: The depth model does not fit the rig; nothing has changed.
         """
         stage = _WhenOpen(self._stage)
-        new = build_pipeline(setup, stage)
+        if _hand(setup) == _hand(self._setup):
+            setup = replace(setup, hand=self._setup.hand)
+            tracker = self._tracker.fresh()
+        else:
+            tracker = HandTracker(setup.hand, setup.hand_markers)
+        new = build_pipeline(setup, stage, tracker=tracker)
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
             waiting = [(number, message) for number, message in list(self._recent) if number > shown]
@@ -107,7 +115,7 @@ class LivePipeline:
             if len(waiting) <= self._close:
                 break
         stage.open = True
-        self._next = new, shown
+        self._setup, self._tracker, self._next = setup, tracker, (new, shown)
 
     def _take_over(self, new: MarkerPipeline, shown: int) -> list[SolvedPose]:
         """Show the new pipeline what it has not seen yet, and take its poses that are later than the last one."""
@@ -161,13 +169,17 @@ class RigTuning:
                 if _content(setup) == _content(self._setup):
                     return
                 _refuse_restart(self._setup, setup)
-                self._pipeline.replace(setup)
+                self._pipeline.change(setup)
             except PhalanxError:
                 self._refused += 1
                 raise
             self._setup = setup
             self._applied += 1
         self._say("changed files are in use")
+
+
+def _hand(setup: RigSetup) -> tuple[object, ...]:
+    return setup.hand.profile, setup.hand_markers
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:

@@ -97,13 +97,12 @@ class CameraTuning:
             if not self._running() or not self._watched.changed(self._paths):
                 return
             try:
-                content = load(self._paths[0], CameraCalibration), load(self._paths[1], RigCalibration)
-                if content == self._on_disk:  # what a command has changed meanwhile stays
-                    return
-                self._on_disk = content
-                if self._apply(*content):
+                camera, rig = load(self._paths[0], CameraCalibration), load(self._paths[1], RigCalibration)
+                was, self._on_disk = self._on_disk, (camera, rig)
+                # Only what the file has changed: what a command has changed meanwhile stays.
+                if self._apply(self._camera if camera == was[0] else camera, rig):
                     self._applied += 1
-                    _LOG.info("%s: changed, in use now", self._paths[0])
+                    _LOG.info("%s, %s: changed, in use now", *self._paths)
             except PhalanxError as error:
                 self._refused += 1
                 _LOG.warning("changed, but not used: %s", error)

@@ -84,7 +84,7 @@ def test_a_camera_is_set_by_command_and_by_file_while_everything_runs(tmp_path: 
         assert (saved.exposure_us, saved.colour_gains) == (4000.0, (0.9, 1.3))
 
         save(desk.left, msgspec.structs.replace(saved, exposure_us=6000.0))
-        assert desk.said("slave", "left.json: changed, in use now")
+        assert desk.said("slave", "changed, in use now")
         assert desk.shown("left")["exposure_us"] == ("6000", "6000")
         assert desk.said("master", "changed files are in use"), "it reads the camera files, too"
         desk.left.write_text("{")

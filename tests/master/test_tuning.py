@@ -17,8 +17,9 @@ from common.errors import BusError, CalibrationError
 from common.keys import new_key
 from common.messages import Command, HandPose, MarkerDetections
 from common.zenoh_bus import ZenohBus
+from master.ik.tracker import HandTracker
 from master.live import LiveSettings, run_live
-from master.rig import RigSetup, load_setup
+from master.rig import RigSetup, build_pipeline, load_setup
 from master.stages import StageTimes
 from master.stereo.caps import CapModel
 from master.tuning import LivePipeline, RigFiles, RigTuning
@@ -52,7 +53,7 @@ def palm_x(pose: HandPose) -> float:
 def with_change(run: SyntheticRun, setup: RigSetup, at: int) -> tuple[list[HandPose], LivePipeline]:
     """All poses of the run, the setup changed before message number `at` while messages go on."""
     pipeline = LivePipeline(run.setup, StageTimes())
-    builder = threading.Thread(target=pipeline.replace, args=(setup,))
+    builder = threading.Thread(target=pipeline.change, args=(setup,))
     poses: list[HandPose] = []
     for number, message in enumerate(run.messages):
         if number == at:
@@ -91,8 +92,21 @@ def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
     for message in exact_run.messages[:40]:
         count += len(pipeline.push(message))
     before = stages._count["filter"]
-    pipeline.replace(exact_run.setup)
+    pipeline.change(exact_run.setup)
     assert stages._count["filter"] == before == count
+
+
+def test_a_fresh_tracker_is_as_good_as_new(exact_run: SyntheticRun) -> None:
+    used = HandTracker(RIGHT, MARKERS)
+
+    def solved(tracker: HandTracker) -> Float:
+        pipeline = build_pipeline(exact_run.setup, StageTimes(), tracker=tracker)
+        poses = [one.pose for message in exact_run.messages[:20] for one in pipeline.push(message)]
+        return np.array([pose.position_m for pose in poses])
+
+    first = solved(used)
+    np.testing.assert_array_equal(solved(used.fresh()), first)
+    assert not np.array_equal(solved(used), first), "one that was used remembers"
 
 
 def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:

@@ -196,6 +196,8 @@ def test_what_a_command_changed_stays_until_the_file_changes(
     tuning.look()
     save(files.camera_path, FILE)
     tuning.look()
+    save(files.rig_path, msgspec.structs.replace(RIG, free_markers=("little",)))
+    tuning.look()
     assert knobs.tuned == [changed(exposure_us=9000.0)]
     save(files.camera_path, changed(analogue_gain=2.0))
     tuning.look()
