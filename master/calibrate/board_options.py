@@ -15,8 +15,8 @@ Size = Annotated[
         help="COLUMNSxROWS: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm).",
     ),
 ]
-SquareMm = Annotated[float, typer.Option(help="Side of a square [mm], measured on the print.")]
-MarkerMm = Annotated[float | None, typer.Option(help="Side of a marker [mm]: the board is a ChArUco board.")]
+SquareMm = Annotated[float, typer.Option(help="Side of a square in mm, measured on the print.")]
+MarkerMm = Annotated[float | None, typer.Option(help="Side of a marker in mm: the board is a ChArUco board.")]
 Dictionary = Annotated[str, typer.Option(help="Family of its markers.")]
 
 
