@@ -9,11 +9,15 @@ from pathlib import Path
 from deploy.demo import DemoError, DemoSettings, run_demo, stop_on_signals
 from deploy.replay import ReplayError, ReplaySettings, run_replay
 
-_EXAMPLES = """examples:
+_EXAMPLES = {
+    "demo": """examples:
   phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
+""",
+    "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
-"""
+""",
+}
 _LABELS = {
     "poses_per_s": ("poses", "/s"),
     "latency_p50_ms": ("latency, median", "ms"),
@@ -90,7 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="phalanx",
         description="Hand tracking from cameras that anyone can buy.",
-        epilog=_EXAMPLES,
+        epilog="`phalanx COMMAND --help` shows its examples.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -98,7 +102,7 @@ def _parser() -> argparse.ArgumentParser:
         "demo",
         help="everything on this machine, without hardware",
         description="Starts a slave with a synthetic camera for each camera of the rig, the master and the viewer.",
-        epilog=_EXAMPLES,
+        epilog=_EXAMPLES["demo"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     view = demo.add_mutually_exclusive_group()
@@ -123,7 +127,7 @@ def _parser() -> argparse.ArgumentParser:
         "replay",
         help="a recording of raw frames, offline",
         description="Detects the markers in every camera's frames, solves the hand, scores it where there is a truth.",
-        epilog=_EXAMPLES,
+        epilog=_EXAMPLES["replay"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     replay.add_argument("recording", type=Path, metavar="RECORDING", help="folder with recording.json")
@@ -138,7 +142,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _positive(text: str) -> float:
-    value = float(text)
+    try:
+        value = float(text)
+    except ValueError as error:  # argparse would tell the name of the function
+        raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
     if not 0.0 < value < 1e6:
         raise argparse.ArgumentTypeError("seconds must be positive")
     return value

@@ -51,15 +51,7 @@ _TRY_AGAIN_S = 0.3
 def phalanx_master() -> None:
     """Turn the detections of several cameras into one hand of 26 joints.
 
-    Examples:
-
-      phalanx-master run --rig desk                     track live, slaves on this machine
-
-      phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
-
-      phalanx-master view --rig desk                    watch a running master
-
-      phalanx-master solve RECORDING --detections DIR --out DIR     the same line, offline
+    `phalanx-master COMMAND --help` shows its examples.
     """
 
 
@@ -78,7 +70,16 @@ def run(
     poses: Annotated[Path | None, typer.Option(help="Write every pose to this .npz.")] = None,
     summary: Annotated[Path | None, typer.Option(help="Write the figures of the run to this .json.")] = None,
 ) -> None:
-    """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file."""
+    """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file.
+
+    The files of rig, cameras and hand are followed: what changes there is used at once.
+
+    Examples:
+
+      phalanx-master run --rig desk
+
+      phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
+    """
     setup = load_setup(calibration, rig, hand)
     settings = LiveSettings(
         address(beacon, "--beacon"),
@@ -102,7 +103,12 @@ def solve_command(
     ] = None,
     hand: Hand = None,
 ) -> None:
-    """Solve recorded detections offline and deterministically: no clock, no network."""
+    """Solve recorded detections offline and deterministically: no clock, no network.
+
+    Examples:
+
+      phalanx-master solve RECORDING --detections DIR --out DIR
+    """
     opened = open_recording(recording)
     rig = opened.manifest.marker_rig()
     setup = RigSetup.of(rig, opened.manifest.cameras, load_hand(calibration, rig.hand, hand))
@@ -123,7 +129,14 @@ def view(
     web_port: Annotated[int, typer.Option(min=1, max=65535, help="TCP port of that page.")] = 9090,
     save: Annotated[Path | None, typer.Option(help="Write an .rrd instead of showing anything.")] = None,
 ) -> None:
-    """Show a running master in Rerun. A process of its own, which may come and go; it waits for the master."""
+    """Show a running master in Rerun. A process of its own, which may come and go; it waits for the master.
+
+    Examples:
+
+      phalanx-master view --rig desk
+
+      phalanx-master view --rig desk --bus tcp/192.168.1.2:47802 --web
+    """
     from master.outputs.rerun import run_viewer
 
     setup = load_setup(calibration, rig, hand)
@@ -159,7 +172,14 @@ def report(
     calibration: Calibration = CALIB_JSON,
     summary: Annotated[Path | None, typer.Option(help="summary.json of the run, to be completed.")] = None,
 ) -> None:
-    """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file."""
+    """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file.
+
+    `phalanx demo` calls it at the end.
+
+    Examples:
+
+      phalanx-master report --poses out/demo/poses.npz --scene-epoch-ns 123456789 --out out/demo
+    """
     from master.report import report_scene
 
     setup = load_setup(calibration, rig)

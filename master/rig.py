@@ -115,7 +115,9 @@ def build_pipeline(
         pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
         law=depth_law(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
-        tracker=tracker or HandTracker(setup.hand, setup.hand_markers, continuous=continuous),
+        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous)
+        if tracker is None
+        else tracker,
         stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
         stage=stage,
