@@ -58,7 +58,7 @@ class Delivered:
 
     Attributes:
         missing: (T, 5) tips without a point, or with one more than a centimetre off.
-        joint_mm: (T, 25) error of every joint, seen or not.
+        joint_mm: (T, 25) error of every joint, seen or not; NaN before the first pose.
         found: Found of the tips that show `SEEN` or more, in all cameras.
     """
 
@@ -132,10 +132,10 @@ def _played() -> Iterator[Row]:
         yield Row("  moments with any such tip", float(any4), "%", f"one pair {any2:.1f}")
         yield Row(
             "  joint error, all joints",
-            float(four.joint_mm.mean()),
+            float(np.nanmean(four.joint_mm)),
             "mm",
-            f"one pair {pair.joint_mm.mean():.1f}; 95 %: {np.percentile(four.joint_mm, 95):.1f}, "
-            f"one pair {np.percentile(pair.joint_mm, 95):.1f}",
+            f"one pair {np.nanmean(pair.joint_mm):.1f}; 95 %: {np.nanpercentile(four.joint_mm, 95):.1f}, "
+            f"one pair {np.nanpercentile(pair.joint_mm, 95):.1f}",
         )
         yield Row(f"  found of tips that show {SEEN} discs or more", 100.0 * four.found, "%", "")
 
