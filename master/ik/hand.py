@@ -14,7 +14,7 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import HandJoints, HandModel
 from master.ik.attached import Attached
-from master.ik.hand_problem import Facing, HandProblem, Minimum, PalmPrior
+from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 
@@ -69,6 +69,7 @@ class HandSolver:
         dt_s: float = 0.0,
         hidden: tuple[Float, Float] | None = None,
         facing: Float | None = None,
+        enough: float = ENOUGH,
     ) -> HandSolution | None:
         """Fit the hand to its markers.
 
@@ -81,6 +82,7 @@ class HandSolver:
                 standard deviation (5,) [rad] of that belief; None: curled out of sight.
             facing: (3,) unit vector, rig frame, from the hand to the cameras where a marker on the back
                 of the hand is seen: that marker faces them. None: nothing known.
+            enough: How much of half chi square the search may leave.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
@@ -100,7 +102,7 @@ class HandSolver:
             None if facing is None else Facing(facing, 1.0 / self.priors.facing),
         )
         seeds = self._seeds(points_m, seen, facing) if last is None else self._seed_of(last)
-        return self._solution(problem.minimise(*seeds), points_m)
+        return self._solution(problem.minimise(*seeds, enough), points_m)
 
     def _beliefs(
         self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None

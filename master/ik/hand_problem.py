@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix, skew, unskew
 from common.hand_model import HandModel
 from master.ik.attached import Attached
@@ -18,7 +18,8 @@ from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
 
 MAX_ITERATIONS = 25
-_MAX_DAMPING = 1e6
+ENOUGH = 1e-7  # of half chi square: what a search may leave
+_FIRST_DAMPING, _MAX_DAMPING = 1e-3, 1e6
 _EYE = np.eye(3)
 
 
@@ -50,18 +51,17 @@ class Linear:
         """That of one of several."""
         return Linear(self.cost[k], self.gradient[k], self.normal[k])
 
-    def replaced(self, by: Bool, other: "Linear") -> "Linear":
-        """With those chosen by (S,) taken from the other."""
-        cost, gradient = (
-            np.where(by, other.cost, self.cost),
-            np.where(by[:, None], other.gradient, self.gradient),
-        )
-        return Linear(cost, gradient, np.where(by[:, None, None], other.normal, self.normal))
+    def or_where(self, use: list[bool], other: "Linear") -> "Linear":
+        """With those of `use` (S,) taken from the other."""
+        if all(use):
+            return other
+        cost, gradient = _either(use, other.cost, self.cost), _either(use, other.gradient, self.gradient)
+        return Linear(cost, gradient, _either(use, other.normal, self.normal))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Where the search ended: pose, free angles (n,), and the linearisation there."""
+    """Where the search ended: pose, free angles (n,), and the linearisation there or just before."""
 
     T_rig_palm: Float
     x: Float
@@ -103,30 +103,25 @@ class HandProblem:
             believed.flat[: 6 * size : size + 1] = self.palm.weight * self.palm.weight
         object.__setattr__(self, "believed", believed)
 
-    def minimise(self, T_rig_palm: Float, x: Float) -> Minimum:
-        """The lowest end of the ways downhill from seeds (S, 4, 4), (S, n) inside the bounds."""
-        T, here = T_rig_palm, self.linearise(T_rig_palm, x)
-        damping, going = [1e-3] * len(x), [True] * len(x)
-        iterations = 0
-        while iterations < MAX_ITERATIONS and any(going):
+    def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> Minimum:
+        """The lowest end of the ways downhill from seeds (S, 4, 4), (S, n) inside the bounds.
+
+        A way ends where a step gains less than `enough`, and a ten-thousandth of the cost.
+        """
+        T, here, iterations = T_rig_palm, self.linearise(T_rig_palm, x), 0
+        paces = [_Pace(enough) for _ in x]
+        while iterations < MAX_ITERATIONS and any(pace.going for pace in paces):
             iterations += 1
-            T_new, x_new = self._step(here, T, x, np.array(damping))
+            T_new, x_new, hoped = self._step(here, T, x, np.array([pace.damping for pace in paces]))
+            costs, gains = here.cost.tolist(), hoped.tolist()
+            last = [pace.arrives(*step) for pace, *step in zip(paces, costs, gains, strict=True)]
+            T, x = _either(last, T_new, T), _either(last, x_new, x)
+            if not any(pace.going for pace in paces):
+                break
             there = self.linearise(T_new, x_new)
-            better: list[bool] = []
-            for k, (cost, before) in enumerate(zip(there.cost.tolist(), here.cost.tolist(), strict=True)):
-                better.append(going[k] and cost < before)
-                if better[k]:
-                    damping[k] = max(damping[k] / 8.0, 1e-9)
-                    going[k] = before - cost >= 1e-4 * (1e-3 + cost)
-                else:
-                    damping[k] *= 8.0
-                    going[k] = going[k] and damping[k] <= _MAX_DAMPING
-            if all(better):
-                T, x, here = T_new, x_new, there
-            elif any(better):
-                use = np.array(better)
-                T, x = np.where(use[:, None, None], T_new, T), np.where(use[:, None], x_new, x)
-                here = here.replaced(use, there)
+            steps = zip(paces, costs, there.cost.tolist(), gains, strict=True)
+            lower = [pace.improves(*step) for pace, *step in steps]
+            T, x, here = _either(lower, T_new, T), _either(lower, x_new, x), here.or_where(lower, there)
         best = int(np.argmin(here.cost))
         return Minimum(T[best], x[best], here.of(best), iterations)
 
@@ -159,7 +154,8 @@ class HandProblem:
             gradient[..., :6] += self.palm.weight * off
         return Linear(cost, gradient, normal)
 
-    def _step(self, here: Linear, T: Float, x: Float, damping: Float) -> tuple[Float, Float]:
+    def _step(self, here: Linear, T: Float, x: Float, damping: Float) -> tuple[Float, Float, Float]:
+        """The next poses (S, 4, 4) and angles (S, n), and how much lower the cost (S,) should be there."""
         low, high = self.parameters.low, self.parameters.high
         damped, downhill = here.normal.copy(), -here.gradient
         seeds, size = downhill.shape
@@ -177,7 +173,51 @@ class HandProblem:
         T_new = T.copy()
         T_new[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
         T_new[:, :3, 3] += step[:, 3:6]
-        return T_new, np.minimum(np.maximum(x + step[:, 6:], low), high)
+        hoped = 0.5 * np.vecdot(downhill, step)
+        return T_new, np.minimum(np.maximum(x + step[:, 6:], low), high), hoped
+
+
+@dataclass(slots=True)
+class _Pace:
+    """How boldly one search goes on. Holds its damping, by what it grows next, and whether the search goes on.
+
+    The damping follows the gain ratio: Madsen, Nielsen, Tingleff, "Methods for Non-Linear Least Squares Problems",
+    2nd edition, 2004, equation 2.21.
+    """
+
+    enough: float
+    damping: float = _FIRST_DAMPING
+    growth: float = 2.0
+    going: bool = True
+
+    def arrives(self, cost: float, hoped: float) -> bool:
+        """Whether this step is the last: an all but undamped model, which is right so near, hopes for no more."""
+        arrived = self.going and self.damping <= _FIRST_DAMPING and hoped < self._little(cost)
+        self.going = self.going and not arrived
+        return arrived
+
+    def improves(self, before: float, cost: float, hoped: float) -> bool:
+        """Whether a step lowers the cost as it goes on; damps the next one accordingly."""
+        if not self.going:
+            return False
+        gain = before - cost
+        if not gain > 0.0:
+            self.damping, self.growth = self.damping * self.growth, 2.0 * self.growth
+            self.going = self.damping <= _MAX_DAMPING
+            return False
+        self.damping = max(self.damping * max(1 / 3, 1.0 - (2.0 * gain / hoped - 1.0) ** 3), 1e-9)
+        self.growth, self.going = 2.0, gain >= self._little(cost)
+        return True
+
+    def _little(self, cost: float) -> float:
+        return self.enough + 1e-4 * cost
+
+
+def _either(use: list[bool], one: Float, other: Float) -> Float:
+    """Row by row (S, ...): `one` where `use` (S,) is true, else the other."""
+    if all(use):
+        return one
+    return np.where(np.array(use).reshape(-1, *[1] * (one.ndim - 1)), one, other) if any(use) else other
 
 
 def _moved(T: Float, T_before: Float) -> Float:
