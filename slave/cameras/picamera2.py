@@ -13,7 +13,7 @@ of the frames that the loop reads, until three in a row show them.
 import contextlib
 import logging
 import threading
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ BUFFERS = 6  # picamera2's own number for video: the pipeline never starves whil
 TIMEOUT_S = 2.0  # libcamera itself gives a silent sensor up after 1 s
 SETTLE_FRAMES = 60  # sensors apply exposure and gain 2-3 frames late, the pipeline adds its own depth: ample
 GOOD_FRAMES = 3
+INSIST_FRAMES = 20  # ample for one writing to show
 SYNC_MARGIN = 1.05  # a client catches up by shorter frames, so the mode must be faster than the rig
 GIVE_BACK_S = 5.0
 _LOG = logging.getLogger(__name__)
@@ -169,12 +170,23 @@ class Picamera2Camera:
             asked = controls(camera, self._options, self._enums, available)
             live = {name: asked[name] for name in LIVE_CONTROLS}
             check_ranges(live, available)
-            self._library.set_controls(live)
         except CameraError as error:
             raise CameraError(f"{self._where}: {error}") from error
-        except RuntimeError as error:
-            raise CameraError(f"{self._where}: its settings cannot be changed: {error}") from error
-        self._settle(camera, self._metadata.following(SETTLE_FRAMES, TIMEOUT_S))
+        self._settle(camera, self._insist(live))
+
+    def _insist(self, live: Mapping[str, Any]) -> Iterator[Mapping[str, object]]:
+        """Write controls, and again some frames later; the metadata of the frames meanwhile.
+
+        picamera2 loses controls that another thread writes while it recycles a request (`CompletedRequest.release`
+        takes the controls, then makes an empty set of them).
+        """
+        for count, metadata in enumerate(self._metadata.following(SETTLE_FRAMES, TIMEOUT_S)):
+            if count % INSIST_FRAMES == 0:
+                try:
+                    self._library.set_controls(live)
+                except RuntimeError as error:
+                    raise CameraError(f"{self._where}: its settings cannot be changed: {error}") from error
+            yield metadata
 
     def _start(self) -> None:
         camera, library = self._calibration, self._library

@@ -62,6 +62,7 @@ class Sensor:
         lost_after: From this frame on no frame comes.
         dropped: Frames that never reach the application.
         sync_ready_at: Frame from which on the cameras are in step; None: never.
+        loses: Writings of controls that come while a request is recycled, and are lost.
         fails: Methods of a request that raise, by name.
         start_ns: Time of frame 0. Frames come as fast as they are asked for, so the first one is 4.5 s old.
     """
@@ -79,6 +80,7 @@ class Sensor:
     sync_ready_at: int | None = 30
     sync_heard_at: int = 10
     adjust: Callable[[dict[str, Any]], None] = lambda _configuration: None
+    loses: int = 0
     fails: frozenset[str] = frozenset()
     busy: bool = False
     start_ns: int = field(default_factory=lambda: time.monotonic_ns() - 4_500_000_000)
@@ -226,6 +228,9 @@ class Picamera2:
         for name in controls:
             if name not in self.camera_controls:
                 raise RuntimeError(f"Control {name} is not advertised by libcamera")
+        if self._sensor.loses > 0:
+            self._sensor.loses -= 1
+            return
         self._changes.append((self._frame + self._sensor.delay, dict(controls)))
 
     def capture_request(

@@ -79,6 +79,13 @@ def test_a_pi_camera_takes_settings_while_it_is_read(monkeypatch: pytest.MonkeyP
     assert got["frame_rate_hz"] == pytest.approx(30.0, rel=2e-3)
 
 
+def test_controls_that_picamera2_loses_are_written_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = pi(monkeypatch, Sensor(loses=2))
+    with reading(source):
+        source.tune(changed(exposure_us=9000.0))
+        assert source.figures()["exposure_us"] == pytest.approx(9000.0, abs=33.6)
+
+
 def pinned(name: str, value: object, after: int) -> Callable[[int, dict[str, Any]], None]:
     """Metadata that say `value` where another than the first was asked for, from some frame on."""
 

@@ -371,7 +371,15 @@ def test_the_stand_in_has_the_signatures_of_the_real_library() -> None:
         pytest.skip("picamera2 is not installed here: its signatures were compared by hand with 0.3.38")
     real: Any = importlib.import_module("picamera2")
     request: Any = importlib.import_module("picamera2.request")
-    for name in ("__init__", "create_video_configuration", "configure", "start", "capture_request", "close"):
+    methods = (
+        "__init__",
+        "create_video_configuration",
+        "configure",
+        "start",
+        "set_controls",
+        "capture_request",
+    )
+    for name in (*methods, "close"):
         assert parameters(getattr(Picamera2, name)) == parameters(getattr(real.Picamera2, name)), name
     for name in ("make_array", "get_metadata", "release"):
         assert parameters(getattr(CompletedRequest, name)) == parameters(

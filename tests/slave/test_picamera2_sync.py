@@ -6,7 +6,12 @@ from typing import Any
 
 import pytest
 
+from common.clock import SystemClock
+from slave.cameras.picamera2 import Picamera2Camera
+from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.picamera2_sync import MOST_OFF_US, PERIOD_FRAMES, SILENT_FRAMES, SyncWatch
+from tests.slave.fake_picamera2 import Sensor, install
+from tests.slave.test_live_settings import FILE
 
 PERIOD_US = 16_667
 READY_AT = 100
@@ -113,3 +118,31 @@ def test_junk_in_the_metadata_is_no_lock() -> None:
         [{"SyncTimer": "?", "FrameWallClock": None, "FrameDuration": [], "SyncReady": True}] * 400
     )
     assert not locked[-1]
+
+
+def test_a_running_camera_reports_its_lock(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def restarts(number: int, metadata: dict[str, Any]) -> None:
+        metadata["SyncReady"] &= not 300 <= number < 310
+
+    install(monkeypatch, Sensor(sync_ready_at=100, tamper=restarts))
+    camera = Picamera2Camera(FILE, Picamera2Options(sync="client"), SystemClock())
+    locks: list[float] = []
+    for _ in range(300):
+        assert camera.read() is not None
+        locks.append(camera.figures()["sync_locked"])
+    camera.close()
+    assert locks[0] == 1.0
+    assert sum(locks) == 290.0
+    assert camera.counts() == {"camera.out_of_step": 1}
+    assert "no longer in step" in caplog.text
+
+
+def test_a_camera_that_runs_free_reports_no_lock(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch, Sensor())
+    camera = Picamera2Camera(FILE, Picamera2Options(), SystemClock())
+    camera.read()
+    assert "sync_locked" not in camera.figures()
+    assert camera.counts() == {}
+    camera.close()
