@@ -8,6 +8,7 @@ from master.calibrate.board_command import board
 from master.calibrate.camera_commands import intrinsics, stereo
 from master.calibrate.capture_command import capture_views
 from master.calibrate.depth_commands import depth
+from master.calibrate.time_commands import time_command
 from master.calibrate.verify_command import verify_command
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -17,6 +18,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "capture": capture_views,
     "depth": depth,
     "verify": verify_command,
+    "time": time_command,
 }
 
 

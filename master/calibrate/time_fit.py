@@ -1,0 +1,137 @@
+"""How much later each camera's frames are than its stamps say, from a recording of a moving hand.
+
+The estimator is that of the running master (`master.stereo.timing`), over the whole recording and every frame. It is
+linear in the offset, so the recording is measured again, and a third time, with the stamps as they were found before.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.messages import MarkerDetections
+from master.stereo.timing import ResidualTiming
+from master.stereo.timing_fit import TimeOffset
+
+SIGMA_AT_MOST_NS = 1e6
+"""Less sure than this an offset is not written: 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)."""
+SIGNIFICANT = 3.0
+_PASSES = 3
+_KEPT_BLOCKS = 3600  # an hour of motion
+_ADVICE = (
+    "record ten seconds of an open hand that all cameras see, swung to and fro about twice a second, up and down as "
+    "well as sideways, half a metre from the cameras, with the fingers kept still"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraTime:
+    """What a recording says of one camera.
+
+    Attributes:
+        camera: Its name.
+        offset: How much later its frames are than its stamps, against the reference camera.
+    """
+
+    camera: str
+    offset: TimeOffset
+
+    @property
+    def significant(self) -> bool:
+        """Whether the offset is not nought by chance."""
+        return abs(self.offset.offset_ns) > SIGNIFICANT * self.offset.sigma_ns
+
+    @property
+    def to_write_us(self) -> float:
+        """What belongs into the rig file [us]: nothing is corrected by a number that may be noise."""
+        return round(1e-3 * self.offset.offset_ns, 1) if self.significant else 0.0
+
+
+def measure_times(
+    models: Mapping[str, CameraModel],
+    frame_rate_hz: Mapping[str, float],
+    messages: Sequence[MarkerDetections],
+) -> tuple[CameraTime, ...]:
+    """Offsets of all cameras but the reference, which is the first.
+
+    Args:
+        models: Camera name -> model, in the rig's order.
+        frame_rate_hz: Camera name -> nominal rate.
+        messages: Detections of all cameras by their stamps, uncorrected.
+
+    Raises:
+        CalibrationError: There is too little motion, or too little of it is seen by both cameras.
+    """
+    found = _pass(models, frame_rate_hz, messages)
+    for _ in range(_PASSES - 1):
+        before = {camera: offset.offset_ns for camera, offset in found.items()}
+        rest = _pass(models, frame_rate_hz, shifted(messages, before))
+        found = {
+            camera: replace(of, offset_ns=of.offset_ns + before.get(camera, 0.0))
+            for camera, of in rest.items()
+        }
+    for camera in tuple(models)[1:]:
+        if camera not in found or found[camera].sigma_ns > SIGMA_AT_MOST_NS:
+            raise CalibrationError(_refusal(next(iter(models)), camera, found.get(camera), messages))
+    return tuple(CameraTime(camera, offset) for camera, offset in found.items())
+
+
+def _pass(
+    models: Mapping[str, CameraModel],
+    frame_rate_hz: Mapping[str, float],
+    messages: Sequence[MarkerDetections],
+) -> dict[str, TimeOffset]:
+    """Offsets of the cameras of which anything can be said."""
+    machine = ResidualTiming(models, frame_rate_hz, kept_blocks=_KEPT_BLOCKS, rate_hz=np.inf)
+    for message in messages:
+        machine.push(message)
+    machine.flush()
+    offsets = {camera: machine.offset_of(camera) for camera in models}
+    return {camera: offset for camera, offset in offsets.items() if offset is not None}
+
+
+def shifted(messages: Sequence[MarkerDetections], late_ns: Mapping[str, float]) -> list[MarkerDetections]:
+    """The messages by their true times, if the frames of a camera are `late_ns` later than its stamps."""
+    late = {camera: round(ns) for camera, ns in late_ns.items()}
+    moved = [
+        msgspec.structs.replace(message, t_ns=message.t_ns + late[message.camera])
+        if late.get(message.camera)
+        else message
+        for message in messages
+    ]
+    return sorted(moved, key=lambda message: message.t_ns)
+
+
+def _refusal(
+    reference: str, camera: str, offset: TimeOffset | None, messages: Sequence[MarkerDetections]
+) -> str:
+    """Why a camera's time cannot be told, and what to do."""
+    known = "" if offset is None else f", only to {1e-6 * offset.sigma_ns:.1f} ms (standard deviation)"
+    parts = ", ".join(
+        f"{name}: {seconds:.1f} s, {speed:.0f} px/s"
+        for name, (seconds, speed) in _motion(messages, (reference, camera))
+    )
+    return f"the time of camera {camera!r} cannot be told{known}; markers seen and their speed: {parts}. {_ADVICE}"
+
+
+def _motion(
+    messages: Sequence[MarkerDetections], cameras: tuple[str, str]
+) -> list[tuple[str, tuple[float, float]]]:
+    """Camera -> how long it saw markers [s], and their speed, root of mean square [px/s]."""
+    out: list[tuple[str, tuple[float, float]]] = []
+    for camera in cameras:
+        frames = [message for message in messages if message.camera == camera]
+        seen = [frame.t_ns for frame in frames if np.isfinite(frame.uv).any()]
+        length = 1e-9 * (max(seen) - min(seen)) if seen else 0.0
+        if len(frames) < 2 or not seen:
+            out.append((camera, (length, 0.0)))
+            continue
+        t_s = 1e-9 * np.array([frame.t_ns - frames[0].t_ns for frame in frames])
+        steps = np.diff(np.array([frame.uv for frame in frames]), axis=0) / np.diff(t_s)[:, None, None]
+        squares = (steps * steps).sum(axis=-1)
+        squares = squares[np.isfinite(squares)]
+        out.append((camera, (length, float(np.sqrt(squares.mean())) if len(squares) else 0.0)))
+    return out
