@@ -21,6 +21,7 @@ SECTIONS = {
     "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
+    "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",
     "depth": "Depth at rest, by fitted laws, and on recorded sweeps; baseline: the error budget",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
