@@ -18,6 +18,7 @@ from collections.abc import Callable, Mapping
 
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.picamera2_frames import MICROSECONDS_BELOW
 
 PERIOD_FRAMES = 30  # from message to message
 SILENT_FRAMES = (
