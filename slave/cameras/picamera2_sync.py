@@ -72,9 +72,8 @@ class SyncWatch:
         timer, wall = metadata.get("SyncTimer"), metadata.get("FrameWallClock")
         self._silent += 1
         if isinstance(timer, int) and isinstance(wall, int):
-            ready_us = (
-                wall // 1000 + timer
-            )  # libcamera rounds as well: without a message it is the same to the us
+            # libcamera rounds as well: without a message the sum is the same to the microsecond.
+            ready_us = (wall if wall < MICROSECONDS_BELOW else wall // 1000) + timer
             if ready_us != self._ready_us:
                 self._ready_us, self._silent = ready_us, 0
 
