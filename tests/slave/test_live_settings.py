@@ -18,6 +18,7 @@ from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reopening import ReopeningCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
 
@@ -196,16 +197,15 @@ def test_without_a_loop_that_reads_frames_nothing_can_be_verified(monkeypatch: p
 
 def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
-    first, second = Camera(gone_after=200, damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
+    first, second = Camera(damaged=frozenset({20, 21})), Camera(damaged=frozenset({13}))
     plugged = [first, second]
     source = ReopeningCamera(lambda file: usb(plugged.pop(0), file), FILE, SystemClock(), threading.Event())
     with reading(source):
         source.tune(changed(exposure_us=9000.0))
-        while source.lost == 0 or not source.figures():
-            time.sleep(0.001)
-        time.sleep(0.05)
+        assert until(lambda: source.counts()["camera.broken"] == 2)
+        first.gone_after = 0
+        assert until(lambda: source.counts() == {"camera.lost": 1, "camera.broken": 3})
         assert source.figures()["exposure_us"] == 9000.0
-        assert source.counts() == {"camera.lost": 1, "camera.broken": 3}
     assert second.knob("Exposure Time").value == 90
 
 
