@@ -177,7 +177,7 @@ class Health(Message, frozen=True, eq=False, tag=True):
     session: Count
     t_ns: TimeNs
     counts: Annotated[dict[Name, Count], Meta(max_length=512)]
-    gauges: Annotated[dict[Name, Finite], Meta(max_length=64)]
+    gauges: Annotated[dict[Name, Finite], Meta(max_length=512)]
 
 
 class Command(Message, frozen=True, eq=False, tag=True):

@@ -1,7 +1,7 @@
 """The live loop: messages in, poses out to every sink; and the figures of a run."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import msgspec
@@ -70,8 +70,9 @@ def run(
     clock: Clock,
     figures: RunFigures,
     stop: threading.Event,
+    watch: Callable[[MarkerDetections], None] = lambda _message: None,
 ) -> None:
-    """Solve and publish until `stop` is set."""
+    """Solve and publish until `stop` is set; `watch` is shown every message once its poses are out."""
     while not stop.is_set():
         message = source.get(timeout_s=0.1)
         if message is None:
@@ -83,10 +84,18 @@ def run(
             for sink in sinks:
                 sink.write(pose)
             figures.add(now, pose.latency_ns)
+        watch(message)
 
 
-def health(session: int, clock: Clock, figures: RunFigures, counts: dict[str, int]) -> Health:
+def health(
+    session: int,
+    clock: Clock,
+    figures: RunFigures,
+    counts: dict[str, int],
+    times: Mapping[str, float] | None = None,
+) -> Health:
     """The master's report; gauges tell what a camera runs at (camera_hz.NAME) from what is solved (poses_per_s)."""
     gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
     gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
+    gauges |= times or {}
     return Health("master", session, clock.now_ns(), {"poses": figures.poses} | counts, gauges)

@@ -21,6 +21,7 @@ from master.outputs.sink import Sink
 from master.rig import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
+from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
 
 _REPORT_S = 1.0
@@ -91,13 +92,16 @@ def run_live(
             sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.rig.markers)))
         for sink in sinks:
             stack.callback(sink.close)
-        reporter = _Reporter(setup.rig.cameras, clock, bus, ingest, pipeline, tuning, figures, stop, say)
+        watch = TimeWatch(setup)
+        reporter = _Reporter(
+            setup.rig.cameras, clock, bus, ingest, pipeline, tuning, watch, figures, stop, say
+        )
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        run(ingest, pipeline, sinks, clock, figures, stop)
+        run(ingest, pipeline, sinks, clock, figures, stop, watch.push)
         stop.set()
         thread.join(_JOIN_S)
         summary: dict[str, object] = {
@@ -128,6 +132,7 @@ class _Reporter:
         ingest: Ingest,
         pipeline: LivePipeline,
         tuning: RigTuning | None,
+        watch: TimeWatch,
         figures: RunFigures,
         stop: threading.Event,
         say: Callable[[str], None],
@@ -136,7 +141,7 @@ class _Reporter:
         self._session = secrets.randbits(63)
         self._cameras, self._clock, self._bus = cameras, clock, bus
         self._ingest, self._pipeline, self._figures = ingest, pipeline, figures
-        self._tuning = tuning
+        self._tuning, self._watch = tuning, watch
         self._stop, self._say = stop, say
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -146,7 +151,9 @@ class _Reporter:
         events = self._ingest.counts.items()
         told = {name: number for name, number in events if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        return health(self._session, self._clock, self._figures, dict(self._pipeline.counts) | told | changes)
+        counts = dict(self._pipeline.counts) | told | changes
+        times = self._watch.gauges(self._ingest.clock_of)
+        return health(self._session, self._clock, self._figures, counts, times)
 
     def answer(self, command: Command) -> Health:
         """Obey a command: "report" says how it is, "reload" uses the files as they are now, "stop" ends the master.
@@ -171,6 +178,8 @@ class _Reporter:
         while not self._stop.wait(_REPORT_S):
             if self._tuning is not None:
                 self._tuning.look()
+                self._watch.follow(self._tuning.setup)
+            lines = self._watch.look()
             self._bus.publish("health", MASTER, self.health())
             heard = self._ingest.connected
             if heard != connected:
@@ -183,6 +192,8 @@ class _Reporter:
                 self._say("tracking")
             if started:
                 self._say(f"rate {self._figures.poses - poses} poses/s")
+            for line in lines:
+                self._say(line)
             poses = self._figures.poses
 
 

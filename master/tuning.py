@@ -144,6 +144,11 @@ class RigTuning:
         self._turn = threading.Lock()
         self._applied = self._refused = 0
 
+    @property
+    def setup(self) -> RigSetup:
+        """The setup in use."""
+        return self._setup
+
     def counts(self) -> dict[str, int]:
         """`reload.applied`, `reload.refused`."""
         return {"reload.applied": self._applied, "reload.refused": self._refused}

@@ -125,7 +125,6 @@ class CameraPair:
         misfit = (normal * seen).sum(-1) + line[..., 2] / length
         place = (along * seen).sum(-1)
         depth = self._depth(a, along, place)
-        depth = np.where((depth > _NEAREST_M) & (depth < _FARTHEST_M), depth, np.nan)
         # The first camera's velocity in the other's image, as if the depth stayed.
         moved = depth[..., None] * (known @ self.rotation[:, :2].T)
         depth_there = depth * a[..., 2] + self.translation[2]
@@ -141,10 +140,11 @@ class CameraPair:
         return value, rate, instrument, _STEP_S * doubt
 
     def _depth(self, a: Float, along: Float, place: Float) -> Float:
-        """Depths (K, M) [m] along the reference rays of places on the epipolar lines."""
+        """Depths (K, M) [m] along the reference rays of places on the epipolar lines; NaN where no hand can be."""
         a_along, t_along = (along * a[..., :2]).sum(-1), along @ self.translation[:2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            return (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
+            depth = (place * self.translation[2] - t_along) / (a_along - place * a[..., 2])
+        return np.where((depth > _NEAREST_M) & (depth < _FARTHEST_M), depth, np.nan)
 
 
 def carried(track: Track, t_s: Float, gap_s: float, jerk_s3: float) -> tuple[Float, Float]:

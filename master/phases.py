@@ -1,0 +1,84 @@
+"""When the cameras expose against each other: whether a lock between them holds, as the master sees it.
+
+The phase of a camera is how much later than the leading camera's frame its own was taken, modulo the period. Cameras
+that run free drift through all phases, some period in minutes; locked ones stay where they are.
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.messages import MarkerDetections
+
+IN_STEP_US = 500.0
+"""A third of the 1.5 ms that cost 2 % of depth at 1 m/s; libcamera's own synchronisation stays within some 10 us."""
+_FRAMES = 64
+_AT_LEAST = 16
+_LOOKS = 10  # in a row: cameras whose rates differ by 50 ppm are out of the band after that
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """Phase of one camera.
+
+    Attributes:
+        phase_us: Later than the leading camera's frame [us], within half a period.
+        spread_us: Standard deviation [us] over the last frames.
+    """
+
+    phase_us: float
+    spread_us: float
+
+
+class CameraPhases:
+    """Push machine. Holds the leading camera's last time, the last 64 phases of the others, and who is in step."""
+
+    def __init__(self, frame_rate_hz: Mapping[str, float]) -> None:
+        """Take the cameras in the rig's order, with their nominal rates; the first one leads."""
+        self._leader = next(iter(frame_rate_hz))
+        self._period_ns = 1e9 / frame_rate_hz[self._leader]
+        self._lead_ns: int | None = None
+        self._turns = {name: deque[float](maxlen=_FRAMES) for name in frame_rate_hz if name != self._leader}
+        self._near = dict.fromkeys(self._turns, 0)
+        self._in_step: dict[str, bool | None] = dict.fromkeys(self._turns)
+
+    def push(self, message: MarkerDetections) -> None:
+        """Take one frame, on the master's clock."""
+        if message.camera == self._leader:
+            self._lead_ns = message.t_ns
+        elif self._lead_ns is not None and (turns := self._turns.get(message.camera)) is not None:
+            turns.append((message.t_ns - self._lead_ns) / self._period_ns)
+
+    def phases(self) -> dict[str, Phase]:
+        """Phase of every camera but the leading one of which enough frames came: the mean direction on a circle."""
+        found: dict[str, Phase] = {}
+        for name, turns in self._turns.items():
+            kept = np.array(turns.copy())
+            if len(kept) < _AT_LEAST:
+                continue
+            mean = np.exp(2j * np.pi * kept).mean()
+            to_us = 1e-3 * self._period_ns / (2.0 * np.pi)
+            spread = np.sqrt(-2.0 * np.log(min(max(abs(mean), 1e-9), 1.0)))
+            found[name] = Phase(float(np.angle(mean)) * to_us, float(spread) * to_us)
+        return found
+
+    def look(self) -> list[str]:
+        """Called once a second: a line for each camera that fell in step, or out of it."""
+        lines: list[str] = []
+        for name, phase in self.phases().items():
+            near = abs(phase.phase_us) <= IN_STEP_US and phase.spread_us <= IN_STEP_US
+            self._near[name] = self._near[name] + 1 if near else 0
+            was = self._in_step[name]
+            now = self._near[name] >= _LOOKS if near else False
+            if near and not now:
+                continue  # not yet told
+            if now != was:
+                self._in_step[name] = now
+                state = "in step with" if now else "free of"
+                lines.append(
+                    f"camera {name}: {state} {self._leader}, {1e-3 * phase.phase_us:+.2f} ms"
+                    f" (spread {1e-3 * phase.spread_us:.2f} ms)"
+                )
+        return lines
