@@ -18,6 +18,7 @@ _PANEL: Colour = (0.105, 0.125, 0.155)
 _LEFT, _WIDTH, _HEIGHT = 0.655, 0.33, 0.205
 _BOTTOMS = (0.63, 0.345, 0.06)
 _PIP = 2
+_LABEL_WIDTH = 0.22  # of a panel
 
 
 def unit(rgb: Rgb) -> Colour:
@@ -109,11 +110,13 @@ def _histogram(axes: Axes, values: Float, title: str, what: str) -> None:
     heights = axes.hist(shown, bins=bins, range=(0.0, top), color=unit(series_rgb(1)), alpha=0.85)[0]
     axes.set_ylim(0.0, 1.2 * float(np.max(heights)))
     axes.set_xlim(0.0, top)
-    for value, name, side in ((middle, "p50", "right"), (tail, "p99", "left")):
+    # Near the axis there is no room on the left; on the right the two would meet, so one stands lower.
+    side, height = ("right", 0.97) if middle > _LABEL_WIDTH * top else ("left", 0.86)
+    for value, name, ha, y in ((middle, "p50", side, height), (tail, "p99", "left", 0.97)):
         axes.axvline(float(value), color=unit(series_rgb(0)), lw=1.4)
-        gap = 4 if side == "left" else -4
-        axes.annotate(f"{name} {value:.1f} {what}", (float(value), 0.97), (gap, 0), xycoords=axes.get_xaxis_transform(),
-                      textcoords="offset points", color=INK, size=10, ha=side, va="top")  # fmt: skip
+        gap = 4 if ha == "left" else -4
+        axes.annotate(f"{name} {value:.1f} {what}", (float(value), y), (gap, 0), xycoords=axes.get_xaxis_transform(),
+                      textcoords="offset points", color=INK, size=10, ha=ha, va="top")  # fmt: skip
 
 
 def _legend_above(axes: Axes) -> None:
