@@ -43,6 +43,7 @@ class DemoSettings:
         seed: Seed of the scene.
         scene: What moves: "standard", or "leap:FILE.npz" for a recorded motion.
         web: The viewer is a page on 127.0.0.1 instead of a window.
+        master: Module that is run as the master.
     """
 
     seconds: float
@@ -53,6 +54,7 @@ class DemoSettings:
     seed: int
     scene: str = "standard"
     web: bool = False
+    master: str = "master"
 
 
 @dataclass(slots=True)
@@ -77,6 +79,29 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
     """
+    epoch_ns = time.monotonic_ns() + _LEAD_NS
+    restarts = play(settings, epoch_ns, stop, say)
+    summary = _report(settings, epoch_ns, say)
+    if restarts:
+        summary["restarts"] = restarts
+        (settings.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+    return summary
+
+
+def play(
+    settings: DemoSettings, epoch_ns: int, stop: threading.Event, say: Callable[[str], None]
+) -> dict[str, int]:
+    """Run the processes for as long as wanted; the master leaves live.json and poses.npz. Who was restarted how often.
+
+    Args:
+        settings: What the user chose.
+        epoch_ns: When the scene begins, on this machine's monotonic clock.
+        stop: Ends the run early.
+        say: Told one line of progress at a time.
+
+    Raises:
+        DemoError: A process does not come up.
+    """
     out = settings.out
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -84,7 +109,6 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
         raise DemoError(f"--out {out}: cannot make the folder: {error.strerror}") from error
     for stale in ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd"):
         (out / stale).unlink(missing_ok=True)
-    epoch_ns = time.monotonic_ns() + _LEAD_NS
     state = _State()
     processes: list[Process] = []
     try:
@@ -92,15 +116,10 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
             processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state)))
         say(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
         _wait_until_tracking(state, processes, stop, say)
-        _play(settings, state, processes, epoch_ns, stop, say)
+        _until_end(settings, state, processes, epoch_ns, stop, say)
     finally:
         _stop(processes)
-    restarts = {p.name: p.restarts for p in processes if p.restarts}
-    summary = _report(settings, epoch_ns, say)
-    if restarts:
-        summary["restarts"] = restarts
-        (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-    return summary
+    return {p.name: p.restarts for p in processes if p.restarts}
 
 
 def _stop(processes: list[Process]) -> None:
@@ -131,7 +150,7 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
         rows.append((camera, [sys.executable, "-m", "slave", *command], key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
-    rows.append(("master", [sys.executable, "-m", "master", "run", *place, *address, *files], key))
+    rows.append(("master", [sys.executable, "-m", settings.master, "run", *place, *address, *files], key))
     if not settings.headless:
         page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))] if settings.web else []
         rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus, *page], key))
@@ -200,7 +219,7 @@ def _look_at_viewer(state: _State, processes: list[Process], say: Callable[[str]
         say(line)
 
 
-def _play(
+def _until_end(
     settings: DemoSettings,
     state: _State,
     processes: list[Process],
