@@ -135,6 +135,8 @@ class MarkerPipeline:
         if instant.rival_uv is None or instant.rival_sigma_px is None:
             return instant
         in_doubt = np.isfinite(instant.rival_uv[..., 0]).any(axis=0)
+        if not in_doubt.any():  # a rival was named in a frame nearby, and is not carried to this instant
+            return replace(instant, rival_uv=None)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
         hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear, instant)
