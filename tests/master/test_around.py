@@ -1,0 +1,75 @@
+"""Cameras on both sides of the hand: its back is turned to those that see the marker on it."""
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import Matrix4, RigCalibration
+from common.geometry import rigid
+from common.messages import HandPose, MarkerDetections
+from master.rig import RigSetup, build_pipeline
+from master.stages import StageTimes
+from master.stereo.caps import CapModel
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, detections, palm, rig_file
+
+BACK = MARKERS.index("back")
+ANGLES = np.radians(
+    np.array([[8, 8, 12, 12], [0, 14, 25, 17], [0, 14, 25, 17], [0, 14, 25, 17], [0, 14, 25, 17]])
+)
+PERIOD_NS = 16_666_667
+
+
+def around(turn_deg: float) -> RigCalibration:
+    """Two pairs, both half a metre from (0.04, 0, 0.5); the second turned about the first's y axis."""
+    a = np.radians(turn_deg)
+    turn = np.array([[np.cos(a), 0.0, np.sin(a)], [0.0, 1.0, 0.0], [-np.sin(a), 0.0, np.cos(a)]])
+    middle = np.array([0.0375, 0.0, 0.5])
+    rig = rig_file(("left", "right", "left2", "right2"))
+    poses = {
+        name: rigid(turn, middle + turn @ (np.array([x, 0.0, 0.0]) - middle))
+        for name, x in (("left2", 0.0), ("right2", 0.075))
+    }
+    places = {name: msgspec.convert(pose.tolist(), Matrix4) for name, pose in poses.items()}
+    return msgspec.structs.replace(rig, T_rig_camera=rig.T_rig_camera | places)
+
+
+def solved(rig: RigCalibration, T_rig_palm: Float) -> list[HandPose]:
+    """Poses of a resting hand; only the first pair sees the marker on its back."""
+    setup = RigSetup.of(rig, {name: camera_file(name, 60.0, 0.0) for name in rig.cameras}, RIGHT)
+    joints = RIGHT.forward(T_rig_palm, ANGLES)
+    points, caps = RIGHT.marker_points(joints, MARKERS), CapModel(RIGHT, MARKERS)
+    models = tuple(setup.models.values())
+    bias = caps.bias_px(joints, points, models)
+    messages: list[MarkerDetections] = []
+    for seq in range(6):
+        for c, (name, camera) in enumerate(setup.models.items()):
+            uv = camera.project(points) + bias[c]
+            uv[BACK] = np.nan if name.endswith("2") else uv[BACK]
+            messages.append(detections(name, seq, 1_000_000_000 + seq * PERIOD_NS, uv))
+    pipeline = build_pipeline(setup, StageTimes())
+    return [found.pose for message in messages for found in pipeline.push(message)]
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("turn_deg", [60.0, 90.0])
+@pytest.mark.parametrize("roll_deg", [-25.0, 0.0, 25.0])
+def test_a_second_pair_aside_does_not_turn_the_hand(turn_deg: float, roll_deg: float) -> None:
+    T = palm(np.array([0.0, roll_deg, 0.0]), np.array([0.04, 0.08, 0.5]))
+    four = around(turn_deg)
+    alone = off_mm(msgspec.structs.replace(four, cameras=("left", "right")), T)
+    assert off_mm(four, T) < min(alone, 3.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_opposite_pairs_look_in_no_common_direction_and_are_tracked() -> None:
+    assert off_mm(around(180.0), palm(np.zeros(3), np.array([0.04, 0.08, 0.5]))) < 4.0
+
+
+def off_mm(rig: RigCalibration, T_rig_palm: Float) -> float:
+    """Mean error [mm] of all joints of the last pose."""
+    poses = solved(rig, T_rig_palm)
+    assert len(poses) >= 4
+    assert poses[-1].valid.all()
+    truth = RIGHT.forward(T_rig_palm, ANGLES).position_m
+    return 1e3 * float(np.linalg.norm(poses[-1].position_m - truth, axis=1).mean())
