@@ -65,7 +65,7 @@ def swing(amplitude_m: float) -> Making:
     """To and fro in any direction, 1 m/s in the middle: the shorter the way, the harder it turns."""
 
     def made(rng: np.random.Generator) -> Motion:
-        home, way, phase = _homes(rng), _ways(rng), rng.uniform(0.0, 2.0 * np.pi, MARKERS)
+        home, way, phase = _homes(rng, 0.02), _ways(rng), rng.uniform(0.0, 2.0 * np.pi, MARKERS)
         turn = SPEED_M_S / amplitude_m
         return lambda t: home + way * (amplitude_m * np.sin(turn * t + phase))[..., None]
 

@@ -36,7 +36,7 @@ _LEAP_M_S, _LEAP_PX = 5.0, 5.0  # what is farther away a frame later is another 
 _SWAPPED = 3.0  # times nearer to the other track: a slave's names are contradicted
 # Sightings see the same cap in the same light, behind the same finger: most of an error stays from frame to frame, and
 # no mean over them removes it. New in each is at most this part of the variance that the slave claims, and this much.
-_FRESH, _FRESH_PX = 0.5, 0.1
+_FRESH, _FRESH_PX = 0.7, 0.1
 # So they also tell less of the motion than as many independent ones.
 _EVIDENCE = 0.5
 # An error in time lies along the motion. One number for both axes cannot say so: all of it covers too much (98-99 %),
