@@ -12,6 +12,7 @@ from master.ik.tracker import HandTracker
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, Stage
+from master.stereo.place import CalibrationResidual
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +115,7 @@ def build_pipeline(
         setup.rig.markers,
         pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
         law=depth_law(setup.rig),
+        residual=CalibrationResidual.of(setup.rig),
         smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous)
         if tracker is None

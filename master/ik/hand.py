@@ -12,7 +12,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
-from common.hand_model import HandJoints, HandModel
+from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
 from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, PalmPrior
 from master.ik.parameters import HandParameters
@@ -32,6 +32,8 @@ class HandSolution:
         angles_rad: (5, 4), inside the limits.
         joints: Forward kinematics of the two.
         cov_m2: (26, 3, 3) [m^2] posterior covariance of the joint positions.
+        tilt_cov_rad2: (5, 3, 3) [rad^2] the same of the directions of the last phalanges.
+        tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much the fit expects that to grow, by the time squared.
         residual_m: (M,) distance of each marker from its place on the model [m]; NaN: not seen.
         cost: Half the sum of squared weighted residuals.
         iterations: Steps taken.
@@ -41,6 +43,8 @@ class HandSolution:
     angles_rad: Float
     joints: HandJoints
     cov_m2: Float
+    tilt_cov_rad2: Float
+    tilt_walk_rad2_s2: Float
     residual_m: Float
     cost: float
     iterations: int
@@ -60,6 +64,8 @@ class HandSolver:
         self._attached = Attached.markers(model, self._parameters, markers)
         self._joints = Attached.joints(model, self._parameters)
         self._prior = AnglePrior.of(model, self._parameters, self.priors)
+        walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
+        self._walk_2 = np.repeat(walks, (3, 3, len(self._parameters.free))) ** 2
 
     def solve(
         self,
@@ -149,12 +155,18 @@ class HandSolver:
         J[:, :, :3] = skew(-local @ T[:3, :3].T)
         J[:, :, 3:6] = np.eye(3)
         J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local)
-        cov = (J.reshape(3 * count, n) @ np.linalg.inv(best.linear.normal)).reshape(count, 3, n)
+        inverse = np.linalg.inv(best.linear.normal)
+        cov = (J.reshape(3 * count, n) @ inverse).reshape(count, 3, n)
+        ends, starts = CHAINS[:, 3], CHAINS[:, 2]
+        length = np.sqrt(np.vecdot(local[ends] - local[starts], local[ends] - local[starts]))
+        turn = (J[ends] - J[starts]) / length[:, None, None]  # of the last phalanges' directions (5, 3, n)
         return HandSolution(
             T_rig_palm=T,
             angles_rad=angles,
             joints=joints,
             cov_m2=cov @ np.swapaxes(J, 1, 2),
+            tilt_cov_rad2=turn @ inverse @ np.swapaxes(turn, 1, 2),
+            tilt_walk_rad2_s2=(turn * self._walk_2) @ np.swapaxes(turn, 1, 2),
             residual_m=np.asarray(np.linalg.norm(marker - points_m, axis=1), np.float64),
             cost=float(best.linear.cost),
             iterations=best.iterations,

@@ -25,9 +25,7 @@ _COAST_S = 0.12  # a lost finger's motion fades with this time constant
 _DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _BAD_FIT_M = 8e-3
-_GLANCE = (
-    0.01  # half chi square left by a first look: a fraction of a millimetre where markers are, and faster
-)
+_GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,6 +118,13 @@ class HandTracker:
         other.last, other._last_ns, other._seen_ns, other._memory = None, 0, None, _Memory(self.model)
         return other
 
+    def recent(self, t_ns: int) -> tuple[HandSolution | None, float]:
+        """The last solution, if it still says anything at `t_ns`, and how long ago it held [s]."""
+        age_s = (t_ns - self._last_ns) * 1e-9
+        if self.last is None or not self._continuous or not 0.0 < age_s <= _FORGET_S:
+            return None, 0.0
+        return self.last, age_s
+
     def push(
         self,
         t_ns: int,
@@ -138,10 +143,7 @@ class HandTracker:
             measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
         """
         seen = seen_markers(points_m, cov_m2)
-        last = self.last if self._continuous else None
-        dt_s = (t_ns - self._last_ns) * 1e-9
-        if last is not None and not 0.0 < dt_s <= _FORGET_S:
-            last = None
+        last, dt_s = self.recent(t_ns)
         if last is None:
             self._memory = _Memory(self.model)
         facing = towards_cameras if (seen & self._on_palm).any() else None

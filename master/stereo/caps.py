@@ -7,48 +7,138 @@ centroid of that silhouette is the mean of the facing surface weighted by the co
 difference in pixels, computed at the hand pose known so far, is taken from the detection.
 """
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from common.arrays import Float
 from common.camera_model import CameraModel
+from common.geometry import cross
 from common.hand_model import HandJoints, HandModel
 
-_RINGS, _SPOKES = 8, 16
-_WHOLE_SHARE = (
-    0.6  # seen from its end a whole cap still shows this share of that; a flat marker, tilted by 53 degrees
-)
+_RINGS, _SPOKES = 16, 48
+_ANGLES = 90  # steps of the tables
+_HEXAGON = np.stack([f(np.arange(6) * np.pi / 3) for f in (np.cos, np.sin)])  # (2, 6)
+_MOST_TILT = 2.0  # tangent of the tilt of a sigma point: it stays on its side
+_BENT_RAD = np.radians(135.0)  # away from the eye: a cap still shows a strip of its side
+_FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or partly hidden
+_LEAST_SHARE = 0.8  # of what a whole cap shows: where its radius is a tenth smaller than the profile says
+_SPECK_M2 = 1e-9
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CapLook:
+    """What C cameras see of M markers, for each of T directions; zero for markers without a cap or not found.
+
+    Attributes:
+        bias_px: Seen centroid minus cap centroid (T, C, M, 2).
+        whole_m2: Area that the whole cap shows (T, C, M), square to the sight.
+    """
+
+    bias_px: Float
+    whole_m2: Float
 
 
 class CapModel:
-    """The painted caps of one hand as sampled surfaces. Holds no state between calls."""
+    """The painted caps of one hand, each as a table of how it looks from all sides. Holds no state between calls.
+
+    Attributes:
+        on_finger: (M,) markers that are caps.
+    """
 
     def __init__(self, model: HandModel, markers: tuple[str, ...]) -> None:
-        """Sample the cap of each marker on a finger; one on the palm, or on no hand, is flat and needs none."""
+        """Tabulate the cap of each marker on a finger; one on the palm, or on no hand, is flat and needs none."""
         self._joint: list[int] = []
+        self._finger: list[int] = []
         self._marker: list[int] = []
-        points: list[Float] = []
-        normals: list[Float] = []
-        areas: list[Float] = []
-        self._offset = np.zeros((len(markers), 3))
+        tables: list[Float] = []
         for index, name in enumerate(markers):
             if name not in model.mounts:
                 continue
             mount = model.mount(name)
-            self._offset[index] = mount.offset_m
             if mount.joint is None or mount.finger is None:
                 continue
-            p, n, a = cap_surface(float(model.radius_m[mount.joint]), float(-mount.offset_m[2]))
+            points, normals, areas = cap_surface(
+                float(model.radius_m[mount.joint]), float(-mount.offset_m[2])
+            )
             # The sampled cap is placed so that its centroid is exactly the profile's point.
-            points.append(p - np.average(p, axis=0, weights=a) + mount.offset_m)
-            normals.append(n)
-            areas.append(a)
+            points -= np.average(points, axis=0, weights=areas)
+            tables.append(_looks(points, normals, areas))
             self._joint.append(mount.joint)
+            self._finger.append(mount.finger)
             self._marker.append(index)
-        self._painted = np.array([model.mount(markers[index]).painted_m for index in self._marker])
+        self._table = np.array(tables)  # (K, _ANGLES + 1, 3)
         self._radius = np.array([model.radius_m[joint] for joint in self._joint])
-        self._points, self._normals, self._areas = np.array(points), np.array(normals), np.array(areas)
+        self._row = np.arange(len(self._joint))
+        self.on_finger = np.zeros(len(markers), np.bool_)
+        self.on_finger[self._marker] = True
 
-    def doubt_px(self, area_px2: Float, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
+    def tilted(self, joints: HandJoints, tilt_cov_rad2: Float) -> Float:
+        """Directions (7, K, 3) of the K caps: those of a hand, and six tilted as far as its pose is unsure.
+
+        The six are sigma points of two uncertain numbers: the mean square of whatever differs between them and the
+        first is its variance (Julier, Uhlmann 1997; four would do where all is linear, but a cap seen from behind
+        looks different from every side).
+
+        Args:
+            joints: Hand pose, rig frame; only the directions of the finger ends are used, so that a wrong pose
+                cannot move a cap by more than its radius.
+            tilt_cov_rad2: (5, 3, 3) covariance of the directions of the last phalanges; only that across them counts.
+        """
+        ahead = self._ahead(joints)
+        square = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
+        # Ascending: the first is along the finger, and nothing.
+        variance, axes = np.linalg.eigh(square @ tilt_cov_rad2[self._finger] @ square)
+        angle = np.minimum(np.sqrt(2.0 * np.maximum(variance[:, 1:], 0.0)), _MOST_TILT)
+        around = axes[:, :, 1:] @ (angle[..., None] * _HEXAGON)  # (K, 3, 6)
+        tilted = ahead + around.transpose(2, 0, 1)
+        tilted /= np.sqrt(np.vecdot(tilted, tilted))[..., None]
+        return np.concatenate([ahead[None], tilted])
+
+    def anyhow(self, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
+        """Directions (5, K, 3) of the K caps at (M, 3) [m] while no hand is known: towards the cameras, and four bent
+        away from them as far as the cap is still seen."""
+        back = np.mean([camera.centre for camera in cameras], axis=0) - points_m[self._marker]
+        back /= np.sqrt(np.vecdot(back, back))[:, None]
+        right = cross(back, cameras[0].T_rig_camera[:3, 1])
+        right /= np.sqrt(np.vecdot(right, right))[:, None]
+        down = cross(back, right)
+        away, across = np.cos(_BENT_RAD) * back, np.sin(_BENT_RAD) * np.stack([right, down, -right, -down])
+        return np.concatenate([back[None], away + across])
+
+    def look(self, ahead: Float, points_m: Float, cameras: tuple[CameraModel, ...]) -> CapLook:
+        """What the cameras see of caps at points (M, 3) [m], rig frame, that point along `ahead` (T, K, 3)."""
+        bias = np.zeros((len(ahead), len(cameras), len(points_m), 2))
+        whole = np.zeros(bias.shape[:3])
+        if not self._joint:
+            return CapLook(bias, whole)
+        middle = points_m[self._marker]
+        back = np.array([camera.centre for camera in cameras])[:, None] - middle  # (C, K, 3)
+        back /= np.sqrt(np.vecdot(back, back))[..., None]
+        cosine = np.clip(np.vecdot(ahead[:, None], back), -1.0, 1.0)  # (T, C, K)
+        across = back - cosine[..., None] * ahead[:, None]
+        along, towards, shown = np.moveaxis(self._seen(np.arccos(cosine)), -1, 0)
+        sine = np.maximum(np.sqrt(1.0 - cosine * cosine), 1e-9)
+        shift = along[..., None] * ahead[:, None] + (towards / sine)[..., None] * across
+        for c, camera in enumerate(cameras):
+            there = camera.project(np.concatenate([middle + shift[:, c], middle[None]]))
+            bias[:, c, self._marker] = there[:-1] - there[-1]
+        whole[..., self._marker] = shown
+        return CapLook(np.nan_to_num(bias), np.nan_to_num(whole))
+
+    def bias_px(self, joints: HandJoints, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
+        """Seen centroid minus cap centroid, (C, M, 2) [px], of one hand pose; see `look`."""
+        return self.look(self._ahead(joints)[None], points_m, cameras).bias_px[0]
+
+    def by_marker(self, by_finger: Float) -> Float:
+        """Numbers of the fingers (5,) for each marker (M,); 1 for those without a cap."""
+        out = np.ones(len(self.on_finger))
+        out[self._marker] = by_finger[self._finger]
+        return out
+
+    def doubt_px(
+        self, area_px2: Float, points_m: Float, cameras: tuple[CameraModel, ...], whole_m2: Float
+    ) -> Float:
         """Extra centroid noise (C, M) [px] of markers that show less than they must: partly hidden.
 
         What is missing lies to one side, so the centroid of a cap moves by up to a radius. Two cameras see different
@@ -60,6 +150,7 @@ class CapModel:
             area_px2: Seen areas (C, M) [px^2].
             points_m: Where the caps were found (M, 3) [m], rig frame.
             cameras: The rig's cameras.
+            whole_m2: Least area (C, M) that the whole caps may show.
         """
         scale = np.stack(
             [_project_scale(camera) / np.linalg.norm(points_m - camera.centre, axis=1) for camera in cameras]
@@ -67,37 +158,38 @@ class CapModel:
         size_m2 = area_px2 / scale**2
         best_m2 = np.fmax.reduce(size_m2, axis=0)
         share = size_m2 / best_m2
-        doubt = np.where(share < _WHOLE_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
+        doubt = np.where(share < _FLAT_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
         if self._joint:
-            share = size_m2[:, self._marker] / (2.0 * self._radius * self._painted)
-            short = np.maximum(_WHOLE_SHARE - share, 0.0)
-            doubt[:, self._marker] = short * self._radius * scale[:, self._marker]
+            k = self._marker
+            least = _LEAST_SHARE * whole_m2[:, k]
+            hidden = np.maximum(1.0 - size_m2[:, k] / np.maximum(least, _SPECK_M2), 0.0)
+            doubt[:, k] = hidden * self._radius * scale[:, k]
         return np.nan_to_num(doubt)
 
-    def bias_px(self, joints: HandJoints, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
-        """Seen centroid minus cap centroid, (C, M, 2) [px]; zero for markers without a cap or not found.
+    def _ahead(self, joints: HandJoints) -> Float:
+        """Directions (K, 3) of the caps of a hand."""
+        return -joints.rotation[self._joint][:, :, 2]
 
-        Args:
-            joints: Hand pose, rig frame; only the orientation of the finger ends is used, so that a wrong pose
-                cannot move a cap by more than its radius.
-            points_m: Where the caps were found (M, 3) [m], rig frame.
-            cameras: The rig's cameras.
-        """
-        bias = np.zeros((len(cameras), len(points_m), 2))
-        if not self._joint:
-            return bias
-        R = joints.rotation[self._joint]  # (K, 3, 3)
-        middle = points_m[self._marker]
-        sight = middle - np.array([camera.centre for camera in cameras])[:, None]  # (C, K, 3)
-        sight /= np.sqrt(np.vecdot(sight, sight))[..., None]
-        local = sight.swapaxes(0, 1) @ R  # (K, C, 3)
-        facing = np.maximum(-local @ self._normals.swapaxes(1, 2), 0.0) * self._areas[:, None]  # (K, C, N)
-        seen = facing @ self._points / facing.sum(axis=2, keepdims=True)
-        shift = (seen - self._offset[self._marker][:, None]) @ R.swapaxes(1, 2)
-        for c, camera in enumerate(cameras):
-            there, here = camera.project(np.stack([middle + shift[:, c], middle]))
-            bias[c, self._marker] = there - here
-        return np.nan_to_num(bias)
+    def _seen(self, angle: Float) -> Float:
+        """Rows (..., K, 3) of the tables, see `_looks`, at the angles (..., K) [rad]."""
+        place = np.nan_to_num(angle) * (_ANGLES / np.pi)
+        low = np.minimum(place.astype(np.int64), _ANGLES - 1)
+        part = (place - low)[..., None]
+        return (1.0 - part) * self._table[self._row, low] + part * self._table[self._row, low + 1]
+
+
+def _looks(points: Float, normals: Float, areas: Float) -> Float:
+    """How a cap looks when its finger points 0..180 degrees away from the eye, (_ANGLES + 1, 3).
+
+    Columns: the seen centroid along the finger and, square to it, towards the eye [m], from the cap's own; and the area
+    seen [m^2]. A cap is round, so that this one angle tells all.
+    """
+    angle = np.arange(_ANGLES + 1) * (np.pi / _ANGLES)
+    eye = np.stack([np.sin(angle), np.zeros_like(angle), -np.cos(angle)], axis=1)
+    facing = np.maximum(eye @ normals.T, 0.0) * areas
+    shown = facing.sum(axis=1)
+    seen = facing @ points / np.maximum(shown, _SPECK_M2)[:, None]
+    return np.stack([-seen[:, 2], seen[:, 0], shown], axis=1)
 
 
 def _project_scale(camera: CameraModel) -> float:

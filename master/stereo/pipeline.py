@@ -22,8 +22,9 @@ from master.ik.hand import HandSolution
 from master.ik.tracker import HandTracker, pose_of
 from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw
+from master.stereo.locate import CapLocator, Located
 from master.stereo.pairing import Instant, Pairing
-from master.stereo.place import Placed, Placement, ray_covariance
+from master.stereo.place import EXACT, CalibrationResidual, Placement, ray_covariance
 from master.stereo.rivals import RivalChooser
 from master.stereo.whereabouts import HandBelief, Past
 
@@ -53,6 +54,7 @@ class MarkerPipeline:
         *,
         pairing: Pairing,
         law: DepthLaw | None = None,
+        residual: CalibrationResidual = EXACT,
         smooth: OneEuro | None = None,
         tracker: HandTracker,
         stamp_offset_us: Mapping[str, float] | None = None,
@@ -67,6 +69,7 @@ class MarkerPipeline:
             markers: Names in the order of every marker array.
             pairing: Brings cameras to one instant.
             law: Depth from disparity of the first two cameras; None: triangulate all cameras.
+            residual: What the calibration is known to leave.
             smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
             tracker: Solves the hand from its own markers, some or all of these.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
@@ -77,11 +80,12 @@ class MarkerPipeline:
         self.counts: Counter[str] = Counter()
         self._cameras = tuple(cameras.values())
         self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
-        self._place = Placement(self._cameras, law)
+        self._place = Placement(self._cameras, law, residual)
         self._choose = RivalChooser(self._cameras, self._place)
         self._on_hand = np.array([markers.index(name) for name in tracker.markers], np.int64)
         self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
+        self._located = CapLocator(self._cameras, self._caps, self._place)
         self._stage, self._volume = stage, volume
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._centres = np.array([camera.centre for camera in self._cameras])
@@ -101,23 +105,25 @@ class MarkerPipeline:
         return [self._solve(instant) for instant in self._pairing.flush()]
 
     def _solve(self, instant: Instant) -> SolvedPose:
-        last = self._tracker.last if self._smooth is not None else None
+        last, age_s = self._tracker.recent(instant.t_ns)
         with self._stage("triangulate"):
             instant = self._without_rivals(instant)
-            raw, cov, apart = self._locate(instant, last)
+            found = self._locate(instant, last, age_s)
         if last is None:
-            # The caps' tilt is not known yet: a first solution without correction tells it.
+            # The caps' tilt is not known yet: a first solution tells it.
             with self._stage("hand"):
                 first = self._tracker.peek(
-                    *self._with_rays(instant, raw, cov, None), self._towards(raw, instant)
+                    *self._with_rays(instant, found.points, found.cov, None, 0.0),
+                    self._towards(found.points, instant),
                 )
             if first is not None:
                 with self._stage("triangulate"):
-                    raw, cov, apart = self._locate(instant, first)
+                    found = self._locate(instant, first, 0.0)
+        raw, cov, apart = found.points, found.cov, found.apart
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
         with self._stage("hand"):
-            aims = self._with_rays(instant, markers, cov, last)
+            aims = self._with_rays(instant, markers, cov + found.repeated, last, age_s)
             measured = np.isfinite(markers[self._on_hand, 0])
             hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers, instant), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
@@ -138,7 +144,7 @@ class MarkerPipeline:
         if not in_doubt.any():  # a rival was named in a frame nearby, and is not carried to this instant
             return replace(instant, rival_uv=None)
         first = self._place(instant.uv, instant.sigma_px)
-        clear = np.where((in_doubt | self._apart(instant.uv, first))[:, None], np.nan, first.points)
+        clear = np.where((in_doubt | first.apart(instant.uv))[:, None], np.nan, first.points)
         hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear, instant)
         others = self._tracker.peek(*hand, curled=False)
         chosen = self._choose(
@@ -155,34 +161,16 @@ class MarkerPipeline:
         area = np.where(chosen.uv[..., 0] == instant.uv[..., 0], instant.area, np.nan)
         return replace(instant, uv=chosen.uv, sigma_px=chosen.sigma_px, area=area, rival_uv=None)
 
-    def _apart(self, uv: Float, placed: Placed) -> Bool:
-        """(M,) markers that two cameras see, but whose rays do not meet: one camera saw something else."""
-        met = np.isfinite(placed.points[:, 0]) & (placed.misfit <= placed.limit)
-        return (np.isfinite(uv[..., 0]).sum(axis=0) >= 2) & ~met
-
     def _count(self, event: str, markers: Bool) -> None:
         """Count an event of each of the markers (M,) by name."""
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 
-    def _locate(self, instant: Instant, hand: HandSolution | None) -> tuple[Float, Float, Bool]:
-        """Cap centroids (M, 3) [m] and covariances (M, 3, 3) at the instant, given the hand known so far.
-
-        Those whose rays do not meet are NaN, and told by the third array (M,).
-        """
-        uv, sigma = instant.uv, instant.sigma_px
-        points = self._place.roughly(uv, sigma)
-        sigma = np.hypot(sigma, self._caps.doubt_px(instant.area, points, self._cameras))
-        if hand is not None:
-            uv = uv - self._caps.bias_px(hand.joints, points, self._cameras)
-        placed = self._place(uv, sigma)
-        apart = self._apart(uv, placed)
-        if apart.any():
-            placed.points[apart], placed.cov[apart] = np.nan, np.nan
-        return placed.points, placed.cov, apart
+    def _locate(self, instant: Instant, hand: HandSolution | None, age_s: float) -> Located:
+        return self._located(instant.uv, instant.sigma_px, instant.area, hand, age_s)
 
     def _with_rays(
-        self, instant: Instant, points: Float, cov: Float, last: HandSolution | None
+        self, instant: Instant, points: Float, cov: Float, last: HandSolution | None, age_s: float
     ) -> tuple[Float, Float]:
         """Points and covariances of the hand's markers, with those added that only one camera sees.
 
@@ -201,12 +189,14 @@ class MarkerPipeline:
         view = np.argmax(seen[:, lone], axis=0)
         uv = instant.uv[view, lone]
         self._place.put(points, lone, view, uv, near)
-        doubt = self._caps.doubt_px(instant.area, points, self._cameras)[view, lone]
-        if last is not None:
-            bias = self._caps.bias_px(last.joints, points, self._cameras)[view, lone]
-            self._place.put(points, lone, view, uv - bias, near)
+        look = self._located.look(points, last, age_s)
+        doubt = self._caps.doubt_px(instant.area, points, self._cameras, look.whole_m2.min(axis=0))
+        bias = look.bias_px[:, view, lone]
+        self._place.put(points, lone, view, uv - bias[0], near)
         sight = points[lone] - self._centres[view]
-        across = np.hypot(instant.sigma_px[view, lone], doubt) / self._focal_px[view]
+        tilt_px2 = ((bias[1:] - bias[0]) ** 2).mean(axis=(0, 2))
+        across = np.sqrt(instant.sigma_px[view, lone] ** 2 + doubt[view, lone] ** 2 + tilt_px2)
+        across /= self._focal_px[view]
         across = across * np.linalg.norm(sight, axis=1)
         depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
         cov[lone] = ray_covariance(sight, across, np.full(len(lone), depth_m))

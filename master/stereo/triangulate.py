@@ -43,6 +43,7 @@ class Triangulation:
     Attributes:
         points: (M, 3) [m], rig frame. NaN: not determined.
         covariance: (M, 3, 3) [m^2].
+        gain: (M, 3, 2 C) [m/px] by how much each point moves with each u, v, u, v ...; 0: not seen.
         residual_px: (M,) reprojection error, RMS over the cameras that saw the marker [px].
         error_px2: (M, C) squared reprojection error in each camera [px^2]; 0: not seen.
         views: (M,) cameras that saw the marker.
@@ -50,6 +51,7 @@ class Triangulation:
 
     points: Float
     covariance: Float
+    gain: Float
     residual_px: Float
     error_px2: Float
     views: Int
@@ -104,7 +106,8 @@ class Triangulator:
             points, covariance = _least_squares(rows)
             error = (rows[..., :3] @ points[..., None])[..., 0] + rows[..., 3]
             error = error.reshape(len(points), len(self.cameras), 2)
-            return _judge(points, covariance, self._depths(points), error, weight.T)
+            gain = (covariance @ rows[..., :3].swapaxes(1, 2)) * np.repeat(weight.T, 2, axis=1)[:, None]
+            return _judge(points, covariance, gain, self._depths(points), error, weight.T)
 
     def roughly(self, uv: Float, sigma_px: float | Float = 0.1) -> Float:
         """The linear solution alone, points (M, 3) [m]; in a third of the time, and not judged. As `triangulate`."""
@@ -151,7 +154,9 @@ def _least_squares(rows: Float) -> tuple[Float, Float]:
     return -(covariance @ normal[:, :3, 3:])[..., 0], covariance
 
 
-def _judge(points: Float, covariance: Float, z: Float, error: Float, weight: Float) -> Triangulation:
+def _judge(
+    points: Float, covariance: Float, gain: Float, z: Float, error: Float, weight: Float
+) -> Triangulation:
     """Residuals, and NaN for what is not determined; `error` (M, C, 2) in sigmas, `weight` (M, C)."""
     seen = weight > 0.0
     views = seen.sum(axis=1)
@@ -163,7 +168,7 @@ def _judge(points: Float, covariance: Float, z: Float, error: Float, weight: Flo
     points[nan] = np.nan
     covariance[nan] = np.nan
     residual[nan] = np.nan
-    return Triangulation(points, covariance, residual, squared, views.astype(np.int64))
+    return Triangulation(points, covariance, gain, residual, squared, views.astype(np.int64))
 
 
 def _inverse(matrix: Float) -> Float:

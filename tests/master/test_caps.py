@@ -79,7 +79,9 @@ def test_markers_without_caps_need_no_correction() -> None:
     back = CapModel(RIGHT, ("back",))
     points = np.array([[0.0, 0.0, 0.5]])
     np.testing.assert_array_equal(back.bias_px(pointing(np.eye(3)), points, CAMERAS), np.zeros((2, 1, 2)))
-    np.testing.assert_array_equal(back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS), np.zeros((2, 1)))
+    np.testing.assert_array_equal(
+        back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS, np.zeros((2, 1))), np.zeros((2, 1))
+    )
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -93,14 +95,38 @@ def test_a_bias_is_never_larger_than_a_finger_tip(seed: int) -> None:
 
 def test_a_sliver_of_a_cap_is_doubted_and_a_whole_one_is_not() -> None:
     points = np.tile([0.0, 0.0, 0.5], (6, 1))
-    whole_px2 = 2 * RADIUS_M * 1.7 * RADIUS_M * (500.0 / 0.5) ** 2  # painted: the sphere and 0.7 r behind it
-    doubt = CAPS.doubt_px(np.array([[whole_px2] * 6, [0.1 * whole_px2] * 6]), points, CAMERAS)
+    whole_m2 = (2 * 1.7 + np.pi / 2 - 1) * RADIUS_M**2  # from the side: half a disc, and the paint behind it
+    whole_px2 = whole_m2 * (500.0 / 0.5) ** 2
+    area = np.array([[whole_px2] * 6, [0.1 * whole_px2] * 6])
+    expected_m2 = np.full((2, 6), whole_m2)
+    doubt = CAPS.doubt_px(area, points, CAMERAS, expected_m2)
     assert (doubt[0] == 0).all()
     away = np.linalg.norm(points[1] - CAMERAS[1].centre)
-    scale = 500.0 / away
-    expected = (0.6 - 0.1 * (away / 0.5) ** 2) * RADIUS_M * scale
+    expected = (1 - 0.1 / 0.8 * (away / 0.5) ** 2) * RADIUS_M * 500.0 / away
     assert doubt[1, 1] == pytest.approx(expected)
-    np.testing.assert_array_equal(CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS), np.zeros((2, 6)))
+    nowhere = CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS, expected_m2)
+    np.testing.assert_array_equal(nowhere, np.zeros((2, 6)))
+
+
+def test_a_cap_shows_a_disc_from_its_end_and_its_whole_length_from_the_side() -> None:
+    points = np.tile([0.0, 0.0, 0.5], (6, 1))
+    towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    shown = CAPS.look(np.repeat(towards[:, None], 5, axis=1), points, CAMERAS).whole_m2[:, 0, 1]
+    np.testing.assert_allclose(shown[0], np.pi * RADIUS_M**2, rtol=0.01)
+    np.testing.assert_allclose(shown[1], (np.pi / 2 + 2 * 0.7) * RADIUS_M**2, rtol=0.01)
+    assert shown[2] == pytest.approx(0.0, abs=1e-12)  # behind the finger
+
+
+def test_a_sure_pose_is_not_tilted_and_an_unsure_one_about_its_own() -> None:
+    joints = pointing(np.eye(3))
+    sure = CAPS.tilted(joints, np.zeros((5, 3, 3)))
+    np.testing.assert_allclose(sure, np.broadcast_to([0.0, 0.0, -1.0], (7, 5, 3)), atol=1e-12)
+    sd = np.array([0.2, 0.05])
+    tilted = CAPS.tilted(joints, np.broadcast_to(np.diag([*sd**2, 0.0]), (5, 3, 3)))
+    np.testing.assert_allclose(np.linalg.norm(tilted, axis=-1), 1.0)
+    np.testing.assert_allclose(
+        np.sqrt((tilted[1:, :, :2] ** 2).mean(axis=0)), np.broadcast_to(sd, (5, 2)), rtol=0.05
+    )
 
 
 @pytest.mark.parametrize("name", ["static", "flex90"])
@@ -128,12 +154,12 @@ def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path
 
 def test_a_flat_marker_is_doubted_where_another_camera_sees_much_more_of_it() -> None:
     points = np.tile([0.0375, 0.0, 0.5], (6, 1))  # as far from one camera as from the other
-    whole = np.full(6, 500.0)
-    alike = CAPS.doubt_px(np.stack([whole, 0.7 * whole]), points, CAMERAS)
+    whole, nothing = np.full(6, 500.0), np.zeros((2, 6))
+    alike = CAPS.doubt_px(np.stack([whole, 0.7 * whole]), points, CAMERAS, nothing)
     np.testing.assert_array_equal(
         alike[:, 5], 0.0
     )  # side by side: all of a pair's sightings stay as they are
-    aslant = CAPS.doubt_px(np.stack([whole, 0.2 * whole]), points, CAMERAS)
+    aslant = CAPS.doubt_px(np.stack([whole, 0.2 * whole]), points, CAMERAS, nothing)
     np.testing.assert_allclose(aslant[:, 5], [0.0, 0.8 * 0.5 * np.sqrt(500.0)])
-    alone = CAPS.doubt_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, CAMERAS)
+    alone = CAPS.doubt_px(np.stack([np.full(6, np.nan), 0.2 * whole]), points, CAMERAS, nothing)
     np.testing.assert_array_equal(alone[:, 5], 0.0)

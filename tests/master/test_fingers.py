@@ -19,7 +19,8 @@ def solved(angles: Float) -> tuple[HandSolution, Float]:
     """A solution with exactly these angles, and its own markers."""
     joints = RIGHT.forward(palm(), angles)
     points = RIGHT.marker_points(joints, MARKERS)
-    return HandSolution(palm(), angles, joints, np.zeros((26, 3, 3)), np.zeros(6), 0.0, 1), points
+    sure = np.zeros((26, 3, 3)), np.zeros((5, 3, 3)), np.zeros((5, 3, 3))
+    return HandSolution(palm(), angles, joints, *sure, np.zeros(6), 0.0, 1), points
 
 
 @given(seeds)

@@ -1,5 +1,7 @@
 """Tests of the whole-hand fit: Jacobians, exact recovery, limits under any input, a palm that turns."""
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from common.arrays import Float
 from common.calibration import Couplings
 from common.errors import CalibrationError
 from common.geometry import rigid, rotation_vector_to_matrix
-from common.hand_model import TIPS, HandModel
+from common.hand_model import CHAINS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.attached import Attached
@@ -152,9 +154,7 @@ def test_a_turned_palm_does_not_become_a_wrong_hand() -> None:
     turns: list[float] = []
     straight = SOLVER.solve(exact(RIGHT, palm(), np.zeros((5, 4))), small_cov(), None, 0.0, None, FACING)
     assert straight is not None
-    believe_straight = HandSolution(
-        palm(), straight.angles_rad, straight.joints, straight.cov_m2, straight.residual_m, 0.0, 0
-    )
+    believe_straight = replace(straight, T_rig_palm=palm())
     for _ in range(120):
         angles, turn = natural_angles(rng), rng.uniform(-20.0, 20.0, 3)
         T = palm(turn)
@@ -349,3 +349,22 @@ def test_the_error_is_as_large_as_the_covariance_says() -> None:
         variance = np.trace(found.cov_m2, axis1=1, axis2=2)
         ratio.append(float(np.mean((error**2).sum(axis=1) / variance)))
     assert 0.1 < np.mean(ratio) < 3.0
+
+
+def test_the_tilt_of_a_finger_end_lies_across_it_and_grows_with_its_joints() -> None:
+    angles = natural_angles(np.random.default_rng(3))
+    found = SOLVER.solve(exact(RIGHT, palm(), angles), small_cov(), None, 0.0, None, FACING)
+    assert found is not None
+    ends, starts = CHAINS[:, 3], CHAINS[:, 2]
+    along = found.joints.position_m[ends] - found.joints.position_m[starts]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    for f in range(5):
+        cov = found.tilt_cov_rad2[f]
+        assert abs(along[f] @ cov @ along[f]) < 1e-9 < np.trace(cov)
+        assert np.degrees(np.sqrt(np.trace(cov))) < 40.0
+    # a bending joint turns the end of its finger as fast as it bends itself: MCP, PIP and DIP = 2/3 PIP together
+    walk = np.sqrt(np.linalg.eigvalsh(found.tilt_walk_rad2_s2)[1:, 2])
+    p = SOLVER.priors
+    np.testing.assert_allclose(
+        walk, np.sqrt(p.palm_walk_rad_s**2 + p.walk_rad_s**2 * (1 + (1 + 2 / 3) ** 2)), rtol=0.02
+    )

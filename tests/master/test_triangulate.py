@@ -73,6 +73,23 @@ def test_covariance_is_that_of_the_errors(rig: Triangulator) -> None:
     assert np.sqrt((out.residual_px**2).mean()) == pytest.approx(expected, rel=0.03)
 
 
+@pytest.mark.parametrize("rig", [PAIR, FOUR])
+def test_the_gain_is_the_derivative_of_the_points(rig: Triangulator) -> None:
+    points = _volume(4, 5)
+    uv, cameras = _project(rig, points), len(rig.cameras)
+    sigma = np.random.default_rng(1).uniform(0.05, 0.5, (cameras, 5))
+    uv[-1, 2] = np.nan if cameras > 2 else uv[-1, 2]
+    out = rig.triangulate(uv, sigma)
+    for c in range(cameras):
+        for axis in range(2):
+            moved = uv.copy()
+            moved[c, :, axis] += 1e-3
+            slope = (rig.triangulate(moved, sigma).points - out.points) / 1e-3
+            np.testing.assert_allclose(out.gain[..., 2 * c + axis], slope, rtol=0.02, atol=2e-5)
+    noise = out.gain * np.repeat(sigma.T, 2, axis=1)[:, None]
+    np.testing.assert_allclose(noise @ noise.swapaxes(1, 2), out.covariance, rtol=1e-6, atol=1e-14)
+
+
 def test_depth_noise_at_half_a_metre_by_hand() -> None:
     # parallel pair: sigma_D = sqrt(2) D^2 / (f B) sigma = 1.414 * 0.25 / (503 * 0.075) * 0.1 px = 0.94 mm
     rig = Triangulator.of(

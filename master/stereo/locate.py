@@ -1,0 +1,107 @@
+"""Where the caps' centroids are, and how sure that is: from pixels, and from the hand as it was known last.
+
+What a camera sees of a cap is not its centroid; the difference follows from the direction in which the finger points
+(`master.stereo.caps`), which is itself only as sure as the hand is. So a point's covariance has these parts:
+
+    centroids     noise, cover and time, each camera's own                  gain diag(sigma^2) gain'
+    direction     one finger is tilted for all cameras alike                spread of six tilted hands
+    radius        the profile's, a tenth                                    0.1 of the whole correction
+    relief        of a flat marker: the back of a hand is none              0.3 mm
+    calibration   what its provenance says is left                          `master.stereo.place`
+
+Tilt matters most along the sight: two cameras see a finger that points at one of them from different sides, so that
+a degree of tilt moves the two centroids apart, and the distance with them.
+
+The hand fit must be told more. It believes that fingers move between instants as fast as its priors allow, and the
+error of this correction repeats that of the last pose: told less than it believes itself, it would follow its own
+error, and finger and cap would drag each other away.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from master.ik.hand import HandSolution
+from master.stereo.caps import CapLook, CapModel
+from master.stereo.place import Placement
+
+TURN_RAD_S = (
+    2.0  # standard deviation of how fast a finger end turns: a fist closes in a second, and mostly rests
+)
+_RADIUS = 0.1  # relative error of a profile's radii: 0.8 mm
+_RELIEF_M = 0.3e-3  # 16 mm of paint on a back with 50 mm radius of curvature bulge by 0.6 mm
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Located:
+    """The markers of one instant.
+
+    Attributes:
+        points: Cap centroids (M, 3) [m]; NaN: not seen by two cameras, or their rays do not meet.
+        cov: (M, 3, 3) [m^2].
+        repeated: (M, 3, 3) [m^2] what is to be added to `cov` for a fit that starts at the same hand.
+        apart: (M,) the rays do not meet.
+    """
+
+    points: Float
+    cov: Float
+    repeated: Float
+    apart: Bool
+
+
+class CapLocator:
+    """Locates the markers of one rig. Holds no state between calls."""
+
+    def __init__(self, cameras: tuple[CameraModel, ...], caps: CapModel, place: Placement) -> None:
+        """Locate with these cameras, caps and depth model."""
+        self._cameras, self._caps, self._place = cameras, caps, place
+
+    def __call__(
+        self, uv: Float, sigma_px: Float, area_px2: Float, hand: HandSolution | None, age_s: float
+    ) -> Located:
+        """Locate the markers of one instant.
+
+        Args:
+            uv: (C, M, 2) [px]; NaN: not seen.
+            sigma_px: (C, M).
+            area_px2: (C, M).
+            hand: The hand known so far; None: a cap may point anywhere where it is seen.
+            age_s: How long ago it was so [s].
+        """
+        points = self._place.roughly(uv, sigma_px)
+        look = self.look(points, hand, age_s)
+        doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2.min(axis=0))
+        placed = self._place(uv - look.bias_px[0], np.hypot(sigma_px, doubt))
+        bias = look.bias_px.transpose(2, 1, 3, 0).reshape(len(points), -1, len(look.bias_px))  # (M, 2C, T)
+        moved = placed.gain @ bias
+        tilt = moved[..., 1:] - moved[..., :1]
+        tilted = tilt @ tilt.swapaxes(1, 2) / tilt.shape[-1]
+        corrected = _RADIUS * moved[..., :1]
+        cov = placed.cov + tilted + corrected @ corrected.swapaxes(1, 2)
+        cov[~self._caps.on_finger] += _RELIEF_M**2 * np.eye(3)
+        apart = placed.apart(uv)
+        if apart.any():
+            placed.points[apart], cov[apart] = np.nan, np.nan
+        repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
+        return Located(placed.points, cov, repeated, apart)
+
+    def look(self, points: Float, hand: HandSolution | None, age_s: float) -> CapLook:
+        """How caps at (M, 3) [m] look: as the hand has them, and tilted as far as it is unsure."""
+        if hand is None:
+            ahead = self._caps.anyhow(points, self._cameras)
+        else:
+            turned = (TURN_RAD_S * age_s) ** 2 * np.eye(3)
+            ahead = self._caps.tilted(hand.joints, hand.tilt_cov_rad2 + turned)
+        return self._caps.look(ahead, points, self._cameras)
+
+    def _unsure(self, hand: HandSolution | None, age_s: float) -> Float:
+        """By how much the variance of the tilt is larger to the hand fit than to us (M,)."""
+        if hand is None:
+            return np.ones(len(self._caps.on_finger))
+        ours = np.trace(hand.tilt_cov_rad2, axis1=1, axis2=2) + 2.0 * (TURN_RAD_S * age_s) ** 2
+        walked = (
+            np.trace(hand.tilt_walk_rad2_s2, axis1=1, axis2=2) * age_s**2 - 2.0 * (TURN_RAD_S * age_s) ** 2
+        )
+        return self._caps.by_marker(1.0 + np.maximum(walked, 0.0) / np.maximum(ours, 1e-12))

@@ -1,0 +1,180 @@
+"""Tests of covariances: what noise, tilt, calibration and depth laws contribute, against worked numbers and spread."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import Provenance
+from common.geometry import rigid
+from common.hand_model import TIPS, HandJoints
+from master.ik.hand import HandSolution
+from master.stereo.caps import CapModel
+from master.stereo.depth import AffineDisparity
+from master.stereo.locate import TURN_RAD_S, CapLocator, Located
+from master.stereo.place import CalibrationResidual, Placement
+from tests.hand_helpers import MARKERS, RIGHT, camera_models, natural_angles, palm, rig_file
+
+RIG = rig_file()
+CAMERAS = tuple(camera_models(RIG).values())
+FOUR = tuple(camera_models(rig_file(("a", "b", "c", "d"))).values())
+CAPS = CapModel(RIGHT, MARKERS)
+WHOLE = np.full((2, 6), 1e6)  # px^2: nothing is hidden
+SIGMA = np.full((2, 6), 0.1)
+
+
+def hand(tilt_rad: float, joints: HandJoints | None = None) -> HandSolution:
+    """A hand whose finger ends are unsure by `tilt_rad` each way across."""
+    joints = RIGHT.forward(palm(), np.radians(np.full((5, 4), 20.0))) if joints is None else joints
+    ends = joints.rotation[TIPS]
+    tilt = tilt_rad**2 * (np.eye(3) - ends[:, :, 2:] @ ends[:, :, 2:].swapaxes(1, 2))
+    nothing = np.zeros((26, 3, 3))
+    return HandSolution(palm(), np.zeros((5, 4)), joints, nothing, tilt, 100.0 * tilt, np.zeros(6), 0.0, 1)
+
+
+def locate(
+    known: HandSolution | None, uv: Float, age_s: float = 0.0, place: Placement | None = None
+) -> Located:
+    locator = CapLocator(CAMERAS, CAPS, place or Placement(CAMERAS, None))
+    return locator(uv, SIGMA, WHOLE, known, age_s)
+
+
+def seen(joints: HandJoints) -> tuple[Float, Float]:
+    """Cap centroids (6, 3) and what the cameras see of them (2, 6, 2)."""
+    points = RIGHT.marker_points(joints, MARKERS)
+    return points, np.stack([c.project(points) for c in CAMERAS]) + CAPS.bias_px(joints, points, CAMERAS)
+
+
+def test_a_known_hand_gives_its_caps_back() -> None:
+    known = hand(0.0)
+    points, uv = seen(known.joints)
+    found = locate(known, uv)
+    np.testing.assert_allclose(
+        found.points, points, atol=2e-4
+    )  # caps are looked at from where they roughly are
+    assert not found.apart.any()
+    np.testing.assert_allclose(found.repeated, 0.0, atol=1e-15)
+
+
+def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> None:
+    rng = np.random.default_rng(5)
+    sd, believed = 0.1, hand(0.1)
+    tilts = rng.normal(0.0, sd, (3000, 5, 2))
+    _, uv = seen(believed.joints)
+    truth = RIGHT.marker_points(believed.joints, MARKERS)
+    errors: list[Float] = []
+    for tilt in tilts:
+        rotation = believed.joints.rotation.copy()
+        R = rotation[TIPS]
+        ahead = -R[:, :, 2] + np.einsum("kij,kj->ki", R[:, :, :2], tilt)
+        rotation[TIPS, :, 2] = -ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
+        _, uv = seen(replace(believed.joints, rotation=rotation))
+        errors.append(locate(believed, uv + rng.normal(0.0, 0.1, uv.shape)).points - truth)
+    spread = np.array(errors)
+    cov = locate(believed, seen(believed.joints)[1]).cov
+    for m in range(5):
+        nees = np.einsum("ni,ij,nj->n", spread[:, m], np.linalg.inv(cov[m]), spread[:, m])
+        assert 0.90 < (nees < 7.815).mean() <= 1.0, MARKERS[m]
+        sd_m = np.sqrt(np.diag(np.cov(spread[:, m].T)))
+        assert (np.sqrt(np.diag(cov[m])) < 1.6 * sd_m + 1e-4).all(), MARKERS[m]
+
+
+def test_an_unsure_pose_widens_most_along_the_sight_and_age_adds_to_it() -> None:
+    _, uv = seen(hand(0.0).joints)
+    sure, unsure = locate(hand(0.0), uv), locate(hand(0.2), uv)
+    more = np.sqrt(np.diagonal(unsure.cov - sure.cov, axis1=1, axis2=2)[:5])
+    assert (more[:, 2] > 2.0 * more[:, :2].max(axis=1)).all()
+    old, turned = locate(hand(0.0), uv, 0.02), locate(hand(0.02 * TURN_RAD_S), uv)
+    size = [np.trace(found.cov[:5] - sure.cov[:5], axis1=1, axis2=2) for found in (old, turned)]
+    np.testing.assert_allclose(*size, rtol=0.05)
+
+
+def test_a_fit_is_told_of_the_motion_that_it_believes_in() -> None:
+    """Here the fit's walk makes a variance 100 dt^2 times as large: at 0.1 s it is doubled."""
+    _, uv = seen(hand(0.0).joints)
+    known, age_s = hand(0.3), 0.1
+    found = locate(known, uv, age_s)
+    tilted = found.cov - locate(hand(0.0), uv).cov
+    ours = 2 * 0.3**2 + 2 * (TURN_RAD_S * age_s) ** 2
+    fits = 2 * 0.3**2 + 100.0 * age_s**2 * 2 * 0.3**2
+    np.testing.assert_allclose(found.repeated[:5], (fits / ours - 1.0) * tilted[:5], rtol=0.05, atol=1e-9)
+    np.testing.assert_array_equal(found.repeated[5], 0.0)
+
+
+def test_without_a_hand_a_cap_may_point_anywhere() -> None:
+    rng = np.random.default_rng(2)
+    inside: list[bool] = []
+    for _ in range(80):
+        joints = RIGHT.forward(palm(rng.uniform(-30, 30, 3)), natural_angles(rng))
+        points, uv = seen(joints)
+        found = locate(None, uv)
+        off = (found.points - points)[:5]
+        nees = np.vecdot(off, np.linalg.solve(found.cov[:5], off[..., None])[..., 0])
+        eye = points[:5] / np.linalg.norm(points[:5], axis=1, keepdims=True)
+        shown = np.vecdot(-joints.rotation[TIPS][:, :, 2], eye) < np.cos(
+            np.radians(45.0)
+        )  # bent away by 135 at most
+        inside += list(nees[shown] < 7.815)
+    assert len(inside) > 100
+    assert np.mean(inside) > 0.9
+
+
+def test_more_cameras_and_better_ones_make_a_point_surer() -> None:
+    points = np.tile([0.1, 0.02, 0.5], (6, 1))
+    uv = np.stack([camera.project(points) for camera in FOUR])
+    place = Placement(FOUR, None)
+    sd: list[float] = []
+    for cameras in (2, 3, 4):
+        some = np.where(np.arange(4)[:, None, None] < cameras, uv, np.nan)
+        sd.append(float(np.sqrt(place(some, np.full((4, 6), 0.1)).cov[0, 2, 2])))
+    assert sd[0] > sd[1] > sd[2]
+    vague = np.full((4, 6), 0.1)
+    vague[2:] = 50.0  # two that hardly tell anything: as good as two cameras
+    assert np.sqrt(place(uv, vague).cov[0, 2, 2]) == pytest.approx(sd[0], rel=0.01)
+
+
+def provenance(**residual: float) -> Provenance:
+    return Provenance(date="2026-11-21T12:00:00Z", tool="test", data=("here",), residual=residual)
+
+
+def test_what_a_calibration_leaves_is_part_of_the_covariance() -> None:
+    rig = rig_file(provenance={"T_rig_camera": provenance(rms_px=0.3)})
+    assert CalibrationResidual.of(RIG) == CalibrationResidual()
+    left = CalibrationResidual.of(rig)
+    assert left == CalibrationResidual(rays_px=0.3)
+    uv = seen(hand(0.0).joints)[1]
+    exact, real = Placement(CAMERAS, None)(uv, SIGMA), Placement(CAMERAS, None, left)(uv, SIGMA)
+    np.testing.assert_allclose(real.cov, exact.cov * (0.1**2 + 0.3**2) / 0.1**2, rtol=1e-6)
+    np.testing.assert_allclose(real.misfit, exact.misfit, atol=1e-12)  # that has its own allowance
+
+
+def test_a_law_of_disparity_has_the_covariance_of_its_geometry_and_of_its_own_residual() -> None:
+    """Of parallel cameras it is the triangulation of u; rows it does not use."""
+    law = AffineDisparity(500.0 * 0.075, 0.0)
+    points = np.tile([0.06, -0.03, 0.5], (6, 1))
+    uv = np.stack([camera.project(points) for camera in CAMERAS])
+    found, full = Placement(CAMERAS, law)(uv, SIGMA), Placement(CAMERAS, None)(uv, SIGMA)
+    np.testing.assert_allclose(found.cov[0, [0, 2]][:, [0, 2]], full.cov[0, [0, 2]][:, [0, 2]], rtol=1e-3)
+    for c, axis in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        moved = uv.copy()
+        moved[c, :, axis] += 1e-3
+        slope = (Placement(CAMERAS, law)(moved, SIGMA).points - found.points) / 1e-3
+        np.testing.assert_allclose(found.gain[..., 2 * c + axis], slope, rtol=1e-3, atol=1e-9)
+    rig = rig_file(
+        depth_model="affine_disparity",
+        provenance={"affine_disparity": provenance(mean_percent=1.0, leave_one_out_mean_percent=2.0)},
+    )
+    left = CalibrationResidual.of(rig)
+    assert left.law == pytest.approx(0.02 * np.sqrt(np.pi / 2))
+    rough = Placement(CAMERAS, law, left)(uv, SIGMA)
+    assert rough.cov[0, 2, 2] - found.cov[0, 2, 2] == pytest.approx((left.law * 0.5) ** 2)
+
+
+def test_covariances_turn_with_the_rig() -> None:
+    turn = rigid(palm(np.array([30.0, -20.0, 70.0]))[:3, :3], np.array([1.0, 2.0, 3.0]))
+    moved = tuple(replace(c, T_rig_camera=turn @ c.T_rig_camera) for c in CAMERAS)
+    uv = seen(hand(0.0).joints)[1]
+    for law in (None, AffineDisparity(500.0 * 0.075, 0.0)):
+        here, there = Placement(CAMERAS, law)(uv, SIGMA).cov, Placement(moved, law)(uv, SIGMA).cov
+        np.testing.assert_allclose(there, turn[:3, :3] @ here @ turn[:3, :3].T, rtol=1e-6, atol=1e-14)
