@@ -172,12 +172,12 @@ class Pairing:
         assert self._origin_ns is not None
         views = [self._neighbours(c, t_ns) for c in range(len(self._names))]
         carried = carry(views, float(t_ns - self._origin_ns), self._scale_px_m)
-        unseen = np.full(carried.sigma_px.shape[1], np.nan)
         return Instant(
             t_ns,
             carried.uv,
             carried.sigma_px,
-            area=np.array([view[0].area if view else unseen for view in views]),
+            # The sigma of a camera that sees nothing is NaN, and so is the area.
+            area=np.array([v[0].area if v else s for v, s in zip(views, carried.sigma_px, strict=True)]),
             ready_t_ns=max(sighting.ready_t_ns for view in views for sighting in view),
             missing=np.array([not view for view in views]),
             rival_uv=carried.rival_uv,

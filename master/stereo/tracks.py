@@ -21,6 +21,7 @@ elsewhere, with the other cameras (`master.stereo.rivals`).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -92,7 +93,7 @@ def carry(views: Sequence[Sequence[Sighting]], t_ns: float, scale_px_m: Float) -
         t_ns: The instant.
         scale_px_m: (C,) pixels that a metre across the sight takes where hands are [px/m].
     """
-    nothing = np.full_like(next(view[0].marks for view in views if view), np.nan)
+    nothing = _nothing(len(next(view[0].marks for view in views if view)))
     marks = np.array([[s.marks for s in view] + [nothing] * (SIGHTINGS - len(view)) for view in views])
     t_sigma_s = np.array([view[0].t_sigma_ns if view else 0.0 for view in views]) * 1e-9
     doubtful = [c for c, view in enumerate(views) if any(s.rivals is not None for s in view)]
@@ -105,6 +106,12 @@ def carry(views: Sequence[Sequence[Sighting]], t_ns: float, scale_px_m: Float) -
         np.array(rivals), t_ns, scale_px_m[doubtful], t_sigma_s[doubtful]
     )
     return Carried(uv, sigma, rival_uv, rival_sigma)
+
+
+@cache
+def _nothing(markers: int) -> Float:
+    """Marks (M, 4) of a frame in which nothing is seen."""
+    return np.full((markers, 4), np.nan)
 
 
 def _at(marks: Float, t_ns: float, scale: Float, t_sigma_s: Float) -> tuple[Float, Float]:
