@@ -164,7 +164,9 @@ def view(
 @app.command()
 def report(
     poses: Annotated[Path, typer.Option(help="poses.npz of the run.")],
-    scene_epoch_ns: Annotated[int, typer.Option(help="Scene time 0 on this machine's monotonic clock [ns].")],
+    scene_epoch_ns: Annotated[
+        int, typer.Option(help="Scene time 0 on this machine's monotonic clock, in ns.")
+    ],
     out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
     scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}.")] = "standard",
     seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,

@@ -48,11 +48,11 @@ def verify_command(
     calibration: Calibration = CALIB_JSON,
     target: Target = "75x50",
     fov_deg: FovDeg = None,
-    sigma_px: Annotated[float, typer.Option(help="Noise of a centroid, one camera, per axis [px].")] = 0.1,
-    speed_m_s: Annotated[float, typer.Option(help="Sideways speed for the budget [m/s].")] = 1.0,
-    skew_ms: Annotated[float, typer.Option(help="Uncorrected time between the two exposures [ms].")] = 0.5,
+    sigma_px: Annotated[float, typer.Option(help="Noise of a centroid, one camera, per axis, in px.")] = 0.1,
+    speed_m_s: Annotated[float, typer.Option(help="Sideways speed for the budget, in m/s.")] = 1.0,
+    skew_ms: Annotated[float, typer.Option(help="Uncorrected time between the two exposures, in ms.")] = 0.5,
     angles: Annotated[
-        str, typer.Option(help="Angles to the side [deg] for the off-axis table.")
+        str, typer.Option(help="Angles to the side, in degrees, for the off-axis table.")
     ] = "-20:20:10",
     json_file: JsonFile = None,
     picture: Picture = None,

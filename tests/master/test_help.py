@@ -1,0 +1,56 @@
+"""What the help of a command shows is what was written: the markup of the help swallows text in square brackets."""
+
+from typing import Annotated
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from master.__main__ import app
+from master.calibrate.cli import calibrate_app
+from master.camera_command import camera
+
+WIDE = {"COLUMNS": "4000", "TERMINAL_WIDTH": "4000"}
+
+
+def whole() -> typer.Typer:
+    """The command line as `main` puts it together."""
+    top = typer.Typer()
+    top.add_typer(app, name="master")
+    top.add_typer(calibrate_app(), name="calibrate")
+    top.command()(camera)
+    return top
+
+
+def swallowed(top: typer.Typer, path: tuple[str, ...] = ()) -> tuple[int, list[str]]:
+    """How many texts of options and arguments the commands below `path` have, and those that are not shown whole."""
+    command = typer.main.get_command(top)
+    for name in path:
+        command = command.commands[name]  # type: ignore[attr-defined]
+    shown = " ".join(CliRunner().invoke(top, [*path, "--help"], env=WIDE).output.split())
+    texts = [text for one in command.params if (text := getattr(one, "help", None))]
+    lost = [f"{' '.join(path)}: {text}" for text in texts if " ".join(text.split()) not in shown]
+    count = len(texts)
+    for name in getattr(command, "commands", {}):
+        more, below = swallowed(top, (*path, name))
+        count, lost = count + more, lost + below
+    return count, lost
+
+
+def test_no_help_loses_its_unit() -> None:
+    count, lost = swallowed(whole())
+    assert count > 60, "the commands were not found: the check would pass on nothing"
+    assert lost == []
+
+
+@pytest.mark.parametrize(("text", "whole_text"), [("Side [mm].", False), ("Side, in mm.", True)])
+def test_the_check_sees_a_swallowed_unit(text: str, whole_text: bool) -> None:
+    top = typer.Typer()
+
+    @top.command()
+    def draw(side: Annotated[float, typer.Option(help=text)] = 1.0) -> None:
+        del side
+
+    _, lost = swallowed(top)
+    assert (lost == []) is whole_text
+    del draw
