@@ -17,6 +17,7 @@ from master.calibrate.coverage import Coverage, advice, coverage
 from master.calibrate.lens_files import camera_model, intrinsics_of, matrix_of
 
 MOST_FOCAL_SD = 0.01  # of the focal length: one percent of every depth
+MOST_RMS = 0.0025  # of the image's width: five times what poor pictures of a good board leave
 LEAST_TILT_DEG = 10.0
 LEAST_COVER = 0.25
 
@@ -122,12 +123,18 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
     uv = [fit.observations[i].uv for i in own]
     covered = coverage(fit.views.sizes_px[name], uv, T_camera_board, bundle.drawn_m.mean(axis=0))
     lens, sd = bundle.lenses[index], fit.solution.lens_sd(index)
+    error = rms([fit.solution.residuals[i] for i in own])
+    if error > MOST_RMS * fit.views.sizes_px[name][0]:
+        raise FitError(
+            f"camera {name!r}: corners are off by {error:.2f} px rms over {len(own)} images: they do not agree on any"
+            " place of the board; is it rigid and flat, are columns and rows right, did the zoom or focus change?"
+        )
     if estimated:
         _check_determined(name, float(sd[0] / lens[0]), covered, len(own))
     return LensResult(
         intrinsics=intrinsics_of(lens),
         sd=sd,
-        rms_px=rms([fit.solution.residuals[i] for i in own]),
+        rms_px=error,
         views=len(own),
         covered=covered,
         estimated=estimated,

@@ -147,11 +147,11 @@ def _none(bundle: Bundle) -> Bool:
 
 
 def _view_errors(seen: Seen, views: Sequence[Sequence[Shot]], bundle: Bundle, sigma: Float) -> Float:
-    """Rms residual (V,) of each view, in units of its cameras' standard deviations."""
+    """Rms residual (V,) [px] of each view, as if all cameras were as good as the middle one."""
     shots = [shot for own in views for shot in own]
     residuals = iter(_settled(seen, shots, bundle))
     cameras = seen.views.cameras
-    return np.array(
+    return float(np.median(sigma)) * np.array(
         [rms([next(residuals) / sigma[cameras.index(shot.camera)] for shot in own]) for own in views]
     )
 

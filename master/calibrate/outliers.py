@@ -6,6 +6,7 @@ from scipy import stats
 from common.arrays import Float
 
 FALSE_ALARM = 0.05  # chance that a set of good views loses one; one view less costs little, a wrong one much
+GOOD_PX = 0.12  # as well as corners can be found: such a view is right, however good the others are
 _LEAST_SPREAD = 0.1  # of log rms: below it, views of one camera hardly ever agree
 
 
@@ -18,7 +19,7 @@ def limit(errors: Float, dof: Float) -> float:
     for the whole set.
 
     Args:
-        errors: Rms error (V,) of each view.
+        errors: Rms error (V,) [px] of each view.
         dof: Degrees of freedom (V,) of each error.
     """
     if len(errors) < 4:
@@ -29,4 +30,4 @@ def limit(errors: Float, dof: Float) -> float:
     # The logarithm of an rms of n normal numbers has the standard deviation 1 / sqrt(2 n).
     spread = max(spread, _LEAST_SPREAD, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
     quantile = float(stats.t.ppf(1.0 - FALSE_ALARM / len(errors), len(errors) - 1))
-    return float(np.exp(middle + quantile * spread))
+    return max(float(np.exp(middle + quantile * spread)), GOOD_PX)
