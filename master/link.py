@@ -299,7 +299,8 @@ class MasterLink:
             period = ECHO_FAST_NS
         else:
             period = ECHO_EARLY_NS if t_ns - session.since_ns < EARLY_NS else ECHO_NS
-        session.next_echo_ns = t_ns + period
+        # On the grid, so that the rate is kept by a thread that wakes late, too.
+        session.next_echo_ns = max(session.next_echo_ns + period, t_ns + period // 2)
         self._outbox.append((seal(session.sealer, EchoAsk(t_ns)), session.address))
 
     def _open_barrier(self, t_ns: int) -> None:

@@ -70,7 +70,11 @@ class ResidualTiming:
         if c is None:
             return
         frames = self._frames[c]
-        if frames and (message.session != frames[-1].session or len(message.area) != len(frames[-1].area)):
+        if frames and (
+            message.session != frames[-1].session
+            or len(message.area) != len(frames[-1].area)
+            or message.t_ns < frames[-1].t_ns - BLOCK_NS  # its clock was known wrongly before
+        ):
             self._forget(c)
         if frames and message.t_ns <= frames[-1].t_ns:
             return

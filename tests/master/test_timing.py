@@ -185,6 +185,17 @@ def test_a_restarted_slave_is_measured_afresh() -> None:
     assert abs(found.offset_ns) < 0.6e6
 
 
+def test_a_time_far_ahead_does_not_silence_a_camera() -> None:
+    models = cameras()
+    messages = recorded(models, scenes.natural(2), 60.0, 6.0, {"right": 8.0}, 2)
+    for camera in ("left", "right"):
+        first = next(message for message in messages if message.camera == camera)
+        ahead = msgspec.structs.replace(first, t_ns=first.t_ns + 3_600_000_000_000)
+        found = run(models, [ahead, *messages], 60.0).offset_of("right")
+        assert found is not None
+        assert abs(found.offset_ns - 8e6) < 1e6
+
+
 def test_what_it_holds_stays_bounded() -> None:
     models = cameras()
     machine = run(models, recorded(models, scenes.natural(3), 30.0, 2.0 * KEPT_BLOCKS, {}, 3), 30.0)
