@@ -1,7 +1,7 @@
 """Which views are wrong, judged by the others."""
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from common.arrays import Float
 
@@ -29,5 +29,5 @@ def limit(errors: Float, dof: Float) -> float:
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     # The logarithm of an rms of n normal numbers has the standard deviation 1 / sqrt(2 n).
     spread = max(spread, _LEAST_SPREAD, 1.0 / np.sqrt(2.0 * max(float(np.median(dof)), 1.0)))
-    quantile = float(stats.t.ppf(1.0 - FALSE_ALARM / len(errors), len(errors) - 1))
+    quantile = float(stdtrit(len(errors) - 1, 1.0 - FALSE_ALARM / len(errors)))
     return max(float(np.exp(middle + quantile * spread)), GOOD_PX)
