@@ -23,6 +23,7 @@ LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 SHAPE_SD_M = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
 _MOST_STEPS = 100
 _STOP = 1e-9  # relative gain of a step
+_STOP_ROBUST = 1e-6  # robust fits only judge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +138,7 @@ def solve(
             gain = cost - new_cost
             now, cost, normal = tried, new_cost, new_normal
             damping = max(damping / 10, 1e-10)
-            if gain <= _STOP * cost:
+            if gain <= (_STOP if cauchy_px is None else _STOP_ROBUST) * cost:
                 break
         else:
             damping *= 10
