@@ -21,6 +21,7 @@ from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
+_EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +65,8 @@ class HandSolver:
         self._attached = Attached.markers(model, self._parameters, markers)
         self._joints = Attached.joints(model, self._parameters)
         self._prior = AnglePrior.of(model, self._parameters, self.priors)
+        natural = np.asarray(np.linalg.solve(self._prior.normal, self._prior.pull), np.float64)
+        self._natural = np.minimum(np.maximum(natural, self._parameters.low), self._parameters.high)
         walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
         self._walk_2 = np.repeat(walks, (3, 3, len(self._parameters.free))) ** 2
 
@@ -76,6 +79,7 @@ class HandSolver:
         hidden: tuple[Float, Float] | None = None,
         facing: Float | None = None,
         enough: float = ENOUGH,
+        near: HandSolution | None = None,
     ) -> HandSolution | None:
         """Fit the hand to its markers.
 
@@ -89,6 +93,9 @@ class HandSolver:
             facing: (3,) unit vector, rig frame, from the hand to the cameras where a marker on the back
                 of the hand is seen: that marker faces them. None: nothing known.
             enough: How much of half chi square the search may leave.
+            near: A hand that may be near, where `last` is None: one search from there, and none from afresh if it
+                ends where all markers are explained. Nothing else is taken from it, and fingers without a marker
+                begin at a natural posture.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
@@ -107,8 +114,15 @@ class HandSolver:
             None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(dt_s)),
             None if facing is None else Facing(facing, 1.0 / self.priors.facing),
         )
-        seeds = self._seeds(points_m, seen, facing) if last is None else self._seed_of(last)
-        return self._solution(problem.minimise(*seeds, enough), points_m)
+        if last is not None:
+            return self._solution(problem.minimise(*self._seed_of(last), enough), points_m)
+        if near is not None:
+            found = self._solution(problem.minimise(*self._seed_near(near, seen), enough), points_m)
+            off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
+            whitened = (problem.whiten @ off[..., None])[..., 0]
+            if (np.vecdot(whitened, whitened) < _EXPLAINED).all():
+                return found
+        return self._solution(problem.minimise(*self._seeds(points_m, seen, facing), enough), points_m)
 
     def _beliefs(
         self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None
@@ -122,6 +136,12 @@ class HandSolver:
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self._parameters.free_of(last.angles_rad)[None]
+
+    def _seed_near(self, hand: HandSolution, seen: Bool) -> tuple[Float, Float]:
+        fingers = self._attached.finger[seen & self._attached.on_finger[:, 0]]
+        known = np.isin(self._parameters.free // 4, fingers)
+        x = np.where(known, self._parameters.free_of(hand.angles_rad), self._natural)
+        return hand.T_rig_palm[None], x[None]
 
     def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
         """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""

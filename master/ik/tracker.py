@@ -200,7 +200,7 @@ class HandTracker:
     def peek(
         self, points_m: Float, cov_m2: Float, towards_cameras: Float, *, curled: bool = True
     ) -> HandSolution | None:
-        """Solve one instant afresh and remember nothing; arguments as `push`.
+        """Solve one instant and remember nothing; of the last pose nothing is believed. Arguments as `push`.
 
         Args:
             points_m, cov_m2, towards_cameras: As in `push`.
@@ -209,7 +209,7 @@ class HandTracker:
         seen = seen_markers(points_m, cov_m2)
         facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None if curled else (np.zeros((5, 4)), np.full(5, np.inf))
-        return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, _GLANCE)
+        return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, _GLANCE, self.last)
 
     def _bits(
         self, t_ns: int, solution: HandSolution | None, seen: Bool, placed: Bool, *, held: bool

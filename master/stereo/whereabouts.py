@@ -1,7 +1,7 @@
 """Where the markers are to be expected: by the hand that the others show, and by the past of each.
 
 Asked only where a slave was in doubt. A marker's own past may be a mistake that repeats itself, so what the hand says
-is made without the marker, and afresh: of the past it takes nothing.
+is made without the marker and believes nothing of the past, which only says where the search begins.
 """
 
 import numpy as np

@@ -106,7 +106,7 @@ def test_gradient_is_the_derivative_of_the_cost(name: str, seed: int) -> None:
 
     def cost(step: Float) -> float:
         turned = rigid(rotation_vector_to_matrix(step[:3]) @ T[:3, :3], T[:3, 3] + step[3:6])
-        return problem.linearise(turned, x + step[6:]).cost
+        return float(problem.linearise(turned, x + step[6:]).cost)
 
     here, h = problem.linearise(T, x), 1e-6
     numeric = np.array([(cost(h * e) - cost(-h * e)) / (2 * h) for e in np.eye(6 + n)])
@@ -368,3 +368,22 @@ def test_the_tilt_of_a_finger_end_lies_across_it_and_grows_with_its_joints() -> 
     np.testing.assert_allclose(
         walk, np.sqrt(p.palm_walk_rad_s**2 + p.walk_rad_s**2 * (1 + (1 + 2 / 3) ** 2)), rtol=0.02
     )
+
+
+@pytest.mark.parametrize("turned_deg", [0.0, 20.0, 120.0, 180.0])
+@given(seeds)
+@settings(max_examples=8)
+def test_where_a_search_begins_does_not_tell_where_it_ends(turned_deg: float, seed: int) -> None:
+    """Nothing of a hand that may be near is believed: one that is not near leads to the same markers."""
+    rng = np.random.default_rng(seed)
+    T, cov = palm(), small_cov()
+    points = exact(RIGHT, T, natural_angles(rng))
+    turn = rotation_vector_to_matrix(np.radians(turned_deg) * np.array([0.6, 0.8, 0.0]))
+    other = SOLVER.solve(exact(RIGHT, rigid(turn @ T[:3, :3], T[:3, 3] + 0.02), natural_angles(rng)), cov)
+    assert other is not None
+    found = SOLVER.solve(points, cov, facing=FACING, near=other)
+    afresh = SOLVER.solve(points, cov, facing=FACING)
+    assert found is not None
+    assert afresh is not None
+    assert found.cost < afresh.cost + 0.5
+    assert found.residual_m.max() < afresh.residual_m.max() + 1e-3
