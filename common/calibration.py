@@ -124,11 +124,15 @@ class Laser(_File, frozen=True):
 
 
 class FilterCalibration(_File, frozen=True):
-    """The 1 € filter of the 3D markers: cut-off at rest, its rise per speed [Hz per m/s], cut-off of the speed."""
+    """The 1 € filter of the 3D markers: cut-off at rest, its rise per speed [Hz per m/s], cut-off of the speed.
+
+    `jitter_m`: what may be left of the noise of a marker at rest, per axis; noisier axes are filtered more.
+    """
 
     min_cutoff_hz: Positive = 6.0
     beta: NonNegative = 120.0
     d_cutoff_hz: Positive = 6.0
+    jitter_m: Positive = 3e-4
 
 
 class Volume(_File, frozen=True):

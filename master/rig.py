@@ -3,11 +3,14 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry import cross
 from common.hand_model import HandModel
-from master.filters import OneEuro
+from master.filters import OneEuroParameters, PointFilter
 from master.ik.tracker import HandTracker
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
@@ -93,6 +96,20 @@ def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> Ha
         raise CalibrationError(f"{hand_file}: {error}") from error
 
 
+def point_filter(setup: RigSetup) -> PointFilter:
+    """The filter this rig's file describes, along the mean sight of its cameras and across it."""
+    settings = setup.rig.filter
+    poses = np.array([model.T_rig_camera for model in setup.models.values()])
+    ahead = poses[:, :3, 2].sum(axis=0)
+    across = cross(poses[0, :3, 1], ahead)
+    view = np.stack([across, cross(ahead, across), ahead])
+    return PointFilter(
+        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
+        settings.jitter_m,
+        view / np.linalg.norm(view, axis=1, keepdims=True),
+    )
+
+
 def build_pipeline(
     setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
 ) -> MarkerPipeline:
@@ -108,7 +125,6 @@ def build_pipeline(
         CalibrationError: The depth model does not fit the rig.
     """
     rates = {name: camera.frame_rate_hz for name, camera in setup.cameras.items()}
-    settings = setup.rig.filter
     return MarkerPipeline(
         setup.models,
         setup.hand,
@@ -116,7 +132,7 @@ def build_pipeline(
         pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
         law=depth_law(setup.rig),
         residual=CalibrationResidual.of(setup.rig),
-        smooth=OneEuro(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz) if continuous else None,
+        smooth=point_filter(setup) if continuous else None,
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous)
         if tracker is None
         else tracker,

@@ -41,12 +41,14 @@ class Located:
     Attributes:
         points: Cap centroids (M, 3) [m]; NaN: not seen by two cameras, or their rays do not meet.
         cov: (M, 3, 3) [m^2].
+        noise: (M, 3, 3) [m^2] the part of `cov` that differs from one instant to the next.
         repeated: (M, 3, 3) [m^2] what is to be added to `cov` for a fit that starts at the same hand.
         apart: (M,) the rays do not meet.
     """
 
     points: Float
     cov: Float
+    noise: Float
     repeated: Float
     apart: Bool
 
@@ -85,7 +87,7 @@ class CapLocator:
         if apart.any():
             placed.points[apart], cov[apart] = np.nan, np.nan
         repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
-        return Located(placed.points, cov, repeated, apart)
+        return Located(placed.points, cov, placed.cov, repeated, apart)
 
     def look(self, points: Float, hand: HandSolution | None, age_s: float) -> CapLook:
         """How caps at (M, 3) [m] look: as the hand has them, and tilted as far as it is unsure."""

@@ -1,4 +1,4 @@
-"""The marker rig's straight line: detections -> one instant -> 3D caps -> 1 € filter -> hand.
+"""The marker rig's straight line: detections -> one instant -> 3D caps -> hand, and filtered caps.
 
 `MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
 and get the same poses. It is built from calibration by `master.rig`.
@@ -17,7 +17,7 @@ from common.calibration import Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
-from master.filters import OneEuro
+from master.filters import PointFilter
 from master.ik.hand import HandSolution
 from master.ik.tracker import HandTracker, pose_of
 from master.stereo.caps import CapModel
@@ -55,7 +55,7 @@ class MarkerPipeline:
         pairing: Pairing,
         law: DepthLaw | None = None,
         residual: CalibrationResidual = EXACT,
-        smooth: OneEuro | None = None,
+        smooth: PointFilter | None = None,
         tracker: HandTracker,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
@@ -121,11 +121,12 @@ class MarkerPipeline:
                     found = self._locate(instant, first, 0.0)
         raw, cov, apart = found.points, found.cov, found.apart
         with self._stage("filter"):
-            markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw)
+            markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw, found.noise)
         with self._stage("hand"):
-            aims = self._with_rays(instant, markers, cov + found.repeated, last, age_s)
-            measured = np.isfinite(markers[self._on_hand, 0])
-            hand = self._tracker.push(instant.t_ns, *aims, self._towards(markers, instant), measured)
+            # The covariances are those of the points before the filter, which do not lag: the fit takes these.
+            aims = self._with_rays(instant, raw, cov + found.repeated, last, age_s)
+            measured = np.isfinite(raw[self._on_hand, 0])
+            hand = self._tracker.push(instant.t_ns, *aims, self._towards(raw, instant), measured)
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.filters import OneEuro, OneEuroParameters
+from master.filters import OneEuro, OneEuroParameters, PointFilter
 
 
 class _LowPass:
@@ -160,3 +160,78 @@ def test_shape_is_kept_and_may_not_change() -> None:
     assert machine.push(0, np.full((6, 3), np.nan)).shape == (6, 3)
     with pytest.raises(ValueError, match="shape"):
         machine.push(1, np.zeros(18))
+
+
+VIEW = np.eye(3)
+SETTINGS = OneEuroParameters(6.0, 120.0, 6.0)
+
+
+def _filtered(points: Float, sd_m: Float, view: Float = VIEW) -> Float:
+    """Points (N, 3) at 60 Hz through the filter, with standard deviations (N, 3) along the axes of the view."""
+    machine = PointFilter(SETTINGS, 3e-4, view)
+    cov = view.T @ (sd_m[:, :, None] ** 2 * np.eye(3)) @ view
+    return np.array(
+        [
+            machine.push(k * 16_666_667, p[None], c[None])[0]
+            for k, (p, c) in enumerate(zip(points, cov, strict=True))
+        ]
+    )
+
+
+def test_sure_points_get_the_paper_s_filter() -> None:
+    points = np.cumsum(np.random.default_rng(1).normal(0.0, 2e-3, (300, 3)), axis=0)
+    plain = OneEuro.of(SETTINGS)
+    expected = np.array([plain.push(k * 16_666_667, p) for k, p in enumerate(points)])
+    np.testing.assert_allclose(_filtered(points, np.full((300, 3), 3e-4)), expected, atol=1e-12)
+
+
+def test_at_rest_no_axis_trembles_more_than_allowed_and_a_quiet_one_is_left_alone() -> None:
+    sd = np.tile([3e-4, 3e-4, 3e-3], (4000, 1))
+    points = np.random.default_rng(2).normal(0.0, 0.3, (4000, 3)) * sd
+    plain = OneEuro.of(SETTINGS)
+    paper = np.array([plain.push(k * 16_666_667, p) for k, p in enumerate(points)])[100:]
+    ours = _filtered(points, sd)[100:]
+    assert ours[:, 2].std() < 0.5 * paper[:, 2].std()
+    np.testing.assert_allclose(ours[:, :2].std(axis=0), paper[:, :2].std(axis=0), rtol=1e-6)
+
+
+def test_a_moving_point_is_followed_in_depth_within_its_noise_and_sideways_as_before() -> None:
+    t = np.arange(240) / 60.0
+    sd = np.tile([3e-4, 3e-4, 3e-3], (240, 1))
+    for axis in range(3):
+        points = np.zeros((240, 3))
+        points[:, axis] = 0.5 * t
+        behind = (points - _filtered(points, sd))[120:, axis]
+        plain = OneEuro.of(SETTINGS)
+        paper = (points - np.array([plain.push(k * 16_666_667, p) for k, p in enumerate(points)]))[120:, axis]
+        if axis < 2:
+            np.testing.assert_allclose(behind, paper, atol=1e-9)
+        assert behind.max() < 3e-3
+
+
+def test_a_sample_far_less_sure_than_its_neighbours_is_ridden_over() -> None:
+    points, sd = np.zeros((200, 3)), np.full((200, 3), 3e-4)
+    points[100:102, 2], sd[100:102] = 0.02, 0.03
+    assert np.abs(_filtered(points, sd)).max() < 1e-3
+    plain = OneEuro.of(SETTINGS)
+    assert np.abs([plain.push(k * 16_666_667, p) for k, p in enumerate(points)]).max() > 0.01
+
+
+def test_the_axes_are_those_of_the_view() -> None:
+    rng = np.random.default_rng(4)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    points, sd = np.cumsum(rng.normal(0.0, 1e-3, (100, 3)), axis=0), np.tile([3e-4, 1e-3, 5e-3], (100, 1))
+    np.testing.assert_allclose(_filtered(points @ turn, sd, turn), _filtered(points, sd) @ turn, atol=1e-9)
+
+
+def test_a_point_without_a_covariance_or_unseen_poisons_nothing() -> None:
+    machine = PointFilter(SETTINGS, 3e-4, VIEW)
+    cov = np.tile(1e-6 * np.eye(3), (2, 1, 1))
+    for k in range(5):
+        machine.push(k * 16_666_667, np.ones((2, 3)), cov)
+    lost, unsure = np.ones((2, 3)), cov.copy()
+    lost[0], unsure[:] = np.nan, np.nan
+    out = machine.push(5 * 16_666_667, lost, unsure)
+    assert np.isnan(out[0]).all()
+    np.testing.assert_allclose(out[1], 1.0)
+    np.testing.assert_allclose(machine.push(6 * 16_666_667, np.ones((2, 3)), cov), 1.0)
