@@ -13,6 +13,13 @@ Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and
 KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
 BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
 Beacon = Annotated[str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")]
+RecordingRig = Annotated[
+    str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")
+]
+ResultTree = Annotated[
+    Path | None, typer.Option("--out", help="Tree to write the files into; may be the one in use.")
+]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
 Bind = Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")]
 
 CALIB_JSON = Path("calib_json")

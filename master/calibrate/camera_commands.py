@@ -28,7 +28,7 @@ from master.calibrate.camera_result import CamerasResult, result
 from master.calibrate.image_sets import image_sets
 from master.calibrate.lens_files import lens_of
 from master.calibrate.views import BoardViews, View, look
-from master.options import CALIB_JSON, Calibration
+from master.options import CALIB_JSON, Calibration, JsonFile, ResultTree
 from master.summary import write_summary
 
 Source = Annotated[
@@ -47,8 +47,6 @@ Flat = Annotated[
         "--flat-board", help="The board is exact and flat (glass, screen): do not estimate its shape."
     ),
 ]
-Out = Annotated[Path | None, typer.Option(help="Tree to write the files into; may be the one in use.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of corners and residuals to this .png.")]
 
 
@@ -61,7 +59,7 @@ def intrinsics(
     camera: Cameras = None,
     flat_board: Flat = False,
     calibration: Calibration = CALIB_JSON,
-    out: Out = None,
+    out: ResultTree = None,
     json_file: JsonFile = None,
     picture: Picture = None,
 ) -> None:
@@ -83,14 +81,14 @@ def intrinsics(
         results[name] = result(fit, {})
         _say_all(report_lines(results[name]))
         _draw(picture if len(views.cameras) == 1 else _named(picture, name), fit)
-    files: list[CameraCalibration] = []
+    files: dict[str, CameraCalibration] = {}
     for name, own in results.items():
         how = lens_provenance(own, name, "calibrate intrinsics", (_source_name(source),))
         lens = own.lenses[name].intrinsics
-        files.append(camera_with_lens(known[name], name, views.sizes_px[name], lens, how))
+        files[name] = camera_with_lens(known[name], name, views.sizes_px[name], lens, how)
     if json_file is not None:
         write_summary(json_file, {"cameras": {name: report_json(own) for name, own in results.items()}})
-    _written([] if out is None else write_files(out, files, None), known)
+    _written([] if out is None else write_files(out, files, {}), known)
 
 
 def stereo(
@@ -106,7 +104,7 @@ def stereo(
     ] = False,
     flat_board: Flat = False,
     calibration: Calibration = CALIB_JSON,
-    out: Out = None,
+    out: ResultTree = None,
     json_file: JsonFile = None,
     picture: Picture = None,
 ) -> None:
@@ -140,8 +138,8 @@ def stereo(
     _say_all(report_lines(found))
     _draw(picture, fit)
     data = (_source_name(source),)
-    files = [
-        camera_with_lens(
+    files = {
+        name: camera_with_lens(
             known[name],
             name,
             views.sizes_px[name],
@@ -150,12 +148,12 @@ def stereo(
         )
         for name in views.cameras
         if name not in held
-    ]
+    }
     how = places_provenance(found, "calibrate stereo", data)
     new = rig_with_places(rig_known, rig, dict(found.T_rig_camera), how)
     if json_file is not None:
         write_summary(json_file, report_json(found) | {"rig": rig})
-    written = [] if out is None else write_files(out, files, new)
+    written = [] if out is None else write_files(out, files, {rig: new})
     if rig_known is None and written:
         typer.echo(f"rig {rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
     _written(written, known)

@@ -1,17 +1,18 @@
 """Into the calibration tree: lenses into cameras/NAME.json, places into rigs/RIG.json, each with its provenance."""
 
-from datetime import UTC, datetime
+from collections.abc import Mapping
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, load, save
+from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, load
 from common.errors import CalibrationError
 from common.geometry import invert
 from master.calibrate.camera_result import CamerasResult
 from master.calibrate.lens_files import matrix_of
+from master.calibrate.tree_files import provenance, write_camera, write_rig
 
 NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not measured"
 
@@ -118,7 +119,7 @@ def lens_provenance(result: CamerasResult, camera: str, tool: str, data: tuple[s
         "cy_sd_px": round(float(lens.sd[3]), 4),
     }
     note = f"{lens.views} images, {sum(no.camera in (camera, '') for no in result.rejected)} with a part left out"
-    return Provenance(date=_now(), tool=tool, data=data, residual=residual, note=note)
+    return provenance(tool, data, residual, note)
 
 
 def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -> Provenance:
@@ -135,31 +136,20 @@ def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -
             residual[f"{camera}_baseline_sd_m"] = round(sd, 7)
     rejected = "; ".join(str(no) for no in result.rejected)
     note = f"{result.views} views shared{'; left out: ' * bool(rejected)}{rejected}"
-    return Provenance(date=_now(), tool=tool, data=data, residual=residual, note=note)
+    return provenance(tool, data, residual, note)
 
 
-def write_files(out: Path, cameras: list[CameraCalibration], rig: RigCalibration | None) -> list[Path]:
-    """Save all files into a tree; each is replaced whole or not at all.
+def write_files(
+    out: Path, cameras: Mapping[str, CameraCalibration], rigs: Mapping[str, RigCalibration]
+) -> list[Path]:
+    """Save files, by their names in the tree; each is replaced whole or not at all.
 
     Raises:
         CalibrationError: A folder or file cannot be written.
     """
-    written: list[Path] = []
-    files = [("cameras", camera.name, camera) for camera in cameras]
-    for folder, name, value in [*files, *([("rigs", rig.name, rig)] if rig is not None else [])]:
-        path = out / folder / f"{name}.json"
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise CalibrationError(f"--out {out}: cannot make the folder: {error.strerror}") from error
-        save(path, value)
-        written.append(path)
-    return written
+    written = [write_camera(out, name, camera) for name, camera in cameras.items()]
+    return written + [write_rig(out, name, rig) for name, rig in rigs.items()]
 
 
 def _array(matrix: Matrix4) -> Float:
     return np.array(matrix, dtype=np.float64)
-
-
-def _now() -> str:
-    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

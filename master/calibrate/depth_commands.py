@@ -7,15 +7,13 @@ from typing import Annotated, Literal
 import typer
 
 from common.arrays import Float
-from common.calibration import (
-    RigCalibration,
-)
-from common.errors import CalibrationError
+from common.calibration import RigCalibration
+from common.errors import CalibrationError, FitError
 from common.frame_recording import FrameRecording
 from common.keys import rig_key
 from master.calibrate.depth_fit import ideal_of
 from master.calibrate.depth_live import sweep_live
-from master.calibrate.depth_report import fit_depth, report_json, report_lines
+from master.calibrate.depth_report import DepthReport, fit_depth, report_json, report_lines
 from master.calibrate.depth_save import conclusion, rig_to_write, write_laws
 from master.calibrate.depth_source import (
     Measured,
@@ -26,7 +24,19 @@ from master.calibrate.depth_source import (
     pair_of,
     parse_target,
 )
-from master.calibrate.depth_sweep import checked
+from master.calibrate.depth_sweep import Sweep, checked
+from master.options import (
+    CALIB_JSON,
+    HERE_BEACON,
+    HERE_BIND,
+    Beacon,
+    Bind,
+    JsonFile,
+    KeyFile,
+    RecordingRig,
+    ResultTree,
+    address,
+)
 from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw
 from master.summary import write_summary
 
@@ -43,17 +53,12 @@ Marker = Annotated[
 Distances = Annotated[
     str | None, typer.Option(help="FIRST:LAST:STEP in metres, a list, or a .csv; default: truth.npz.")
 ]
-RigName = Annotated[
-    str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")
-]
 Calibration = Annotated[Path, typer.Option(help="Folder with rigs/ and cameras/.")]
 Target = Annotated[str, typer.Option(help="Its shape, WIDTHxHEIGHT or round: the lens shifts its centroid.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of the errors to this .png.")]
 FovDeg = Annotated[
     float | None, typer.Option(help="Nominal horizontal field of view, for cameras without intrinsics.")
 ]
-Out = Annotated[Path | None, typer.Option(help="Tree to write rigs/<rig>.json into.")]
 Use = Annotated[
     Literal["power_law", "affine_disparity", "stereo"] | None,
     typer.Option(help="Also make this the rig's depth_model."),
@@ -64,11 +69,7 @@ SaveTable = Annotated[
 ]
 Frames = Annotated[int, typer.Option(min=8, help="With --live: frames to average, at least.")]
 Seconds = Annotated[float, typer.Option(min=1.0, max=60.0, help="With --live: time to average.")]
-Beacon = Annotated[str, typer.Option(help="With --live: ADDRESS:PORT of the slaves.")]
-Bind = Annotated[str, typer.Option(help="With --live: own ADDRESS:PORT.")]
-KeyFile = Annotated[Path | None, typer.Option(help="With --live: rig key.")]
 
-CALIB_JSON = Path("calib_json")
 _SWEEP = "1.00:0.20:-0.05"  # the published one
 
 
@@ -77,11 +78,11 @@ def depth(
     detections: Detections = None,
     marker: Marker = None,
     distances: Distances = None,
-    rig: RigName = None,
+    rig: RecordingRig = None,
     calibration: Calibration = CALIB_JSON,
     target: Target = "75x50",
     fov_deg: FovDeg = None,
-    out: Out = None,
+    out: ResultTree = None,
     use: Use = None,
     json_file: JsonFile = None,
     picture: Picture = None,
@@ -89,8 +90,8 @@ def depth(
     save_table: SaveTable = None,
     frames: Frames = 30,
     seconds: Seconds = 1.0,
-    beacon: Beacon = "127.255.255.255:47800",
-    bind: Bind = "127.0.0.1:47801",
+    beacon: Beacon = HERE_BEACON,
+    bind: Bind = HERE_BIND,
     key_file: KeyFile = None,
 ) -> None:
     """Fit depth to disparity from a target at known distances: the power law D = k x^z, and x = a/D + x0.
@@ -104,16 +105,17 @@ def depth(
       phalanx-master calibrate depth --live --rig desk --marker index --out calib_json
     """
     outline = parse_target(target)
+    _refuse_idle("--live", source=live and source, detections=live and detections)
+    _refuse_idle("a measurement without --live", save=not live and save_table)
     if live:
-        link = (_address(beacon, "--beacon"), _address(bind, "--bind"), rig_key(os.environ, key_file))
+        link = (address(beacon, "--beacon"), address(bind, "--bind"), rig_key(os.environ, key_file))
         pair = load_pair(calibration, rig or "desk", fov_deg)
         measured = sweep_live(pair, marker, distances or _SWEEP, frames, seconds, link, save_table, outline)
     else:
         measured = measured_from(source, detections, marker, distances, rig, calibration, fov_deg, outline)
     pair = measured.pair
     base = rig_to_write(pair, out)
-    sweep = checked(measured.sweep, pair.cameras, pair.size_px)
-    report = fit_depth(sweep, laws_before(pair, base))
+    sweep, report = _fitted(measured, laws_before(pair, base))
     typer.echo(measured.about)
     for line in report_lines(report):
         typer.echo(line)
@@ -125,6 +127,20 @@ def depth(
         from master.calibrate.depth_picture import draw_errors
 
         draw_errors(picture, measured.about, sweep.distance_m, report.errors, used=report.used)
+
+
+def _fitted(measured: Measured, before: dict[str, DepthLaw]) -> tuple[Sweep, DepthReport]:
+    """The sweep as it was fitted, and the outcome.
+
+    Raises:
+        FitError: The sweep is unfit; the text begins with what it was read from.
+    """
+    pair = measured.pair
+    try:
+        sweep = checked(measured.sweep, pair.cameras, pair.size_px)
+        return sweep, fit_depth(sweep, before)
+    except FitError as error:
+        raise FitError(f"{', '.join(measured.data)}: {error}") from error
 
 
 def measured_from(
@@ -156,7 +172,11 @@ def measured_from(
 
         return from_recording(source, detections, marker, distances, pair_for, outline)
     if source.suffix.lower() != ".csv":
-        raise CalibrationError(f"{source}: neither the folder of a recording nor a .csv")
+        raise CalibrationError(
+            f"{source}: {'neither' if source.exists() else 'does not exist; give'} the folder of a recording"
+            f" {'nor' if source.exists() else 'or'} a .csv"
+        )
+    _refuse_idle(f"{source}, a table", detections=detections, marker=marker, distances=distances)
     return from_table(source, Pair() if rig is None else load_pair(calibration, rig, fov_deg), outline)
 
 
@@ -172,8 +192,9 @@ def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
     return laws
 
 
-def _address(text: str, option: str) -> tuple[str, int]:
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdigit() or int(port) > 65535:
-        raise CalibrationError(f"{option} {text!r}: expected ADDRESS:PORT, for example 127.0.0.1:47801")
-    return host, int(port)
+def _refuse_idle(where: str, **options: object) -> None:
+    """Refuse options that `where` does not use, rather than to leave them out silently."""
+    for name, value in options.items():
+        if value:
+            told = "a recording or a table" if name == "source" else f"--{name}"
+            raise CalibrationError(f"{told} has no meaning with {where}: leave it out")

@@ -1,6 +1,5 @@
 """Into the rig file: the fitted laws with date, data and residual, and what is to be said about it."""
 
-from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
@@ -11,12 +10,11 @@ from common.calibration import (
     PowerLawCalibration,
     Provenance,
     RigCalibration,
-    load,
-    save,
 )
 from common.errors import CalibrationError
 from master.calibrate.depth_report import DepthReport
 from master.calibrate.depth_source import Measured, Pair
+from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
 
 
 def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
@@ -35,15 +33,7 @@ def rig_to_write(pair: Pair, out: Path | None) -> RigCalibration | None:
             f"rig {rig.name!r} has {len(rig.cameras)} cameras: laws of disparity are for two; it needs"
             " depth_model 'stereo'"
         )
-    path = out / "rigs" / f"{pair.file_name}.json"
-    if not path.exists():
-        return rig
-    there = load(path, RigCalibration)
-    if there.cameras != rig.cameras:
-        raise CalibrationError(
-            f"{path}: cameras are {', '.join(there.cameras)}, the sweep was made with {', '.join(rig.cameras)}"
-        )
-    return there
+    return rig_in_tree(out, pair.file_name, rig)
 
 
 def write_laws(
@@ -56,11 +46,10 @@ def write_laws(
     """
     assert rig is not None  # `rig_to_write` has refused it
     power, affine = report.power_law, report.affine_disparity
-    date = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
     low, high = float(report.sweep.distance_m.min()), float(report.sweep.distance_m.max())
     dropped = "" if report.used.all() else f"; left out: {report.sweep.names(~report.used)}"
 
-    def provenance(name: str) -> Provenance:
+    def how(name: str) -> Provenance:
         mean, largest = report.mean_max(name)
         residual = {
             "mean_percent": round(100 * mean, 4),
@@ -68,22 +57,16 @@ def write_laws(
             "leave_one_out_mean_percent": round(100 * float(np.abs(report.left_out[name]).mean()), 4),
         }
         note = f"{int(report.used.sum())} distances, {low:.3g} to {high:.3g} m{dropped}"
-        return Provenance(date=date, tool="calibrate depth", data=measured.data, residual=residual, note=note)
+        return provenance("calibrate depth", measured.data, residual, note)
 
     new = msgspec.structs.replace(
         rig,
         power_law=PowerLawCalibration(k_m=power.k_m, z=power.z),
         affine_disparity=AffineDisparityCalibration(a_m_px=affine.a_m_px, x0_px=affine.x0_px),
         depth_model=rig.depth_model if use is None else use,
-        provenance=rig.provenance | {name: provenance(name) for name in report.left_out},
+        provenance=rig.provenance | {name: how(name) for name in report.left_out},
     )
-    path = out / "rigs" / f"{measured.pair.file_name}.json"
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"--out {out}: cannot make the folder: {error.strerror}") from error
-    save(path, new)
-    return path
+    return write_rig(out, measured.pair.file_name, new)
 
 
 def conclusion(report: DepthReport, rig: RigCalibration | None, use: str | None, written: Path | None) -> str:

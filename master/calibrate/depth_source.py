@@ -103,8 +103,10 @@ def load_pair(
         recorded: Camera files of a recording; the tree's are taken where they carry the provenance of a measurement.
 
     Raises:
-        CalibrationError: A file is missing or broken.
+        CalibrationError: A file is missing or broken, or `fov_deg` is no angle of view.
     """
+    if fov_deg is not None and not 0.0 < fov_deg < 180.0:
+        raise CalibrationError(f"--fov-deg {fov_deg:g}: expected an angle between 0 and 180 degrees")
     rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
     paths = {name: calibration / "cameras" / f"{name}.json" for name in rig.cameras}
     there = recorded is None or all(path.exists() for path in paths.values())
@@ -215,8 +217,6 @@ def _with_view(file: CameraCalibration, fov_deg: float | None) -> CameraCalibrat
     """A camera file; where it has no intrinsics, with an ideal lens of `fov_deg`."""
     if file.intrinsics is not None or fov_deg is None:
         return file
-    if not 0.0 < fov_deg < 180.0:
-        raise CalibrationError(f"--fov-deg {fov_deg:g}: expected an angle between 0 and 180 degrees")
     f = 0.5 * file.width_px / float(np.tan(np.radians(0.5 * fov_deg)))
     ideal = Intrinsics(fx_px=f, fy_px=f, cx_px=0.5 * (file.width_px - 1), cy_px=0.5 * (file.height_px - 1))
     return msgspec.structs.replace(file, intrinsics=ideal)

@@ -144,8 +144,12 @@ def check_enough(sweep: Sweep) -> None:
 def _check_seen(sweep: Sweep, cameras: tuple[str, str]) -> None:
     bad = ~((sweep.distance_m > 0.0) & (sweep.distance_m < FARTHEST_M))  # NaN too
     if bad.any():
-        places = ", ".join(sweep.place[i] for i in np.flatnonzero(bad).tolist())
-        raise FitError(f"{places}: distance_m must be metres, above 0 and below {FARTHEST_M:g}")
+        places = (
+            "all places" if bad.all() else ", ".join(sweep.place[i] for i in np.flatnonzero(bad).tolist())
+        )
+        raise FitError(
+            f"{places}: distance_m must be metres, above 0 and below {FARTHEST_M:g}: not centimetres or millimetres"
+        )
     lost = np.isnan(sweep.disparity_px)
     if not lost.any():
         return

@@ -10,7 +10,9 @@ import numpy as np
 from common.arrays import Float
 from common.errors import CalibrationError
 from common.replacing import replacing
-from master.calibrate.depth_sweep import Sweep
+from master.calibrate.depth_sweep import FARTHEST_M, Sweep
+
+_MORE = "\0"  # key of what a row has beyond its columns; no name of a column
 
 
 def read_table(path: Path) -> Sweep:
@@ -24,7 +26,9 @@ def read_table(path: Path) -> Sweep:
     """
     columns, rows = rows_of(path)
     if "distance_m" not in columns:
-        raise CalibrationError(f"{path}: column distance_m is missing; it has {', '.join(columns)}")
+        raise CalibrationError(
+            f"{path}: column distance_m is missing; it has {', '.join(columns)} (separated by commas?)"
+        )
     place = [f"line {number}" for number, _ in rows]
     distance = column(path, rows, "distance_m")
     u = [f"u_{side}_px" for side in ("left", "right")]
@@ -68,25 +72,46 @@ def parse_distances(text: str) -> Float:
     """Distances [m] of `1.00:0.20:-0.05` (first, last, step), or of a list `1.0,0.8,0.6`.
 
     Raises:
+        CalibrationError: Neither of the two, a step that does not lead from the first to the last, or no metres.
+    """
+    distances = parse_numbers(
+        text, "--distances", "FIRST:LAST:STEP in metres, such as 1.00:0.20:-0.05, or a list 1.0,0.8,0.6"
+    )
+    if not ((distances > 0.0) & (distances < FARTHEST_M)).all():
+        raise CalibrationError(
+            f"--distances {text!r}: distances must be metres, above 0 and below {FARTHEST_M:g}: not centimetres"
+        )
+    return distances
+
+
+def parse_numbers(text: str, option: str, wanted: str) -> Float:
+    """Numbers of FIRST:LAST:STEP, or of a list with commas.
+
+    Args:
+        text: What the user wrote.
+        option: Where, for the message.
+        wanted: What was expected, for the message.
+
+    Raises:
         CalibrationError: Neither of the two, or a step that does not lead from the first to the last.
     """
-    wanted = "expected FIRST:LAST:STEP in metres, such as 1.00:0.20:-0.05, a list 1.0,0.8,0.6, or a .csv file"
     try:
         numbers = [float(part) for part in text.split(":" if ":" in text else ",")]
-    except ValueError as error:
-        raise CalibrationError(f"--distances {text!r}: {wanted}") from error
-    if not all(math.isfinite(n) for n in numbers):
-        raise CalibrationError(f"--distances {text!r}: {wanted}")
-    if ":" not in text:
+    except ValueError:
+        numbers = []
+    ranged = ":" in text
+    if (
+        not numbers
+        or not all(map(math.isfinite, numbers))
+        or (ranged and (len(numbers) != 3 or not numbers[2]))
+    ):
+        raise CalibrationError(f"{option} {text!r}: expected {wanted}")
+    if not ranged:
         return np.array(numbers)
-    if len(numbers) != 3 or numbers[2] == 0.0:
-        raise CalibrationError(f"--distances {text!r}: {wanted}")
     first, last, step = numbers
     count = (last - first) / step
     if count < 0.0 or abs(count - round(count)) > 1e-6 * max(count, 1.0) or count > 10_000:
-        raise CalibrationError(
-            f"--distances {text!r}: steps of {step:g} m do not lead from {first:g} to {last:g} m"
-        )
+        raise CalibrationError(f"{option} {text!r}: steps of {step:g} do not lead from {first:g} to {last:g}")
     return np.array([first + step * i for i in range(round(count) + 1)])
 
 
@@ -94,7 +119,7 @@ def rows_of(path: Path) -> tuple[tuple[str, ...], list[tuple[int, dict[str, str]
     """Column names, and (line number, row) of a CSV with a header."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
+            reader = csv.DictReader(file, restkey=_MORE, restval="", skipinitialspace=True)
             columns = tuple(name.strip() for name in reader.fieldnames or ())
             reader.fieldnames = list(columns)
             rows = [(reader.line_num, row) for row in reader]
@@ -106,6 +131,13 @@ def rows_of(path: Path) -> tuple[tuple[str, ...], list[tuple[int, dict[str, str]
         raise CalibrationError(
             f"{path}: no rows; the first line must name the columns, such as distance_m,disparity_px"
         )
+    if doubled := {name for name in columns if columns.count(name) > 1}:
+        raise CalibrationError(f"{path}: column {', '.join(sorted(doubled))} stands there twice")
+    for number, row in rows:
+        if any(row.get(_MORE, ())):
+            raise CalibrationError(
+                f"{path}: line {number}: more cells than columns; commas separate cells, numbers have a decimal point"
+            )
     return columns, rows
 
 
@@ -113,9 +145,9 @@ def column(path: Path, rows: Sequence[tuple[int, dict[str, str]]], name: str) ->
     """One column as finite numbers."""
     out = np.empty(len(rows))
     for i, (number, row) in enumerate(rows):
-        text = row.get(name)
+        text = row[name]
         try:
-            out[i] = float(text if text is not None else "")
+            out[i] = float(text)
         except ValueError as error:
             raise CalibrationError(f"{path}: line {number}: {name}: {text!r} is not a number") from error
         if not math.isfinite(out[i]):

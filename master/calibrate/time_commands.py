@@ -1,39 +1,33 @@
 """`phalanx-master calibrate time`: from a recording of a moving hand to the offsets of the cameras' stamps."""
 
 from collections.abc import Mapping
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
 
-from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
+from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.frame_recording import FrameRecording, open_recording
 from master.calibrate.time_fit import SIGNIFICANT, CameraTime, measure_times
+from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
+from master.options import CALIB_JSON, JsonFile, RecordingRig, ResultTree
 from master.solve import recorded_detections
 from master.summary import write_summary
 
 Recording = Annotated[Path, typer.Argument(help="Folder of a raw-frame recording: a hand that moves.")]
 Detections = Annotated[Path, typer.Option(help="Folder with detections_<camera>.npz of it.")]
-RigName = Annotated[
-    str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")
-]
 Calibration = Annotated[Path, typer.Option(help="Folder with rigs/ and cameras/, for --rig.")]
-Out = Annotated[Path | None, typer.Option(help="Tree to write rigs/<rig>.json into.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
-
-_CALIB_JSON = Path("calib_json")
 
 
 def time_command(
     recording: Recording,
     detections: Detections,
-    rig: RigName = None,
-    calibration: Calibration = _CALIB_JSON,
-    out: Out = None,
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    out: ResultTree = None,
     json_file: JsonFile = None,
 ) -> None:
     """Measure how much later a camera's frames are than its stamps say, from a hand that moves.
@@ -48,7 +42,7 @@ def time_command(
     """
     opened = open_recording(recording)
     used, cameras = _geometry(opened, rig, calibration)
-    base = _rig_to_write(used, out)
+    base = rig_in_tree(out, rig or used.name, used)
     times = measure(opened, used, cameras, detections)
     for line in report_lines(used, times):
         typer.echo(line)
@@ -56,7 +50,7 @@ def time_command(
     if out is None:
         typer.echo("nothing written: give --out DIR")
     else:
-        written = write_offsets(out, base, times, recording.resolve().name)
+        written = write_offsets(out, rig or used.name, base, times, recording.resolve().name)
         typer.echo(f"wrote {written}: stamp_offset_us")
     if json_file is not None:
         write_summary(
@@ -140,50 +134,19 @@ def report_json(rig: RigCalibration, times: tuple[CameraTime, ...]) -> dict[str,
     }
 
 
-def write_offsets(out: Path, rig: RigCalibration, times: tuple[CameraTime, ...], data: str) -> Path:
-    """Write the rig file with the offsets and their provenance; those within noise are written as 0.
+def write_offsets(
+    out: Path, file_name: str, rig: RigCalibration, times: tuple[CameraTime, ...], data: str
+) -> Path:
+    """Write rigs/<file_name>.json with the offsets and their provenance; those within noise are written as 0.
 
     Raises:
         CalibrationError: The file cannot be written; the old one is untouched.
     """
     residual = {f"{time.camera}_sigma_us": round(1e-3 * time.offset.sigma_ns, 1) for time in times}
-    how = Provenance(
-        date=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        tool="calibrate time",
-        data=(data,),
-        residual=residual,
-        note=f"against {rig.cameras[0]}",
-    )
+    how = provenance("calibrate time", (data,), residual, f"against {rig.cameras[0]}")
     new = msgspec.structs.replace(
         rig,
         stamp_offset_us={time.camera: time.to_write_us for time in times},
         provenance=rig.provenance | {"stamp_offset_us": how},
     )
-    path = _path(out, rig)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise CalibrationError(f"--out {out}: cannot make the folder: {error.strerror}") from error
-    save(path, new)
-    return path
-
-
-def _path(out: Path, rig: RigCalibration) -> Path:
-    return out / "rigs" / f"{rig.name}.json"
-
-
-def _rig_to_write(rig: RigCalibration, out: Path | None) -> RigCalibration:
-    """The rig file that gets the offsets: the one in `out` where there is one, else the recording's.
-
-    Raises:
-        CalibrationError: The one in `out` is broken, or has other cameras.
-    """
-    if out is None or not _path(out, rig).exists():
-        return rig
-    there = load(_path(out, rig), RigCalibration)
-    if there.cameras != rig.cameras:
-        raise CalibrationError(
-            f"{_path(out, rig)}: cameras are {', '.join(there.cameras)}, the recording was made with "
-            f"{', '.join(rig.cameras)}: the first one is the reference, so they must be the same"
-        )
-    return there
+    return write_rig(out, file_name, new)

@@ -8,22 +8,19 @@ import typer
 from common.arrays import Float
 from common.errors import CalibrationError
 from master.calibrate.depth_commands import (
-    CALIB_JSON,
     Calibration,
     Detections,
     Distances,
     FovDeg,
-    JsonFile,
     Marker,
     Picture,
-    RigName,
     Source,
     Target,
     measured_from,
 )
 from master.calibrate.depth_source import Measured, Pair, load_pair, parse_target
 from master.calibrate.depth_sweep import check_places
-from master.calibrate.depth_tables import parse_distances
+from master.calibrate.depth_tables import parse_distances, parse_numbers
 from master.calibrate.verify import Noise, Verified, budget, laws_of, off_axis, verify
 from master.calibrate.verify_report import (
     budget_lines,
@@ -32,6 +29,7 @@ from master.calibrate.verify_report import (
     off_axis_lines,
     verified_json,
 )
+from master.options import CALIB_JSON, JsonFile, RecordingRig
 from master.stereo.depth import tolerable_skew_s
 from master.summary import write_summary
 
@@ -44,7 +42,7 @@ def verify_command(
     detections: Detections = None,
     marker: Marker = None,
     distances: Distances = None,
-    rig: RigName = None,
+    rig: RecordingRig = None,
     calibration: Calibration = CALIB_JSON,
     target: Target = "75x50",
     fov_deg: FovDeg = None,
@@ -80,7 +78,7 @@ def verify_command(
         found = _measured(measured, noise)
         numbers |= verified_json(found)
         distance = parse_distances(_TABLE)
-    numbers |= _expected(pair, distance, parse_distances(angles), noise)
+    numbers |= _expected(pair, distance, _angles(angles), noise)
     if json_file is not None:
         write_summary(json_file, numbers)
     if picture is not None:
@@ -146,6 +144,20 @@ def _expected(pair: Pair, distance: Float, angle: Float, noise: Noise) -> dict[s
     for line in [*budget_lines(distance, expected, noise), *off_axis_lines(distance, angle, errors)]:
         typer.echo(line)
     return expected_json(distance, expected, noise, angle, errors)
+
+
+def _angles(text: str) -> Float:
+    """Angles [deg] of --angles.
+
+    Raises:
+        CalibrationError: Not numbers, or not in front of the cameras.
+    """
+    angles = parse_numbers(
+        text, "--angles", "FIRST:LAST:STEP in degrees, such as -20:20:10, or a list -20,0,20"
+    )
+    if not (np.abs(angles) < 90.0).all():
+        raise CalibrationError(f"--angles {text!r}: expected angles between -90 and 90 degrees")
+    return angles
 
 
 def _noise(sigma_px: float, speed_m_s: float, skew_ms: float) -> Noise:

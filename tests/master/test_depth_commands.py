@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
 from common.camera_model import CameraModel
-from common.errors import CalibrationError, FitError
+from common.errors import CalibrationError, FitError, PhalanxError
 from common.geometry import axis_rotation, rigid
 from master.calibrate.cli import calibrate_app
 from master.calibrate.depth_source import load_pair
@@ -130,7 +130,14 @@ def test_what_is_wrong_stays_out_of_the_tree(tmp_path: Path) -> None:
     ("arguments", "words"),
     [
         ((), "what to read is missing"),
-        (("nothing.txt",), "neither the folder of a recording nor a .csv"),
+        (("nothing",), "nothing: does not exist"),
+        (("calib/rigs/desk.json",), "neither the folder of a recording nor a .csv"),
+        (("s.csv", "--distances", "1:0.2:-0.05"), "--distances has no meaning with s.csv, a table"),
+        (("s.csv", "--live"), "a recording or a table has no meaning with --live"),
+        (("s.csv", "--save", "x.csv"), "--save has no meaning with a measurement without --live"),
+        (("s.csv", "--rig", "desk", "--calibration", "calib", "--fov-deg", "400"), "--fov-deg 400"),
+        (("few.csv",), "few.csv: 5 usable distances"),
+        (("nothing.txt",), "nothing.txt: does not exist"),
         (("s.csv", "--out", "x"), "--rig NAME"),
         (("s.csv", "--target", "big"), "--target 'big'"),
         (("s.csv", "--rig", "absent"), "absent.json"),
@@ -144,9 +151,27 @@ def test_a_call_that_cannot_work_says_what_is_missing(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PHALANX_RIG_KEY", bytes(range(32)).hex())
     tree(tmp_path)
-    table(tmp_path / "s.csv")
-    with pytest.raises(CalibrationError, match=words):
+    lines = table(tmp_path / "s.csv").read_text().splitlines()
+    (tmp_path / "few.csv").write_text("\n".join(lines[:6]))
+    with pytest.raises(PhalanxError, match=words):
         run("depth", *arguments)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--distances", "-1,0,2"), "--distances '-1,0,2': distances must be metres, above 0"),
+        (("--distances", "100:20:-5"), "not centimetres"),
+        (("--angles", "a"), "--angles 'a': expected FIRST:LAST:STEP in degrees"),
+        (("--angles", "nan"), "--angles 'nan'"),
+        (("--angles", "-90:90:10"), "between -90 and 90"),
+    ],
+)
+def test_verify_names_the_option_that_is_wrong(
+    tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    with pytest.raises(CalibrationError, match=words):
+        run("verify", "--rig", "desk", "--calibration", tree(tmp_path), *arguments)
 
 
 def test_laws_are_refused_for_three_cameras(tmp_path: Path) -> None:

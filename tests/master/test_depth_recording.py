@@ -174,7 +174,7 @@ def test_a_file_of_distances_by_time_frame_or_counter(tmp_path: Path) -> None:
         ("when,distance_m\n1,0.5\n", "one of t_s, frame, seq"),
         ("t_s,distance_m\n", "no rows"),
         ("t_s,distance_m\n0.5,far\n", "line 2: distance_m: 'far' is not a number"),
-        ("t_s,distance_m\n0.5\n", "line 2: distance_m: None is not a number"),
+        ("t_s,distance_m\n0.5\n", "line 2: distance_m: '' is not a number"),
     ],
 )
 def test_a_wrong_file_of_distances_is_refused(tmp_path: Path, text: str, words: str) -> None:
@@ -223,6 +223,9 @@ def test_a_table_comes_back_as_it_was_written(tmp_path: Path) -> None:
         ("distance_m,u_left_px\n0.5,1\n", "u_left_px and u_right_px, are missing"),
         ("d,disparity_px\n0.5,1\n", "distance_m is missing; it has d, disparity_px"),
         ("", "no rows"),
+        ("distance_m;disparity_px\n1.0;39.9\n", "separated by commas"),
+        ("distance_m,disparity_px\n1,00,39,9\n", "line 2: more cells than columns"),
+        ("distance_m,disparity_px,disparity_px\n1,39.9,3\n", "column disparity_px stands there twice"),
     ],
 )
 def test_a_wrong_table_is_refused(tmp_path: Path, text: str, words: str) -> None:

@@ -102,7 +102,7 @@ def cut_by_the_border() -> Sweep:
         (cut_by_the_border(), ["partly outside the image of camera 'right'", "0.2 m (line 18)"]),
         (table(STEPS, np.where(STEPS > 0.9, np.nan, RIG.disparity(STEPS))), ["1 m (line 2)", "NaN"]),
         (table(np.where(STEPS > 0.99, -1.0, STEPS), RIG.disparity(STEPS)), ["line 2", "above 0"]),
-        (table(100.0 * STEPS, RIG.disparity(STEPS)), ["line 2", "metres"]),
+        (table(100.0 * STEPS, RIG.disparity(STEPS)), ["all places", "not centimetres"]),
     ],
 )  # fmt: skip
 def test_what_is_unfit_is_refused_with_its_name(sweep: Sweep, words: list[str]) -> None:

@@ -1,0 +1,64 @@
+"""Into a calibration tree: which rig file gets a result, where it comes from, and the file written whole or not."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
+from common.errors import CalibrationError
+
+
+def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], note: str = "") -> Provenance:
+    """Of a result that was made now.
+
+    Args:
+        tool: The command, such as "calibrate depth".
+        data: Names of what it was measured from.
+        residual: Quantity with its unit -> value.
+        note: What else a reader should know.
+    """
+    date = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    return Provenance(date=date, tool=tool, data=data, residual=residual, note=note)
+
+
+def rig_in_tree(out: Path | None, file_name: str, rig: RigCalibration) -> RigCalibration:
+    """The rig file that gets a result: the one in the tree `out` where there is one, else `rig` itself.
+
+    Raises:
+        CalibrationError: The one in `out` is broken, or has other cameras, or another first one.
+    """
+    if out is None or not (path := _path(out, "rigs", file_name)).exists():
+        return rig
+    there = load(path, RigCalibration)
+    if there.cameras != rig.cameras:
+        raise CalibrationError(
+            f"{path}: cameras are {', '.join(there.cameras)}, it was measured with {', '.join(rig.cameras)}:"
+            " they must be the same, and the first one too, which is the reference; give another --out"
+        )
+    return there
+
+
+def write_rig(out: Path, file_name: str, rig: RigCalibration) -> Path:
+    """Write rigs/<file_name>.json of the tree `out`; return its path.
+
+    Raises:
+        CalibrationError: The folder or the file cannot be written; an old file is untouched.
+    """
+    return _write(_path(out, "rigs", file_name), rig)
+
+
+def write_camera(out: Path, file_name: str, camera: CameraCalibration) -> Path:
+    """Write cameras/<file_name>.json of the tree `out`; as `write_rig`."""
+    return _write(_path(out, "cameras", file_name), camera)
+
+
+def _path(out: Path, folder: str, name: str) -> Path:
+    return out / folder / f"{name}.json"
+
+
+def _write(path: Path, value: RigCalibration | CameraCalibration) -> Path:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"--out: cannot make the folder {path.parent}: {error.strerror}") from error
+    save(path, value)
+    return path
