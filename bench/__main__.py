@@ -18,6 +18,7 @@ SECTIONS = {
     "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
     "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",
     "filters": "1 euro filter, 18 signals; baseline: one object per signal",
+    "uncertainty": "95 % regions of markers: how often they hold the truth; rendered hands, a profile off by a tenth",
     "ik": "Inverse kinematics, one finger or one hand; baseline: FABRIK as published, with limits",
     "hand": "The whole hand with palm pose and covariances; baseline: a general least-squares solver",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
