@@ -16,12 +16,12 @@ import cv2
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.errors import FitError
 from common.geometry import rigid, rotation_vector_to_matrix, transform
 
 LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "p1", "p2", "k3")
 SHAPE_SD_M = 3e-4  # a print glued on a plate by hand: some tenths of a millimetre
 _MOST_STEPS = 100
+_ALMOST_NOTHING = 1e-3  # px^2 per rad^2 or m^2, where one view has 10^7 and more
 _STOP = 1e-9  # relative gain of a step
 _STOP_ROBUST = 1e-6  # robust fits only judge
 
@@ -123,8 +123,7 @@ def solve(
         cauchy_px: Residual [px] at which a corner begins to lose its say; None: plain least squares.
         sigma_px: Standard deviation of a corner [px], against which the prior of the shape is weighed.
 
-    Raises:
-        FitError: The observations do not determine what is free.
+    What the observations do not determine has an enormous standard deviation in the result.
     """
     mask = free.mask(len(start.drawn_m))
     prior = (sigma_px / SHAPE_SD_M) ** 2 if free.shape else 0.0
@@ -256,12 +255,10 @@ def _reduced(normal: Normal, mask: Bool, damping: float) -> tuple[Float, Float, 
     """The equations of what is free and shared, and what leads back to the views' own."""
     shared, mixed, own, right, right_own = normal
     shared, mixed, right = shared[np.ix_(mask, mask)], mixed[:, mask], right[mask]
-    damped: Float = own * (1.0 + damping * np.eye(6))
+    # A board that wrong corners drove far away no longer moves any pixel; its equations must stay solvable.
+    damped: Float = own * (1.0 + damping * np.eye(6)) + _ALMOST_NOTHING * np.eye(6)
     sides: Float = np.concatenate([mixed.transpose(0, 2, 1), right_own[:, :, None]], axis=2)
-    try:
-        back = cast(Float, np.linalg.solve(damped, sides))
-    except np.linalg.LinAlgError as error:
-        raise FitError("a view has too few corners to place the board") from error
+    back = cast(Float, np.linalg.solve(damped, sides))
     by_shared, by_right = back[:, :, :-1], back[:, :, -1]
     schur = shared + damping * np.diag(np.diag(shared)) - np.tensordot(mixed, by_shared, ((0, 2), (0, 1)))
     return schur, right - np.einsum("vsi,vi->s", mixed, by_right), by_shared, by_right

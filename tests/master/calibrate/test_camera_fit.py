@@ -225,3 +225,16 @@ def test_too_few_views_and_views_that_contradict_each_other_are_refused() -> Non
         )
     with pytest.raises(FitError, match=r"camera 'left': .*(agree|px rms)"):
         result(fit_cameras(views), {})
+
+
+def test_a_picture_upside_down_among_three_cameras_is_parted_however_far_it_drives_the_board() -> None:
+    for seed in (50, 51):
+        truth = scene(seed, 3, views=14)
+        views = truth.views(NOISE_PX, seed)
+        name = next(view.name for view in views.views if len(view.sightings) == 3)
+        views = with_sighting(
+            views, name, "top", lambda s: replace(s, corners_px=np.array([639.0, 479.0]) - s.corners_px)
+        )
+        fit = fit_cameras(views)
+        assert [(no.view, no.camera) for no in fit.rejected] == [(name, "top")]
+        assert errors(fit, truth)[1] < 0.8
