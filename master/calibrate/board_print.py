@@ -14,6 +14,7 @@ from matplotlib.path import Path as Outline
 
 from common.errors import CalibrationError
 from common.replacing import replacing
+from master.calibrate.board_options import options_of
 from master.calibrate.boards import Board, Charuco, Checkerboard
 
 PAPERS_MM = {
@@ -137,10 +138,7 @@ def _foot(axes: Axes, page: Page, board: Board) -> None:
         at = min(max(step - 0.1, 0.0), _RULER_MM - 0.2)  # the end marks end with the ruler
         marks.append((left + at, top, 0.2, length))
     _fill(axes, marks)
-    size = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
-    if isinstance(board, Charuco):
-        size += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"
-    axes.text(left, top + 7, f"{board}:   {size}", fontsize=7, va="center")
+    axes.text(left, top + 7, f"{board}:   {options_of(board)}", fontsize=7, va="center")
     axes.text(
         left + _RULER_MM + 3,
         top + 1.2,

@@ -40,7 +40,7 @@ class Round:
     """
 
     stills: Mapping[str, Still]
-    images: Mapping[str, Image]
+    images: Mapping[str, Image]  # (H, W, 3) BGR
     spread_ms: float
 
 
@@ -58,32 +58,33 @@ def capture(
     Args:
         take: Gives the next round.
         live: Judges it.
-        folder: Where CAMERA/NUMBER.jpg go, as they came.
+        folder: Where CAMERA/NUMBER.jpg go, as they came; made by `new_folder`.
         wanted: Views to keep.
         stop: Ends it early.
         say: Told what the person should read.
         advise: Called after each view that was kept: what is still missing.
 
     Raises:
-        CalibrationError: The folder holds pictures already, or cannot be written.
+        CalibrationError: The folder cannot be written.
     """
-    _make(folder)
     said, said_s = "", 0.0
     spread: list[float] = []
     while len(live.views) < wanted and not stop.is_set():
         began = time.monotonic()
         round_ = take()
         verdict = live.push(round_.images) if round_.images else Verdict(False, "no camera answers")
+        text = verdict.text + _without([name for name in live.cameras if name not in round_.images])
         if verdict.kept:
             view = live.views[-1]
             spread.append(round_.spread_ms)
             _keep(folder, view.name, {name: round_.stills[name] for name in view.sightings})
-            say(f"view {len(live.views)} of {wanted}: {verdict.text}{_then(advise())}")
-        elif verdict.text != said or began - said_s > _SAY_S:
-            say(verdict.text)
-            said, said_s = verdict.text, began
+            say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
+        elif text != said or began - said_s > _SAY_S:
+            say(text)
+            said, said_s = text, began
         stop.wait(max(0.0, ROUND_S - (time.monotonic() - began)))
-    _note(folder, live, spread)
+    if live.views:
+        _note(folder, live, spread)
     return len(live.views)
 
 
@@ -147,7 +148,16 @@ def _then(advice: str) -> str:
     return f"; {advice}" if advice else ""
 
 
-def _make(folder: Path) -> None:
+def _without(silent: list[str]) -> str:
+    return f" (no picture from {' and '.join(silent)}: is the slave running?)" if silent else ""
+
+
+def new_folder(folder: Path) -> None:
+    """Make the folder for the pictures, or take an empty one.
+
+    Raises:
+        CalibrationError: It holds something already, or cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         taken = next(folder.iterdir(), None)

@@ -13,8 +13,8 @@ from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.keys import rig_key
 from common.zenoh_bus import ZenohBus
-from master.calibrate.board_options import Dictionary, MarkerMm, Size, SquareMm, board_of
-from master.calibrate.capture import StillTaker, capture
+from master.calibrate.board_options import Dictionary, MarkerMm, Size, SquareMm, board_of, options_of
+from master.calibrate.capture import StillTaker, capture, new_folder
 from master.calibrate.live_views import LiveViews
 from master.ingest import Ingest
 from master.options import (
@@ -34,6 +34,8 @@ from master.stopping import stop_on_signals
 
 FEWEST = 5  # from which a lens can be fitted at all
 _START_S = 5.0
+_LOOK_S = 0.2
+_HINT_ROUNDS = 50  # ten seconds
 
 
 def capture_views(
@@ -42,7 +44,7 @@ def capture_views(
     square_mm: SquareMm = 25.0,
     marker_mm: MarkerMm = None,
     dictionary: Dictionary = "4X4_50",
-    views: Annotated[int, typer.Option(min=1, max=200, help="Pictures to keep.")] = 25,
+    views: Annotated[int, typer.Option(min=FEWEST, max=200, help="Views to keep.")] = 25,
     rig: Rig = "desk",
     calibration: Calibration = CALIB_JSON,
     beacon: Beacon = HERE_BEACON,
@@ -61,24 +63,31 @@ def capture_views(
 
       phalanx-master calibrate stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json      then
     """
+    ends = address(beacon, "--beacon"), address(bind, "--bind")
     live = LiveViews(board_of(board, square_mm, marker_mm, dictionary), cameras_of(calibration, rig))
     key = rig_key(os.environ, key_file)
     clock = SystemClock()
+    new_folder(out)
     stop = stop_on_signals()
     with ExitStack() as stack:
         link = ZenohBus(bus, None)
         stack.callback(link.close)
-        ingest = Ingest(
-            live.cameras, key, clock, address(beacon, "--beacon"), address(bind, "--bind"), bus, _START_S
-        )
+        ingest = Ingest(live.cameras, key, clock, *ends, bus, _START_S)
         stack.callback(ingest.close)
         _wait(ingest, live.cameras, stop)
         taker = StillTaker(link, ingest, live.cameras)
         stack.callback(taker.close)
-        kept = capture(taker.take, live, out, views, stop, typer.echo)
+        kept = capture(taker.take, live, out, views, stop, typer.echo, live.missing)
     if kept < FEWEST:
-        raise CalibrationError(f"{out}: {kept} pictures kept; a calibration needs {FEWEST}, better {views}")
-    typer.echo(f"{kept} pictures in {out}; next: phalanx-master calibrate stereo {out} ...")
+        raise CalibrationError(f"{out}: {kept} views kept; a calibration needs {FEWEST}, better {views}")
+    typer.echo(f"{kept} views in {out}; next: phalanx-master calibrate {_next(live, out, rig)}")
+
+
+def _next(live: LiveViews, out: Path, rig: str) -> str:
+    """The command that makes a calibration of what was kept."""
+    several = len(live.cameras) > 1
+    what, of_rig = ("stereo", f" --rig {rig}") if several else ("intrinsics", "")
+    return f"{what} {out} {options_of(live.board)}{of_rig} --out DIR"
 
 
 def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
@@ -93,11 +102,17 @@ def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> No
         CalibrationError: Told to stop before.
     """
     said: frozenset[str] | None = None
+    rounds = 0
     while not ingest.started:
         here = ingest.connected
         if here != said:
             absent = ", ".join(name for name in cameras if name not in here)
             typer.echo(f"waiting for {absent or 'the start'}")
             said = here
-        if stop.wait(0.2):
+        rounds += 1
+        if rounds % _HINT_ROUNDS == 0 and not here:
+            typer.echo(
+                "no slave answers: is it running, with the same rig key, and does --beacon reach it? Its log says more"
+            )
+        if stop.wait(_LOOK_S):
             raise CalibrationError("stopped before any slave was there")

@@ -12,6 +12,7 @@ import numpy as np
 
 from common.arrays import Float, Image
 from master.calibrate.boards import Board
+from master.calibrate.coverage import advice_so_far
 from master.calibrate.detect import Sighting, find_board
 from master.calibrate.views import BoardViews, View
 
@@ -63,6 +64,19 @@ class LiveViews:
     def board_views(self) -> BoardViews:
         """What was kept, as the fits take it."""
         return BoardViews(self.board, dict(self._sizes), tuple(self.views))
+
+    def missing(self) -> str:
+        """The view that would help most now, for the camera that needs one most; what to do once none is missing."""
+        views = self.board_views()
+        for name in sorted(self.cameras, key=lambda name: len(views.of(name))):
+            if wish := advice_so_far(views, name):
+                return f"for {name}, {wish}" if views.of(name) else wish
+        alone = [
+            name for name in self.cameras if not any({name} < set(view.sightings) for view in self.views)
+        ]
+        if alone and len(self.cameras) > 1:
+            return f"show the board to {alone[0]} and another camera at once"
+        return "nothing is missing any more; more views make it more certain"
 
     def _is_new(self, seen: Mapping[str, Sighting]) -> bool:
         """Whether some camera sees the board as in no view before; a set of cameras that is new is news as well."""

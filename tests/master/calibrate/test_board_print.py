@@ -10,6 +10,7 @@ import pytest
 
 from common.arrays import Float, Image
 from common.errors import CalibrationError
+from master.calibrate.board_options import board_of, options_of
 from master.calibrate.board_print import page_for, print_board
 from master.calibrate.boards import Board, Charuco, Checkerboard, board_corners, grid_edges
 from master.calibrate.detect import find_board
@@ -92,3 +93,20 @@ def test_only_vector_files_and_only_into_folders_that_are_there(tmp_path: Path) 
         print_board(tmp_path / "nowhere" / "board.pdf", BOARDS[0], "A4")
     print_board(tmp_path / "board.svg", BOARDS[0], "A4")
     assert b"841.88" in (tmp_path / "board.svg").read_bytes()[:2000]  # 297 mm in points
+
+
+@pytest.mark.parametrize("board", BOARDS)
+def test_the_options_on_the_page_name_the_board_again(board: Board) -> None:
+    words = options_of(board).split()
+    given = dict(zip(words[::2], words[1::2], strict=True))
+    marker = given.get("--marker-mm")
+    found = board_of(
+        given["--board"],
+        float(given["--square-mm"]),
+        None if marker is None else float(marker),
+        given.get("--dictionary", "4X4_50"),
+    )
+    assert (found.columns, found.rows, type(found)) == (board.columns, board.rows, type(board))
+    assert found.square_m == pytest.approx(board.square_m)
+    if isinstance(found, Charuco) and isinstance(board, Charuco):
+        assert (found.dictionary, found.marker_m) == (board.dictionary, pytest.approx(board.marker_m))

@@ -12,9 +12,9 @@ from common.arrays import Image
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Still
-from common.sim.board import COLUMNS, HELD_S, MOVED_S, ROWS, SQUARE_M, BoardRenderer, BoardScene
+from common.sim.board import COLUMNS, HELD_S, MOVED_S, POSES, ROWS, SQUARE_M, BoardRenderer, BoardScene
 from master.calibrate.boards import Checkerboard
-from master.calibrate.capture import NOTES, Round, capture
+from master.calibrate.capture import NOTES, Round, capture, new_folder
 from master.calibrate.image_sets import image_sets
 from master.calibrate.live_views import LiveViews
 from master.calibrate.views import look
@@ -87,6 +87,7 @@ def test_what_was_kept_is_a_folder_that_the_calibrations_read(
 
     live = LiveViews(BOARD, RIG.cameras)
     folder = tmp_path / "board"
+    new_folder(folder)
     count = capture(take, live, folder, 3, threading.Event(), lines.append, lambda: "tilt it more")
     assert count == 3
     assert [line for line in lines if line.startswith("view 3 of 3: left and right; tilt it more")]
@@ -98,7 +99,7 @@ def test_what_was_kept_is_a_folder_that_the_calibrations_read(
             step = mine.sightings[name].corners_px - read.sightings[name].corners_px
             assert np.abs(step).max() < 0.2  # what JPEG costs
     with pytest.raises(CalibrationError, match=r"holds .* already"):
-        capture(take, live, folder, 3, threading.Event(), lines.append)
+        new_folder(folder)
 
 
 def test_a_stop_ends_it_with_what_there_is(tmp_path: Path) -> None:
@@ -109,6 +110,44 @@ def test_a_stop_ends_it_with_what_there_is(tmp_path: Path) -> None:
         stop.set()
         return Round({}, {}, float("nan"))
 
+    new_folder(tmp_path / "new")
     assert capture(take, LiveViews(BOARD, ("left",)), tmp_path / "new", 5, stop, lines.append) == 0
-    assert lines == ["no camera answers"]
-    assert msgspec.json.decode((tmp_path / "new" / NOTES).read_bytes())["views"] == 0
+    assert lines == ["no camera answers (no picture from left: is the slave running?)"]
+    new_folder(tmp_path / "new")  # nothing was kept: it can be used again
+
+
+def test_a_camera_that_gives_no_picture_is_named(renderers: dict[str, BoardRenderer], tmp_path: Path) -> None:
+    times = iter((0.2, 0.5))
+    lines: list[str] = []
+
+    def take() -> Round:
+        image = {"left": renderers["left"].render(next(times))}
+        return Round(stills(image, 1), image, 0.0)
+
+    new_folder(tmp_path / "one")
+    capture(take, LiveViews(BOARD, RIG.cameras), tmp_path / "one", 1, threading.Event(), lines.append)
+    assert lines[-1] == "view 1 of 1: left (no picture from right: is the slave running?)"
+
+
+def test_after_each_view_it_says_what_is_missing_until_nothing_is(
+    renderers: dict[str, BoardRenderer],
+) -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    said: list[str] = []
+    for k in range(POSES):
+        for t_s in (0.2, 0.5):
+            kept = live.push(at(renderers, k * STEP_S + t_s)).kept
+        if kept:
+            said.append(live.missing())
+    assert "tilt the board" in said[0]  # one view shows no tilt
+    assert (
+        len({text for text in said if "image" in text}) >= 2
+    )  # then parts of an image that no corner has seen
+    assert said[-1].startswith("nothing is missing")
+
+
+def test_a_camera_that_saw_no_board_comes_first(renderers: dict[str, BoardRenderer]) -> None:
+    live = LiveViews(BOARD, RIG.cameras)
+    for t_s in (0.2, 0.5):
+        live.push({"left": renderers["left"].render(t_s)})
+    assert live.missing() == "show the board to right"
