@@ -61,7 +61,14 @@ class CapLocator:
         self._cameras, self._caps, self._place = cameras, caps, place
 
     def __call__(
-        self, uv: Float, sigma_px: Float, area_px2: Float, hand: HandSolution | None, age_s: float
+        self,
+        uv: Float,
+        sigma_px: Float,
+        area_px2: Float,
+        hand: HandSolution | None,
+        age_s: float,
+        *,
+        as_seen: bool = False,
     ) -> Located:
         """Locate the markers of one instant.
 
@@ -71,9 +78,13 @@ class CapLocator:
             area_px2: (C, M).
             hand: The hand known so far; None: a cap may point anywhere where it is seen.
             age_s: How long ago it was so [s].
+            as_seen: Nothing tells of a hand, so the markers may be on something flat: what is seen of them is taken
+                for their centroid, and the whole correction for doubt.
         """
         points = self._place.roughly(uv, sigma_px)
         look = self.look(points, hand, age_s)
+        if as_seen:
+            look.bias_px[0] = 0.0
         doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2.min(axis=0))
         placed = self._place(uv - look.bias_px[0], np.hypot(sigma_px, doubt))
         bias = look.bias_px.transpose(2, 1, 3, 0).reshape(len(points), -1, len(look.bias_px))  # (M, 2C, T)

@@ -116,9 +116,8 @@ class MarkerPipeline:
                     *self._with_rays(instant, found.points, found.cov, None, 0.0),
                     self._towards(found.points, instant),
                 )
-            if first is not None:
-                with self._stage("triangulate"):
-                    found = self._locate(instant, first, 0.0)
+            with self._stage("triangulate"):
+                found = self._locate(instant, first, 0.0, as_seen=first is None)
         raw, cov, apart = found.points, found.cov, found.apart
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw, found.noise)
@@ -167,8 +166,10 @@ class MarkerPipeline:
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 
-    def _locate(self, instant: Instant, hand: HandSolution | None, age_s: float) -> Located:
-        return self._located(instant.uv, instant.sigma_px, instant.area, hand, age_s)
+    def _locate(
+        self, instant: Instant, hand: HandSolution | None, age_s: float, *, as_seen: bool = False
+    ) -> Located:
+        return self._located(instant.uv, instant.sigma_px, instant.area, hand, age_s, as_seen=as_seen)
 
     def _with_rays(
         self, instant: Instant, points: Float, cov: Float, last: HandSolution | None, age_s: float
