@@ -8,6 +8,7 @@ difference in pixels, computed at the hand pose known so far, is taken from the 
 """
 
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -18,7 +19,8 @@ from common.hand_model import HandJoints, HandModel
 
 _RINGS, _SPOKES = 16, 48
 _ANGLES = 90  # steps of the tables
-_HEXAGON = np.stack([f(np.arange(6) * np.pi / 3) for f in (np.cos, np.sin)])  # (2, 6)
+_HEXAGON = sqrt(2.0) * np.stack([f(np.arange(6) * np.pi / 3) for f in (np.cos, np.sin)])  # (2, 6)
+_LEAST_TILT_2 = 1e-30  # [rad^2]
 _MOST_TILT = 2.0  # tangent of the tilt of a sigma point: it stays on its side
 _BENT_RAD = np.radians(135.0)  # away from the eye: a cap still shows a strip of its side
 _FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or partly hidden
@@ -85,12 +87,15 @@ class CapModel:
                 cannot move a cap by more than its radius.
             tilt_cov_rad2: (5, 3, 3) covariance of the directions of the last phalanges; only that across them counts.
         """
-        ahead = self._ahead(joints)
-        square = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
-        # Ascending: the first is along the finger, and nothing.
-        variance, axes = np.linalg.eigh(square @ tilt_cov_rad2[self._finger] @ square)
-        angle = np.minimum(np.sqrt(2.0 * np.maximum(variance[:, 1:], 0.0)), _MOST_TILT)
-        around = axes[:, :, 1:] @ (angle[..., None] * _HEXAGON)  # (K, 3, 6)
+        R = joints.rotation[self._joint]
+        across, ahead = R[:, :, :2], -R[:, :, 2]
+        cov = across.swapaxes(1, 2) @ tilt_cov_rad2[self._finger] @ across  # (K, 2, 2)
+        # Its Cholesky factor, which gives a round hexagon its shape.
+        first = np.sqrt(np.maximum(cov[:, 0, 0], _LEAST_TILT_2))
+        mixed = cov[:, 0, 1] / first
+        second = np.sqrt(np.maximum(cov[:, 1, 1] - mixed * mixed, 0.0))
+        root = np.stack([first, np.zeros_like(first), mixed, second], axis=1).reshape(-1, 2, 2)
+        around = across @ np.clip(root @ _HEXAGON, -_MOST_TILT, _MOST_TILT)  # (K, 3, 6)
         tilted = ahead + around.transpose(2, 0, 1)
         tilted /= np.sqrt(np.vecdot(tilted, tilted))[..., None]
         return np.concatenate([ahead[None], tilted])

@@ -113,8 +113,7 @@ class CapLocator:
         """By how much the variance of the tilt is larger to the hand fit than to us (M,)."""
         if hand is None:
             return np.ones(len(self._caps.on_finger))
-        ours = np.trace(hand.tilt_cov_rad2, axis1=1, axis2=2) + 2.0 * (TURN_RAD_S * age_s) ** 2
-        walked = (
-            np.trace(hand.tilt_walk_rad2_s2, axis1=1, axis2=2) * age_s**2 - 2.0 * (TURN_RAD_S * age_s) ** 2
-        )
+        turned = 2.0 * (TURN_RAD_S * age_s) ** 2
+        ours = np.einsum("fii->f", hand.tilt_cov_rad2) + turned
+        walked = np.einsum("fii->f", hand.tilt_walk_rad2_s2) * (age_s * age_s) - turned
         return self._caps.by_marker(1.0 + np.maximum(walked, 0.0) / np.maximum(ours, 1e-12))
