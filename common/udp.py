@@ -39,7 +39,9 @@ class UdpSocket:
             self._socket.bind(bind)
         except OSError as error:
             self._socket.close()
-            raise BusError(f"cannot bind UDP {bind[0]}:{bind[1]}: {error}") from error
+            taken = error.errno == errno.EADDRINUSE
+            why = "another program has it, perhaps another master" if taken else error.strerror
+            raise BusError(f"cannot bind UDP {bind[0]}:{bind[1]}: {why}") from error
         self.address: Address = self._socket.getsockname()
         self.would_block = 0
         self.failed = 0

@@ -13,6 +13,7 @@ zenoh's own threads.
 import atexit
 import json
 import logging
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -64,7 +65,7 @@ class ZenohBus:
             )
         except zenoh.ZError as error:
             raise BusError(
-                f"cannot open the bus ({self._where or 'no endpoint'}): {error}. "
+                f"cannot open the bus ({self._where or 'no endpoint'}): {_plain(error)}. "
                 + ("Is the master running?" if beyond else "Is the address taken or mistyped?")
             ) from error
         self._inboxes: list[Inbox] = []
@@ -203,6 +204,11 @@ class ZenohBus:
             return text + "no process is connected. Is the master running, and is this its bus endpoint?"
         names = ", ".join(sorted(self.alive())) or "none announced"
         return text + f"{self.peers} connected, alive: {names}. Is the target running and named so?"
+
+
+def _plain(error: zenoh.ZError) -> str:
+    """What went wrong, without the places in zenoh's source that it names."""
+    return re.sub(r" at /\S+:\d+\.?", "", str(error)).rstrip(".")
 
 
 def _settings(listen: str | None, connect: str | None, beyond: bool) -> dict[str, object]:

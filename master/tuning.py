@@ -76,7 +76,8 @@ class LivePipeline:
         self._recent: deque[tuple[int, MarkerDetections]] = deque(maxlen=_WARM_FRAMES * cameras)
         self._number = 0
         self._last_ns = -(2**63)
-        self._next: tuple[MarkerPipeline, int] | None = None  # and the number of the last message it has seen
+        # And the number of the last message it has seen. One thread fills it, another empties it.
+        self._next: deque[tuple[MarkerPipeline, int]] = deque(maxlen=1)
 
     @property
     def counts(self) -> Counter[str]:
@@ -87,8 +88,7 @@ class LivePipeline:
         """Take one camera's detections; return the poses they complete, oldest first."""
         self._number += 1
         self._recent.append((self._number, message))
-        coming, self._next = self._next, None
-        solved = self._now.push(message) if coming is None else self._take_over(*coming)
+        solved = self._take_over(*self._next.popleft()) if self._next else self._now.push(message)
         if solved:
             self._last_ns = solved[-1].pose.t_ns
         return solved
@@ -115,7 +115,8 @@ class LivePipeline:
             if len(waiting) <= self._close:
                 break
         stage.open = True
-        self._setup, self._tracker, self._next = setup, tracker, (new, shown)
+        self._setup, self._tracker = setup, tracker
+        self._next.append((new, shown))
 
     def _take_over(self, new: MarkerPipeline, shown: int) -> list[SolvedPose]:
         """Show the new pipeline what it has not seen yet, and take its poses that are later than the last one."""

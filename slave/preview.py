@@ -6,6 +6,7 @@ waiting one, so a slow bus costs pictures and never a measurement. A *still*, on
 same way: cameras are calibrated from stills.
 """
 
+import logging
 import threading
 from collections import deque
 
@@ -25,6 +26,7 @@ QUALITY = 80
 STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
 WAIT_S = 0.5
 _NEVER_NS = -(2**63)
+_LOG = logging.getLogger(__name__)
 
 
 class Gate:
@@ -113,11 +115,20 @@ class Previews:
             self._wake.wait(WAIT_S)
             self._wake.clear()
             if self._still and not self._closing.is_set():
-                frame = self._still.popleft()
-                self._publish("still", Still(self._camera, frame.seq, frame.t_ns, whole_jpeg(frame.image)))
+                self._send_whole(self._still.popleft())
             if self._waiting and not self._closing.is_set():
                 frame = self._waiting.popleft()
                 self._publish("preview", Preview(self._camera, frame.t_ns, small_jpeg(frame.image)))
+
+    def _send_whole(self, frame: Frame) -> None:
+        data = whole_jpeg(frame.image)
+        if data is None:
+            height, width = frame.image.shape[:2]
+            _LOG.warning(
+                "a still of %d x %d px does not fit into a message: take a smaller mode", width, height
+            )
+            return
+        self._publish("still", Still(self._camera, frame.seq, frame.t_ns, data))
 
     def _publish(self, stream: str, picture: Preview | Still) -> None:
         with self._lock:
@@ -130,14 +141,16 @@ class Previews:
                 return  # the bus has gone; the reporter finds the next one
 
 
-def whole_jpeg(image: Image) -> bytes:
-    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey in its full size, as good as fits into a message."""
-    data = b""
+def whole_jpeg(image: Image) -> bytes | None:
+    """JPEG file of `image` (H, W, 3) BGR or (H, W) grey in its full size, as good as fits into a message.
+
+    None: not even the worst does, which are tens of megapixels, or noise.
+    """
     for quality in STILL_QUALITIES:
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
         if len(data) <= MAX_STILL_BYTES:
-            break
-    return data
+            return data
+    return None
 
 
 def small_jpeg(image: Image) -> bytes:

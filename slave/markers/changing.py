@@ -5,6 +5,7 @@ follows the light it must know the light before it is of use: it looks at some f
 too, and takes over as soon as it may tell markers by their colours.
 """
 
+from collections import deque
 from typing import TypeAlias
 
 import numpy as np
@@ -27,13 +28,13 @@ class ChangingDetector:
     def __init__(self, detector: Changeable) -> None:
         """Begin with `detector`."""
         self._detector = detector
-        self._next: Changeable | None = None
+        self._next: deque[Changeable] = deque(maxlen=1)  # one thread fills it, another empties it
         self._frames = Passing[tuple[Image, int]]()
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
-        coming, self._next = self._next, None
-        if coming is not None:
+        if self._next:
+            coming = self._next.popleft()
             _hand_over(self._detector, coming)
             self._detector = coming
         self._frames.put((image, t_ns))
@@ -61,7 +62,7 @@ class ChangingDetector:
                         break
             except CameraError:
                 pass  # no frames: it learns the light when they come, as at the start
-        self._next = detector
+        self._next.append(detector)
 
     @property
     def kind(self) -> type[Changeable]:

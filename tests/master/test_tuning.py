@@ -133,7 +133,7 @@ class Told:
 
     @property
     def upcoming(self) -> bool:
-        return self.pipeline._next is not None
+        return bool(self.pipeline._next)
 
 
 @pytest.fixture

@@ -222,5 +222,30 @@ def test_a_still_is_the_next_frame_whole_and_only_one() -> None:
 
 def test_a_still_of_any_size_fits_into_a_message() -> None:
     noise = np.random.default_rng(4).integers(0, 256, (1088, 1456, 3), np.uint8)
-    assert len(whole_jpeg(noise)) <= MAX_STILL_BYTES
-    assert cv2.imdecode(np.frombuffer(whole_jpeg(IMAGE), np.uint8), cv2.IMREAD_COLOR) is not None
+    for image in (noise, IMAGE):
+        data = whole_jpeg(image)
+        assert data is not None
+        assert len(data) <= MAX_STILL_BYTES
+        assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
+
+
+def test_a_still_too_large_for_a_message_is_told_and_the_next_one_goes_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    noise = np.random.default_rng(4).integers(0, 256, (3000, 4000, 3), np.uint8)
+    assert whole_jpeg(noise) is None
+    bus = LoopbackBus()
+    feed = bus.subscribe("still")
+    shown = Previews("left", ManualClock(10**9))
+    try:
+        shown.use(bus)
+        shown.ask_still()
+        shown.offer(Frame(0, 10**9, 10**9, noise))
+        assert until(lambda: "4000 x 3000 px does not fit" in caplog.text)
+        shown.ask_still()
+        shown.offer(Frame(1, 10**9, 10**9, IMAGE))
+        still = feed.get(5.0)
+        assert isinstance(still, Still)
+        assert still.seq == 1
+    finally:
+        shown.close()
