@@ -30,7 +30,7 @@ import numpy as np
 from common.arrays import Float
 
 AT_LEAST = 5  # echoes before the offset is used
-DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twice this (Raspberry Pi: +-100 ppm each)
+DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twice this (Pi: +-100 ppm each)
 WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
 SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
 SUSPECTS_AMONG = 20  # so many echoes
