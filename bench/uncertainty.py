@@ -28,8 +28,8 @@ _WHOLE = 0.97  # of a cap visible in both cameras; less is partly hidden
 _HOLD_S, _MOVE_S = 0.8, 0.7
 _SETTLED_S = 0.4  # after this a held hand is still for tracks and tracker too
 _RADIUS = 0.1
-_SECONDS = {"still": 24.0, "standard scene": 30.0, "sideways, 1 m/s": 6.0}
-_SEEDS = {"still": (1, 2), "standard scene": (7, 8), "sideways, 1 m/s": (1, 2, 4)}
+_SECONDS = {"still": 24.0, "standard scene": 30.0, "sideways, 1 m/s": 2.0}
+_SEEDS = {"still": (1, 2), "standard scene": (7, 8), "sideways, 1 m/s": (0, 1, 2, 3, 4, 5)}
 
 
 class _Stills:
@@ -58,7 +58,7 @@ class _Stills:
 
 
 class _Sideways:
-    """One of the six poses on a sine along the baseline, 1 m/s at most."""
+    """Each of the six poses on a sine along the baseline, 1 m/s at most; a seed for each."""
 
     period_s = 1e6
     _RATE_HZ = 1.35
