@@ -28,8 +28,8 @@ def free_tcp_port() -> int:
 def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) -> None:
     key = bytes.fromhex(new_key())
     beacon, bus = free_udp_port(), f"tcp/127.0.0.1:{free_tcp_port()}"
-    files = {"poses": tmp_path / "poses.npz", "summary": tmp_path / "live.json"}
-    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, **files)
+    poses, summary = tmp_path / "poses.npz", tmp_path / "live.json"
+    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, poses, summary)
     setup = load_setup(root / "calib_json", "desk")
     lines: list[str] = []
     stop = threading.Event()
