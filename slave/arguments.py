@@ -86,7 +86,7 @@ def parser() -> argparse.ArgumentParser:
 def _run(run: argparse.ArgumentParser) -> None:
     _camera(run)
     run.add_argument(
-        "--beacon-port", type=int, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
+        "--beacon-port", type=_port, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
     )
     run.add_argument(
         "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
@@ -198,17 +198,25 @@ def _camera(command: argparse.ArgumentParser) -> None:
         "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
     )
     sim.add_argument(
-        "--clock-offset-ms", type=float, default=0.0, metavar="X", help="this machine's clock is ahead"
+        "--clock-offset-ms", type=_number, default=0.0, metavar="X", help="this machine's clock is ahead"
     )
-    sim.add_argument("--clock-ppm", type=float, default=0.0, metavar="Y", help="and gains on the true one")
-    sim.add_argument("--start-offset-ms", type=float, default=0.0, metavar="Z", help="its frames come later")
+    sim.add_argument("--clock-ppm", type=_number, default=0.0, metavar="Y", help="and gains on the true one")
+    sim.add_argument(
+        "--start-offset-ms", type=_number, default=0.0, metavar="Z", help="its frames come later"
+    )
 
 
 def _positive(text: str) -> float:
     value = _number(text)
-    if not 0.0 < value < math.inf:
+    if not 0.0 < value:
         raise argparse.ArgumentTypeError(f"{text}: must be positive")
     return value
+
+
+def _port(text: str) -> int:
+    if not text.isdecimal() or not 0 < int(text) < 65536:
+        raise argparse.ArgumentTypeError(f"{text}: must be a port, 1 to 65535")
+    return int(text)
 
 
 def _count(text: str) -> int:
@@ -219,13 +227,16 @@ def _count(text: str) -> int:
 
 def _megabytes(text: str) -> float:
     value = _number(text)
-    if not 0.0 <= value < math.inf:
+    if not 0.0 <= value:
         raise argparse.ArgumentTypeError(f"{text}: must not be negative")
     return value
 
 
 def _number(text: str) -> float:
     try:
-        return float(text)
+        value = float(text)
     except ValueError as error:  # argparse would tell the name of the function
         raise argparse.ArgumentTypeError(f"{text}: must be a number") from error
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text}: must be a finite number")
+    return value

@@ -63,11 +63,7 @@ def run_live(
     rig = files.rig
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
 
-    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
-        if colours == "follow":
-            return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
-        return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
-
+    make = _maker(colours, engine, workers)
     changing = None if colours == "none" else ChangingDetector(make(files.camera, rig))
     detector = BlindDetector(len(rig.markers)) if changing is None else changing
     tally = Tally(rig.markers)
@@ -102,3 +98,16 @@ def run_live(
         source.close()
         workers.shutdown(cancel_futures=True)
     say(f"{tally.counts()['frames']} frames, sent {uplink.counts['sent']}")
+
+
+def _maker(
+    colours: Colours, engine: Engine, workers: ThreadPoolExecutor
+) -> Callable[[CameraCalibration, RigCalibration], Changeable]:
+    """What makes a detector for given files, now and whenever they change."""
+
+    def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
+        if colours == "follow":
+            return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
+        return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
+
+    return make

@@ -38,7 +38,7 @@ def scene_by_name(
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
         return Scene.of_motion(rig, cameras, hand, motion, seed)
-    raise PhalanxError(f"scene {name!r}: there are {NAMES}")
+    raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board for cameras only)")
 
 
 def view_by_name(

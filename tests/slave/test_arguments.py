@@ -36,7 +36,8 @@ def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> 
     [
         ("--queue-mb", "abc", "abc: must be a number"),
         ("--queue-mb", "-1", "must not be negative"),
-        ("--queue-mb", "nan", "must not be negative"),
+        ("--queue-mb", "nan", "must be a finite number"),
+        ("--clock-ppm", "inf", "must be a finite number"),
         ("--seconds", "soon", "soon: must be a number"),
         ("--seconds", "0", "must be positive"),
         ("--frames", "1.5", "1.5: must be a whole number"),
@@ -53,6 +54,13 @@ def test_a_wrong_number_is_named_and_no_function_is(
     assert says in error
     assert option in error
     assert " _" not in error
+
+
+@pytest.mark.parametrize("text", ["99999", "0", "x"])
+def test_a_wrong_port_is_named(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        parser().parse_args(["run", "--name", "left", "--camera", "synthetic", "--beacon-port", text])
+    assert f"{text}: must be a port, 1 to 65535" in capsys.readouterr().err
 
 
 def test_what_is_right_is_taken() -> None:
