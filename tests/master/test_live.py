@@ -28,8 +28,8 @@ def free_tcp_port() -> int:
 def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) -> None:
     key = bytes.fromhex(new_key())
     beacon, bus = free_udp_port(), f"tcp/127.0.0.1:{free_tcp_port()}"
-    poses, summary = tmp_path / "poses.npz", tmp_path / "live.json"
-    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, poses, summary)
+    poses_file, summary_file = tmp_path / "poses.npz", tmp_path / "live.json"
+    settings = LiveSettings(("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, poses_file, summary_file)
     setup = load_setup(root / "calib_json", "desk")
     lines: list[str] = []
     stop = threading.Event()
@@ -60,8 +60,8 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
         master.join(10.0)
         for end in (left, right, asker):
             end.close()
-    summary = json.loads((tmp_path / "live.json").read_text())
-    poses = load_poses(tmp_path / "poses.npz")
+    summary = json.loads(summary_file.read_text())
+    poses = load_poses(poses_file)
     assert len(poses) == summary["poses"] > 20
     assert summary["lost"] == 0
     assert lines[0].startswith("listening on 127.0.0.1:")
