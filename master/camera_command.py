@@ -22,6 +22,8 @@ ANSWER_S = (
 APPEAR_S = 2.0  # whoever has just connected is not known everywhere yet
 STEP_S = 0.1
 _ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us")
+_EVENTS = ("camera.", "reload.")
+_MOST = 1e9
 
 
 def camera(
@@ -119,7 +121,7 @@ def table(health: Health) -> list[str]:
             rows.append((setting, f"{value:.6g}", "-" if got is None else f"{got:.6g}"))
     also = [gauge for gauge in health.gauges if gauge in _ALSO or gauge.startswith("control.")]
     rows += [(gauge, "", f"{health.gauges[gauge]:.6g}") for gauge in also]
-    rows += [(event, "", str(n)) for event, n in health.counts.items() if event.startswith("camera.")]
+    rows += [(event, "", str(n)) for event, n in health.counts.items() if event.startswith(_EVENTS)]
     return [f"{name:<22} {wanted:>10} {got:>10}".rstrip() for name, wanted, got in rows]
 
 
@@ -140,8 +142,8 @@ def _appear(bus: Bus, name: str) -> None:
 
 
 def _positive(value: float | None, option: str) -> float | None:
-    if value is not None and not 0.0 < value <= 1e9:
-        raise PhalanxError(f"{option} {value:g}: must be positive")
+    if value is not None and not 0.0 < value <= _MOST:
+        raise PhalanxError(f"{option} {value:g}: must be positive and at most {_MOST:g}")
     return value
 
 

@@ -187,7 +187,7 @@ class Reporter:
                 if count % LOG_EVERY == 0:
                     _LOG.warning("no bus: %s", error)
             if count % LOG_EVERY == 0 and self._numbers.counts().get("frames", 0):
-                _LOG.info("%s", "  ".join(f"{k} {v:.0f}" for k, v in self._gauges.items()))
+                _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._gauges.items()))
             count += 1
         self._leave()
 
@@ -211,6 +211,11 @@ class Reporter:
         if self._bus is not None:
             self._bus.close()
         self._bus, self._endpoint = None, None
+
+
+def _short(value: float) -> str:
+    """Three digits at least, and no exponent for microseconds: a gain of 0.83 is not 1."""
+    return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
 
 
 def _why_alone(counts: Mapping[str, int]) -> str:

@@ -13,7 +13,7 @@ def measured_lines(found: Verified) -> list[str]:
     """Errors by distance and model, and their means; beside them what noise explains."""
     names = list(found.error_m)
     lines = [
-        "measured  distance  off axis  " + "  ".join(f"{name:>19s}" for name in names) + "   noise, 1 sigma"
+        "measured  distance  off axis  " + "  ".join(f"{name:>20s}" for name in names) + "   noise, 1 sigma"
     ]
     for i in range(found.sweep.size):
         cells = "  ".join(
@@ -26,7 +26,7 @@ def measured_lines(found: Verified) -> list[str]:
         )
     for which in ("mean", "max"):
         cells = "  ".join(
-            f"{found.figures(n)[f'{which}_mm']:8.2f} mm {found.figures(n)[f'{which}_percent']:5.2f} %"
+            f"{found.figures(n)[f'{which}_mm']:8.2f} mm {found.figures(n)[f'{which}_percent']:6.2f} %"
             for n in names
         )
         lines.append(f"          {which + ' |error|':18s}  {cells}")
