@@ -25,6 +25,7 @@ from master.calibrate.depth_source import (
     parse_target,
 )
 from master.calibrate.depth_sweep import Sweep, checked
+from master.calibrate.verify import laws_of
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -37,7 +38,7 @@ from master.options import (
     ResultTree,
     address,
 )
-from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw
+from master.stereo.depth import DepthLaw
 from master.summary import write_summary
 
 Source = Annotated[
@@ -185,11 +186,8 @@ def laws_before(pair: Pair, rig: RigCalibration | None) -> dict[str, DepthLaw]:
     laws: dict[str, DepthLaw] = {}
     if pair.models is not None:
         laws["ideal"] = ideal_of(*pair.models)
-    if rig is not None and rig.power_law is not None:
-        laws["previous power"] = PowerLaw.of(rig.power_law)
-    if rig is not None and rig.affine_disparity is not None:
-        laws["previous affine"] = AffineDisparity.of(rig.affine_disparity)
-    return laws
+    previous = {} if rig is None else laws_of(rig)
+    return laws | {f"previous {name.partition('_')[0]}": law for name, law in previous.items()}
 
 
 def _refuse_idle(where: str, **options: object) -> None:

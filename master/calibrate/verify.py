@@ -60,8 +60,11 @@ class Verified:
         return self.error_m[model] / self.sweep.distance_m
 
     def figures(self, model: str) -> dict[str, float]:
-        """Mean and largest |error|, in mm and per cent of the distance."""
-        mm, percent = 1e3 * np.abs(self.error_m[model]), 100.0 * np.abs(self.relative(model))
+        """Mean and largest |error| where the model gives a depth, in mm and per cent of the distance; else NaN."""
+        known = np.isfinite(self.error_m[model])
+        if not known.any():
+            return dict.fromkeys(("mean_mm", "max_mm", "mean_percent", "max_percent"), float("nan"))
+        mm, percent = 1e3 * np.abs(self.error_m[model][known]), 100.0 * np.abs(self.relative(model)[known])
         return {
             "mean_mm": float(mm.mean()),
             "max_mm": float(mm.max()),

@@ -76,7 +76,11 @@ def verified_json(found: Verified) -> dict[str, object]:
         }
         for i in range(found.sweep.size)
     ]
-    return {"models": {name: found.figures(name) for name in found.error_m}, "rows": rows}
+    models = {
+        name: {figure: _number(value) for figure, value in found.figures(name).items()}
+        for name in found.error_m
+    }
+    return {"models": models, "rows": rows}
 
 
 def expected_json(

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
+from common.calibration import (
+    AffineDisparityCalibration,
+    CameraCalibration,
+    Provenance,
+    RigCalibration,
+    load,
+    save,
+)
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, FitError, PhalanxError
 from common.geometry import axis_rotation, rigid
@@ -263,3 +270,20 @@ def test_a_camera_file_made_for_its_colours_does_not_replace_the_recorded_lens(t
     (calib / "cameras" / "left.json").unlink()
     with pytest.raises(CalibrationError, match="camera 'right', the recording has not"):
         load_pair(calib, "desk", recorded={"left": recorded["left"]})
+
+
+def test_a_law_without_depth_at_a_place_is_shown_as_such_and_the_means_are_of_the_others(
+    tmp_path: Path,
+) -> None:
+    law = AffineDisparityCalibration(
+        a_m_px=37.3, x0_px=60.0
+    )  # no depth below 60 px of disparity: beyond 0.65 m
+    calib = tree(tmp_path, rig_file(affine_disparity=law))
+    numbers = tmp_path / "n.json"
+    out = run(
+        "verify", table(tmp_path / "s.csv"), "--calibration", calib, "--rig", "desk", "--json", numbers
+    )  # fmt: skip
+    assert "nan" not in out
+    found = json.loads(numbers.read_text(), parse_constant=pytest.fail)  # NaN is no JSON
+    assert found["rows"][-1]["error_mm"]["affine_disparity"] is None
+    assert found["models"]["affine_disparity"]["mean_mm"] > 0.0
