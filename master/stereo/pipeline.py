@@ -20,6 +20,7 @@ from common.messages import HandPose, MarkerDetections
 from master.filters import PointFilter
 from master.ik.hand import HandSolution
 from master.ik.tracker import HandTracker, pose_of
+from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw
 from master.stereo.locate import CapLocator, Located
@@ -80,6 +81,7 @@ class MarkerPipeline:
         self.counts: Counter[str] = Counter()
         self._cameras = tuple(cameras.values())
         self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
+        self._lens_shift = LensShift(self._cameras)
         self._place = Placement(self._cameras, law, residual)
         self._choose = RivalChooser(self._cameras, self._place)
         self._on_hand = np.array([markers.index(name) for name in tracker.markers], np.int64)
@@ -107,6 +109,8 @@ class MarkerPipeline:
     def _solve(self, instant: Instant) -> SolvedPose:
         last, age_s = self._tracker.recent(instant.t_ns)
         with self._stage("triangulate"):
+            if self._lens_shift.any:
+                instant = replace(instant, uv=self._lens_shift.centres(instant.uv, instant.area))
             instant = self._without_rivals(instant)
             found = self._locate(instant, last, age_s)
         if last is None:

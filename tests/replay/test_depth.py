@@ -12,7 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 import pytest
+
+from common.calibration import RigCalibration, load
+from common.frame_recording import open_recording
+from master.outputs.files import load_poses
+from master.rig import RigSetup, load_hand
+from master.solve import solve
 
 CAMERAS = ("left", "right")
 
@@ -94,6 +102,34 @@ def test_misaligned_and_distorted_cameras(sweeps: dict[str, Sweep]) -> None:
         assert abs(row["error_mm"]["stereo"]) < 3.0 * row["expected_sigma_mm"], row
     fit = sweeps["sweep_rough"].calibrate("depth")
     assert fit["laws"]["power_law"]["mean_percent"] < 1.0
+
+
+def test_every_depth_model_of_the_running_line_is_as_good_as_its_calibration(
+    sweeps: dict[str, Sweep], datasets: Path, tmp_path: Path
+) -> None:
+    """It corrects what the lens does to large blobs as the calibration does, but does not know their outline."""
+    sweep = sweeps["sweep_rough"]
+    laws = sweep.calibrate("depth", "--out", sweep.tree)["laws"]
+    rig = load(sweep.tree / "rigs" / "sweep_rough.json", RigCalibration)
+    recording = open_recording(sweep.recording)
+    hand = load_hand(None, rig.hand, datasets / "hands" / "webxr-right.json")
+    with np.load(sweep.recording / "truth.npz") as truth:
+        true_m = truth["center"][:, 2]
+
+    def percent(model: str) -> np.ndarray:
+        chosen = msgspec.structs.replace(rig, depth_model=model)
+        solve(recording, RigSetup.of(chosen, recording.manifest.cameras, hand), sweep.found, tmp_path)
+        found_m = load_poses(tmp_path / "poses.npz").markers_raw_m[:, rig.markers.index("middle"), 2]
+        return 100.0 * np.abs(found_m / true_m - 1.0)
+
+    stereo = percent("stereo")
+    assert stereo.mean() < 0.5
+    assert stereo.max() < 1.2
+    assert stereo[np.argmin(true_m)] < 0.5  # 1 % without
+    for law in ("power_law", "affine_disparity"):
+        assert percent(law).mean() == pytest.approx(
+            laws[law]["mean_percent"], abs=0.05
+        )  # 0.06 and 0.19 without
 
 
 def test_the_size_of_the_target_alone_corrects_most_of_the_lens(sweeps: dict[str, Sweep]) -> None:
