@@ -8,12 +8,12 @@ import typer
 
 from common.arrays import Float
 from common.calibration import RigCalibration
-from common.errors import CalibrationError, FitError
+from common.errors import CalibrationError
 from common.frame_recording import FrameRecording
 from common.keys import rig_key
 from master.calibrate.depth_fit import ideal_of
 from master.calibrate.depth_live import sweep_live
-from master.calibrate.depth_report import DepthReport, fit_depth, report_json, report_lines
+from master.calibrate.depth_report import fit_depth, report_json, report_lines
 from master.calibrate.depth_save import conclusion, rig_to_write, write_laws
 from master.calibrate.depth_source import (
     Measured,
@@ -24,7 +24,7 @@ from master.calibrate.depth_source import (
     pair_of,
     parse_target,
 )
-from master.calibrate.depth_sweep import Sweep, checked
+from master.calibrate.depth_sweep import checked
 from master.calibrate.verify import laws_of
 from master.options import (
     CALIB_JSON,
@@ -116,7 +116,9 @@ def depth(
         measured = measured_from(source, detections, marker, distances, rig, calibration, fov_deg, outline)
     pair = measured.pair
     base = rig_to_write(pair, out)
-    sweep, report = _fitted(measured, laws_before(pair, base))
+    with measured.named():
+        sweep = checked(measured.sweep, pair.cameras, pair.size_px)
+        report = fit_depth(sweep, laws_before(pair, base))
     typer.echo(measured.about)
     for line in report_lines(report):
         typer.echo(line)
@@ -128,20 +130,6 @@ def depth(
         from master.calibrate.depth_picture import draw_errors
 
         draw_errors(picture, measured.about, sweep.distance_m, report.errors, used=report.used)
-
-
-def _fitted(measured: Measured, before: dict[str, DepthLaw]) -> tuple[Sweep, DepthReport]:
-    """The sweep as it was fitted, and the outcome.
-
-    Raises:
-        FitError: The sweep is unfit; the text begins with what it was read from.
-    """
-    pair = measured.pair
-    try:
-        sweep = checked(measured.sweep, pair.cameras, pair.size_px)
-        return sweep, fit_depth(sweep, before)
-    except FitError as error:
-        raise FitError(f"{', '.join(measured.data)}: {error}") from error
 
 
 def measured_from(

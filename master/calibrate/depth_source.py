@@ -1,6 +1,7 @@
 """Everything a depth command works on, read from the files that the user names: the sweep, the pair, the rig."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration, Intrinsics, RigCalibration, load
 from common.camera_model import CameraModel
-from common.errors import CalibrationError
+from common.errors import CalibrationError, FitError
 from common.frame_recording import FrameRecording, open_recording
 from master.calibrate.depth_recording import Pairs, by_file, by_list, by_truth, read_pairs
 from master.calibrate.depth_sweep import Sweep
@@ -62,6 +63,18 @@ class Measured:
     pair: Pair
     data: tuple[str, ...]
     about: str
+
+    @contextmanager
+    def named(self) -> Generator[None, None, None]:
+        """Refusals of the sweep begin with what it was read from.
+
+        Raises:
+            FitError: As the block.
+        """
+        try:
+            yield
+        except FitError as error:
+            raise FitError(f"{', '.join(self.data)}: {error}") from error
 
 
 def pair_of(

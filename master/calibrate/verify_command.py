@@ -107,7 +107,9 @@ def _measured(measured: Measured, noise: Noise) -> Verified:
         raise CalibrationError(
             "there is nothing to verify: give --rig NAME, a rig with power_law, affine_disparity or calibrated cameras"
         )
-    found = verify(check_places(measured.sweep, pair.cameras, pair.size_px), laws, pair.models, noise)
+    with measured.named():
+        sweep = check_places(measured.sweep, pair.cameras, pair.size_px)
+    found = verify(sweep, laws, pair.models, noise)
     if not found.error_m:
         raise CalibrationError(
             "the stereo model needs the columns v_left_px and v_right_px, and the rig has no law of disparity"
