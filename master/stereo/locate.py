@@ -17,7 +17,7 @@ error of this correction repeats that of the last pose: told less than it believ
 error, and finger and cap would drag each other away.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from master.ik.hand import HandSolution
 from master.stereo.caps import CapLook, CapModel
+from master.stereo.odd_camera import odd_camera
 from master.stereo.place import Placement
 
 TURN_RAD_S = (
@@ -44,6 +45,7 @@ class Located:
         noise: (M, 3, 3) [m^2] the part of `cov` that differs from one instant to the next.
         repeated: (M, 3, 3) [m^2] what is to be added to `cov` for a fit that starts at the same hand.
         apart: (M,) the rays do not meet.
+        left_out: (C, M) sightings without which they do.
     """
 
     points: Float
@@ -51,6 +53,7 @@ class Located:
     noise: Float
     repeated: Float
     apart: Bool
+    left_out: Bool
 
 
 class CapLocator:
@@ -59,6 +62,7 @@ class CapLocator:
     def __init__(self, cameras: tuple[CameraModel, ...], caps: CapModel, place: Placement) -> None:
         """Locate with these cameras, caps and depth model."""
         self._cameras, self._caps, self._place = cameras, caps, place
+        self._nothing = np.zeros((len(cameras), len(caps.on_finger)), dtype=np.bool_)
 
     def __call__(
         self,
@@ -81,12 +85,32 @@ class CapLocator:
             as_seen: Nothing tells of a hand, so the markers may be on something flat: what is seen of them is taken
                 for their centroid, and the whole correction for doubt.
         """
+        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
+        if not found.left_out.any():
+            return found
+        out = found.left_out
+        uv, area_px2 = np.where(out[..., None], np.nan, uv), np.where(out, np.nan, area_px2)
+        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
+        return replace(found, left_out=out & ~found.apart)
+
+    def _once(
+        self,
+        uv: Float,
+        sigma_px: Float,
+        area_px2: Float,
+        hand: HandSolution | None,
+        age_s: float,
+        *,
+        as_seen: bool,
+    ) -> Located:
+        """As `__call__`, but `left_out` is only told, not yet left out."""
         points = self._place.roughly(uv, sigma_px)
         look = self.look(points, hand, age_s)
         if as_seen:
             look.bias_px[0] = 0.0
         doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2.min(axis=0))
-        placed = self._place(uv - look.bias_px[0], np.hypot(sigma_px, doubt))
+        caps_uv, sure_px = uv - look.bias_px[0], np.hypot(sigma_px, doubt)
+        placed = self._place(caps_uv, sure_px)
         bias = look.bias_px.transpose(2, 1, 3, 0).reshape(len(points), -1, len(look.bias_px))  # (M, 2C, T)
         moved = placed.gain @ bias
         tilt = moved[..., 1:] - moved[..., :1]
@@ -95,10 +119,12 @@ class CapLocator:
         cov = placed.cov + tilted + corrected @ corrected.swapaxes(1, 2)
         cov[~self._caps.on_finger] += _RELIEF_M**2 * np.eye(3)
         apart = placed.apart(uv)
+        left_out = self._nothing
         if apart.any():
+            left_out = odd_camera(self._place, caps_uv, sure_px, apart)
             placed.points[apart], cov[apart] = np.nan, np.nan
         repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
-        return Located(placed.points, cov, placed.cov, repeated, apart)
+        return Located(placed.points, cov, placed.cov, repeated, apart, left_out)
 
     def look(self, points: Float, hand: HandSolution | None, age_s: float) -> CapLook:
         """How caps at (M, 3) [m] look: as the hand has them, and tilted as far as it is unsure."""

@@ -79,7 +79,7 @@ class MarkerPipeline:
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter()
-        self._cameras = tuple(cameras.values())
+        self._names, self._cameras = tuple(cameras), tuple(cameras.values())
         self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
         self._lens_shift = LensShift(self._cameras)
         self._place = Placement(self._cameras, law, residual)
@@ -134,6 +134,8 @@ class MarkerPipeline:
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
         self._count("apart", apart)
+        if found.left_out.any():
+            self._count_left_out(found, instant)
         self.counts["epipolar_misfits"] += int(apart.sum())
         self.counts["poses"] += 1
         self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
@@ -169,6 +171,15 @@ class MarkerPipeline:
         """Count an event of each of the markers (M,) by name."""
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
+
+    def _count_left_out(self, found: Located, instant: Instant) -> None:
+        """Count what was left out of each camera, and instants at which that is most of what it sees."""
+        sees = np.isfinite(instant.uv[..., 0]) & np.isfinite(found.points[:, 0])
+        mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
+        for c in np.flatnonzero(found.left_out.any(axis=1)):
+            self.counts[f"left_out.{self._names[c]}"[:_NAME]] += int(found.left_out[c].sum())
+            if mostly[c]:
+                self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1
 
     def _locate(
         self, instant: Instant, hand: HandSolution | None, age_s: float, *, as_seen: bool = False
