@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 import typer
 
-from master.calibrate.board_command import board
-from master.calibrate.camera_commands import intrinsics, stereo
-from master.calibrate.capture_command import capture_views
-from master.calibrate.depth_commands import depth
-from master.calibrate.time_commands import time_command
-from master.calibrate.verify_command import verify_command
+from master.calibrate.cameras.board_command import board
+from master.calibrate.cameras.capture_command import capture_views
+from master.calibrate.cameras.commands import intrinsics, stereo
+from master.calibrate.depth.commands import depth
+from master.calibrate.depth.verify_command import verify_command
+from master.calibrate.time.commands import time_command
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "board": board,

@@ -8,9 +8,9 @@ from pathlib import Path
 import cv2
 
 from common.keys import new_key
-from master.calibrate.boards import Checkerboard
-from master.calibrate.image_sets import image_sets
-from master.calibrate.views import look
+from master.calibrate.cameras.boards import Checkerboard
+from master.calibrate.cameras.image_sets import image_sets
+from master.calibrate.cameras.views import look
 from tests.network_helpers import free_endpoint, free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -1,0 +1,1 @@
+"""Lenses and places of cameras, from pictures of a board."""

@@ -1,0 +1,192 @@
+"""Takes the pictures for a calibration from running slaves: whole frames over the bus, on a person's pace.
+
+While it runs it *is* the rig's master: it gives the start and keeps the clocks, so that slaves need not know that
+nobody tracks. Nothing is calibrated here; the folder it leaves is what `calibrate intrinsics` and `stereo` read.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from common.arrays import Image
+from common.bus import Bus, Subscription
+from common.errors import BusError, CalibrationError
+from common.messages import Command, Still
+from master.calibrate.cameras.live_views import LiveViews, Verdict
+from master.ingest import Ingest
+
+ROUND_S = 0.3
+ANSWER_S = 1.0
+_ASK_S = 0.5
+_SAY_S = 2.0  # the same words are not said more often
+NOTES = "capture.json"
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Pictures that were asked for together.
+
+    Attributes:
+        stills: Camera -> what it sent.
+        images: Camera -> the same, decoded.
+        spread_ms: Time between the first and the last of them [ms]; NaN while a clock is not known.
+    """
+
+    stills: Mapping[str, Still]
+    images: Mapping[str, Image]  # (H, W, 3) BGR
+    spread_ms: float
+
+
+def capture(
+    take: Callable[[], Round],
+    live: LiveViews,
+    folder: Path,
+    wanted: int,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    advise: Callable[[], str] = lambda: "",
+) -> int:
+    """Keep views until there are enough or `stop` is set; return how many.
+
+    Args:
+        take: Gives the next round.
+        live: Judges it.
+        folder: Where CAMERA/NUMBER.jpg go, as they came; made by `new_folder`.
+        wanted: Views to keep.
+        stop: Ends it early.
+        say: Told what the person should read.
+        advise: Called after each view that was kept: what is still missing.
+
+    Raises:
+        CalibrationError: The folder cannot be written.
+    """
+    said, said_s = "", 0.0
+    spread: list[float] = []
+    while len(live.views) < wanted and not stop.is_set():
+        began = time.monotonic()
+        round_ = take()
+        verdict = live.push(round_.images) if round_.images else Verdict(False, "no camera answers")
+        text = verdict.text + _without([name for name in live.cameras if name not in round_.images])
+        if verdict.kept:
+            view = live.views[-1]
+            spread.append(round_.spread_ms)
+            _keep(folder, view.name, {name: round_.stills[name] for name in view.sightings})
+            say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
+        elif text != said or began - said_s > _SAY_S:
+            say(text)
+            said, said_s = text, began
+        stop.wait(max(0.0, ROUND_S - (time.monotonic() - began)))
+    if live.views:
+        _note(folder, live, spread)
+    return len(live.views)
+
+
+class StillTaker:
+    """Asks every camera for its next frame. Holds the bus subscription and the ingest that keeps the clocks."""
+
+    def __init__(self, bus: Bus, ingest: Ingest, cameras: tuple[str, ...]) -> None:
+        """Listen for stills of `cameras` from now on."""
+        self._bus, self._ingest, self._cameras = bus, ingest, cameras
+        self._feed: Subscription = bus.subscribe("still", depth=4 * len(cameras))
+
+    def take(self) -> Round:
+        """One round: ask all, then wait until all that answered have sent, at most a second."""
+        while self._feed.get(0.0) is not None:
+            pass  # what came too late for its own round
+        askers = [threading.Thread(target=self._ask, args=(name,), daemon=True) for name in self._cameras]
+        for thread in askers:
+            thread.start()
+        stills: dict[str, Still] = {}
+        end = time.monotonic() + ANSWER_S
+        while len(stills) < len(self._cameras) and (left := end - time.monotonic()) > 0.0:
+            message = self._feed.get(left)
+            if isinstance(message, Still) and message.camera in self._cameras:
+                stills[message.camera] = message
+        for thread in askers:
+            thread.join()
+        while self._ingest.get(0.0) is not None:
+            pass  # detections come along; nobody needs them
+        images = {
+            name: image
+            for name in self._cameras
+            if name in stills and (image := _decoded(stills[name])) is not None
+        }
+        return Round(stills, images, self._spread_ms(stills))
+
+    def close(self) -> None:
+        """Listen no more. Safe to call twice."""
+        self._feed.close()
+
+    def _ask(self, camera: str) -> None:
+        try:
+            self._bus.ask(Command(camera, "still"), _ASK_S)
+        except BusError:
+            return  # it is not there, or busy: the next round asks again, and the person reads who is seen
+
+    def _spread_ms(self, stills: Mapping[str, Still]) -> float:
+        times: list[int] = []
+        for name, still in stills.items():
+            if (estimate := self._ingest.clock_of(name)) is None:
+                return float("nan")
+            times.append(estimate.to_local(still.t_ns))
+        return (max(times) - min(times)) * 1e-6 if times else float("nan")
+
+
+def _decoded(still: Still) -> Image | None:
+    image = cv2.imdecode(np.frombuffer(still.jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return None if image is None else np.asarray(image, np.uint8)
+
+
+def _then(advice: str) -> str:
+    return f"; {advice}" if advice else ""
+
+
+def _without(silent: list[str]) -> str:
+    return f" (no picture from {' and '.join(silent)}: is the slave running?)" if silent else ""
+
+
+def new_folder(folder: Path) -> None:
+    """Make the folder for the pictures, or take an empty one.
+
+    Raises:
+        CalibrationError: It holds something already, or cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        taken = next(folder.iterdir(), None)
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot make this folder: {error.strerror}") from error
+    if taken is not None:
+        raise CalibrationError(f"{folder}: holds {taken.name} already; give a new or empty folder")
+
+
+def _keep(folder: Path, view: str, stills: Mapping[str, Still]) -> None:
+    try:
+        for name, still in stills.items():
+            (folder / name).mkdir(exist_ok=True)
+            (folder / name / f"{view}.jpg").write_bytes(still.jpeg)
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot write: {error.strerror}") from error
+
+
+def _note(folder: Path, live: LiveViews, spread_ms: list[float]) -> None:
+    """What the pictures are of, for whoever finds the folder."""
+    known = [value for value in spread_ms if np.isfinite(value)]
+    notes = {
+        "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "board": str(live.board),
+        "cameras": list(live.cameras),
+        "views": len(live.views),
+        "largest_spread_ms": round(max(known), 3) if known else None,
+    }
+    try:
+        (folder / NOTES).write_bytes(msgspec.json.format(msgspec.json.encode(notes)) + b"\n")
+    except OSError as error:
+        raise CalibrationError(f"{folder / NOTES}: cannot write: {error.strerror}") from error

@@ -1,0 +1,116 @@
+"""How well a camera's views cover what its lens can do, and which view is missing most."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from master.calibrate.cameras.alone import corners_seen
+from master.calibrate.cameras.boards import board_corners
+from master.calibrate.cameras.first_guess import guess_lens, place_board
+from master.calibrate.cameras.views import BoardViews
+
+CELLS = (6, 8)  # rows and columns: a cell is about as large as a board's square seen near
+ENOUGH_SHARE = 0.7
+ENOUGH_TILT_DEG = 40.0
+ENOUGH_RANGE = 1.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Coverage:
+    """What the views of one camera cover.
+
+    Attributes:
+        cells: Whether a corner was seen in that part of the image (6, 8), rows from the top.
+        tilt_deg: Angle [deg] between the board's normal and the camera's axis (V,).
+        tilt_spread_deg: Largest angle [deg] between two views' normals: what determines the focal length.
+        across: Spread [deg] of the normals to the sides and up and down.
+        distance_m: Distance [m] of the board's middle (V,).
+    """
+
+    cells: Bool
+    tilt_deg: Float
+    tilt_spread_deg: float
+    across: tuple[float, float]
+    distance_m: Float
+
+    @property
+    def share(self) -> float:
+        """Share of the image's cells with a corner."""
+        return float(self.cells.mean())
+
+
+def coverage(
+    size_px: tuple[int, int], uv: Sequence[Float], T_camera_board: Float, middle_m: Float
+) -> Coverage:
+    """Coverage of views.
+
+    Args:
+        size_px: Width and height of the image.
+        uv: Corners (n, 2) [px] of each view.
+        T_camera_board: Places of the board (V, 4, 4) [m].
+        middle_m: Middle of the board (3,) [m] in its frame.
+    """
+    rows, columns = CELLS
+    points = np.concatenate(uv)
+    u = np.clip((points[:, 0] + 0.5) * columns / size_px[0], 0, columns - 1).astype(int)
+    v = np.clip((points[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
+    cells = np.zeros(CELLS, dtype=np.bool_)
+    cells[v, u] = True
+    normals = T_camera_board[:, :3, 2]
+    cosines = np.clip(normals @ normals.T, -1.0, 1.0)
+    sides = np.degrees(np.arctan2(normals[:, :2], normals[:, 2:]))
+    places = T_camera_board[:, :3, :3] @ middle_m + T_camera_board[:, :3, 3]
+    return Coverage(
+        cells=cells,
+        tilt_deg=np.degrees(np.arccos(np.clip(normals[:, 2], -1.0, 1.0))),
+        tilt_spread_deg=float(np.degrees(np.arccos(cosines.min()))),
+        across=(float(np.ptp(sides[:, 0])), float(np.ptp(sides[:, 1]))),
+        distance_m=np.linalg.norm(places, axis=1),
+    )
+
+
+def advice(covered: Coverage) -> str:
+    """The view that would help most, or "" where all is covered."""
+    if covered.tilt_spread_deg < ENOUGH_TILT_DEG:
+        sideways, upright = covered.across
+        about = "its upright axis (left edge nearer, then right edge)"
+        if upright < sideways:
+            about = "its level axis (top edge nearer, then bottom edge)"
+        return f"tilt the board 20 to 40° about {about}"
+    if covered.share < ENOUGH_SHARE:
+        return f"show the board {_emptiest(covered.cells)}"
+    if covered.distance_m.max() < ENOUGH_RANGE * covered.distance_m.min():
+        near, far = covered.distance_m.max() / ENOUGH_RANGE, covered.distance_m.min() * ENOUGH_RANGE
+        return f"show the board nearer than {near:.2f} m or beyond {far:.2f} m"
+    return ""
+
+
+def advice_so_far(views: BoardViews, camera: str) -> str:
+    """`advice` while views are still being taken and no lens is known."""
+    drawn = board_corners(views.board)
+    seen = [corners_seen(sighting) for _, sighting in views.of(camera)]
+    if not seen:
+        return f"show the board to {camera}"
+    lens = guess_lens(seen, drawn, views.sizes_px[camera])
+    places = np.stack([place_board(drawn[corners], uv, lens)[0] for corners, uv in seen])
+    return advice(coverage(views.sizes_px[camera], [uv for _, uv in seen], places, drawn.mean(axis=0)))
+
+
+def _emptiest(cells: Bool) -> str:
+    """The ninth of the image with the fewest cells covered, in words."""
+    rows, columns = CELLS
+    best, words = 2.0, ""
+    for i, level in enumerate(("top", "middle", "bottom")):
+        for j, side in enumerate(("left", "middle", "right")):
+            part = cells[i * rows // 3 : (i + 1) * rows // 3, j * columns // 3 : (j + 1) * columns // 3]
+            if part.mean() < best:
+                best = float(part.mean())
+                words = (
+                    "in the middle of the image" if level == side else f"at the {level} {side} of the image"
+                )
+                if "middle" in (level, side) and level != side:
+                    edge = side if level == "middle" else level
+                    words = f"at the {edge} edge of the image"
+    return words

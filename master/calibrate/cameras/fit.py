@@ -1,0 +1,205 @@
+"""All cameras that saw a board in one bundle: lenses, places, and the board's shape; what is wrong is left out.
+
+every camera alone -> links between them -> robust bundle <-> judge images and views -> plain least squares
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.errors import FitError
+from master.calibrate.cameras.alone import MIN_VIEWS, Rejection, fit_alone
+from master.calibrate.cameras.boards import board_corners
+from master.calibrate.cameras.bundle import Bundle, Free, Observation, Solution, predict, rms, solve
+from master.calibrate.cameras.judge import Seen, Shot, judge, place_boards
+from master.calibrate.cameras.links import link
+from master.calibrate.cameras.views import BoardViews
+
+MIN_SHARED = 3  # views that a camera must share with the others: one can be wrong, two cannot outvote it
+_ROUNDS = 6
+_SURE = 3.0  # standard deviations that a term of the distortion must be away from zero
+_MIN_SHAPE_VIEWS = 6  # fewer cannot tell a bent board from a bent lens
+_TANGENTIAL = (6, 7)
+_TERMS = ((8,), _TANGENTIAL, (5,), (4,))  # k3, p1 and p2, k2, k1: in this order they are given up
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CamerasFit:
+    """The result.
+
+    Attributes:
+        views: What was seen.
+        shots: The accepted images.
+        observations: Their corners, in the order of `shots`.
+        solution: Plain least squares over them; the rig's frame is that of the first camera.
+        rejected: Images that are not used, and views whose cameras do not agree.
+        flat_rms_px: Rms with the board taken as drawn; equal to `rms_px` where its shape was not estimated.
+    """
+
+    views: BoardViews
+    shots: tuple[Shot, ...]
+    observations: tuple[Observation, ...]
+    solution: Solution
+    rejected: tuple[Rejection, ...]
+    flat_rms_px: float
+
+    @property
+    def rms_px(self) -> float:
+        """Reprojection rms over all accepted images."""
+        return rms(self.solution.residuals)
+
+    def of(self, camera: str) -> tuple[int, ...]:
+        """Indices of the accepted images of a camera."""
+        return tuple(i for i, shot in enumerate(self.shots) if shot.camera == camera)
+
+    def shared(self) -> tuple[int, ...]:
+        """Indices of the accepted images in whose place of the board another camera has one too."""
+        places = [shot.place for shot in self.shots]
+        return tuple(i for i, place in enumerate(places) if places.count(place) > 1)
+
+
+def fit_cameras(
+    views: BoardViews, held: Mapping[str, Float] | None = None, *, shaped: bool = True
+) -> CamerasFit:
+    """Lenses and places of all cameras of `views`.
+
+    Args:
+        views: What was seen.
+        held: Camera -> known lens (9,), in the order of `bundle.LENS`; those of the others are estimated.
+        shaped: Estimate the board's shape too; False: it is exactly as drawn (a print on glass, a screen).
+
+    Raises:
+        FitError: The views do not determine what is asked for; the text says what is missing.
+    """
+    held = held or {}
+    alone = {camera: fit_alone(views, camera, held.get(camera)) for camera in views.cameras}
+    links = link(views.board, views.cameras, {camera: fit.T_camera_board for camera, fit in alone.items()})
+    seen = Seen(views, links.turned)
+    drawn = board_corners(views.board)
+    bundle = Bundle(
+        lenses=np.stack([alone[camera].lens for camera in views.cameras]),
+        T_camera_rig=np.stack([links.T_camera_rig[camera] for camera in views.cameras]),
+        T_rig_board=np.zeros((0, 4, 4)),
+        drawn_m=drawn,
+        shape_m=np.zeros_like(drawn),
+    )
+    candidates = tuple(
+        Shot(view.name, camera, view.name)
+        for view in views.views
+        for camera in views.cameras
+        if view.name in alone[camera].T_camera_board
+    )
+    sigma = max(fit.sigma_px for fit in alone.values())
+    free = _free(views, held)
+    shots, notes = candidates, tuple[Rejection, ...]()
+    # At first the lenses stay as each camera by itself found them: they would bend to suit a board that moved.
+    stages = [replace(free, lenses=np.zeros_like(free.lenses))] + [free] * _ROUNDS
+    for stage in stages:
+        _check_enough(views, shots, held)
+        bundle, sigma = _robust(seen, shots, bundle, stage, sigma, shaped=shaped)
+        judged, notes = judge(seen, candidates, bundle)
+        if judged == shots and stage is free:
+            break
+        shots = judged
+    _check_enough(views, shots, held)
+    first = tuple(no for fit in alone.values() for no in fit.rejected)
+    return _final(seen, shots, bundle, free, sigma, first + notes, shaped=shaped)
+
+
+def _free(views: BoardViews, held: Mapping[str, Float]) -> Free:
+    """Everything but what is held, the place of the first camera, and the last term of the distortion."""
+    lenses = np.array([[camera not in held and term < 8 for term in range(9)] for camera in views.cameras])
+    return Free(lenses, np.arange(len(views.cameras)) > 0, shape=False)
+
+
+def _robust(
+    seen: Seen, shots: Sequence[Shot], bundle: Bundle, free: Free, sigma: float, *, shaped: bool
+) -> tuple[Bundle, float]:
+    """The bundle by Cauchy's loss, its scale three robust standard deviations, first flat and then with its shape."""
+    observations = seen.observations(shots)
+    bundle = place_boards(observations, bundle)
+    for shape in (False, True):
+        if shape and not (shaped and len(bundle.T_rig_board) >= _MIN_SHAPE_VIEWS):
+            break
+        bundle = solve(observations, bundle, replace(free, shape=shape), 3 * sigma, sigma).bundle
+        distances = [np.linalg.norm(o.uv - predict(bundle, o), axis=1) for o in observations]
+        sigma = max(float(np.median(np.concatenate(distances))) / 1.1774, 1e-3)
+    return bundle, sigma
+
+
+def _final(
+    seen: Seen,
+    shots: tuple[Shot, ...],
+    start: Bundle,
+    free: Free,
+    sigma: float,
+    rejected: tuple[Rejection, ...],
+    *,
+    shaped: bool,
+) -> CamerasFit:
+    observations = seen.observations(shots)
+    start = place_boards(observations, start)
+    shape = shaped and len(start.T_rig_board) >= _MIN_SHAPE_VIEWS
+    estimated: Bool = np.any(free.lenses, axis=1, keepdims=True)
+    lenses: Bool = np.repeat(estimated, 9, axis=1)
+    while True:
+        # From the start anew each time: what a term that is not determined did to the others must not stay.
+        begin = replace(start, lenses=np.where(lenses | ~estimated, start.lenses, _bare(start.lenses)))
+        solution = solve(observations, begin, Free(lenses, free.cameras, shape), None, sigma)
+        fewer = _determined(solution, lenses)
+        if np.array_equal(fewer, lenses):
+            break
+        lenses = fewer
+    flat = solution
+    if shape:
+        begin = replace(solution.bundle, shape_m=np.zeros_like(start.shape_m))
+        flat = solve(observations, begin, Free(lenses, free.cameras, shape=False))
+    return CamerasFit(seen.views, shots, observations, solution, rejected, rms(flat.residuals))
+
+
+def _bare(lenses: Float) -> Float:
+    """The lenses without distortion."""
+    return np.where(np.arange(9) < 4, lenses, 0.0)
+
+
+def _determined(solution: Solution, lenses: Bool) -> Bool:
+    """The free terms (C, 9), less the next one of each camera that may as well be zero."""
+    kept = lenses.copy()
+    for camera, lens in enumerate(solution.bundle.lenses):
+        for term in _TERMS:
+            index = list(term)
+            if not kept[camera, index].any():
+                continue
+            at = 9 * camera + np.array(index)
+            covariance = solution.covariance[np.ix_(at, at)]
+            square = float(lens[index] @ cast(Float, np.linalg.solve(covariance, lens[index])))
+            if square < len(index) * _SURE**2:
+                kept[camera, index] = False
+                break
+            if term != _TANGENTIAL and not kept[camera, _TANGENTIAL[0]]:
+                break  # a radial term that is needed needs those before it
+    return kept
+
+
+def _check_enough(views: BoardViews, shots: Sequence[Shot], held: Mapping[str, Float]) -> None:
+    """Refuse where too little is left.
+
+    Raises:
+        FitError: A camera has too few images, or shares too few views.
+    """
+    places = [shot.place for shot in shots]
+    for camera in views.cameras:
+        own = [shot for shot in shots if shot.camera == camera]
+        if camera not in held and len(own) < max(MIN_VIEWS, len(views.of(camera)) / 2):
+            raise FitError(
+                f"camera {camera!r}: only {len(own)} of {len(views.of(camera))} images agree with each other"
+            )
+        shared = sum(places.count(shot.place) > 1 for shot in own)
+        if len(views.cameras) > 1 and shared < MIN_SHARED:
+            raise FitError(
+                f"camera {camera!r} shares {shared} good views of the board with the other cameras, at least"
+                f" {MIN_SHARED} are needed (better 15)"
+            )

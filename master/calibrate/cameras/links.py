@@ -1,0 +1,106 @@
+"""How the cameras stand to each other, from views that two of them share; wrong views are outvoted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import FitError
+from common.geometry import fit_rigid, invert, transform
+from master.calibrate.cameras.boards import Board, board_corners, orderings
+
+Places = Mapping[str, Mapping[str, Float]]
+"""Camera -> view -> T_camera_board (4, 4) [m]."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Links:
+    """First estimate of a rig.
+
+    Attributes:
+        T_camera_rig: Camera -> (4, 4) [m]; the rig's frame is that of the first camera.
+        turned: View -> camera -> order (N,): what the camera calls corner i is corner order[i] of the view.
+    """
+
+    T_camera_rig: Mapping[str, Float]
+    turned: Mapping[str, Mapping[str, Int]]
+
+
+def link(board: Board, cameras: Sequence[str], places: Places) -> Links:
+    """Chain the cameras by the pairs that share most views.
+
+    Raises:
+        FitError: The cameras fall into groups that share no view; the text names them.
+    """
+    drawn = board_corners(board)
+    # Corner i of a turned board is corner order[i] of the upright one.
+    turns = [(order, fit_rigid(drawn, drawn[order])) for order in orderings(board)]
+    known: dict[str, Float] = {cameras[0]: np.eye(4)}
+    while len(known) < len(cameras):
+        shared = {
+            (a, b): sorted(places[a].keys() & places[b].keys())
+            for a in known
+            for b in cameras
+            if b not in known
+        }
+        a, b = max(shared, key=lambda pair: len(shared[pair]))
+        if not shared[a, b]:
+            raise FitError(_islands(cameras, places))
+        known[b] = _relative(drawn, turns, places[b], places[a], shared[a, b]) @ known[a]
+    return Links(known, _turned(drawn, turns, known, places))
+
+
+def _relative(
+    drawn: Float,
+    turns: list[tuple[Int, Float]],
+    to: Mapping[str, Float],
+    of: Mapping[str, Float],
+    views: list[str],
+) -> Float:
+    """T_to_of (4, 4) [m]: of all views' estimates, the one from which the others are least far in the middle."""
+    candidates = [np.stack([to[view] @ turn @ invert(of[view]) for _, turn in turns]) for view in views]
+    points = [transform(of[view], drawn) for view in views]
+
+    def distance(T: Float) -> float:
+        """Median over views of how far [m] the board is from where T puts it, in the ordering that suits."""
+        off = [
+            min(float(np.linalg.norm(transform(T, p) - transform(other, p), axis=1).mean()) for other in own)
+            for own, p in zip(candidates, points, strict=True)
+        ]
+        return float(np.median(off))
+
+    return min((T for own in candidates for T in own), key=distance)
+
+
+def _turned(
+    drawn: Float, turns: list[tuple[Int, Float]], known: Mapping[str, Float], places: Places
+) -> dict[str, dict[str, Int]]:
+    """For each view the order of each camera's corners that agrees best with the first camera of the view."""
+    turned: dict[str, dict[str, Int]] = {}
+    for view in sorted(set[str]().union(*places.values())):
+        first: Float | None = None
+        turned[view] = {}
+        for camera in known:
+            if view not in places[camera]:
+                continue
+            in_rig = [invert(known[camera]) @ places[camera][view] @ turn for _, turn in turns]
+            best = 0
+            if first is None:
+                first = in_rig[0]
+            else:
+                there = transform(first, drawn)
+                best = int(np.argmin([np.linalg.norm(transform(T, drawn) - there) for T in in_rig]))
+            turned[view][camera] = turns[best][0]
+    return turned
+
+
+def _islands(cameras: Sequence[str], places: Places) -> str:
+    groups: list[list[str]] = []
+    for camera in cameras:
+        touching = [g for g in groups if any(places[camera].keys() & places[other].keys() for other in g)]
+        groups = [g for g in groups if g not in touching] + [
+            [*(name for g in touching for name in g), camera]
+        ]
+    named = " and ".join("{" + ", ".join(group) + "}" for group in groups)
+    return f"the cameras {named} share no view of the board: show it to both groups at once"

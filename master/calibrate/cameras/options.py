@@ -1,0 +1,43 @@
+"""How a board is named on the command line."""
+
+import re
+from typing import Annotated
+
+import typer
+
+from common.errors import CalibrationError
+from master.calibrate.cameras.boards import Board, Charuco, Checkerboard
+
+Size = Annotated[
+    str,
+    typer.Option(
+        "--board",
+        help="COLUMNSxROWS: inner corners of a checkerboard, squares of a ChArUco board (--marker-mm).",
+    ),
+]
+SquareMm = Annotated[float, typer.Option(help="Side of a square in mm, measured on the print.")]
+MarkerMm = Annotated[float | None, typer.Option(help="Side of a marker in mm: the board is a ChArUco board.")]
+Dictionary = Annotated[str, typer.Option(help="Family of its markers.")]
+
+
+def board_of(size: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+    """The board that the options name.
+
+    Raises:
+        CalibrationError: The size is not two numbers, or there can be no such board.
+    """
+    found = re.fullmatch(r"(\d+)x(\d+)", size)
+    if found is None:
+        raise CalibrationError(f"--board {size!r}: expected COLUMNSxROWS, for example 9x6")
+    columns, rows = int(found[1]), int(found[2])
+    if marker_mm is None:
+        return Checkerboard(columns, rows, square_mm * 1e-3)
+    return Charuco(columns, rows, square_mm * 1e-3, marker_mm * 1e-3, dictionary)
+
+
+def options_of(board: Board) -> str:
+    """The options that say `board`: `board_of` of them is that board again."""
+    text = f"--board {board.columns}x{board.rows} --square-mm {1e3 * board.square_m:g}"
+    if isinstance(board, Charuco):
+        text += f" --marker-mm {1e3 * board.marker_m:g} --dictionary {board.dictionary}"
+    return text

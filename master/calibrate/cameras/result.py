@@ -1,0 +1,177 @@
+"""What the fits of cameras say: lenses and places with their uncertainty, or why the views are not enough."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import Intrinsics, Matrix4
+from common.errors import FitError
+from common.geometry import invert, skew
+from master.calibrate.cameras.alone import Rejection
+from master.calibrate.cameras.audit import PairAudit, audit_pair, pairs_with_views
+from master.calibrate.cameras.bundle import rms
+from master.calibrate.cameras.coverage import Coverage, advice, coverage
+from master.calibrate.cameras.fit import CamerasFit
+from master.calibrate.cameras.lens_files import camera_model, intrinsics_of, matrix_of
+
+MOST_FOCAL_SD = 0.01  # of the focal length: one percent of every depth
+MOST_RMS = 0.0025  # of the image's width: five times what poor pictures of a good board leave
+LEAST_TILT_DEG = 10.0
+LEAST_COVER = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LensResult:
+    """One camera.
+
+    Attributes:
+        intrinsics: As written to the file.
+        sd: Standard deviations (9,) in the order of `bundle.LENS`; 0: held or left at zero.
+        rms_px: Reprojection rms over its accepted images.
+        views: Number of accepted images.
+        covered: What they cover.
+        estimated: False: the lens was given, only used.
+    """
+
+    intrinsics: Intrinsics
+    sd: Float
+    rms_px: float
+    views: int
+    covered: Coverage
+    estimated: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CamerasResult:
+    """All cameras.
+
+    Attributes:
+        lenses: Camera -> its lens.
+        T_rig_camera: Camera -> its place, as written to the file; the first camera is the rig's frame.
+        place_sd: Camera -> standard deviations of its centre (3,) [m] and turn (3,) [rad].
+        baseline_sd_m: Camera -> standard deviation of its distance from the first [m].
+        rms_px: Reprojection rms over all accepted images that share their view; one camera: over all.
+        flat_rms_px: The same of all accepted images, had the board been taken as drawn.
+        shape_mm: How far the board's corners are from the drawn ones, in its plane and out of it, root mean square.
+        pairs: Audit of each two cameras that share views.
+        views: Number of views that cameras share; one camera: of all.
+        rejected: What was left out, and why.
+    """
+
+    lenses: Mapping[str, LensResult]
+    T_rig_camera: Mapping[str, Matrix4]
+    place_sd: Mapping[str, Float]
+    baseline_sd_m: Mapping[str, float]
+    rms_px: float
+    flat_rms_px: float
+    shape_mm: tuple[float, float]
+    pairs: tuple[PairAudit, ...]
+    views: int
+    rejected: tuple[Rejection, ...]
+
+
+def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
+    """The numbers of a fit.
+
+    Raises:
+        FitError: They are not worth writing: a focal length is not determined, or a lens barely covered.
+    """
+    names = fit.views.cameras
+    bundle = fit.solution.bundle
+    lenses = {name: _lens(fit, index, name not in held) for index, name in enumerate(names)}
+    places = {name: matrix_of(invert(bundle.T_camera_rig[i])) for i, name in enumerate(names)}
+    models = {
+        name: camera_model(lenses[name].intrinsics, fit.views.sizes_px[name], places[name]) for name in names
+    }
+    shared: dict[str, dict[str, Float]] = {}
+    for i in fit.shared():
+        corners = np.full((len(bundle.drawn_m), 2), np.nan)
+        corners[fit.observations[i].corners] = fit.observations[i].uv
+        shared.setdefault(fit.shots[i].place, {})[fit.shots[i].camera] = corners
+    pairs = tuple(
+        audit_pair(fit.views.board, pair, (models[pair[0]], models[pair[1]]), views)
+        for pair, views in pairs_with_views(shared).items()
+    )
+    used = fit.shared() if len(names) > 1 else range(len(fit.shots))
+    shape = 1e3 * bundle.shape_m
+    centres = {name: _centre_sd(fit, i) for i, name in enumerate(names)}
+    return CamerasResult(
+        lenses=lenses,
+        T_rig_camera=places,
+        place_sd={name: sd for name, (sd, _) in centres.items()},
+        baseline_sd_m={name: sd for name, (_, sd) in centres.items()},
+        rms_px=rms([fit.solution.residuals[i] for i in used]),
+        flat_rms_px=fit.flat_rms_px,
+        shape_mm=(
+            float(np.sqrt((shape[:, :2] ** 2).sum(axis=1).mean())),
+            float(np.sqrt((shape[:, 2] ** 2).mean())),
+        ),
+        pairs=pairs,
+        views=len(shared) if len(names) > 1 else len(fit.shots),
+        rejected=fit.rejected,
+    )
+
+
+def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
+    name = fit.views.cameras[index]
+    bundle, own = fit.solution.bundle, fit.of(name)
+    T_camera_board = np.stack(
+        [bundle.T_camera_rig[index] @ bundle.T_rig_board[fit.observations[i].view] for i in own]
+    )
+    uv = [fit.observations[i].uv for i in own]
+    covered = coverage(fit.views.sizes_px[name], uv, T_camera_board, bundle.drawn_m.mean(axis=0))
+    lens, sd = bundle.lenses[index], fit.solution.lens_sd(index)
+    error = rms([fit.solution.residuals[i] for i in own])
+    if error > MOST_RMS * fit.views.sizes_px[name][0]:
+        raise FitError(
+            f"camera {name!r}: corners are off by {error:.2f} px rms over {len(own)} images: they do not agree on any"
+            " place of the board; is it rigid and flat, are columns and rows right, did the zoom or focus change?"
+        )
+    if estimated:
+        _check_determined(name, float(sd[0] / lens[0]), covered, len(own))
+    return LensResult(
+        intrinsics=intrinsics_of(lens),
+        sd=sd,
+        rms_px=error,
+        views=len(own),
+        covered=covered,
+        estimated=estimated,
+    )
+
+
+def _check_determined(camera: str, focal_sd: float, covered: Coverage, views: int) -> None:
+    what = ""
+    if covered.tilt_spread_deg < LEAST_TILT_DEG or not focal_sd <= MOST_FOCAL_SD:
+        what = (
+            f"the focal length is not determined (standard deviation {min(100 * focal_sd, 999):.2g} %, at most"
+            f" {100 * MOST_FOCAL_SD:g} %): the board's tilts lie within {covered.tilt_spread_deg:.0f}° of each other"
+        )
+    elif covered.share < LEAST_COVER:
+        what = (
+            f"corners cover {100 * covered.share:.0f} % of the image, at least {100 * LEAST_COVER:.0f} %"
+            " are needed: beyond them the distortion would be a guess"
+        )
+    if what:
+        wish = advice(covered)
+        raise FitError(f"camera {camera!r}: {what}, in {views} views{'; ' * bool(wish)}{wish}")
+
+
+def _centre_sd(fit: CamerasFit, index: int) -> tuple[Float, float]:
+    """Standard deviations of a camera's centre (3,) [m] and turn (3,) [rad], and of its distance from the first [m].
+
+    The centre is -R' t of T_camera_rig; turning by w on the left and moving by d moves it by -R' (d + t x w).
+    """
+    bundle = fit.solution.bundle
+    rotation, t = bundle.T_camera_rig[index][:3, :3], bundle.T_camera_rig[index][:3, 3]
+    at = 9 * len(bundle.lenses) + 6 * index
+    covariance = fit.solution.covariance[at : at + 6, at : at + 6]
+    by_step = -rotation.T @ np.concatenate([skew(t), np.eye(3)], axis=1)
+    centre = by_step @ covariance @ by_step.T
+    sd = np.sqrt(np.concatenate([np.diag(centre), np.diag(covariance)[:3]]))
+    length = float(np.linalg.norm(t))
+    if length == 0.0:
+        return sd, 0.0
+    way = -rotation.T @ t / length
+    return sd, float(np.sqrt(way @ centre @ way))

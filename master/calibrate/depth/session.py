@@ -1,0 +1,214 @@
+"""A sweep by hand: the target is put at one distance after another, and measured there while it stands still.
+
+Nothing is paired: the target stands still, so each camera's centroids are averaged on their own.
+"""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.clock import Clock
+from common.errors import FitError
+from common.messages import MarkerDetections
+from master.app import Source
+from master.calibrate.depth.sweep import FARTHEST_M, Sweep
+
+STILL_PX = 0.2  # drift over the reading, five times the noise of a quarter's mean; 0.5 % of the depth at 1 m
+SHAKE_PX = 0.5  # standard deviation of single frames, five times the noise of a good centroid
+PATIENCE_S = 10.0
+_QUARTERS = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reading:
+    """The target at rest.
+
+    Attributes:
+        uv: (2, 2) mean centroids [px] in the two cameras.
+        area_px2: (2,) mean areas.
+        sigma_px: Standard deviation of one frame pair's disparity [px].
+        frames: (2,) frames averaged.
+        rate_hz: (2,) rate of the cameras, by their stamps.
+    """
+
+    uv: Float
+    area_px2: Float
+    sigma_px: float
+    frames: Int
+    rate_hz: Float
+
+
+class Meter:
+    """Push machine: averages one marker in two cameras. Holds the frames of the last `seconds`, and why it waits."""
+
+    def __init__(self, cameras: tuple[str, str], marker: int, frames: int, seconds: float) -> None:
+        """Wait for `frames` frames of each camera over `seconds` during which the marker stands still."""
+        self._cameras, self._marker = cameras, marker
+        self._frames, self._span_ns = max(frames, 2 * _QUARTERS), round(seconds * 1e9)
+        self._kept: tuple[deque[tuple[int, Float]], ...] = (deque(), deque())
+        self.trouble = f"no frames from {' and '.join(cameras)}"
+
+    def push(self, message: MarkerDetections) -> Reading | None:
+        """Take one camera's detections; return the reading once it is complete."""
+        if message.camera not in self._cameras:
+            return None
+        mine = self._kept[self._cameras.index(message.camera)]
+        m = self._marker
+        if np.isnan(message.uv[m, 0]):
+            mine.clear()
+        else:
+            mine.append((message.t_ns, np.array([*message.uv[m], message.area[m]])))
+            while len(mine) > self._frames and mine[-1][0] - mine[1][0] >= self._span_ns:
+                mine.popleft()
+        return self._judge()
+
+    @property
+    def progress(self) -> float:
+        """Share of what is needed, 0...1, of the camera that is behind."""
+        return min(
+            min(len(kept) / self._frames, (kept[-1][0] - kept[0][0]) / self._span_ns if kept else 0.0, 1.0)
+            for kept in self._kept
+        )
+
+    def _judge(self) -> Reading | None:
+        for camera, kept in zip(self._cameras, self._kept, strict=True):
+            if len(kept) < self._frames or kept[-1][0] - kept[0][0] < self._span_ns:
+                self.trouble = (
+                    f"camera {camera!r} does not see the target all the time: it is outside the image, hidden, or the"
+                    " camera is silent"
+                )
+                return None
+        seen = [np.array([values for _, values in kept]) for kept in self._kept]
+        drift = max(_drift(values[:, :2]) for values in seen)
+        shake = max(float(values[:, :2].std(axis=0).max()) for values in seen)
+        if drift > STILL_PX or shake > SHAKE_PX:
+            self.trouble = (
+                f"the target moves: its image drifts by {drift:.2f} px and shakes by {shake:.2f} px; {STILL_PX} and"
+                f" {SHAKE_PX} are allowed"
+            )
+            return None
+        times = [np.array([t for t, _ in kept], np.int64) for kept in self._kept]
+        return Reading(
+            uv=np.stack([values[:, :2].mean(axis=0) for values in seen]),
+            area_px2=np.array([values[:, 2].mean() for values in seen]),
+            sigma_px=float(np.hypot(*(values[:, 0].std(ddof=1) for values in seen))),
+            frames=np.array([len(values) for values in seen]),
+            rate_hz=np.array([(t.size - 1) / ((t[-1] - t[0]) * 1e-9) for t in times]),
+        )
+
+
+def _drift(uv: Float) -> float:
+    """Largest distance between the means of the quarters of a reading (T, 2) [px]."""
+    means = np.array([quarter.mean(axis=0) for quarter in np.array_split(uv, _QUARTERS)])
+    return float(np.ptp(means, axis=0).max())
+
+
+def measure(source: Source, meter: Meter, clock: Clock, progress: Callable[[float], None]) -> Reading:
+    """Read the target that stands before the cameras now.
+
+    Raises:
+        FitError: It did not stand still, or was not seen, for ten seconds; says which.
+    """
+    while source.get(0.0) is not None:  # what was seen while it was being put there
+        pass
+    since_ns = clock.now_ns()
+    while clock.now_ns() - since_ns < PATIENCE_S * 1e9:
+        message = source.get(0.1)
+        if message is None or message.t_ns < since_ns:
+            continue
+        reading = meter.push(message)
+        progress(meter.progress)
+        if reading is not None:
+            return reading
+    raise FitError(meter.trouble)
+
+
+def run_session(
+    source: Source,
+    cameras: tuple[str, str],
+    marker: int,
+    distances: Sequence[float],
+    *,
+    frames: int,
+    seconds: float,
+    clock: Clock,
+    ask: Callable[[str], str | None],
+    say: Callable[[str], None],
+    progress: Callable[[float], None],
+    keep: Callable[[Sweep], None],
+) -> Sweep:
+    """Lead a person through a sweep.
+
+    Args:
+        source: Detections, times on `clock`.
+        cameras: First (left) and second camera.
+        marker: Index of the target's marker.
+        distances: Where to put the target [m].
+        frames: Frames of each camera to average, at least.
+        seconds: Time over which, at least.
+        clock: The master's.
+        ask: Shows a prompt and returns the answer; None: nobody answers any more.
+        say: Told one line for each result.
+        progress: Told the share of a reading that is done.
+        keep: Given the sweep so far after each reading, to save it.
+
+    Returns:
+        All places measured, in the order of measurement; it may be empty.
+    """
+    done: list[tuple[float, Reading]] = []
+    waiting = deque(distances)
+    while waiting:
+        answer = ask(f"target at {waiting[0]:.3f} m, then Enter (its true distance; s to skip; q to end): ")
+        answer = None if answer is None else answer.strip().lower()
+        if answer is None or answer == "q":
+            break
+        distance = waiting[0] if answer == "" else _number(answer)
+        if answer == "s" or distance is None:
+            if answer == "s":
+                waiting.popleft()
+            else:
+                say(f"{answer!r}: neither a distance in metres, nor s, nor q")
+            continue
+        try:
+            reading = measure(source, Meter(cameras, marker, frames, seconds), clock, progress)
+        except FitError as error:
+            say(f"{distance:.3f} m: not measured: {error}; try again")
+            continue
+        waiting.popleft()
+        done.append((distance, reading))
+        say(_told(distance, reading, cameras))
+        keep(_sweep(done))
+    return _sweep(done)
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0.0 < value < FARTHEST_M else None
+
+
+def _told(distance: float, reading: Reading, cameras: tuple[str, str]) -> str:
+    disparity = float(reading.uv[0, 0] - reading.uv[1, 0])
+    rates = ", ".join(f"{c} {r:.1f} Hz" for c, r in zip(cameras, reading.rate_hz.tolist(), strict=True))
+    return (
+        f"{distance:.3f} m: disparity {disparity:.3f} px, standard deviation {reading.sigma_px:.3f} px,"
+        f" {int(reading.frames.min())} frames (cameras: {rates})"
+    )
+
+
+def _sweep(done: Sequence[tuple[float, Reading]]) -> Sweep:
+    uv = np.stack([r.uv for _, r in done], axis=1) if done else np.empty((2, 0, 2))
+    return Sweep(
+        distance_m=np.array([d for d, _ in done], np.float64),
+        disparity_px=uv[0, :, 0] - uv[1, :, 0],
+        uv=uv,
+        area_px2=np.stack([r.area_px2 for _, r in done], axis=1) if done else np.empty((2, 0)),
+        sigma_px=np.array([r.sigma_px for _, r in done], np.float64),
+        frames=np.array([int(r.frames.min()) for _, r in done], np.int64),
+        place=tuple(f"reading {i}" for i in range(1, len(done) + 1)),
+    )

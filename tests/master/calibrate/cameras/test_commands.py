@@ -1,0 +1,208 @@
+"""The commands on real pictures: the numbers asked for, the files they write, and what they say to bad input."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from common.calibration import CameraCalibration, PowerLawCalibration, RigCalibration, load, save
+from common.camera_model import CameraModel
+from common.errors import CalibrationError, PhalanxError, RecordingError
+from common.geometry import invert
+from master.calibrate.cameras.boards import Checkerboard, grid_edges
+from master.calibrate.cameras.detect import find_board
+from master.calibrate.cameras.image_sets import image_sets
+from master.calibrate.cli import calibrate_app
+from tests.master.calibrate.cameras.board_images import render
+from tests.master.calibrate.cameras.board_scenes import scene
+
+BOARD = ["--board", "9x6", "--square-mm", "25"]
+
+
+def run(*arguments: object) -> str:
+    """What a command says.
+
+    Raises:
+        PhalanxError: What it refuses.
+    """
+    done = CliRunner().invoke(calibrate_app(), [str(a) for a in arguments])
+    if done.exception is not None and not isinstance(done.exception, SystemExit):
+        raise done.exception
+    assert done.exit_code == 0, done.output
+    return done.output
+
+
+@pytest.fixture(scope="module")
+def pictures(datasets: Path) -> Path:
+    return datasets / "opencv_stereo"
+
+
+@pytest.fixture(scope="module")
+def written(pictures: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object], str]:
+    """Tree, numbers and words of one stereo calibration of the real pictures."""
+    out = tmp_path_factory.mktemp("stereo")
+    said = run(
+        "stereo", pictures, *BOARD, "--rig", "bench", "--calibration", out, "--out", out,
+        "--json", out / "numbers.json", "--picture", out / "picture.png",
+    )  # fmt: skip
+    return out, json.loads((out / "numbers.json").read_text()), said
+
+
+def test_real_pictures_give_the_published_lens_and_a_good_pair(
+    pictures: Path, written: tuple[Path, dict[str, object], str]
+) -> None:
+    out, numbers, said = written
+    published = cv2.FileStorage(str(pictures / "left_intrinsics.yml"), cv2.FILE_STORAGE_READ)
+    focal = float(published.getNode("camera_matrix").mat()[0, 0])
+    left = load(out / "cameras" / "left.json", CameraCalibration)
+    assert left.intrinsics is not None
+    assert abs(left.intrinsics.fx_px - focal) < 2.5
+    assert isinstance(numbers["rms_px"], float)
+    assert numbers["rms_px"] < 0.35
+    assert "stereo rms" in said
+    picture = cv2.imread(str(out / "picture.png"))
+    assert picture is not None
+    assert len(picture) > 500
+
+
+def test_squares_triangulated_from_the_written_files_are_25_mm(
+    pictures: Path, written: tuple[Path, dict[str, object], str]
+) -> None:
+    # By OpenCV alone: undistort, triangulate, measure; also with its own plain corners in the published size.
+    out, numbers, _ = written
+    rig = load(out / "rigs" / "bench.json", RigCalibration)
+    models = {
+        name: CameraModel.of(load(out / "cameras" / f"{name}.json", CameraCalibration), rig.camera_pose(name))
+        for name in rig.cameras
+    }
+    board = Checkerboard(9, 6, 0.025)
+    sides: list[float] = []
+    for name, images in image_sets(pictures):
+        seen = {camera: find_board(board, read()) for camera, read in images.items()}
+        points = [
+            cv2.undistortPoints(
+                s.corners_px.reshape(-1, 1, 2), models[c].matrix, models[c].distortion
+            ).reshape(-1, 2)
+            for c, s in seen.items()
+            if s is not None
+        ]
+        assert len(points) == 2, name
+        T = invert(models["right"].T_rig_camera) @ models["left"].T_rig_camera
+        homogeneous = cv2.triangulatePoints(np.eye(4)[:3], T[:3], points[0].T, points[1].T)
+        corners = (homogeneous[:3] / homogeneous[3]).T
+        edges = grid_edges(board)
+        sides += [1e3 * float(np.linalg.norm(corners[a] - corners[b])) for a, b in edges]
+    assert np.mean(sides) == pytest.approx(25.0, abs=0.3)
+    assert np.std(sides) < 0.3
+    pairs = numbers["pairs"]
+    assert isinstance(pairs, list)
+    assert pairs[0]["edge_mean_mm"] == pytest.approx(np.mean(sides), abs=0.05)
+
+
+def test_files_carry_provenance_and_say_what_is_not_measured(
+    written: tuple[Path, dict[str, object], str],
+) -> None:
+    out, _, said = written
+    camera = load(out / "cameras" / "left.json", CameraCalibration)
+    how = camera.provenance["intrinsics"]
+    assert how.tool == "calibrate stereo"
+    assert how.data == ("opencv_stereo",)
+    assert "neutral" in how.note
+    assert "neutral" in said
+    rig = load(out / "rigs" / "bench.json", RigCalibration)
+    assert rig.cameras == ("left", "right")
+    assert rig.provenance["T_rig_camera"].residual["rms_px"] < 0.35
+
+
+def _pictures_of(folder: Path, cameras: int = 2, views: int = 8) -> Path:
+    truth = scene(31, cameras, views)
+    for view in range(views):
+        for camera in truth.lenses:
+            file = folder / camera / f"{view:02d}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(file), render(truth, view, camera, seed=31))
+    return folder
+
+
+def test_a_rig_that_is_there_keeps_everything_but_the_places(tmp_path: Path) -> None:
+    views, out = _pictures_of(tmp_path / "views"), tmp_path / "calib"
+    run("intrinsics", views, *BOARD, "--calibration", out, "--out", out)
+    before = load(out / "cameras" / "right.json", CameraCalibration)
+    (out / "rigs").mkdir()
+    law = PowerLawCalibration(k_m=45.4, z=-1.03)
+    T_rig_right = ((1.0, 0.0, 0.0, 0.5), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    kept = RigCalibration(
+        version=1, name="pair", kind="markers", cameras=("right", "left"), hand="mine",
+        T_rig_camera={"right": T_rig_right, "left": T_rig_right}, power_law=law, depth_model="power_law",
+    )  # fmt: skip
+    save(out / "rigs" / "pair.json", kept)
+    said = run(
+        "stereo", views, *BOARD, "--rig", "pair", "--keep-intrinsics", "--calibration", out, "--out", out
+    )
+    assert "(held)" in said
+    rig = load(out / "rigs" / "pair.json", RigCalibration)
+    assert (rig.power_law, rig.depth_model, rig.hand, rig.cameras) == (
+        law,
+        "power_law",
+        "mine",
+        ("right", "left"),
+    )
+    assert rig.T_rig_camera["right"] == T_rig_right  # the rig's frame stays where it was
+    truth = scene(31, 2, 8).T_camera_rig
+    found = invert(rig.camera_pose("right")) @ rig.camera_pose("left")
+    assert 1e3 * np.linalg.norm((found - truth["right"] @ invert(truth["left"]))[:3, 3]) < 1.0
+    assert load(out / "cameras" / "right.json", CameraCalibration) == before
+
+
+def test_images_of_another_mode_than_the_file_are_refused(tmp_path: Path) -> None:
+    views, out = _pictures_of(tmp_path / "views", cameras=1), tmp_path / "calib"
+    run("intrinsics", views, *BOARD, "--calibration", out, "--out", out)
+    truth = scene(31, 1, 8)
+    for view, file in enumerate(sorted((views / "left").iterdir())):
+        small = cv2.resize(render(truth, view, "left", seed=31), (320, 240))
+        cv2.imwrite(str(file), small)
+    with pytest.raises(CalibrationError, match=r"320 x 240 px, its file says 640 x 480"):
+        run("intrinsics", views, *BOARD, "--calibration", out)
+
+
+def test_what_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="is not a folder"):
+        run("intrinsics", tmp_path / "no", *BOARD)
+    with pytest.raises(RecordingError, match="no images here"):
+        run("intrinsics", tmp_path, *BOARD)
+    (tmp_path / "left01.png").write_bytes(b"not a picture")
+    with pytest.raises(RecordingError, match=r"left01\.png: is no image"):
+        run("intrinsics", tmp_path, *BOARD)
+    with pytest.raises(RecordingError, match=r"no image is named right\*; the names begin with left"):
+        run("intrinsics", tmp_path, *BOARD, "--camera", "right", "--camera", "left")
+    cv2.imwrite(str(tmp_path / "left01.png"), np.zeros((64, 64), np.uint8))
+    with pytest.raises(PhalanxError, match="no checkerboard of 9 x 6 inner corners"):
+        run("intrinsics", tmp_path, *BOARD)
+
+
+def test_views_are_matched_by_the_rest_of_the_name(tmp_path: Path) -> None:
+    names = [
+        "left1.png",
+        "right1.png",
+        "left2.png",
+        "left10.png",
+        "right10.png",
+        "left_top1.png",
+        "notes.txt",
+    ]
+    for name in names:
+        (tmp_path / name).write_bytes(b"")
+    sets = image_sets(tmp_path, ["left", "right", "left_top"])
+    assert [(name, set(images)) for name, images in sets] == [
+        ("1", {"left", "right", "left_top"}),
+        ("2", {"left"}),
+        ("10", {"left", "right"}),
+    ]
+    assert {camera for _, images in image_sets(tmp_path) for camera in images} == {
+        "left",
+        "right",
+        "left_top",
+    }
