@@ -15,6 +15,7 @@ from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
 from master.ingest import Ingest
+from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
 from master.outputs.files import PosesFile
 from master.outputs.sink import Sink
@@ -141,7 +142,7 @@ class _Reporter:
         self._session = secrets.randbits(63)
         self._cameras, self._clock, self._bus = cameras, clock, bus
         self._ingest, self._pipeline, self._figures = ingest, pipeline, figures
-        self._tuning, self._watch = tuning, watch
+        self._tuning, self._watch, self._odd = tuning, watch, OddWatch(cameras)
         self._stop, self._say = stop, say
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -179,7 +180,7 @@ class _Reporter:
             if self._tuning is not None:
                 self._tuning.look()
                 self._watch.follow(self._tuning.setup)
-            lines = self._watch.look()
+            lines = self._watch.look() + self._odd.look(self._pipeline.counts)
             self._bus.publish("health", MASTER, self.health())
             heard = self._ingest.connected
             if heard != connected:
