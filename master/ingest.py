@@ -10,7 +10,8 @@ from collections import deque
 from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
 
-from common.clock import Clock, ClockEstimate
+from common.clock import Clock
+from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
 from common.messages import MarkerDetections

@@ -15,7 +15,8 @@ from math import hypot
 
 import msgspec
 
-from common.clock import Clock, ClockEstimate, OffsetEstimator
+from common.clock import Clock
+from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
 from common.messages import MarkerDetections, decode

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from common.clock import ClockEstimate
+from common.clock_offset import ClockEstimate
 from common.messages import MarkerDetections
 from master.phases import CameraPhases
 from master.rig import RigSetup

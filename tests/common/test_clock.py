@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.clock import ClockEstimate, OffsetEstimator, SkewedClock, SystemClock, Ticker
+from common.clock import SkewedClock, SystemClock, Ticker
+from common.clock_offset import ClockEstimate, OffsetEstimator
 from tests.network_helpers import ManualClock
 
 MS = 1_000_000

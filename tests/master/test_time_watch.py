@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import pytest
 
-from common.clock import ClockEstimate
+from common.clock_offset import ClockEstimate
 from common.messages import Health, MarkerDetections, decode, encode
 from master.phases import CameraPhases
 from master.rig import RigSetup

@@ -1,0 +1,237 @@
+"""The offset of a foreign clock: how another machine's monotonic clock runs against ours.
+
+Each machine has its own, so the master measures every slave's by the four time stamps of NTP (RFC 5905, section 8):
+
+    t1 master sends, t2 slave receives, t3 slave answers, t4 master receives
+    there = t2 - t1 = offset + delay          back = t4 - t3 = delay - offset
+
+A network only ever adds delay. So in a plot over time the offset is a line below all `there` and above
+all `-back`, and the best one is the middle of the widest corridor between the two clouds. For delays
+with an exponential tail that is the maximum likelihood (Jeske, "On maximum-likelihood estimation of
+clock offset", IEEE Trans. Commun. 53, 2005; the corridor's slope: Moon, Skelly & Towsley, "Estimation
+and removal of clock skew from network delay measurements", INFOCOM 1999). Each way has its own fastest
+echo: one way may queue as much as it likes, and no echo need be fast both ways, as NTP's filter wants.
+
+What no echo can see is a constant difference of the two ways. The offset is off by half of it, which
+is at most half of the corridor's width; where in there is unknown. An echo that leaves the corridor by
+more than its width would have arrived before it was sent: the remote clock was stepped, or a machine slept.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from math import hypot, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+
+AT_LEAST = 5  # echoes before the offset is used
+DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twice this (Pi: +-100 ppm each)
+WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
+SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
+SUSPECTS_AMONG = 20  # so many echoes
+_FLOOR_NS = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
+_EDGE_SHARE = 8  # one echo in so many tells how sharp the edge of a cloud is
+_SOFT_EDGE = 1.5  # few delays are quite as short as an exponential law would have it
+_WIDEST_DRIFT = 800e-6  # a clock that is slewed by its time service: 500 ppm
+_GRID: Float = np.linspace(-1.0, 1.0, 33)
+_ZOOMS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class ClockEstimate:
+    """How a remote clock runs against the local one.
+
+    Attributes:
+        t_ns: Local time at which `offset_ns` holds [ns]: the newest echo.
+        offset_ns: Remote minus local time [ns].
+        drift_ppm: Rate of the remote clock minus that of the local one [1e-6].
+        sigma_ns: Standard deviation of the offset from scatter [ns], if both ways of the network cost the same.
+        bound_ns: Half of the corridor's width, that is of the shortest round trip [ns]: however much the two
+            ways differ, the offset cannot be further off than that.
+        drift_sigma_ppm: Standard deviation of the drift.
+    """
+
+    t_ns: int
+    offset_ns: int
+    drift_ppm: float
+    sigma_ns: float
+    bound_ns: int
+    drift_sigma_ppm: float = 0.0
+
+    def to_local(self, t_remote_ns: int) -> int:
+        """Return the local time [ns] at which the remote clock shows `t_remote_ns`."""
+        drift = self.drift_ppm * 1e-6
+        elapsed = t_remote_ns - (self.t_ns + self.offset_ns)
+        return self.t_ns + elapsed - round(elapsed * (drift / (1.0 + drift)))
+
+    def to_remote(self, t_local_ns: int) -> int:
+        """Return what the remote clock shows [ns] at the local time `t_local_ns`."""
+        return t_local_ns + self.offset_ns + round((t_local_ns - self.t_ns) * (self.drift_ppm * 1e-6))
+
+    def scatter_at(self, t_local_ns: int) -> float:
+        """Standard deviation [ns] of the offset at a local time, if both ways cost the same.
+
+        It grows with the time since the newest echo, as the drift is known and as a crystal wanders.
+        """
+        drift = 1e-6 * hypot(self.drift_sigma_ppm, WANDER_PPM) * (t_local_ns - self.t_ns)
+        return hypot(self.sigma_ns, drift)
+
+    def sigma_at(self, t_local_ns: int) -> float:
+        """Standard deviation [ns] of a converted time, with what no echo can see.
+
+        Of the difference of the two ways only the bound is known, so any value within it is as likely as another.
+        """
+        return hypot(self.scatter_at(t_local_ns), self.bound_ns / sqrt(3.0))
+
+
+class _Echo(NamedTuple):
+    t_ns: int  # middle of the round trip, local clock
+    there_ns: int  # offset + delay
+    back_ns: int  # delay - offset
+
+
+class OffsetEstimator:
+    """Widest corridor between the echoes of a sliding window: offset, drift and their uncertainty.
+
+    Holds the echoes of the window and the estimate from them; after an echo that contradicts it, also those since.
+    Three such echoes among twenty are a stepped clock and start the estimate afresh from these. `steps` counts such
+    restarts, `refused` impossible echoes.
+    """
+
+    def __init__(self, window_ns: int = 20_000_000_000, capacity: int = 512, step_ns: int = 200_000) -> None:
+        """Keep at most `capacity` echoes of `window_ns`; a jump above `step_ns` can be a step."""
+        self._window_ns = window_ns
+        self._step_ns = step_ns
+        self._echoes: deque[_Echo] = deque(maxlen=capacity)
+        self._since: list[_Echo] = []
+        self._suspects = 0
+        self._estimate: ClockEstimate | None = None
+        self.steps = 0
+        self.refused = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether there are enough echoes for a usable estimate."""
+        return len(self._echoes) >= AT_LEAST
+
+    @property
+    def settled(self) -> bool:
+        """Whether there are enough echoes, and none that contradict: no need to hurry."""
+        return len(self._echoes) >= 2 * AT_LEAST and not self._suspects
+
+    def push(self, t1_ns: int, t2_ns: int, t3_ns: int, t4_ns: int) -> None:
+        """Take one echo: t1, t4 on the local clock, t2, t3 on the remote clock [ns]."""
+        if (t4_ns - t1_ns) - (t3_ns - t2_ns) < 0 or t4_ns < t1_ns or t3_ns < t2_ns:
+            self.refused += 1
+            return
+        echo = _Echo((t1_ns + t4_ns) // 2, t2_ns - t1_ns, t4_ns - t3_ns)
+        if self._doubted(echo):
+            return
+        self._echoes.append(echo)
+        while echo.t_ns - self._echoes[0].t_ns > self._window_ns:
+            self._echoes.popleft()
+        self._estimate = _fit(self._echoes)
+
+    def estimate(self) -> ClockEstimate | None:
+        """Return the estimate at the newest echo, or None before the first."""
+        return self._estimate
+
+    def _doubted(self, echo: _Echo) -> bool:
+        """Whether this echo is not to be used yet; starts afresh where too many contradict."""
+        wrong = self._contradicts(echo)
+        if wrong or self._suspects:
+            self._since.append(echo)
+            self._suspects += wrong
+        if self._suspects >= SUSPECTS_TO_RESTART:
+            self.steps += 1
+            self._echoes.clear()
+            self._echoes.extend(self._since[:-1])
+            wrong = False
+        if self._suspects >= SUSPECTS_TO_RESTART or len(self._since) >= SUSPECTS_AMONG:
+            self._since, self._suspects = [], 0
+        return wrong
+
+    def _contradicts(self, echo: _Echo) -> bool:
+        """Whether no delay of the network explains this echo (see the theory above)."""
+        known = self._estimate
+        if known is None:
+            return False
+        expected = known.to_remote(echo.t_ns) - echo.t_ns
+        least = min(echo.there_ns - expected, echo.back_ns + expected)
+        return least < -(known.bound_ns + self._step_ns + 3.0 * known.scatter_at(echo.t_ns))
+
+
+@dataclass(frozen=True, slots=True)
+class _Corridor:
+    """What the echoes say of a range of drifts; all in ns and ns/s, at the newest echo."""
+
+    offset: float
+    sigma: float
+    width: float
+    drift: float
+    drift_sigma: float
+    step: float  # between neighbouring drifts
+
+    @classmethod
+    def of(cls, t_s: Float, there: Float, back: Float, centre: float, half: float) -> "_Corridor":
+        """Posterior mean and spread, for drifts within `half` of `centre`.
+
+        Given the drift, the distances of the walls from the shortest possible delays are exponential, with the spacing
+        of the shortest delays as their scale. The drift's own posterior has a Gaussian prior, and the heights of the
+        walls at the mean time, in units of their scales: minus the sum of all delays above them.
+        """
+        drift = centre + half * _GRID
+        shift = drift[:, None] * t_s
+        wall, other = (there - shift).min(axis=1), (back + shift).min(axis=1)
+        widest = int(np.argmax(wall + other))
+        gap, other_gap = _spacing(there - shift[widest]), _spacing(back + shift[widest])
+        middle_time = drift * t_s.mean()
+        log = (wall + middle_time) / gap + (other - middle_time) / other_gap
+        log -= 0.5 * (drift * (1e-9 / DRIFT_PRIOR)) ** 2
+        share = np.exp(log - log.max())
+        share /= share.sum()
+        middle = 0.5 * ((wall - gap) - (other - other_gap))
+        offset, mean = float(share @ middle), float(share @ drift)
+        variance = float(share @ (middle - offset) ** 2) + 0.25 * (gap * gap + other_gap * other_gap)
+        return cls(
+            offset=offset,
+            sigma=variance**0.5,
+            width=float(share @ (wall + other)),
+            drift=mean,
+            drift_sigma=float(share @ (drift - mean) ** 2) ** 0.5,
+            step=float(drift[1] - drift[0]),
+        )
+
+
+def _fit(echoes: deque[_Echo]) -> ClockEstimate:
+    """The corridor at the newest echo; the grid of drifts closes in on it until it is fine enough."""
+    table = np.array(echoes, dtype=np.int64)
+    newest = int(table[-1, 0])
+    base = (int(table[-1, 1]) - int(table[-1, 2])) // 2
+    t_s = (table[:, 0] - newest).astype(np.float64) * 1e-9
+    there, back = (table[:, 1] - base).astype(np.float64), (table[:, 2] + base).astype(np.float64)
+    found = _Corridor.of(t_s, there, back, 0.0, _WIDEST_DRIFT * 1e9)
+    for _ in range(_ZOOMS):
+        if found.drift_sigma > 2.0 * found.step:
+            break
+        found = _Corridor.of(t_s, there, back, found.drift, 4.0 * max(found.drift_sigma, found.step))
+    return ClockEstimate(
+        t_ns=newest,
+        offset_ns=base + round(found.offset),
+        drift_ppm=found.drift * 1e-3,
+        sigma_ns=found.sigma,
+        bound_ns=max(0, round(0.5 * found.width)),
+        drift_sigma_ppm=max(found.drift_sigma, found.step) * 1e-3,
+    )
+
+
+def _spacing(delay_ns: Float) -> float:
+    """How far apart the shortest delays lie (n,) [ns]: as far as the shortest is from the shortest possible one."""
+    n = len(delay_ns)
+    if n < AT_LEAST:
+        return max(_FLOOR_NS, float(delay_ns.max() - delay_ns.min()))
+    count = max(AT_LEAST - 1, n // _EDGE_SHARE)
+    shortest = np.partition(delay_ns, count)[: count + 1]
+    return max(_FLOOR_NS, _SOFT_EDGE * float(shortest.max() - shortest.min()) / count)
