@@ -14,6 +14,7 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
+from master.ik.certainty import covariance_alone
 from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
@@ -33,7 +34,8 @@ class HandSolution:
         angles_rad: (5, 4), inside the limits.
         joints: Forward kinematics of the two.
         cov_m2: (26, 3, 3) [m^2] posterior covariance of the joint positions.
-        tilt_cov_rad2: (5, 3, 3) [rad^2] the same of the directions of the last phalanges.
+        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone
+            (`master.ik.certainty`).
         tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much the fit expects that to grow, by the time squared.
         residual_m: (M,) distance of each marker from its place on the model [m]; NaN: not seen.
         cost: Half the sum of squared weighted residuals.
@@ -104,35 +106,38 @@ class HandSolver:
         seen = seen_markers(points_m, cov_m2)
         if last is None and not _determined(points_m[seen], facing):
             return None
+        habits = self._habits(seen, hidden)
         problem = HandProblem(
             self.model,
             self._parameters,
             self._attached.only(seen),
             points_m[seen],
             _whitening(cov_m2[seen], self.priors.model_m),
-            self._beliefs(seen, last, dt_s, hidden),
+            self._and_last(habits, last, dt_s),
             None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(dt_s)),
             None if facing is None else Facing(facing, 1.0 / self.priors.facing),
         )
         if last is not None:
-            return self._solution(problem.minimise(*self._seed_of(last), enough), points_m)
+            return self._solution(problem, habits, problem.minimise(*self._seed_of(last), enough), points_m)
         if near is not None:
-            found = self._solution(problem.minimise(*self._seed_near(near, seen), enough), points_m)
+            way = problem.minimise(*self._seed_near(near, seen), enough)
+            found = self._solution(problem, habits, way, points_m)
             off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
             whitened = (problem.whiten @ off[..., None])[..., 0]
             if (np.vecdot(whitened, whitened) < _EXPLAINED).all():
                 return found
-        return self._solution(problem.minimise(*self._seeds(points_m, seen, facing), enough), points_m)
+        best = problem.minimise(*self._seeds(points_m, seen, facing), enough)
+        return self._solution(problem, habits, best, points_m)
 
-    def _beliefs(
-        self, seen: Bool, last: HandSolution | None, dt_s: float, hidden: tuple[Float, Float] | None
-    ) -> AnglePrior:
+    def _habits(self, seen: Bool, hidden: tuple[Float, Float] | None) -> AnglePrior:
         on_finger = self._attached.on_finger[:, 0]
         fingers = frozenset(self._attached.finger[seen & on_finger].tolist())
-        prior = self._prior.and_single(*hidden_belief(self._parameters, self.priors, fingers, hidden))
+        return self._prior.and_single(*hidden_belief(self._parameters, self.priors, fingers, hidden))
+
+    def _and_last(self, habits: AnglePrior, last: HandSolution | None, dt_s: float) -> AnglePrior:
         if last is None:
-            return prior
-        return prior.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, dt_s))
+            return habits
+        return habits.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, dt_s))
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self._parameters.free_of(last.angles_rad)[None]
@@ -161,7 +166,9 @@ class HandSolver:
             seeds.append((fit_rigid(observed, expected, w), x))
         return np.array([T for T, _ in seeds]), np.array([x for _, x in seeds])
 
-    def _solution(self, best: Minimum, points_m: Float) -> HandSolution:
+    def _solution(
+        self, problem: HandProblem, habits: AnglePrior, best: Minimum, points_m: Float
+    ) -> HandSolution:
         T = best.T_rig_palm
         low, high = self.model.limits_rad[..., 0], self.model.limits_rad[..., 1]
         # The bounds hold already; what is cut is the rounding of a coupled angle.
@@ -185,7 +192,7 @@ class HandSolver:
             angles_rad=angles,
             joints=joints,
             cov_m2=cov @ np.swapaxes(J, 1, 2),
-            tilt_cov_rad2=turn @ inverse @ np.swapaxes(turn, 1, 2),
+            tilt_cov_rad2=turn @ covariance_alone(problem, habits, best) @ np.swapaxes(turn, 1, 2),
             tilt_walk_rad2_s2=(turn * self._walk_2) @ np.swapaxes(turn, 1, 2),
             residual_m=np.asarray(np.linalg.norm(marker - points_m, axis=1), np.float64),
             cost=float(best.linear.cost),

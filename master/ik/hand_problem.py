@@ -154,6 +154,13 @@ class HandProblem:
             gradient[..., :6] += self.palm.weight * off
         return Linear(cost, gradient, normal)
 
+    def palm_cost(self, T_rig_palm: Float) -> float:
+        """What a palm (4, 4) costs by the belief about it."""
+        if self.palm is None:
+            return 0.0
+        off = self.palm.weight * _moved(T_rig_palm, self.palm.T_rig_palm)
+        return 0.5 * float(off @ off)
+
     def _step(self, here: Linear, T: Float, x: Float, damping: Float) -> tuple[Float, Float, Float]:
         """The next poses (S, 4, 4) and angles (S, n), and how much lower the cost (S,) should be there."""
         low, high = self.parameters.low, self.parameters.high

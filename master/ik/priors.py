@@ -91,6 +91,10 @@ class AnglePrior:
         pushed = x @ self.normal
         return np.vecdot(0.5 * pushed - self.pull, x) + self.constant, pushed - self.pull
 
+    def least(self) -> float:
+        """The cost where it is least: beliefs that contradict each other."""
+        return self.constant - 0.5 * float(self.pull @ np.linalg.solve(self.normal, self.pull))
+
 
 def hidden_belief(
     parameters: HandParameters, priors: Priors, seen: frozenset[int], known: tuple[Float, Float] | None

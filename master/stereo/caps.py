@@ -25,6 +25,7 @@ _MOST_TILT = 2.0  # tangent of the tilt of a sigma point: it stays on its side
 _BENT_RAD = np.radians(135.0)  # away from the eye: a cap still shows a strip of its side
 _FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or partly hidden
 _LEAST_SHARE = 0.8  # of what a whole cap shows: where its radius is a tenth smaller than the profile says
+_ALIKE = 0.9  # of the share that another camera sees: what edges of two blobs of 200 px do not explain
 _SPECK_M2 = 1e-9
 
 
@@ -147,15 +148,20 @@ class CapModel:
         """Extra centroid noise (C, M) [px] of markers that show less than they must: partly hidden.
 
         What is missing lies to one side, so the centroid of a cap moves by up to a radius. Two cameras see different
-        remains of a hidden cap; without this, a sliver would pass for a point known to a tenth of a pixel. A flat
-        marker may show little because it is tilted or because skin hides it, which is the same to us: a camera that
-        sees much less of it than the one that sees it best knows it to half of its side only.
+        remains of a hidden cap; without this, a sliver would pass for a point known to a tenth of a pixel. The radius
+        of a cap may be wrong, but it is wrong for all cameras: one that sees less of its share than another sees a
+        cap that is partly hidden. Whatever part of a disc is cut off, its centroid moves by about that part of the
+        radius, until half is gone.
+
+        A flat marker may show little because it is tilted or because skin hides it, which is the same to us: a camera
+        that sees much less of it than the one that sees it best knows it to half of its side only.
 
         Args:
             area_px2: Seen areas (C, M) [px^2].
             points_m: Where the caps were found (M, 3) [m], rig frame.
             cameras: The rig's cameras.
-            whole_m2: Least area (C, M) that the whole caps may show.
+            whole_m2: Areas (T, C, M) that the whole caps show where they point in T directions; doubted is what none
+                of them explains.
         """
         scale = np.stack(
             [_project_scale(camera) / np.linalg.norm(points_m - camera.centre, axis=1) for camera in cameras]
@@ -166,8 +172,10 @@ class CapModel:
         doubt = np.where(share < _FLAT_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
         if self._joint:
             k = self._marker
-            least = _LEAST_SHARE * whole_m2[:, k]
-            hidden = np.maximum(1.0 - size_m2[:, k] / np.maximum(least, _SPECK_M2), 0.0)
+            shows = size_m2[:, k] / np.maximum(whole_m2[..., k], _SPECK_M2)  # (T, C, K)
+            hidden = np.maximum(1.0 - shows.max(axis=0) / _LEAST_SHARE, 0.0)
+            alike = (shows / np.fmax.reduce(shows, axis=1)[:, None]).max(axis=0)
+            hidden = np.maximum(hidden, np.where(alike < _ALIKE, 1.0 - alike, 0.0))
             doubt[:, k] = hidden * self._radius * scale[:, k]
         return np.nan_to_num(doubt)
 

@@ -12,9 +12,10 @@ What a camera sees of a cap is not its centroid; the difference follows from the
 Tilt matters most along the sight: two cameras see a finger that points at one of them from different sides, so that
 a degree of tilt moves the two centroids apart, and the distance with them.
 
-The hand fit must be told more. It believes that fingers move between instants as fast as its priors allow, and the
-error of this correction repeats that of the last pose: told less than it believes itself, it would follow its own
-error, and finger and cap would drag each other away.
+How sure a tilt is, an instant says alone (`master.ik.certainty`): the error of this correction repeats that of the last
+pose. For the same reason the hand fit must be told more. It believes that fingers move between instants as fast as its
+priors allow: told less than it believes itself, it would follow its own error, and finger and cap would drag each
+other away.
 """
 
 from dataclasses import dataclass, replace
@@ -108,7 +109,7 @@ class CapLocator:
         look = self.look(points, hand, age_s)
         if as_seen:
             look.bias_px[0] = 0.0
-        doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2.min(axis=0))
+        doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2)
         caps_uv, sure_px = uv - look.bias_px[0], np.hypot(sigma_px, doubt)
         placed = self._place(caps_uv, sure_px)
         bias = look.bias_px.transpose(2, 1, 3, 0).reshape(len(points), -1, len(look.bias_px))  # (M, 2C, T)

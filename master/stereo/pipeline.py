@@ -207,7 +207,7 @@ class MarkerPipeline:
         uv = instant.uv[view, lone]
         self._place.put(points, lone, view, uv, near)
         look = self._located.look(points, last, age_s)
-        doubt = self._caps.doubt_px(instant.area, points, self._cameras, look.whole_m2.min(axis=0))
+        doubt = self._caps.doubt_px(instant.area, points, self._cameras, look.whole_m2)
         bias = look.bias_px[:, view, lone]
         self._place.put(points, lone, view, uv - bias[0], near)
         sight = points[lone] - self._centres[view]

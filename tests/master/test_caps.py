@@ -80,7 +80,7 @@ def test_markers_without_caps_need_no_correction() -> None:
     points = np.array([[0.0, 0.0, 0.5]])
     np.testing.assert_array_equal(back.bias_px(pointing(np.eye(3)), points, CAMERAS), np.zeros((2, 1, 2)))
     np.testing.assert_array_equal(
-        back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS, np.zeros((2, 1))), np.zeros((2, 1))
+        back.doubt_px(np.full((2, 1), 3.0), points, CAMERAS, np.zeros((1, 2, 1))), np.zeros((2, 1))
     )
 
 
@@ -98,14 +98,32 @@ def test_a_sliver_of_a_cap_is_doubted_and_a_whole_one_is_not() -> None:
     whole_m2 = (2 * 1.7 + np.pi / 2 - 1) * RADIUS_M**2  # from the side: half a disc, and the paint behind it
     whole_px2 = whole_m2 * (500.0 / 0.5) ** 2
     area = np.array([[whole_px2] * 6, [0.1 * whole_px2] * 6])
-    expected_m2 = np.full((2, 6), whole_m2)
+    expected_m2 = np.full((1, 2, 6), whole_m2)
     doubt = CAPS.doubt_px(area, points, CAMERAS, expected_m2)
     assert (doubt[0] == 0).all()
     away = np.linalg.norm(points[1] - CAMERAS[1].centre)
-    expected = (1 - 0.1 / 0.8 * (away / 0.5) ** 2) * RADIUS_M * 500.0 / away
+    expected = (1 - 0.1 * (away / 0.5) ** 2) * RADIUS_M * 500.0 / away
     assert doubt[1, 1] == pytest.approx(expected)
+    # One that both see alike may be a smaller cap, as far as a radius may be wrong.
+    both = CAPS.doubt_px(
+        0.4 * area[:1] * np.array([[1.0], [(0.5 / away) ** 2]]), points, CAMERAS, expected_m2
+    )
+    np.testing.assert_allclose(both[:, 1], 0.5 * RADIUS_M * 500.0 / np.array([0.5, away]))
     nowhere = CAPS.doubt_px(np.full((2, 6), np.nan), points, CAMERAS, expected_m2)
     np.testing.assert_array_equal(nowhere, np.zeros((2, 6)))
+
+
+def test_a_cap_of_another_radius_is_whole_and_one_that_two_cameras_see_unlike_is_not() -> None:
+    points = np.tile([0.0375, 0.0, 0.5], (6, 1))  # as far from one camera as from the other
+    expected_m2 = np.stack([np.full((2, 6), 2e-4), np.full((2, 6), 3e-4)])  # as its direction may be
+    px2_m2 = (500.0 / float(np.linalg.norm(points[0] - CAMERAS[0].centre))) ** 2
+    smaller = np.full((2, 6), 0.81 * 2e-4 * px2_m2)  # a radius smaller by a tenth
+    np.testing.assert_array_equal(CAPS.doubt_px(smaller, points, CAMERAS, expected_m2)[:, :5], 0.0)
+    smaller[1] *= 0.75
+    doubt = CAPS.doubt_px(smaller, points, CAMERAS, expected_m2)[:, 1]
+    np.testing.assert_allclose(doubt, [0.0, 0.25 * RADIUS_M * np.sqrt(px2_m2)])
+    turned = expected_m2 * np.array([[[1.0], [1.0]], [[1.0], [0.75]]])  # or it points away from one of them
+    np.testing.assert_array_equal(CAPS.doubt_px(1.1 * smaller / 0.75, points, CAMERAS, turned)[:, 1], 0.0)
 
 
 def test_a_cap_shows_a_disc_from_its_end_and_its_whole_length_from_the_side() -> None:
@@ -154,7 +172,7 @@ def test_the_correction_brings_rendered_silhouettes_to_their_caps(datasets: Path
 
 def test_a_flat_marker_is_doubted_where_another_camera_sees_much_more_of_it() -> None:
     points = np.tile([0.0375, 0.0, 0.5], (6, 1))  # as far from one camera as from the other
-    whole, nothing = np.full(6, 500.0), np.zeros((2, 6))
+    whole, nothing = np.full(6, 500.0), np.zeros((1, 2, 6))
     alike = CAPS.doubt_px(np.stack([whole, 0.7 * whole]), points, CAMERAS, nothing)
     np.testing.assert_array_equal(
         alike[:, 5], 0.0

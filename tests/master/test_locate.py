@@ -20,7 +20,7 @@ RIG = rig_file()
 CAMERAS = tuple(camera_models(RIG).values())
 FOUR = tuple(camera_models(rig_file(("a", "b", "c", "d"))).values())
 CAPS = CapModel(RIGHT, MARKERS)
-WHOLE = np.full((2, 6), 1e6)  # px^2: nothing is hidden
+UNSTATED = np.full((2, 6), np.nan)  # px^2: without areas nothing is known to be hidden
 SIGMA = np.full((2, 6), 0.1)
 
 
@@ -37,7 +37,7 @@ def locate(
     known: HandSolution | None, uv: Float, age_s: float = 0.0, place: Placement | None = None
 ) -> Located:
     locator = CapLocator(CAMERAS, CAPS, place or Placement(CAMERAS, None))
-    return locator(uv, SIGMA, WHOLE, known, age_s)
+    return locator(uv, SIGMA, UNSTATED, known, age_s)
 
 
 def seen(joints: HandJoints) -> tuple[Float, Float]:

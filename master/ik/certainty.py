@@ -1,0 +1,58 @@
+"""How sure a hand is of what its markers do not tell, such as where a finger points: judged by one instant alone.
+
+To the fit the last pose is a prior, as wide as a hand moves meanwhile. That holds it steady, but it is no second
+witness: the same habits led to it from the same markers, so a wrong direction of a finger is as wrong in every frame
+of a held pose. Counted as a witness, a hundred times a second, it would make the pose look surer than it ever was.
+So it is left out here, and an angle that nothing else tells is somewhere within its limits.
+
+What is left are the markers and habits. Habits hold better of some postures than of others: a pointing hand defies
+them, a relaxed one is nearer to them than they claim. By how much is told by the misfit of the instant itself, which
+scales the covariance (Birge 1932), with the claimed widths as one observation more (a prior of unit information: Kass,
+Wasserman 1995):
+
+    covariance = s^2 (J' J + normal)^-1,   s^2 = (1 + chi^2) / (1 + f),   f = 3 N - 6 + (2 if the back is seen)
+
+N markers are 3 N numbers, and the palm takes six; each angle is as much a number as a belief. Beliefs that contradict
+each other, whatever the markers, tell nothing of the instant: their least cost is no part of chi^2.
+"""
+
+import numpy as np
+
+from common.arrays import Float
+from master.ik.hand_problem import HandProblem, Minimum
+from master.ik.parameters import HandParameters
+from master.ik.priors import AnglePrior
+
+_CLAIMED = 1.0  # observations that the claimed widths of habits count as
+_PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
+_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
+
+
+def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> Float:
+    """Covariance (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and of the free angles [rad], of one instant.
+
+    Args:
+        problem: The fit, which may believe in the last pose as well.
+        habits: What it believes of angles without the last pose.
+        found: Its solution.
+    """
+    normal = found.linear.normal - problem.believed
+    normal.flat[:: len(normal) + 1] += anywhere(problem.parameters)
+    normal[6:, 6:] += habits.normal
+    free = max(3 * len(problem.points_m) - 6 + (0 if problem.facing is None else 2), 0)
+    scale = (_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free)
+    return np.asarray(scale * np.linalg.inv(normal), np.float64)
+
+
+def chi_square_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> float:
+    """Squared misfit of markers and habits, without the last pose and what habits cost anyway."""
+    past = problem.palm_cost(found.T_rig_palm) + float(problem.prior.cost_and_gradient(found.x)[0])
+    habit = float(habits.cost_and_gradient(found.x)[0]) - habits.least()
+    return max(2.0 * (float(found.linear.cost) - past + habit), 0.0)
+
+
+def anywhere(parameters: HandParameters) -> Float:
+    """(6 + n,) inverse variances of a hand of which nothing is known but its limits."""
+    turn, shift = _PALM
+    span = np.maximum(parameters.high - parameters.low, _NARROWEST_RAD)
+    return np.concatenate([np.repeat([turn**-2.0, shift**-2.0], 3), 12.0 / (span * span)])

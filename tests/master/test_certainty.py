@@ -1,0 +1,85 @@
+"""Tests of what one instant tells of a hand: a held pose is no second witness, and errors are as large as claimed."""
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.hand_model import TIPS
+from master.ik.hand import HandSolution, HandSolver
+from tests.hand_helpers import FACING, MARKERS, RIGHT, palm, small_cov
+
+SOLVER = HandSolver(RIGHT, MARKERS)
+NATURAL = np.radians([[8.0, 8.0, 10.0, 15.0]] + [[0.0, 15.0, 25.0, 50.0 / 3]] * 4)
+# two fingers straight, two bent, all far apart: against habits
+UNNATURAL = np.radians(
+    [
+        [20.0, 20.0, 0.0, 40.0],
+        [-18.0, 0.0, 0.0, 0.0],
+        [15.0, 60.0, 20.0, 40.0 / 3],
+        [-15.0, 0.0, 0.0, 0.0],
+        [18.0, 70.0, 20.0, 40.0 / 3],
+    ]
+)
+
+
+def solved(
+    angles: Float, last: HandSolution | None = None, dt_s: float = 0.0, gone: int | None = None
+) -> HandSolution:
+    points = RIGHT.marker_points(RIGHT.forward(palm(), angles), MARKERS)
+    if gone is not None:
+        points[gone] = np.nan
+    found = SOLVER.solve(points, small_cov(), last, dt_s, None, FACING)
+    assert found is not None
+    return found
+
+
+def tilt_deg(hand: HandSolution) -> Float:
+    return np.degrees(np.sqrt(np.trace(hand.tilt_cov_rad2, axis1=1, axis2=2)))
+
+
+@pytest.mark.parametrize("dt_s", [0.002, 0.011, 0.1])
+def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
+    first = solved(NATURAL)
+    hand = first
+    for _ in range(20):
+        hand = solved(NATURAL, hand, dt_s)
+    np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.05)
+
+
+def test_a_hand_against_habits_is_less_sure_than_a_relaxed_one() -> None:
+    relaxed, odd = tilt_deg(solved(NATURAL)), tilt_deg(solved(UNNATURAL))
+    assert (relaxed < 10.0).all()
+    assert np.median(odd / relaxed) > 1.5
+
+
+def test_beliefs_that_contradict_each_other_are_no_news_of_the_instant() -> None:
+    """A finger out of sight is believed curled, and its neighbours alike: counted as misfit, that gives 3 and more."""
+    all_seen, ratio = tilt_deg(solved(NATURAL)), list[Float]()
+    for gone in range(5):
+        others = np.arange(5) != gone
+        ratio.append((tilt_deg(solved(NATURAL, gone=gone)) / all_seen)[others])
+    assert 1.0 < np.mean(ratio) < 2.4
+
+
+def test_directions_err_as_much_as_is_claimed() -> None:
+    """Over hands drawn from the habits themselves, squared errors over variances average to about 1."""
+    rng = np.random.default_rng(5)
+    p, ratio = SOLVER.priors, list[Float]()
+    low, high = RIGHT.limits_rad[..., 0], RIGHT.limits_rad[..., 1]
+    for _ in range(80):
+        angles = np.empty((5, 4))
+        angles[0] = rng.normal(p.thumb_mean, p.thumb)
+        pip = p.pip_mean + rng.normal(0.0, 0.5 * p.pip) + rng.normal(0.0, 0.5 * p.neighbour_pip, 4)
+        angles[1:, 2] = np.clip(pip, low[1:, 2], high[1:, 2])
+        angles[1:, 0] = rng.normal(0.0, p.abduction, 4)
+        angles[1:, 1] = RIGHT.mcp_per_pip * angles[1:, 2] + rng.normal(0.0, p.natural_flexion, 4)
+        angles[1:, 3] = (RIGHT.dip_per_pip or 0.0) * angles[1:, 2]
+        angles = np.clip(angles, low, high)
+        T = palm(np.degrees(rng.normal(0.0, p.facing / np.sqrt(2.0), 3)))
+        truth = RIGHT.forward(T, angles)
+        points = RIGHT.marker_points(truth, MARKERS) + rng.multivariate_normal(np.zeros(3), small_cov()[0], 6)
+        found = SOLVER.solve(points, small_cov(), None, 0.0, None, FACING)
+        assert found is not None
+        off = found.joints.rotation[TIPS][:, :, 2] - truth.rotation[TIPS][:, :, 2]
+        ratio.append((off**2).sum(axis=1) / np.trace(found.tilt_cov_rad2, axis1=1, axis2=2))
+    assert 0.6 < np.mean(ratio) < 1.6
