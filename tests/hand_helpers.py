@@ -10,9 +10,10 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, Intrinsics, RigCalibration, load
 from common.camera_model import CameraModel
 from common.geometry import rigid
-from common.hand_model import CHAINS, HandModel
+from common.hand_model import CHAINS, HandJoints, HandModel
 from common.hand_profiles import generated_profile
 from common.messages import MarkerDetections
+from master.stereo.caps import CapModel
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 RIGHT = HandModel.of(generated_profile("made-right", "right"))
@@ -95,7 +96,17 @@ def camera_models(rig: RigCalibration, row_time_us: float = 0.0) -> dict[str, Ca
     }
 
 
-def detections(camera: str, seq: int, t_ns: int, uv: Float, area_px2: float = 400.0) -> MarkerDetections:
+def cap_areas_px2(joints: HandJoints, models: tuple[CameraModel, ...]) -> Float:
+    """Areas (C, 6) that cameras see of whole caps, which differ with the side they see; flat markers have 400 px."""
+    caps, points = CapModel(RIGHT, MARKERS), RIGHT.marker_points(joints, MARKERS)
+    shown = caps.look(caps.tilted(joints, np.zeros((5, 3, 3)))[:1], points, models).whole_m2[0]
+    scale = [m.matrix[0, 0] / np.linalg.norm(points - m.centre, axis=1) for m in models]
+    return np.where(caps.on_finger, shown * np.square(scale), 400.0)
+
+
+def detections(
+    camera: str, seq: int, t_ns: int, uv: Float, area_px2: float | Float = 400.0
+) -> MarkerDetections:
     """One message; area, quality and sigma follow what is seen, and nothing has a rival."""
     seen = np.isfinite(uv[:, 0])
     return MarkerDetections(

@@ -11,7 +11,7 @@ from common.messages import HandPose, MarkerDetections
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
 from master.stereo.caps import CapModel
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, detections, palm, rig_file
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, cap_areas_px2, detections, palm, rig_file
 
 BACK = MARKERS.index("back")
 ANGLES = np.radians(
@@ -40,13 +40,13 @@ def solved(rig: RigCalibration, T_rig_palm: Float) -> list[HandPose]:
     joints = RIGHT.forward(T_rig_palm, ANGLES)
     points, caps = RIGHT.marker_points(joints, MARKERS), CapModel(RIGHT, MARKERS)
     models = tuple(setup.models.values())
-    bias = caps.bias_px(joints, points, models)
+    bias, area = caps.bias_px(joints, points, models), cap_areas_px2(joints, models)
     messages: list[MarkerDetections] = []
     for seq in range(6):
         for c, (name, camera) in enumerate(setup.models.items()):
             uv = camera.project(points) + bias[c]
             uv[BACK] = np.nan if name.endswith("2") else uv[BACK]
-            messages.append(detections(name, seq, 1_000_000_000 + seq * PERIOD_NS, uv))
+            messages.append(detections(name, seq, 1_000_000_000 + seq * PERIOD_NS, uv, area[c]))
     pipeline = build_pipeline(setup, StageTimes())
     return [found.pose for message in messages for found in pipeline.push(message)]
 

@@ -13,7 +13,7 @@ from master.stages import StageTimes
 from master.stereo.caps import CapModel
 from master.stereo.odd_camera import odd_camera
 from master.stereo.place import Placement
-from tests.hand_helpers import MARKERS, RIGHT, camera_models, detections, palm, rig_file
+from tests.hand_helpers import MARKERS, RIGHT, camera_models, cap_areas_px2, detections, palm, rig_file
 from tests.synthetic_run import setup_of
 
 AT = {
@@ -54,11 +54,12 @@ def messages(names: tuple[str, ...], swapped: str = "") -> list[MarkerDetections
     seen = np.stack([c.project(TRUTH) for c in cameras]) + CapModel(RIGHT, MARKERS).bias_px(
         HAND, TRUTH, cameras
     )
+    area = cap_areas_px2(HAND, cameras)
     if swapped:
         c = names.index(swapped)
         seen[c, [1, 3]] = seen[c, [3, 1]]
     return [
-        detections(name, seq, 10**9 + seq * 16_666_667, seen[c] + rng.normal(0.0, 0.1, (6, 2)))
+        detections(name, seq, 10**9 + seq * 16_666_667, seen[c] + rng.normal(0.0, 0.1, (6, 2)), area[c])
         for seq in range(FRAMES)
         for c, name in enumerate(names)
     ]
