@@ -58,7 +58,7 @@ def test_a_second_pair_aside_does_not_turn_the_hand(turn_deg: float, roll_deg: f
     T = palm(np.array([0.0, roll_deg, 0.0]), np.array([0.04, 0.08, 0.5]))
     four = around(turn_deg)
     alone = off_mm(msgspec.structs.replace(four, cameras=("left", "right")), T)
-    # How far the palm rolls is told by habits rather than by markers here, in either rig: 8 or 9 degrees are left of 25.
+    # How far the palm rolls is told by habits here, not by markers, in either rig: 8 or 9 degrees are left of 25.
     assert off_mm(four, T) < min(1.15 * alone, 3.5)
 
 
