@@ -62,7 +62,6 @@ def run_live(
     """
     rig = files.rig
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
-
     make = _maker(colours, engine, workers)
     changing = None if colours == "none" else ChangingDetector(make(files.camera, rig))
     detector = BlindDetector(len(rig.markers)) if changing is None else changing

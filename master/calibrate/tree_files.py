@@ -7,6 +7,11 @@ from common.calibration import CameraCalibration, Provenance, RigCalibration, lo
 from common.errors import CalibrationError
 
 
+def date_now() -> str:
+    """The wall clock's date and time as files state it: UTC, to the second."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
 def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], note: str = "") -> Provenance:
     """Of a result that was made now.
 
@@ -16,8 +21,7 @@ def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], not
         residual: Quantity with its unit -> value.
         note: What else a reader should know.
     """
-    date = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    return Provenance(date=date, tool=tool, data=data, residual=residual, note=note)
+    return Provenance(date=date_now(), tool=tool, data=data, residual=residual, note=note)
 
 
 def rig_in_tree(out: Path | None, file_name: str, rig: RigCalibration) -> RigCalibration:

@@ -17,11 +17,10 @@ from common.hand_model import HandModel
 from master.ik.chain import THUMB
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
-from master.ik.hand import HandSolution
+from master.ik.hand import EXPLAINED, HandSolution
 from master.ik.joints import Vector
 
 MODEL_M = 1e-3  # bones and caps are known to about this
-EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _ON_CAP_M = 1e-4  # residual below which a finger is on its cap
 _ITERATIONS = 10  # the seed is the answer; what it cannot reach, iterations improve little
 

@@ -22,7 +22,7 @@ from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
-_EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
+EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ class HandSolver:
             found = self._solution(problem, habits, way, points_m)
             off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
             whitened = (problem.whiten @ off[..., None])[..., 0]
-            if (np.vecdot(whitened, whitened) < _EXPLAINED).all():
+            if (np.vecdot(whitened, whitened) < EXPLAINED).all():
                 return found
         best = problem.minimise(*self._seeds(points_m, seen, facing), enough)
         return self._solution(problem, habits, best, points_m)

@@ -16,8 +16,8 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
-from master.ik.fingers import EXPLAINED, FingerRefiner, surprise_of
-from master.ik.hand import HandSolution, HandSolver, seen_markers
+from master.ik.fingers import FingerRefiner, surprise_of
+from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.priors import Priors
 from master.volume import inside
 

@@ -195,8 +195,3 @@ def _pairs(markers: int) -> tuple[Int, Int]:
     }
     one, other = np.array(sorted(pairs), np.int64).reshape(-1, 2).T
     return one, other
-
-
-def item_count(markers: int) -> int:
-    """Number of items I that so many markers give."""
-    return markers + len(_pairs(markers)[0])

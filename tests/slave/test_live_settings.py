@@ -21,18 +21,8 @@ from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 from tests.network_helpers import until
 from tests.slave.fake_picamera2 import Sensor, install
 from tests.slave.fake_v4l2 import Camera, FakeDevice
+from tests.slave.test_real_cameras import CALIBRATION as FILE
 
-FILE = CameraCalibration(
-    version=1,
-    name="left",
-    width_px=640,
-    height_px=480,
-    frame_rate_hz=30.0,
-    exposure_us=5000.0,
-    analogue_gain=1.25,
-    colour_gains=(0.83, 1.24),
-    row_time_us=33.6,
-)
 GIVEN = {"gain": 32, "white_balance_temperature": 4600}
 
 

@@ -5,10 +5,8 @@ nobody tracks. Nothing is calibrated here; the folder it leaves is what `calibra
 """
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -17,15 +15,17 @@ import numpy as np
 
 from common.arrays import Image
 from common.bus import Bus, Subscription
+from common.clock import now_ns
 from common.errors import BusError, CalibrationError
 from common.messages import Command, Still
 from master.calibrate.cameras.live_views import LiveViews, Verdict
+from master.calibrate.tree_files import date_now
 from master.ingest import Ingest
 
 ROUND_S = 0.3
-ANSWER_S = 1.0
+ANSWER_NS = 1_000_000_000
 _ASK_S = 0.5
-_SAY_S = 2.0  # the same words are not said more often
+_SAY_NS = 2_000_000_000  # the same words are not said more often
 NOTES = "capture.json"
 
 
@@ -67,10 +67,10 @@ def capture(
     Raises:
         CalibrationError: The folder cannot be written.
     """
-    said, said_s = "", 0.0
+    said, said_ns = "", now_ns()
     spread: list[float] = []
     while len(live.views) < wanted and not stop.is_set():
-        began = time.monotonic()
+        began_ns = now_ns()
         round_ = take()
         verdict = live.push(round_.images) if round_.images else Verdict(False, "no camera answers")
         text = verdict.text + _without([name for name in live.cameras if name not in round_.images])
@@ -79,10 +79,10 @@ def capture(
             spread.append(round_.spread_ms)
             _keep(folder, view.name, {name: round_.stills[name] for name in view.sightings})
             say(f"view {len(live.views)} of {wanted}: {text}{_then(advise())}")
-        elif text != said or began - said_s > _SAY_S:
+        elif text != said or began_ns - said_ns > _SAY_NS:
             say(text)
-            said, said_s = text, began
-        stop.wait(max(0.0, ROUND_S - (time.monotonic() - began)))
+            said, said_ns = text, began_ns
+        stop.wait(max(0.0, ROUND_S - (now_ns() - began_ns) * 1e-9))
     if live.views:
         _note(folder, live, spread)
     return len(live.views)
@@ -104,9 +104,9 @@ class StillTaker:
         for thread in askers:
             thread.start()
         stills: dict[str, Still] = {}
-        end = time.monotonic() + ANSWER_S
-        while len(stills) < len(self._cameras) and (left := end - time.monotonic()) > 0.0:
-            message = self._feed.get(left)
+        end_ns = now_ns() + ANSWER_NS
+        while len(stills) < len(self._cameras) and (left_ns := end_ns - now_ns()) > 0:
+            message = self._feed.get(left_ns * 1e-9)
             if isinstance(message, Still) and message.camera in self._cameras:
                 stills[message.camera] = message
         for thread in askers:
@@ -180,7 +180,7 @@ def _note(folder: Path, live: LiveViews, spread_ms: list[float]) -> None:
     """What the pictures are of, for whoever finds the folder."""
     known = [value for value in spread_ms if np.isfinite(value)]
     notes = {
-        "date": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        "date": date_now(),
         "board": str(live.board),
         "cameras": list(live.cameras),
         "views": len(live.views),
