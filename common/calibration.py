@@ -87,6 +87,7 @@ class CameraCalibration(_File, frozen=True):
     analogue_gain: Positive
     colour_gains: tuple[Positive, Positive]
     row_time_us: NonNegative
+    focus_m: Positive | None = None  # of a lens with a motor; the intrinsics are those of this distance
     intrinsics: Intrinsics | None = None
     markers: dict[Name, HsvRange] | None = None
     provenance: dict[str, Provenance] = {}

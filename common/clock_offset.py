@@ -31,6 +31,8 @@ DRIFT_PRIOR = 100e-6  # standard deviation; two crystals differ by less than twi
 WANDER_PPM = 1.0  # a crystal's rate changes by so much with its temperature within minutes
 SUSPECTS_TO_RESTART = 3  # echoes that contradict: one may be a freak
 SUSPECTS_AMONG = 20  # so many echoes
+_REFIT_SHARE = 16  # fit anew when one echo in so many is new: less moves the corridor by next to nothing
+_REFIT_NS = 500_000_000  # or when the fit is so old
 _FLOOR_NS = 2_000.0  # scatter of the fastest echoes: scheduling of two threads
 _EDGE_SHARE = 8  # one echo in so many tells how sharp the edge of a cloud is
 _SOFT_EDGE = 1.5  # few delays are quite as short as an exponential law would have it
@@ -44,7 +46,7 @@ class ClockEstimate:
     """How a remote clock runs against the local one.
 
     Attributes:
-        t_ns: Local time at which `offset_ns` holds [ns]: the newest echo.
+        t_ns: Local time at which `offset_ns` holds [ns]: the newest echo of the fit.
         offset_ns: Remote minus local time [ns].
         drift_ppm: Rate of the remote clock minus that of the local one [1e-6].
         sigma_ns: Standard deviation of the offset from scatter [ns], if both ways of the network cost the same.
@@ -108,6 +110,7 @@ class OffsetEstimator:
         self._since: list[_Echo] = []
         self._suspects = 0
         self._estimate: ClockEstimate | None = None
+        self._unfitted = 0  # echoes since the estimate
         self.steps = 0
         self.refused = 0
 
@@ -132,10 +135,18 @@ class OffsetEstimator:
         self._echoes.append(echo)
         while echo.t_ns - self._echoes[0].t_ns > self._window_ns:
             self._echoes.popleft()
-        self._estimate = _fit(self._echoes)
+        self._unfitted += 1
+        known = self._estimate
+        if (
+            known is None
+            or self._unfitted * _REFIT_SHARE >= len(self._echoes)
+            or echo.t_ns - known.t_ns >= _REFIT_NS
+        ):
+            self._estimate = _fit(self._echoes)
+            self._unfitted = 0
 
     def estimate(self) -> ClockEstimate | None:
-        """Return the estimate at the newest echo, or None before the first."""
+        """Return the estimate, which may be a few echoes old, or None before the first."""
         return self._estimate
 
     def _doubted(self, echo: _Echo) -> bool:
@@ -148,6 +159,7 @@ class OffsetEstimator:
             self.steps += 1
             self._echoes.clear()
             self._echoes.extend(self._since[:-1])
+            self._estimate = None  # of the clock before the step
             wrong = False
         if self._suspects >= SUSPECTS_TO_RESTART or len(self._since) >= SUSPECTS_AMONG:
             self._since, self._suspects = [], 0

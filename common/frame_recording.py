@@ -130,6 +130,13 @@ def open_recording(folder: Path) -> FrameRecording:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
+    for camera, count in _repeated(rows).items():
+        _LOG.warning(
+            "%s: camera %s: frames with the time of another one: %d; of one time only one gives a pose",
+            path,
+            camera,
+            count,
+        )
     unknown = {row.camera for row in rows} - manifest.cameras.keys()
     if unknown:
         raise RecordingError(f"{path}: camera {min(unknown)!r} is not in {MANIFEST}")
@@ -150,6 +157,14 @@ def check_manifest(manifest: Manifest, where: str) -> None:
         check(rig, f"{where}: rig {rig.name!r}")
         if missing := set(rig.cameras) - manifest.cameras.keys():
             raise CalibrationError(f"{where}: cameras: {min(missing)!r} of rig {rig.name!r} is missing")
+
+
+def _repeated(rows: tuple[FrameRow, ...]) -> dict[str, int]:
+    """Per camera with equal times: in how many rows; one camera has one frame at a time."""
+    times: dict[str, list[int]] = {}
+    for row in rows:
+        times.setdefault(row.camera, []).append(row.t_ns)
+    return {camera: len(own) - len(set(own)) for camera, own in times.items() if len(set(own)) < len(own)}
 
 
 def _rows(path: Path, text: str) -> tuple[FrameRow, ...]:

@@ -24,7 +24,7 @@ from slave.cameras.settings import Tunable
 from slave.markers.changing import Changeable, ChangingDetector
 
 _LOG = logging.getLogger(__name__)
-NEEDS_RESTART = ("name", "width_px", "height_px", "frame_rate_hz")
+NEEDS_RESTART = ("name", "width_px", "height_px", "frame_rate_hz", "focus_m")
 
 
 @dataclass(frozen=True, slots=True)

@@ -243,7 +243,7 @@ class Picamera2Camera:
         Raises:
             CameraError: They do not; every setting that differs is named.
         """
-        wanted = wanted_settings(camera, self._options, self._library.camera_controls)
+        wanted = wanted_settings(camera, self._library.camera_controls)
         good, metadata = 0, dict[str, object]()
         for metadata in frames:
             good = 0 if differences(wanted, metadata) else good + 1

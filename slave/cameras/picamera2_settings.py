@@ -39,14 +39,12 @@ class Picamera2Options:
         index: Number of the camera on this Pi.
         sync: Whether frames follow another camera's ("client"), lead ("server") or run free.
         sync_timeout_s: How long to wait for the others [s].
-        focus_m: Distance in focus [m]; needed by a camera with a focus motor, refused by any other.
         lores: Width and height of a second, small YUV420 image of each frame [px], or None.
     """
 
     index: int = 0
     sync: Sync = "off"
     sync_timeout_s: float = 60.0
-    focus_m: float | None = None
     lores: tuple[int, int] | None = None
 
 
@@ -56,8 +54,8 @@ def controls(
     """Controls of the configuration, by libcamera's names.
 
     Args:
-        camera: Exposure, gains and rate.
-        options: Focus and synchronisation.
+        camera: Exposure, gains, rate and focus.
+        options: Synchronisation.
         enums: Values of libcamera's enumerations.
         available: Controls that this camera has.
 
@@ -80,7 +78,7 @@ def controls(
     }
     if "NoiseReductionMode" in available:  # a camera without it has none to switch off
         asked["NoiseReductionMode"] = enums.noise_reduction_off
-    asked |= _focus(options, enums, available) | _sync(options, enums, available)
+    asked |= _focus(camera, enums, available) | _sync(options, enums, available)
     missing = [name for name in asked if name not in available]
     if missing:
         raise CameraError(
@@ -90,20 +88,19 @@ def controls(
     return asked
 
 
-def _focus(options: Picamera2Options, enums: Enums, available: Mapping[str, object]) -> dict[str, Any]:
+def _focus(camera: CameraCalibration, enums: Enums, available: Mapping[str, object]) -> dict[str, Any]:
     if "AfMode" not in available:
-        if options.focus_m is not None:
+        if camera.focus_m is not None:
             raise CameraError(
-                f"--focus {options.focus_m:g}: it has no focus motor; turn its lens, and leave --focus away"
+                f"focus_m {camera.focus_m:g}: it has no focus motor; turn its lens, and leave focus_m out of the file"
             )
         return {}
-    if options.focus_m is None:
+    if camera.focus_m is None:
         raise CameraError(
-            "it has a focus motor, which would move: give the distance in focus, for example --focus 0.6"
+            "it has a focus motor, which would move: write the distance in focus into the camera file, for example "
+            '"focus_m": 0.6'
         )
-    if not options.focus_m > 0.0:
-        raise CameraError(f"--focus {options.focus_m:g}: must be a distance above 0 m")
-    return {"AfMode": enums.af_manual, "LensPosition": 1.0 / options.focus_m}  # dioptres
+    return {"AfMode": enums.af_manual, "LensPosition": 1.0 / camera.focus_m}  # dioptres
 
 
 def _sync(options: Picamera2Options, enums: Enums, available: Mapping[str, object]) -> dict[str, Any]:
@@ -142,12 +139,10 @@ def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, An
                 f"{name} {', '.join(f'{v:g}' for v in values)} is not within {low[0]:g} to {high[0]:g}"
             )
     if wrong:
-        raise CameraError(f"in this mode {'; '.join(wrong)}: change the camera file (or --focus)")
+        raise CameraError(f"in this mode {'; '.join(wrong)}: change the camera file")
 
 
-def wanted_settings(
-    camera: CameraCalibration, options: Picamera2Options, available: Mapping[str, object]
-) -> tuple[Setting, ...]:
+def wanted_settings(camera: CameraCalibration, available: Mapping[str, object]) -> tuple[Setting, ...]:
     """What the metadata of a captured frame must say; tolerances as in the text above."""
     row_us = camera.row_time_us if camera.row_time_us > 0.0 else GLOBAL_SHUTTER_ROW_US
     exposure = row_us + EXPOSURE_SHARE * camera.exposure_us
@@ -161,8 +156,8 @@ def wanted_settings(
         Setting("ColourGains", camera.colour_gains, COLOUR_GAIN, "", "colour_gains"),
         Setting("FrameDuration", (1e6 / camera.frame_rate_hz,), row_us + 1.0, "us", rate),
     ]
-    if "AfMode" in available and options.focus_m is not None:
-        wanted.append(Setting("LensPosition", (1.0 / options.focus_m,), DIOPTRES, "dioptres", "--focus"))
+    if "AfMode" in available and camera.focus_m is not None:
+        wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), DIOPTRES, "dioptres", "focus_m"))
     return tuple(wanted)
 
 

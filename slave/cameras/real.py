@@ -19,7 +19,6 @@ CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 OPTIONS: dict[str, tuple[str, object]] = {
     "sync": ("picamera2", "off"),
     "sync_timeout": ("picamera2", 60.0),
-    "focus": ("picamera2", None),
     "control": ("v4l2", []),
     "allow_missing": ("v4l2", []),
 }
@@ -40,9 +39,6 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=60.0,
         metavar="S",
         help="how long to wait for them (default: %(default)s)",
-    )
-    pi.add_argument(
-        "--focus", type=float, metavar="M", help="distance in focus [m], for a camera with a focus motor"
     )
     usb = parser.add_argument_group("USB camera (v4l2)")
     usb.add_argument(
@@ -89,7 +85,7 @@ def open_real(
             flag = "--" + name.replace("_", "-")
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     if kind == "picamera2":
-        pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, options.focus)
+        pi = Picamera2Options(_index(place), options.sync, options.sync_timeout)
         return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop)
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing))

@@ -192,3 +192,10 @@ def test_recordings_of_the_data_sets_open_whole(datasets: Path) -> None:
             times = [row.t_ns for row in recording.frames_of(name) if row.illumination is Illumination.NONE]
             assert times == sorted(set(times)), f"{folder.name}: two frames of {name} at one instant"
         assert all((folder / row.file).is_file() for row in recording.rows)
+
+
+def test_frames_of_one_camera_at_one_time_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    open_recording(write(tmp_path))
+    assert "the time of another" not in caplog.text
+    open_recording(write(tmp_path, rows=(*ROWS, "left,2,2000,none,left/2.png")))
+    assert "camera left: frames with the time of another one: 1;" in caplog.text

@@ -124,7 +124,8 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     # From the stamps, so it does not matter how many frames a busy machine had no time for.
     rates = {"left": 60.0, "right": 60.0, "left2": 30.0, "right2": 30.0}
     assert summary["camera_hz"] == pytest.approx(rates, rel=2e-3)
-    assert summary["joint_mm"] < 8.0
+    # Of the markers that were placed: how long a pair is gone, and fingers unseen, depends on how busy the machine is.
+    assert summary["marker_mm"] < 4.0
     poses = load_poses(tmp_path / "poses.npz")
     alone = (poses.t_ns > killed_ns) & (
         poses.t_ns < killed_ns + 500_000_000

@@ -210,18 +210,18 @@ def test_focus_is_fixed_where_there_is_focus_and_refused_where_there_is_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     sensor = Sensor(focus=True)
-    opened(monkeypatch, sensor, Picamera2Options(focus_m=0.5)).close()
+    opened(monkeypatch, sensor, focus_m=0.5).close()
     controls = sensor.opened[0].config["controls"]
     assert (controls["AfMode"], controls["LensPosition"]) == (0, 2.0), "manual, 1 / 0.5 m"
     with pytest.raises(CameraError, match="it has a focus motor, which would move"):
         opened(monkeypatch, Sensor(focus=True))
     with pytest.raises(CameraError, match="no focus motor"):
-        opened(monkeypatch, Sensor(), Picamera2Options(focus_m=0.5))
+        opened(monkeypatch, Sensor(), focus_m=0.5)
     with pytest.raises(CameraError, match="LensPosition 20 is not within 0 to 15"):
-        opened(monkeypatch, Sensor(focus=True), Picamera2Options(focus_m=0.05))
+        opened(monkeypatch, Sensor(focus=True), focus_m=0.05)
     moved = Sensor(focus=True, tamper=overwrite("LensPosition", 1.0))
-    with pytest.raises(CameraError, match=r"LensPosition: wanted 2 dioptres .--focus., got 1 dioptres"):
-        opened(monkeypatch, moved, Picamera2Options(focus_m=0.5))
+    with pytest.raises(CameraError, match=r"LensPosition: wanted 2 dioptres .focus_m., got 1 dioptres"):
+        opened(monkeypatch, moved, focus_m=0.5)
 
 
 @pytest.mark.parametrize("role", ["server", "client"])

@@ -100,7 +100,11 @@ def test_other_drivers_are_not_its_business() -> None:
     [
         ("v4l2", ("--sync", "server"), "--sync is an option of --camera picamera2"),
         ("picamera2", ("--control", "gain=1"), "--control is an option of --camera v4l2"),
-        ("synthetic", ("--focus", "0.5"), "--focus is an option of --camera picamera2, not of synthetic"),
+        (
+            "synthetic",
+            ("--sync-timeout", "5"),
+            "--sync-timeout is an option of --camera picamera2, not of synthetic",
+        ),
         ("synthetic", ("--allow-missing", "gain"), "--allow-missing is an option of --camera v4l2"),
         ("v4l2", ("--control", "gain"), "write NAME=NUMBER"),
         ("v4l2", ("--control", "gain=1", "--control", "gain=2"), "--control gain is given twice"),

@@ -1,6 +1,5 @@
 """`calibrate time`: offsets of a recording to the rig file, refusals that say what to do, and the offset at work."""
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from tests import timing_scenes as scenes
 from tests.hand_helpers import camera_file, rig_file
 from tests.timing_scenes import Motion, cameras, recorded
 
-DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[4] / "shared" / "datasets"))
 RATES = {"left": 60.0, "right": 60.0}
 NAMES = ("left", "right")
 
@@ -141,13 +139,12 @@ def test_unrelated_frames_and_other_cameras_are_refused(tmp_path: Path) -> None:
     assert "must be the same" in text
 
 
-@pytest.mark.skipif(
-    not (DATASETS / "stereo").is_dir(), reason=f"no recordings at {DATASETS} (PHALANX_DATASETS)"
-)
 @pytest.mark.parametrize("late_ms", [0.0, 8.0, -8.0])
-def test_a_rendered_recording_of_eighteen_pairs_is_enough(late_ms: float, tmp_path: Path) -> None:
+def test_a_rendered_recording_of_eighteen_pairs_is_enough(
+    late_ms: float, tmp_path: Path, datasets: Path
+) -> None:
     """The exact centroids of the visible pixels, 0.1 px of noise; its stamps are true, and shifted here."""
-    folder = DATASETS / "stereo" / "translate_8ms"
+    folder = datasets / "stereo" / "translate_8ms"
     rng = np.random.default_rng(3)
     with np.load(folder / "truth.npz") as truth:
         uv, t_s = truth["uv"] + rng.normal(0.0, 0.1, truth["uv"].shape), truth["t_row0"]
