@@ -55,7 +55,7 @@ def _panel(axes: Axes, rate_hz: float) -> None:
         axes.plot(OFFSETS_MS, error, color=colour, label=label, linewidth=1.8)
     for value, name in ((GOAL, "goal"), (STRETCH, "stretch")):
         axes.axhline(value, color="#555555", linewidth=0.8, linestyle=":")
-        axes.text(16.7, value * 1.04, f"{name} {value:g} %", ha="right", fontsize=8, color="#555555")
+        axes.text(3.5, value * 1.04, f"{name} {value:g} %", fontsize=8, color="#555555")
     axes.set_yscale("log")
     axes.set_ylim(0.15, 40.0)
     axes.set_yticks([0.2, 0.5, 1, 2, 5, 10, 20], ["0.2", "0.5", "1", "2", "5", "10", "20"])
