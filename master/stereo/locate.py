@@ -4,13 +4,18 @@ What a camera sees of a cap is not its centroid; the difference follows from the
 (`master.stereo.caps`), which is itself only as sure as the hand is. So a point's covariance has these parts:
 
     centroids     noise, cover and time, each camera's own                  gain diag(sigma^2) gain'
+    alike         part of the noise is the same in all cameras              moves the point, not its depth
     direction     one finger is tilted for all cameras alike                spread of six tilted hands
     radius        the profile's, a tenth                                    0.1 of the whole correction
-    relief        of a flat marker: the back of a hand is none              0.3 mm
+    relief        of a flat marker: the back of a hand is none              0.4 mm
     calibration   what its provenance says is left                          `master.stereo.place`
 
 Tilt matters most along the sight: two cameras see a finger that points at one of them from different sides, so that
 a degree of tilt moves the two centroids apart, and the distance with them.
+
+Cameras side by side see the same cap in the same light, so that its rim and its shading mislead them alike: of what a
+whole cap's centroid is wrong by, most is an error of place that all cameras see, and little is one of disparity. What
+hides a part of a cap, or comes of time, is each camera's own.
 
 How sure a tilt is, an instant says alone (`master.ik.certainty`): the error of this correction repeats that of the last
 pose. For the same reason the hand fit must be told more. It believes that fingers move between instants as fast as its
@@ -33,7 +38,10 @@ TURN_RAD_S = (
     2.0  # standard deviation of how fast a finger end turns: a fist closes in a second, and mostly rests
 )
 _RADIUS = 0.1  # relative error of a profile's radii: 0.8 mm
-_RELIEF_M = 0.3e-3  # 16 mm of paint on a back with 50 mm radius of curvature bulge by 0.6 mm
+_RELIEF_M = 0.4e-3  # 16 mm of paint on a back with 50 mm radius of curvature bulge by 0.6 mm
+# Of the variance of whole caps' centroids: 0.65 to 0.8 by finger and motion where caps are rendered and detected. Above
+# this sigma a slave suspects that something hides a part (`slave.markers.sigma`), or time adds its own.
+_ALIKE, _ALIKE_PX = 0.75, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +51,7 @@ class Located:
     Attributes:
         points: Cap centroids (M, 3) [m]; NaN: not seen by two cameras, or their rays do not meet.
         cov: (M, 3, 3) [m^2].
-        noise: (M, 3, 3) [m^2] the part of `cov` that differs from one instant to the next.
+        noise: (M, 3, 3) [m^2] the part of `cov` that may differ from one instant to the next, and between cameras.
         repeated: (M, 3, 3) [m^2] what is to be added to `cov` for a fit that starts at the same hand.
         apart: (M,) the rays do not meet.
         left_out: (C, M) sightings without which they do.
@@ -63,6 +71,8 @@ class CapLocator:
     def __init__(self, cameras: tuple[CameraModel, ...], caps: CapModel, place: Placement) -> None:
         """Locate with these cameras, caps and depth model."""
         self._cameras, self._caps, self._place = cameras, caps, place
+        # How far each u, v, u, v ... goes with a step of a metre along x, y, z, by the scale of the image (2 C, 3).
+        self._axes = np.concatenate([camera.T_rig_camera[:3, :2].T for camera in cameras])
         self._nothing = np.zeros((len(cameras), len(caps.on_finger)), dtype=np.bool_)
 
     def __call__(
@@ -117,7 +127,8 @@ class CapLocator:
         tilt = moved[..., 1:] - moved[..., :1]
         tilted = tilt @ tilt.swapaxes(1, 2) / tilt.shape[-1]
         corrected = _RADIUS * moved[..., :1]
-        cov = placed.cov + tilted + corrected @ corrected.swapaxes(1, 2)
+        alike = self._alike(placed.gain, sigma_px, doubt)
+        cov = placed.cov + alike + tilted + corrected @ corrected.swapaxes(1, 2)
         cov[~self._caps.on_finger] += _RELIEF_M**2 * np.eye(3)
         apart = placed.apart(uv)
         left_out = self._nothing
@@ -126,6 +137,21 @@ class CapLocator:
             placed.points[apart], cov[apart] = np.nan, np.nan
         repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
         return Located(placed.points, cov, placed.cov, repeated, apart, left_out)
+
+    def _alike(self, gain: Float, sigma_px: Float, doubt_px: Float) -> Float:
+        """What it changes in covariances (M, 3, 3) that cameras err alike, as if the marker were elsewhere.
+
+        The same part of each camera's variance is taken as one step of the marker, instead of as each camera's own.
+
+        Args:
+            gain: (M, 3, 2 C) [m/px].
+            sigma_px: (C, M) as the slaves have it; NaN: not seen.
+            doubt_px: (C, M) of hidden caps, who share nothing: what hides them is elsewhere for each camera.
+        """
+        least = np.minimum(np.nan_to_num(np.fmin.reduce(sigma_px, axis=0)), _ALIKE_PX)
+        shared = np.where(doubt_px.any(axis=0), 0.0, _ALIKE * least * least)
+        step = gain @ self._axes
+        return shared[:, None, None] * (step @ step.swapaxes(1, 2) - gain @ gain.swapaxes(1, 2))
 
     def look(self, points: Float, hand: HandSolution | None, age_s: float) -> CapLook:
         """How caps at (M, 3) [m] look: as the hand has them, and tilted as far as it is unsure."""

@@ -7,6 +7,7 @@ import pytest
 
 from common.arrays import Float
 from common.calibration import Provenance
+from common.camera_model import CameraModel
 from common.geometry import rigid
 from common.hand_model import TIPS, HandJoints
 from master.ik.hand import HandSolution
@@ -46,6 +47,12 @@ def seen(joints: HandJoints) -> tuple[Float, Float]:
     return points, np.stack([c.project(points) for c in CAMERAS]) + CAPS.bias_px(joints, points, CAMERAS)
 
 
+def centroid_errors(rng: np.random.Generator, sigma_px: float = 0.1) -> Float:
+    """Errors (2, 6, 2) [px], three quarters of whose variance are the same in both cameras."""
+    alike, own = rng.normal(0.0, sigma_px, (1, 6, 2)), rng.normal(0.0, sigma_px, (2, 6, 2))
+    return np.sqrt(0.75) * alike + np.sqrt(0.25) * own
+
+
 def test_a_known_hand_gives_its_caps_back() -> None:
     known = hand(0.0)
     points, uv = seen(known.joints)
@@ -70,7 +77,7 @@ def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> 
         ahead = -R[:, :, 2] + np.einsum("kij,kj->ki", R[:, :, :2], tilt)
         rotation[TIPS, :, 2] = -ahead / np.linalg.norm(ahead, axis=1, keepdims=True)
         _, uv = seen(replace(believed.joints, rotation=rotation))
-        errors.append(locate(believed, uv + rng.normal(0.0, 0.1, uv.shape)).points - truth)
+        errors.append(locate(believed, uv + centroid_errors(rng)).points - truth)
     spread = np.array(errors)
     cov = locate(believed, seen(believed.joints)[1]).cov
     for m in range(5):
@@ -78,6 +85,54 @@ def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> 
         assert 0.90 < (nees < 7.815).mean() <= 1.0, MARKERS[m]
         sd_m = np.sqrt(np.diag(np.cov(spread[:, m].T)))
         assert (np.sqrt(np.diag(cov[m])) < 1.6 * sd_m + 1e-4).all(), MARKERS[m]
+
+
+def test_errors_that_cameras_have_alike_move_a_point_and_not_its_depth() -> None:
+    rng = np.random.default_rng(3)
+    known = hand(0.0)
+    _, uv = seen(known.joints)
+    found = np.array([locate(known, uv + centroid_errors(rng)).points for _ in range(4000)])
+    locator = CapLocator(CAMERAS, CAPS, Placement(CAMERAS, None))
+    claimed = locate(known, uv).cov - locator(uv, 1e-3 * SIGMA, UNSTATED, known, 0.0).cov
+    spread = np.array([np.cov(found[:, m].T) for m in range(6)])
+    np.testing.assert_allclose(
+        np.diagonal(claimed, axis1=1, axis2=2), np.diagonal(spread, axis1=1, axis2=2), rtol=0.12
+    )
+    # Depth is sure to half of what each camera's own errors would make of it: a quarter of the variance.
+    np.testing.assert_allclose(claimed[:, 2, 2], 0.25 * locate(known, uv).noise[:, 2, 2], rtol=0.2)
+
+
+def test_cameras_share_nothing_of_a_cap_that_is_partly_hidden() -> None:
+    known = hand(0.0)
+    points, uv = seen(known.joints)
+    whole = CAPS.look(-known.joints.rotation[TIPS][None, :, :, 2], points, CAMERAS).whole_m2[0]
+    away = np.stack([np.linalg.norm(points - camera.centre, axis=1) for camera in CAMERAS])
+    area = whole * (500.0 / away) ** 2
+    area[:, 5] = np.nan
+    covered = area.copy()
+    covered[1, 3] *= 0.5
+    locator = CapLocator(CAMERAS, CAPS, Placement(CAMERAS, None))
+    before, after = (locator(uv, SIGMA, seen_px2, known, 0.0) for seen_px2 in (area, covered))
+    assert (before.cov - before.noise)[3, 2, 2] < 0.0
+    assert (after.cov - after.noise)[3, 2, 2] > 0.0
+    np.testing.assert_allclose(np.delete(after.cov, 3, axis=0), np.delete(before.cov, 3, axis=0))
+
+
+@pytest.mark.parametrize("cameras", [CAMERAS, FOUR])
+def test_covariances_stay_positive_whoever_sees_a_marker_and_however_surely(
+    cameras: tuple[CameraModel, ...],
+) -> None:
+    rng = np.random.default_rng(8)
+    locator = CapLocator(cameras, CAPS, Placement(cameras, None))
+    points = RIGHT.marker_points(hand(0.0).joints, MARKERS)
+    for _ in range(100):
+        uv = np.stack([camera.project(points) for camera in cameras])
+        uv[rng.random(uv.shape[:2]) < 0.2] = np.nan
+        sigma = np.where(np.isnan(uv[..., 0]), np.nan, 10.0 ** rng.uniform(-2.0, 1.0, uv.shape[:2]))
+        found = locator(uv, sigma, np.full(sigma.shape, np.nan), hand(0.0), 0.0)
+        placed = np.isfinite(found.points[:, 0])
+        assert (np.linalg.eigvalsh(found.cov[placed]) > 0.0).all()
+        np.testing.assert_array_equal(placed, np.isfinite(found.cov).all(axis=(1, 2)))
 
 
 def test_an_unsure_pose_widens_most_along_the_sight_and_age_adds_to_it() -> None:
