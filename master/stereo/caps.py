@@ -27,7 +27,7 @@ _FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or p
 _LEAST_SHARE = 0.8  # of what a whole cap shows: where its radius is a tenth smaller than the profile says
 _ALIKE = 0.9  # of the share that another camera sees: what edges of two blobs of 200 px do not explain
 # What hides a part from one camera is near to the sight of the others too, and may hide as much from all as none of
-# them can tell: rendered hands, mean of the lesser share by the larger (its rms is 0.28).
+# them can tell: the lesser hidden share by the larger, of 20 rendered caps, is 0.16 in the mean and 0.28 rms.
 _REACH = 0.2
 _SPECK_M2 = 1e-9
 
