@@ -9,6 +9,7 @@ import csv
 import io
 import logging
 import re
+from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path, PurePath
@@ -130,7 +131,9 @@ def open_recording(folder: Path) -> FrameRecording:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
-    for camera, count in _repeated(rows).items():
+    repeated = Counter(row.camera for row in rows)
+    repeated -= Counter(camera for camera, _ in {(row.camera, row.t_ns) for row in rows})
+    for camera, count in repeated.items():
         _LOG.warning(
             "%s: camera %s: frames with the time of another one: %d; of one time only one gives a pose",
             path,
@@ -157,14 +160,6 @@ def check_manifest(manifest: Manifest, where: str) -> None:
         check(rig, f"{where}: rig {rig.name!r}")
         if missing := set(rig.cameras) - manifest.cameras.keys():
             raise CalibrationError(f"{where}: cameras: {min(missing)!r} of rig {rig.name!r} is missing")
-
-
-def _repeated(rows: tuple[FrameRow, ...]) -> dict[str, int]:
-    """Per camera with equal times: in how many rows; one camera has one frame at a time."""
-    times: dict[str, list[int]] = {}
-    for row in rows:
-        times.setdefault(row.camera, []).append(row.t_ns)
-    return {camera: len(own) - len(set(own)) for camera, own in times.items() if len(set(own)) < len(own)}
 
 
 def _rows(path: Path, text: str) -> tuple[FrameRow, ...]:
