@@ -202,15 +202,21 @@ class MarkerMount(_File, frozen=True):
 
 
 Span = tuple[Number, Number]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class FingerLimits(_File, frozen=True):
-    """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP."""
+    """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
+
+    `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
+    1: the range stays.
+    """
 
     abduction_rad: Span
     flexion_rad: Span
     pip_rad: Span
     dip_rad: Span
+    spread_at_full_flexion: Share = 1.0
 
 
 class Limits(_File, frozen=True):
@@ -224,10 +230,16 @@ class Limits(_File, frozen=True):
 
 
 class Couplings(_File, frozen=True):
-    """Natural relations between angles. `dip_per_pip` None: the DIP is free."""
+    """Natural relations between the angles of index ... little; each can be switched off.
+
+    `dip_per_pip` None: the DIP is free. `dip_spread_rad`: standard deviation of the DIP about that ratio; 0: it is
+    kept exactly. `mcp_per_pip` None: no natural flexion. `neighbours`: fingers side by side tend to bend alike.
+    """
 
     dip_per_pip: NonNegative | None = 2.0 / 3.0
-    mcp_per_pip: NonNegative = 0.54
+    dip_spread_rad: Annotated[float, Meta(ge=0.0, le=3.2)] = 0.0
+    mcp_per_pip: NonNegative | None = 0.54
+    neighbours: bool = True
 
 
 class HandProfile(_File, frozen=True):

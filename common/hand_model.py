@@ -9,15 +9,19 @@ joint's own +x; an abduction is a rotation about the palm's +y, positive towards
 
 All five fingers are the same chain of four joints (root, two hinges, tip), so forward kinematics is four
 stacked products and no loop over fingers.
+
+Limits are per angle, but the abduction's narrow with flexion (`spread_left`): spread fingers cannot stay spread in
+a fist, because the collateral ligaments of the MCP tighten.
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.calibration import Couplings, HandProfile, Limits
+from common.calibration import Couplings, FingerLimits, HandProfile, Limits
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix
 from common.hand_presets import preset_limits, radius_share
@@ -49,6 +53,19 @@ FINGER_JOINTS = (
 )
 PALM_FRAME = "palm_frame"
 TIPS = CHAINS[:, 3]
+ABDUCTION, FLEXION = 0, 1  # columns of the angles
+
+FloatOrArray = TypeVar("FloatOrArray", float, Float)
+
+
+def spread_left(flexed: FloatOrArray, at_full_flexion: FloatOrArray) -> FloatOrArray:
+    """Share of the abduction range that is left, a parabola from 1 down to `at_full_flexion`.
+
+    Args:
+        flexed: Flexion as a share of the highest, 0 ... 1.
+        at_full_flexion: Share left where `flexed` is 1.
+    """
+    return 1.0 - (1.0 - at_full_flexion) * flexed * flexed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,9 +122,12 @@ class HandModel:
         rest_position_m: (26, 3) [m], palm frame.
         rest_rotation: (26, 3, 3), joint frame -> palm frame.
         radius_m: (26,) [m].
-        limits_rad: (5, 4, 2) low and high of every angle.
+        limits_rad: (5, 4, 2) low and high of every angle; the abduction's where nothing narrows it.
+        spread_at_full_flexion: (5,) share of the abduction range left at the highest flexion.
         dip_per_pip: Coupling of index ... little, or None where the DIP is free.
-        mcp_per_pip: Natural flexion, a prior only.
+        dip_spread_rad: Standard deviation of the DIP about that ratio; 0: it is kept exactly.
+        mcp_per_pip: Natural flexion, a prior only, or None where there is none.
+        neighbours: Whether fingers side by side tend to bend alike, a prior only.
         mounts: Marker name -> where it sits.
         side_sign: +1 right, -1 left.
         bone_m: (5, 3, 3) link k of each finger in the frame of its joint k.
@@ -121,8 +141,11 @@ class HandModel:
     rest_rotation: Float
     radius_m: Float
     limits_rad: Float
+    spread_at_full_flexion: Float
     dip_per_pip: float | None
-    mcp_per_pip: float
+    dip_spread_rad: float
+    mcp_per_pip: float | None
+    neighbours: bool
     mounts: dict[str, Mount]
     side_sign: float
     bone_m: Float
@@ -146,16 +169,20 @@ class HandModel:
                 turn[f, k] = rotation[a].T @ rotation[b]
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
-        couplings = profile.couplings or Couplings()
+        couplings = _couplings(profile, where)
+        limits = profile.limits_rad or preset_limits("K")
         side_sign = 1.0 if profile.side == "right" else -1.0
         return cls(
             profile=profile,
             rest_position_m=position,
             rest_rotation=rotation,
             radius_m=_radii(profile, where),
-            limits_rad=_limits(profile.limits_rad or preset_limits("K"), where),
+            limits_rad=_limits(limits, where),
+            spread_at_full_flexion=_spreads(limits, where),
             dip_per_pip=couplings.dip_per_pip,
+            dip_spread_rad=couplings.dip_spread_rad,
             mcp_per_pip=couplings.mcp_per_pip,
+            neighbours=couplings.neighbours,
             mounts=_mounts(profile, where),
             side_sign=side_sign,
             bone_m=bone,
@@ -226,10 +253,28 @@ class HandModel:
             )
         return self.mounts[name]
 
+    def abduction_limits_rad(self, flexion_rad: Float) -> tuple[Float, Float]:
+        """Low and high (..., 5) [rad] of the abduction at flexions (..., 5) [rad]; NaN where the flexion is."""
+        most = self.limits_rad[:, FLEXION, 1]
+        flexed = np.clip(flexion_rad, 0.0, most) / np.where(most > 0.0, most, 1.0)
+        left = spread_left(np.maximum(flexed, 0.0), self.spread_at_full_flexion)
+        return left * self.limits_rad[:, ABDUCTION, 0], left * self.limits_rad[:, ABDUCTION, 1]
+
     def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
-        """Whether each of the angles (..., 5, 4) is inside its limits."""
+        """Whether each of the angles (..., 5, 4) is inside its limits; the abduction inside those of its flexion."""
         low, high = self.limits_rad[..., 0], self.limits_rad[..., 1]
-        return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
+        inside = (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
+        low, high = self.abduction_limits_rad(angles_rad[..., FLEXION])
+        spread = angles_rad[..., ABDUCTION]
+        inside[..., ABDUCTION] &= (spread >= low - slack_rad) & (spread <= high + slack_rad)
+        return inside
+
+    def clamp(self, angles_rad: Float) -> Float:
+        """Angles (..., 5, 4) cut at their limits, the abduction at those of the flexion that is left."""
+        legal = np.clip(angles_rad, self.limits_rad[..., 0], self.limits_rad[..., 1])
+        low, high = self.abduction_limits_rad(legal[..., FLEXION])
+        legal[..., ABDUCTION] = np.clip(legal[..., ABDUCTION], low, high)
+        return legal
 
 
 def _swing(root: Float, turn: Float, side_sign: float) -> Float:
@@ -296,6 +341,30 @@ def _limits(limits: Limits, where: str) -> Float:
     if len(crossed):
         raise CalibrationError(f"{where}: limits_rad.{FINGERS[crossed[0][0]]}: low is above high")
     return table
+
+
+def _spreads(limits: Limits, where: str) -> Float:
+    shares: list[float] = []
+    for finger in FINGERS:
+        of: FingerLimits = getattr(limits, finger)
+        low, high = of.abduction_rad
+        if of.spread_at_full_flexion < 1.0 and not low <= 0.0 <= high:
+            raise CalibrationError(
+                f"{where}: limits_rad.{finger}.spread_at_full_flexion: below 1 it narrows abduction_rad towards 0,"
+                f" which {low} ... {high} does not contain"
+            )
+        shares.append(of.spread_at_full_flexion)
+    return np.array(shares)
+
+
+def _couplings(profile: HandProfile, where: str) -> Couplings:
+    couplings = profile.couplings or Couplings()
+    if couplings.dip_per_pip is None and couplings.dip_spread_rad > 0.0:
+        raise CalibrationError(
+            f"{where}: couplings.dip_spread_rad: there is no ratio to stray from while dip_per_pip is null; give"
+            " dip_per_pip a ratio, or leave dip_spread_rad out"
+        )
+    return couplings
 
 
 def _mounts(profile: HandProfile, where: str) -> dict[str, Mount]:

@@ -145,11 +145,14 @@ def _natural_rows(model: HandModel, parameters: HandParameters, priors: Priors) 
     for f in range(1, 5):
         a = 4 * f
         add({a: 1.0}, 0.0, priors.abduction)
-        add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
+        if model.mcp_per_pip is None:
+            add({a + 1: 1.0}, priors.pip_mean, priors.pip)  # as little as is known of the PIP
+        else:
+            add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
         add({a + 2: 1.0}, priors.pip_mean, priors.pip)
         if model.dip_per_pip is None:
             add({a + 3: 1.0, a + 2: -_DIP_PER_PIP}, 0.0, priors.free_dip)
-        if f < 4:
+        if model.neighbours and f < 4:
             add({a + 1: 1.0, a + 5: -1.0}, 0.0, priors.neighbour_flexion)
             add({a + 2: 1.0, a + 6: -1.0}, 0.0, priors.neighbour_pip)
     return np.array(rows), np.array(means)

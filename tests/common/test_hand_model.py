@@ -213,6 +213,59 @@ def test_limits_are_checked_angle_by_angle() -> None:
     assert not RIGHT.within_limits(np.full((5, 4), np.nan)).any()
 
 
+def narrowed(share: float, preset: str = "D") -> HandModel:
+    """A hand whose index keeps a share of its abduction in a fist."""
+    limits = preset_limits("K" if preset == "K" else "D")
+    index = msgspec.structs.replace(limits.index, spread_at_full_flexion=share)
+    limits = msgspec.structs.replace(limits, index=index)
+    return HandModel.of(msgspec.structs.replace(RIGHT.profile, limits_rad=limits))
+
+
+def test_abduction_narrows_by_a_parabola() -> None:
+    model = narrowed(0.4)
+    flexion = np.radians([[-5.0], [0.0], [50.0], [100.0], [120.0]]) * np.ones(5)
+    low, high = model.abduction_limits_rad(flexion)
+    # 20 deg, of which 60 % go with the square of the flexion: half way a quarter of them.
+    np.testing.assert_allclose(np.degrees(high[:, 1]), [20, 20, 20 * (1 - 0.6 / 4), 8, 8])
+    np.testing.assert_allclose(low[:, 1], -high[:, 1])
+    still = HandModel.of(msgspec.structs.replace(RIGHT.profile, limits_rad=preset_limits("D")))
+    np.testing.assert_allclose(np.degrees(narrowed(1.0).abduction_limits_rad(flexion)[1][:, 1]), 20.0)
+    np.testing.assert_allclose(high[:, 0], still.limits_rad[0, 0, 1])  # the thumb's stays
+
+
+def test_a_spread_fist_is_outside_and_cut() -> None:
+    model = narrowed(0.4)
+    angles = np.zeros((2, 5, 4))
+    angles[:, 1, 0] = np.radians(15.0)
+    angles[1, 1, 1] = np.radians(100.0)
+    inside = model.within_limits(angles)
+    assert inside[0].all()
+    assert not inside[1, 1, 0]
+    assert inside.sum() == 39
+    assert narrowed(1.0).within_limits(angles).all()
+    cut = model.clamp(angles)
+    np.testing.assert_array_equal(cut[0], angles[0])
+    assert np.degrees(cut[1, 1, 0]) == pytest.approx(8.0)
+    assert model.within_limits(cut, 0.0).all()
+    angles[0, 1, 1] = np.nan
+    assert not model.within_limits(angles)[0, 1, :2].any()
+
+
+def test_couplings_are_off_soft_or_fixed() -> None:
+    def of(couplings: Couplings) -> HandModel:
+        return HandModel.of(msgspec.structs.replace(RIGHT.profile, couplings=couplings))
+
+    assert (RIGHT.dip_spread_rad, RIGHT.neighbours) == (0.0, True)
+    assert of(Couplings(dip_per_pip=None)).dip_per_pip is None
+    soft = of(Couplings(dip_per_pip=0.84, dip_spread_rad=0.1, mcp_per_pip=None, neighbours=False))
+    assert (soft.dip_per_pip, soft.dip_spread_rad, soft.mcp_per_pip, soft.neighbours) == (
+        0.84,
+        0.1,
+        None,
+        False,
+    )
+
+
 def test_marker_of_the_palm_follows_the_palm_and_of_a_tip_its_joint() -> None:
     T = palm(np.array([20.0, -10.0, 5.0]))
     joints = RIGHT.forward(T, np.zeros((5, 4)))
@@ -244,6 +297,16 @@ def crossed(profile: HandProfile) -> HandProfile:
     return msgspec.structs.replace(profile, limits_rad=msgspec.structs.replace(limits, ring=ring))
 
 
+def spread_without_zero(profile: HandProfile) -> HandProfile:
+    limits = preset_limits("K")
+    ring = msgspec.structs.replace(limits.ring, abduction_rad=(0.1, 0.2), spread_at_full_flexion=0.5)
+    return msgspec.structs.replace(profile, limits_rad=msgspec.structs.replace(limits, ring=ring))
+
+
+def stray_without_ratio(profile: HandProfile) -> HandProfile:
+    return msgspec.structs.replace(profile, couplings=Couplings(dip_per_pip=None, dip_spread_rad=0.1))
+
+
 def mounted(profile: HandProfile) -> HandProfile:
     mounts = {**profile.markers, "index": MarkerMount(joint="elbow", offset_m=(0.0, 0.0, 0.0))}
     return msgspec.structs.replace(profile, markers=mounts)
@@ -261,6 +324,8 @@ BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] 
         ("rest_joints", "1 mm"),
     ),
     "crossed limits": (crossed, ("limits_rad.ring",)),
+    "narrowing away from zero": (spread_without_zero, ("limits_rad.ring.spread_at_full_flexion", "0.1")),
+    "straying from nothing": (stray_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
     "unknown mount": (mounted, ("markers.index.joint", "elbow")),
     "unknown radius": (lambda p: msgspec.structs.replace(p, radius_m={"elbow": 0.01}), ("radius_m", "elbow")),
 }

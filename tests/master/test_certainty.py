@@ -72,7 +72,7 @@ def test_directions_err_as_much_as_is_claimed() -> None:
         pip = p.pip_mean + rng.normal(0.0, 0.5 * p.pip) + rng.normal(0.0, 0.5 * p.neighbour_pip, 4)
         angles[1:, 2] = np.clip(pip, low[1:, 2], high[1:, 2])
         angles[1:, 0] = rng.normal(0.0, p.abduction, 4)
-        angles[1:, 1] = RIGHT.mcp_per_pip * angles[1:, 2] + rng.normal(0.0, p.natural_flexion, 4)
+        angles[1:, 1] = (RIGHT.mcp_per_pip or 0.0) * angles[1:, 2] + rng.normal(0.0, p.natural_flexion, 4)
         angles[1:, 3] = (RIGHT.dip_per_pip or 0.0) * angles[1:, 2]
         angles = np.clip(angles, low, high)
         T = palm(np.degrees(rng.normal(0.0, p.facing / np.sqrt(2.0), 3)))

@@ -123,6 +123,7 @@ def believed(model: HandModel) -> tuple[Float, Priors]:
     angles = np.zeros((5, 4))
     pip = Priors().pip_mean
     assert model.dip_per_pip is not None
+    assert model.mcp_per_pip is not None
     angles[1:] = [0.0, model.mcp_per_pip * pip, pip, model.dip_per_pip * pip]
     angles[0] = thumb
     return angles, Priors(thumb_mean=(thumb[0], thumb[1], thumb[2], thumb[3]))
