@@ -5,6 +5,7 @@ names where they are not SI. The JSON schema of each file is exported to docs/ f
 """
 
 import inspect
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
@@ -29,10 +30,9 @@ Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
 LinearLight = Annotated[float, Meta(gt=0.0, le=1.0)]
-Json = Annotated[object, Meta(extra_json_schema={"description": "any JSON value"})]
 Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
 
-
+UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
 StructT = TypeVar("StructT", bound=Struct)
 
 
@@ -143,6 +143,23 @@ class Volume(_File, frozen=True):
     high_m: Vector3
 
 
+class ImuCalibration(_File, frozen=True):
+    """An IMU fixed to the palm, as far as known; its orientation is used where mounting and world are.
+
+    `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
+    frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
+    the vertical, which drifts by `heading_drift_rad_s`; null: not known at all, as without a magnetometer.
+    """
+
+    name: Name = "imu"
+    rate_hz: Positive = 120.0
+    q_palm_imu: Quaternion | None = None
+    q_rig_world: Quaternion | None = None
+    orientation_sigma_rad: Positive = math.radians(2.0)
+    heading_sigma_rad: Positive | None = None
+    heading_drift_rad_s: NonNegative = 0.0
+
+
 class RigCalibration(_File, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
 
@@ -170,7 +187,7 @@ class RigCalibration(_File, frozen=True):
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
     led: tuple[Vector3, ...] | None = None
-    imu: dict[str, Json] | None = None
+    imu: ImuCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
         """`T_rig_camera` (4, 4) [m] of one camera.
@@ -315,6 +332,8 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         a >= b for a, b in zip(rig.volume.low_m, rig.volume.high_m, strict=True)
     ):
         raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
+    if rig.imu is not None:
+        _check_imu(rig.imu, rig.cameras, where)
     if rig.kind == "wrist":
         return
     # None at all: a rig that is still to be measured.
@@ -333,6 +352,18 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
         )
+
+
+def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> None:
+    if imu.name in cameras:
+        raise CalibrationError(
+            f"{where}: imu.name: {imu.name!r} is a camera; every sender has a name of its own"
+        )
+    for key, value in (("q_palm_imu", imu.q_palm_imu), ("q_rig_world", imu.q_rig_world)):
+        if value is not None and abs(math.hypot(*value) - 1.0) > UNIT_WITHIN:
+            raise CalibrationError(
+                f"{where}: imu.{key}: length {math.hypot(*value):.4g}, a rotation is a quaternion wxyz of length 1"
+            )
 
 
 def save(path: Path, value: Struct) -> None:

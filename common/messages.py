@@ -19,7 +19,7 @@ from msgspec import Meta, Struct
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 3
+WIRE_VERSION = 4
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
@@ -98,6 +98,36 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "rival_uv", np.float64, (m, 2))
         if not np.isnan(self.rival_uv[unseen]).all():
             raise ValueError("rival_uv: a rival of a marker that is not seen")
+
+
+class ImuSample(Message, frozen=True, eq=False, tag=True):
+    """What one inertial sensor measured at one instant, in its own axes. NaN: it has no such sensor, or no value.
+
+    Attributes:
+        source: Name of the sensor, that of the rig's `imu`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Sample counter of this sensor; a gap is a dropped sample.
+        t_ns: When it was measured [ns], sender's clock until `ingest`, then the master's.
+        gyro_rad_s: Angular velocity (3,) [rad/s].
+        accel_m_s2: Specific force (3,) [m/s^2]: at rest it points up, 9.81 long.
+        mag_ut: Magnetic field (3,) [uT].
+        orientation_wxyz: (4,) quaternion, sensor axes -> the sensor's world, whose z axis is vertical.
+    """
+
+    source: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    gyro_rad_s: Float
+    accel_m_s2: Float
+    mag_ut: Float
+    orientation_wxyz: Float
+
+    def __post_init__(self) -> None:
+        _freeze(self, "gyro_rad_s", np.float64, (3,))
+        _freeze(self, "accel_m_s2", np.float64, (3,))
+        _freeze(self, "mag_ut", np.float64, (3,))
+        _freeze(self, "orientation_wxyz", np.float64, (4,))
 
 
 class HandPose(Message, frozen=True, eq=False, tag=True):
@@ -232,13 +262,13 @@ class Still(Message, frozen=True, eq=False, tag=True):
             raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_STILL_BYTES}")
 
 
-AnyMessage: TypeAlias = MarkerDetections | HandPose | Health | Command | Preview | Still
+AnyMessage: TypeAlias = MarkerDetections | ImuSample | HandPose | Health | Command | Preview | Still
 
 _JPEG_START = b"\xff\xd8\xff"
 _NONE = np.empty((0, 2))
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
-    MarkerDetections | HandPose | Health | Command | Preview | Still,
+    MarkerDetections | ImuSample | HandPose | Health | Command | Preview | Still,
     dec_hook=lambda kind, raw: _from_bytes(kind, raw),
 )
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from common.messages import Command, HandPose, Health, MarkerDetections, Message, Preview, Still
+from common.messages import Command, HandPose, Health, ImuSample, MarkerDetections, Message, Preview, Still
 
 
 class Path(StrEnum):
@@ -32,6 +32,7 @@ class Stream:
 
 STREAMS = {
     "markers": Stream(MarkerDetections, Path.DATAGRAM, None, True),
+    "imu": Stream(ImuSample, Path.DATAGRAM, None, True),
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
     "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),

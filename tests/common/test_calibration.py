@@ -16,6 +16,7 @@ from common.calibration import (
     CameraCalibration,
     HandProfile,
     HsvRange,
+    ImuCalibration,
     Intrinsics,
     MarkerMount,
     PowerLawCalibration,
@@ -146,10 +147,27 @@ def test_what_is_saved_is_loaded_equal(value: CameraCalibration | HandProfile, t
     assert load(path, type(value)) == value
 
 
-@given(
-    number, st.floats(1e-3, 1e3), st.floats(-3.0, -1e-3), st.dictionaries(st.text(), st.text(), max_size=3)
-)
-def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: dict[str, str]) -> None:
+imus = st.builds(
+    ImuCalibration,
+    name=names,
+    rate_hz=positive,
+    q_palm_imu=st.none() | st.sampled_from([(1.0, 0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5)]),
+    q_rig_world=st.none() | st.just((0.6, 0.0, 0.8, 0.0)),
+    orientation_sigma_rad=positive,
+    heading_sigma_rad=st.none() | positive,
+    heading_drift_rad_s=st.floats(0.0, 1e9),
+).filter(lambda imu: imu.name not in ("left", "right"))
+
+
+def test_an_imu_of_which_nothing_is_known_is_an_empty_map() -> None:
+    content = msgspec.to_builtins(SAMPLES[RigCalibration]) | {"imu": {}}
+    rig = parse(msgspec.json.encode(content), RigCalibration, "sample")
+    # Neither mounting nor heading is assumed.
+    assert rig.imu == ImuCalibration(q_palm_imu=None, q_rig_world=None, heading_sigma_rad=None)
+
+
+@given(number, st.floats(1e-3, 1e3), st.floats(-3.0, -1e-3), st.none() | imus)
+def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: ImuCalibration | None) -> None:
     rig = RigCalibration(
         version=1,
         name="desk",
@@ -160,7 +178,7 @@ def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: dict[str, str
         depth_model="affine_disparity",
         power_law=PowerLawCalibration(k_m=k, z=z),
         affine_disparity=AffineDisparityCalibration(a_m_px=k, x0_px=x0),
-        imu=dict(imu),
+        imu=imu,
     )
     assert parse(compact_numbers(msgspec.json.encode(rig).decode()).encode(), RigCalibration, "memory") == rig
 
@@ -173,6 +191,10 @@ def test_the_samples_of_this_file_are_valid(kind: type[msgspec.Struct]) -> None:
 @pytest.mark.parametrize(
     ("kind", "path", "value", "said"),
     [
+        (RigCalibration, "imu", {"q_palm_imu": [1, 1, 0, 0]}, r"imu\.q_palm_imu: length 1\.414"),
+        (RigCalibration, "imu", {"q_rig_world": [1, 0, 0]}, r"\$\.imu\.q_rig_world"),
+        (RigCalibration, "imu", {"name": "left"}, r"imu\.name: 'left' is a camera"),
+        (RigCalibration, "imu", {"drift": 1}, r"`drift`.*\$\.imu"),
         (CameraCalibration, "exposure_ms", 6, "exposure_ms"),
         (CameraCalibration, "intrinsics.fx", 503.0, r"`fx`.*\$\.intrinsics"),
         (CameraCalibration, "markers.thumb.hsv", [1, 2, 3], "`hsv`"),

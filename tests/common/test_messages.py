@@ -24,6 +24,7 @@ from common.messages import (
     Command,
     HandPose,
     Health,
+    ImuSample,
     MarkerDetections,
     Message,
     Preview,
@@ -90,6 +91,17 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
     )
 
 
+imu_samples = st.builds(
+    ImuSample,
+    source=names,
+    session=counts,
+    seq=counts,
+    t_ns=times,
+    gyro_rad_s=floats(3),
+    accel_m_s2=floats(3),
+    mag_ut=floats(3),
+    orientation_wxyz=floats(4),
+)
 healths = st.builds(
     Health,
     source=names,
@@ -134,6 +146,7 @@ def sample_detections(markers: int = 6, rivals: Float | None = None) -> MarkerDe
 
 SAMPLES: tuple[Message, ...] = (
     sample_detections(),
+    ImuSample("imu", 1, 2, 3, np.zeros(3), np.ones(3), np.full(3, np.nan), np.array([1.0, 0.0, 0.0, 0.0])),
     sample_pose(),
     Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}),
     Command("left", "stop"),
@@ -158,7 +171,7 @@ def as_map(message: Message) -> dict[str, object]:
     return msgspec.msgpack.decode(encode(message), type=dict[str, object])
 
 
-@given(st.one_of(detections(), hand_poses(), healths, commands, previews))
+@given(st.one_of(detections(), imu_samples, hand_poses(), healths, commands, previews))
 def test_round_trip_keeps_every_bit(message: Message) -> None:
     wire = encode(message)
     assert_same(decode(wire), message)
