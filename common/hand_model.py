@@ -10,20 +10,19 @@ joint's own +x; an abduction is a rotation about the palm's +y, positive towards
 All five fingers are the same chain of four joints (root, two hinges, tip), so forward kinematics is four
 stacked products and no loop over fingers.
 
-Limits are per angle, but the abduction's narrow with flexion (`spread_left`): spread fingers cannot stay spread in
-a fist, because the collateral ligaments of the MCP tighten.
+Limits are per angle, but the abduction's narrow with flexion (`common.hand_limits`).
 """
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.calibration import Couplings, FingerLimits, HandProfile, Limits
+from common.calibration import Couplings, HandProfile
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix
+from common.hand_limits import ABDUCTION, FLEXION, limit_table, spread_left, spread_table
 from common.hand_presets import preset_limits, radius_share
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
@@ -53,19 +52,6 @@ FINGER_JOINTS = (
 )
 PALM_FRAME = "palm_frame"
 TIPS = CHAINS[:, 3]
-ABDUCTION, FLEXION = 0, 1  # columns of the angles
-
-FloatOrArray = TypeVar("FloatOrArray", float, Float)
-
-
-def spread_left(flexed: FloatOrArray, at_full_flexion: FloatOrArray) -> FloatOrArray:
-    """Share of the abduction range that is left, a parabola from 1 down to `at_full_flexion`.
-
-    Args:
-        flexed: Flexion as a share of the highest, 0 ... 1.
-        at_full_flexion: Share left where `flexed` is 1.
-    """
-    return 1.0 - (1.0 - at_full_flexion) * flexed * flexed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,8 +163,8 @@ class HandModel:
             rest_position_m=position,
             rest_rotation=rotation,
             radius_m=_radii(profile, where),
-            limits_rad=_limits(limits, where),
-            spread_at_full_flexion=_spreads(limits, where),
+            limits_rad=limit_table(limits, where),
+            spread_at_full_flexion=spread_table(limits, where),
             dip_per_pip=couplings.dip_per_pip,
             dip_spread_rad=couplings.dip_spread_rad,
             mcp_per_pip=couplings.mcp_per_pip,
@@ -325,36 +311,6 @@ def _radii(profile: HandProfile, where: str) -> Float:
     length = float(np.linalg.norm(b - a))
     given = profile.radius_m or {}
     return np.array([given.get(name, length * radius_share(name)) for name in JOINTS])
-
-
-def _limits(limits: Limits, where: str) -> Float:
-    table = np.array(
-        [
-            [
-                getattr(getattr(limits, finger), f"{angle}_rad")
-                for angle in ("abduction", "flexion", "pip", "dip")
-            ]
-            for finger in FINGERS
-        ]
-    )
-    crossed = np.argwhere(table[..., 0] > table[..., 1])
-    if len(crossed):
-        raise CalibrationError(f"{where}: limits_rad.{FINGERS[crossed[0][0]]}: low is above high")
-    return table
-
-
-def _spreads(limits: Limits, where: str) -> Float:
-    shares: list[float] = []
-    for finger in FINGERS:
-        of: FingerLimits = getattr(limits, finger)
-        low, high = of.abduction_rad
-        if of.spread_at_full_flexion < 1.0 and not low <= 0.0 <= high:
-            raise CalibrationError(
-                f"{where}: limits_rad.{finger}.spread_at_full_flexion: below 1 it narrows abduction_rad towards 0,"
-                f" which {low} ... {high} does not contain"
-            )
-        shares.append(of.spread_at_full_flexion)
-    return np.array(shares)
 
 
 def _couplings(profile: HandProfile, where: str) -> Couplings:

@@ -12,13 +12,15 @@ angles; a direction that is legal comes back unchanged.
 
 The rotor has four half-angles. `box`: every flexion with every abduction. `ellipse`: the four quadrants of a cone,
 (a / A)^2 + (f / F)^2 <= 1 with the A and F of the quadrant (FABRIK's elliptic cone; Aristidou & Lasenby 2011).
-Both may lose abduction with flexion: spread fingers cannot stay spread in a fist.
+Both may lose abduction with flexion by the parabola of `common.hand_limits`. A rotor has no third angle: the twist
+of its bone is what these two rotations make of it, and no solver can turn it further.
 """
 
 from dataclasses import dataclass
 from math import acos, atan2, cos, hypot, inf, pi, sin, sqrt
 from typing import Literal
 
+from common.hand_limits import spread_left
 from master.ik.vectors import (
     IDENTITY,
     Matrix,
@@ -140,15 +142,19 @@ class Rotor:
     def abduction_span(self, flexion_rad: float) -> tuple[float, float]:
         """Low and high of the abduction at one flexion [rad]."""
         low, high = self.abduction_rad
-        most = self.flexion_rad[1]
-        share = 1.0
-        if self.spread_at_full_flexion < 1.0 and flexion_rad > 0.0 and most > 0.0:
-            share = 1.0 - (1.0 - self.spread_at_full_flexion) * min(flexion_rad / most, 1.0)
+        share = self.spread_left(flexion_rad)
         if self.shape == "ellipse":
             half = self.flexion_rad[flexion_rad > 0.0]
             used = flexion_rad / half if half else 0.0
             share = min(share, sqrt(max(1.0 - used * used, 0.0)))
         return low * share, high * share
+
+    def spread_left(self, flexion_rad: float) -> float:
+        """Share of the abduction range that narrowing leaves at one flexion [rad]."""
+        most = self.flexion_rad[1]
+        if self.spread_at_full_flexion == 1.0 or not flexion_rad > 0.0 or not most > 0.0:
+            return 1.0
+        return spread_left(min(flexion_rad / most, 1.0), self.spread_at_full_flexion)
 
     def fit(self, bone: Vector, direction: Vector, now: Angles) -> Angles:
         """Legal (abduction, flexion) that bring Q bone to `direction`, or near it when it is out of reach.

@@ -323,7 +323,7 @@ BROKEN: dict[str, tuple[Callable[[HandProfile], HandProfile], tuple[str, ...]]] 
         lambda p: with_joint(p, "thumb-tip", position_m=p.rest_joints["thumb-phalanx-distal"].position_m),
         ("rest_joints", "1 mm"),
     ),
-    "crossed limits": (crossed, ("limits_rad.ring",)),
+    "crossed limits": (crossed, ("limits_rad.ring.pip_rad",)),
     "narrowing away from zero": (spread_without_zero, ("limits_rad.ring.spread_at_full_flexion", "0.1")),
     "straying from nothing": (stray_without_ratio, ("couplings.dip_spread_rad", "dip_per_pip")),
     "unknown mount": (mounted, ("markers.index.joint", "elbow")),

@@ -42,7 +42,7 @@ def _inside(joint: Joint, angles: tuple[float, ...]) -> bool:
         return joint.low_rad - slack <= angles[0] <= joint.high_rad + slack
     a, f = angles
     (al, ah), (fl, fh) = joint.abduction_rad, joint.flexion_rad
-    share = 1.0 - (1.0 - joint.spread_at_full_flexion) * max(f, 0.0) / fh
+    share = 1.0 - (1.0 - joint.spread_at_full_flexion) * (max(f, 0.0) / fh) ** 2
     box = al * share - slack <= a <= ah * share + slack and fl - slack <= f <= fh + slack
     if joint.shape == "box":
         return box
@@ -110,8 +110,8 @@ def test_shapes_by_hand() -> None:
     assert CONE.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(25 * math.sqrt(0.75))
     assert CONE.abduction_span(-10 * DEGREE)[0] / DEGREE == pytest.approx(-15 * math.sqrt(0.75))
     assert CONE.clamp((50 * DEGREE, 0.0))[0] / DEGREE == pytest.approx(25.0)
-    # 45 of 90 deg flexed: half of the 80 % loss
-    assert SHRINKING.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(20 * 0.6)
+    # 45 of 90 deg flexed: a quarter of the 80 % loss
+    assert SHRINKING.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(20 * 0.8)
     assert BOX.clamp((1.0, 2.0)) == pytest.approx((15 * DEGREE, 90 * DEGREE))
     assert MIDDLE.clamp((0.2, 0.5)) == (0.0, 0.5)
 
