@@ -159,6 +159,11 @@ class ImuCalibration(_File, frozen=True):
     heading_sigma_rad: Positive | None = None
     heading_drift_rad_s: NonNegative = 0.0
 
+    @property
+    def placed(self) -> bool:
+        """Whether its orientation tells that of the palm in the rig."""
+        return self.q_palm_imu is not None and self.q_rig_world is not None
+
 
 class RigCalibration(_File, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.

@@ -11,10 +11,12 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.errors import RecordingError
+from common.errors import CalibrationError, RecordingError
 from common.frame_recording import Illumination, Manifest
 from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
+from common.imu_recording import write_imu
+from common.sim.imu import SimulatedImu
 from common.sim.light import PAINT_LINEAR_RGB
 from common.sim.paint import MarkerView
 from common.sim.render import Renderer
@@ -23,6 +25,7 @@ from common.sim.scene import Scene, SceneTruth
 TRUTH = "truth.npz"
 TRUTH_META = "truth_meta.json"
 FIRST_NS = 10**9  # scene time 0 in frames.csv
+_AROUND_S = 0.1
 ANGLE_NAMES = (
     *("thumb_cmc_flex", "thumb_cmc_abd", "thumb_cmc_twist", "thumb_mcp", "thumb_ip"),
     *(f"{f}_{a}" for f in FINGERS[1:] for a in ("mcp_flex", "mcp_abd", "pip", "dip")),
@@ -39,7 +42,13 @@ class _Row:
 
 
 def record_scene(
-    folder: Path, scene: Scene, seconds: float, start_s: float = 0.0, continuous: bool = True
+    folder: Path,
+    scene: Scene,
+    seconds: float,
+    start_s: float = 0.0,
+    continuous: bool = True,
+    *,
+    imu: bool = False,
 ) -> int:
     """Render `seconds` of a scene with every camera of its rig; return the number of frames per camera.
 
@@ -52,8 +61,10 @@ def record_scene(
         seconds: How long [s]; at least one frame is written.
         start_s: Scene time of the first frame [s].
         continuous: False tells readers that every frame is a pose of its own.
+        imu: Whether the rig's IMU is recorded too, from a little before the first frame to a little after the last.
 
     Raises:
+        CalibrationError: The rig has no IMU, or it is not known how that is mounted.
         RecordingError: The folder holds something already, or cannot be written.
         ValueError: The cameras differ in frame rate.
     """
@@ -63,6 +74,7 @@ def record_scene(
         raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
     period = 1.0 / rates.pop()
     count = max(round(seconds / period), 1)
+    sensor = _imu_of(scene) if imu else None
     renderers = [Renderer(scene, name) for name in names]
     offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
     lead = scene.cameras[names[0]]
@@ -84,11 +96,20 @@ def record_scene(
             rows.append(_Row(tuple(views), times, scene.truth(times[0] + centre_s)))
     finally:
         writer.close()
+    if sensor is not None:
+        span = rows[0].t_row0[0] - _AROUND_S, max(rows[-1].t_row0) + _AROUND_S
+        write_imu(folder, sensor.over(*span, FIRST_NS))
     try:
         _write_truth(folder, scene, rows)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
     return count
+
+
+def _imu_of(scene: Scene) -> SimulatedImu:
+    if scene.rig.imu is None:
+        raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to simulate")
+    return SimulatedImu(scene.motion, scene.rig.imu, scene.seed)
 
 
 def _manifest(scene: Scene, first: list[MarkerView], continuous: bool) -> Manifest:

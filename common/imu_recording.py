@@ -1,0 +1,116 @@
+"""The IMU of a recording: imu.csv beside frames.csv, one row per sample, on the same clock.
+
+`t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz]` in rad/s, m/s^2 and uT; the quaternion takes the sensor's axes to
+its world, whose z axis is vertical. `nan` is a value that the sensor did not give. As of frames.csv, only the last
+row can be cut by whatever ended the recording: it is left out, every other broken row is an error.
+"""
+
+import csv
+import io
+import logging
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float
+from common.errors import RecordingError
+from common.messages import ImuSample
+from common.replacing import replacing
+
+IMU = "imu.csv"
+_RATES = ("gx", "gy", "gz", "ax", "ay", "az")
+_FIELD, _TURN = ("mx", "my", "mz"), ("qw", "qx", "qy", "qz")
+HEADERS = tuple(("t_ns", *_RATES, *field, *turn) for field in ((), _FIELD) for turn in ((), _TURN))
+_INTEGER = re.compile(r"-?[0-9]{1,18}")
+_LOG = logging.getLogger(__name__)
+
+
+def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
+    """The samples of a recording's IMU, called `source`, by time; none where it has no imu.csv.
+
+    Raises:
+        RecordingError: The file is broken; the text names file, line and column.
+    """
+    path = folder / IMU
+    try:
+        text = path.read_bytes().decode()
+    except FileNotFoundError:
+        return ()
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: not a table of text: {error}") from error
+    whole, _, cut = text.rpartition("\n")
+    if cut:
+        _LOG.warning("%s: the last line is cut, left out: the recording was not ended, but broke off", path)
+    try:
+        reader = csv.reader(io.StringIO(whole, newline=""))
+        header = tuple(next(reader, ()))
+        lines = [(reader.line_num, line) for line in reader if line]
+    except csv.Error as error:
+        raise RecordingError(f"{path}: not a table of text: {error}") from error
+    if header not in HEADERS:
+        allowed = f"t_ns,{','.join(_RATES)}, then {','.join(_FIELD)} or not, then {','.join(_TURN)} or not"
+        raise RecordingError(f"{path}: header {','.join(header)}: must be {allowed}")
+    samples: list[ImuSample] = []
+    for number, line in lines:
+        sample = _sample(f"{path}: line {number}", source, len(samples), header, line)
+        if samples and sample.t_ns <= samples[-1].t_ns:
+            raise RecordingError(
+                f"{path}: line {number}: t_ns: {sample.t_ns} is not after {samples[-1].t_ns}"
+            )
+        samples.append(sample)
+    return tuple(samples)
+
+
+def write_imu(folder: Path, samples: Iterable[ImuSample]) -> None:
+    """Write imu.csv, all columns; with the digits that give back the same numbers.
+
+    Raises:
+        RecordingError: It cannot be written; nothing is left half done.
+    """
+    text = io.StringIO(newline="")
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(HEADERS[-1])
+    for one in samples:
+        values = np.concatenate([one.gyro_rad_s, one.accel_m_s2, one.mag_ut, one.orientation_wxyz])
+        table.writerow([one.t_ns, *values.tolist()])
+    try:
+        with replacing(folder / IMU) as file:
+            file.write(text.getvalue().encode())
+    except OSError as error:
+        raise RecordingError(f"{folder / IMU}: cannot write: {error.strerror}") from error
+
+
+def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequence[str]) -> ImuSample:
+    if len(line) != len(header):
+        raise RecordingError(f"{where}: {len(line)} columns, the header has {len(header)}")
+    if not _INTEGER.fullmatch(line[0]):
+        raise RecordingError(f"{where}: t_ns: {line[0]!r} is not an integer")
+    values = {name: _number(where, name, text) for name, text in zip(header[1:], line[1:], strict=True)}
+
+    def vector(*names: str) -> Float:
+        return np.array([values.get(name, np.nan) for name in names])
+
+    return ImuSample(
+        source=source,
+        session=0,
+        seq=seq,
+        t_ns=int(line[0]),
+        gyro_rad_s=vector(*_RATES[:3]),
+        accel_m_s2=vector(*_RATES[3:]),
+        mag_ut=vector(*_FIELD),
+        orientation_wxyz=vector(*_TURN),
+    )
+
+
+def _number(where: str, name: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise RecordingError(f"{where}: {name}: {text!r} is not a number") from error
+    if np.isinf(value):
+        raise RecordingError(f"{where}: {name}: {text!r} is not a finite number")
+    return value
