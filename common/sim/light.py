@@ -23,6 +23,11 @@ PAINT_LINEAR_RGB = {
     "little": (0.52, 0.03, 0.22),
     "back": (0.26, 0.52, 0.06),
 }
+# Of markers that no rendered recording has; their hues lie in the widest gaps between those of the six.
+MORE_PAINT_LINEAR_RGB = {
+    "back2": (0.30, 0.03, 0.31),
+    "back3": (0.075, 0.42, 0.04),
+}
 SKIN_LINEAR_RGB = (0.700, 0.410, 0.255)
 SLEEVE_LINEAR_RGB = (0.235, 0.195, 0.165)
 CARD_LINEAR_RGB = (0.030, 0.030, 0.034)
@@ -86,7 +91,9 @@ def paint(marker: str) -> tuple[float, float, float]:
     Raises:
         CalibrationError: The simulator has no paint of that name.
     """
-    if marker not in PAINT_LINEAR_RGB:
-        known = ", ".join(PAINT_LINEAR_RGB)
-        raise CalibrationError(f"marker {marker!r}: the simulator has no such paint; it has {known}")
-    return PAINT_LINEAR_RGB[marker]
+    known = PAINT_LINEAR_RGB | MORE_PAINT_LINEAR_RGB
+    if marker not in known:
+        raise CalibrationError(
+            f"marker {marker!r}: the simulator has no such paint; it has {', '.join(known)}"
+        )
+    return known[marker]

@@ -17,7 +17,7 @@ from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu_recording import write_imu
 from common.sim.imu import SimulatedImu
-from common.sim.light import PAINT_LINEAR_RGB
+from common.sim.light import paint
 from common.sim.paint import MarkerView
 from common.sim.render import Renderer
 from common.sim.scene import Scene, SceneTruth
@@ -155,7 +155,7 @@ def _write_truth(folder: Path, scene: Scene, rows: list[_Row]) -> None:
         "joints": WEBXR_JOINTS,
         "angles": ANGLE_NAMES,
         "seed": scene.seed,
-        "paint_reflectance_linear_srgb": PAINT_LINEAR_RGB,
+        "paint_reflectance_linear_srgb": {name: paint(name) for name in scene.rig.markers},
     }
     (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
 

@@ -183,9 +183,9 @@ def inside(hsv: Image, colour: HsvRange) -> Bool:
 
 def test_colours_of_the_camera_files_find_their_marker_and_nothing_else() -> None:
     for name, renderer in zip(RIG.cameras, (LEFT, RIGHT), strict=True):
-        colours = CAMERAS[name].markers
-        assert colours is not None
-        assert list(colours) == list(RIG.markers)
+        markers = CAMERAS[name].markers
+        assert markers is not None
+        colours = {marker: markers[marker] for marker in RIG.markers}  # those of other rigs are there, too
         for t in (0.0, 9.5, 16.2, 21.4, 25.0, 28.8, 45.6, 50.1):
             image, view = renderer.observe(t)
             hsv = hsv_of(image)
