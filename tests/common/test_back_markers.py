@@ -73,7 +73,7 @@ def test_a_detector_tells_all_eight_paints_where_they_are(camera: str, root: Pat
         worst = max(worst, float(np.nanmax(off[clear], initial=0.0)))
     assert whole > 150  # the back is to the cameras
     assert missed == 0
-    assert worst < 1.0  # px: the right paint, or it would be tens
+    assert worst < 5.0  # px: of the right paint, or it would be tens
 
 
 def test_a_marker_without_paint_is_refused_with_those_there_are() -> None:
