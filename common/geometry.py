@@ -60,6 +60,14 @@ def rotation_vector_to_matrix(vector: Float) -> Float:
     return _EYE + np.sin(angle) / angle * k + (1 - np.cos(angle)) / (angle * angle) * (k @ k)
 
 
+def matrix_to_rotation_vector(rotation: Float) -> Float:
+    """Rotation vectors (..., 3) [rad], at most half a turn, of rotation matrices (..., 3, 3)."""
+    q = matrix_to_quaternion(rotation)
+    sine = np.sqrt(np.vecdot(q[..., 1:], q[..., 1:]))
+    half = np.arctan2(sine, q[..., 0])
+    return q[..., 1:] * np.where(sine > 1e-9, 2.0 * half / np.maximum(sine, 1e-9), 2.0)[..., None]
+
+
 def skew(vector: Float) -> Float:
     """Matrices (..., 3, 3) with `skew(a) @ b == cross(a, b)`."""
     return (vector @ _SKEW).reshape(*vector.shape, 3)

@@ -27,6 +27,7 @@ class Attached:
         offset_m: (P, 3) place in that joint's frame; palm: in the palm frame.
         moves: (P, 4, n) how much the free angles turn each of the four axes, 0 where that leaves the point alone.
         abduction_axis: (5, 1, 3) palm frame; the only axis that no angle turns.
+        parameters: The free angles.
     """
 
     finger: Int
@@ -35,6 +36,7 @@ class Attached:
     offset_m: Float
     moves: Float
     abduction_axis: Float
+    parameters: HandParameters
 
     @classmethod
     def markers(cls, model: HandModel, parameters: HandParameters, names: Sequence[str]) -> "Attached":
@@ -81,7 +83,7 @@ class Attached:
         axis[:, 0, 1] = model.side_sign
         axis[0, 0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
         offset = np.array([offset for _, offset in places]).reshape(count, 3)
-        return cls(finger, level, on_finger, offset, moves, axis)
+        return cls(finger, level, on_finger, offset, moves, axis, parameters)
 
     def only(self, use: Bool) -> "Attached":
         """The points where `use` (P,) is true."""
@@ -92,6 +94,7 @@ class Attached:
             self.offset_m[use],
             self.moves[use],
             self.abduction_axis,
+            self.parameters,
         )
 
     def place(self, chains: Chains) -> Float:
@@ -100,11 +103,11 @@ class Attached:
         p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
 
-    def jacobian(self, chains: Chains, points_m: Float) -> Float:
-        """Derivatives (..., P, 3, n) [m/rad] of the points (..., P, 3), palm frame, by the free angles."""
+    def jacobian(self, chains: Chains, points_m: Float, x: Float) -> Float:
+        """Derivatives (..., P, 3, n) [m/rad] of points (..., P, 3), palm frame, by the parameters, at x (..., n)."""
         axes = np.empty((*chains.position_m.shape[:-3], 5, 4, 3))
         axes[..., :1, :] = self.abduction_axis
         np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])
         arm = points_m[..., None, :] - chains.position_m[..., self.finger[:, None], _AXIS_JOINT, :]
         turned = skew(axes)[..., self.finger, :, :, :] @ arm[..., None]  # (..., P, 4, 3, 1)
-        return np.swapaxes(turned[..., 0], -1, -2) @ self.moves
+        return self.parameters.by_parameters(np.swapaxes(turned[..., 0], -1, -2) @ self.moves, x)

@@ -4,6 +4,9 @@ Six markers give 18 numbers for 21 unknowns and more (the palm's orientation is 
 missing ones come from what hands do: natural flexion, small abduction, neighbours that move alike, and the
 last frame. All of it is one bounded least-squares problem (`master.ik.hand_problem`). The inverse of its normal
 matrix is the posterior covariance of every joint.
+
+It is solved twice side by side, for a natural hand and for one that is free of habits (`master.ik.priors`), and each
+counts by its evidence (`master.ik.mixture`).
 """
 
 from dataclasses import dataclass
@@ -14,8 +17,8 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
-from master.ik.certainty import covariance_alone
-from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, PalmPrior
+from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, Orientation, PalmPrior
+from master.ik.mixture import Mixture
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 
@@ -23,6 +26,7 @@ _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand abou
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
+_ORIENTED_RAD = np.radians(15.0)  # an orientation that is known better than this fixes the hand's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +42,9 @@ class HandSolution:
             (`master.ik.certainty`).
         tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much the fit expects that to grow, by the time squared.
         residual_m: (M,) distance of each marker from its place on the model [m]; NaN: not seen.
-        cost: Half the sum of squared weighted residuals.
+        cost: Half the sum of squared weighted residuals, of the likeliest hypothesis.
         iterations: Steps taken.
+        natural: Probability that the hand obeys habits; 1 where nothing else is considered.
     """
 
     T_rig_palm: Float
@@ -51,6 +56,7 @@ class HandSolution:
     residual_m: Float
     cost: float
     iterations: int
+    natural: float
 
 
 class HandSolver:
@@ -67,7 +73,7 @@ class HandSolver:
         self._attached = Attached.markers(model, self._parameters, markers)
         self._joints = Attached.joints(model, self._parameters)
         self._prior = AnglePrior.of(model, self._parameters, self.priors)
-        natural = np.asarray(np.linalg.solve(self._prior.normal, self._prior.pull), np.float64)
+        natural = np.asarray(np.linalg.solve(self._prior.normal[0], self._prior.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(natural, self._parameters.low), self._parameters.high)
         walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
         self._walk_2 = np.repeat(walks, (3, 3, len(self._parameters.free))) ** 2
@@ -82,6 +88,7 @@ class HandSolver:
         facing: Float | None = None,
         enough: float = ENOUGH,
         near: HandSolution | None = None,
+        orientation: Orientation | None = None,
     ) -> HandSolution | None:
         """Fit the hand to its markers.
 
@@ -98,13 +105,14 @@ class HandSolver:
             near: A hand that may be near, where `last` is None: one search from there, and none from afresh if it
                 ends where all markers are explained. Nothing else is taken from it, and fingers without a marker
                 begin at a natural posture.
+            orientation: The palm's orientation as an IMU has it; None: not known.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
-            one line, or two where `facing` is known and not along theirs.
+            one line, two where `facing` is known and not along theirs, or one where the orientation is known.
         """
         seen = seen_markers(points_m, cov_m2)
-        if last is None and not _determined(points_m[seen], facing):
+        if last is None and not _determined(points_m[seen], facing, orientation):
             return None
         habits = self._habits(seen, hidden)
         problem = HandProblem(
@@ -116,6 +124,7 @@ class HandSolver:
             self._and_last(habits, last, dt_s),
             None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(dt_s)),
             None if facing is None else Facing(facing, 1.0 / self.priors.facing),
+            orientation,
         )
         if last is not None:
             return self._solution(problem, habits, problem.minimise(*self._seed_of(last), enough), points_m)
@@ -140,12 +149,12 @@ class HandSolver:
         return habits.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, dt_s))
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
-        return last.T_rig_palm[None], self._parameters.free_of(last.angles_rad)[None]
+        return last.T_rig_palm[None], self._parameters.of_angles(last.angles_rad)[None]
 
     def _seed_near(self, hand: HandSolution, seen: Bool) -> tuple[Float, Float]:
         fingers = self._attached.finger[seen & self._attached.on_finger[:, 0]]
         known = np.isin(self._parameters.free // 4, fingers)
-        x = np.where(known, self._parameters.free_of(hand.angles_rad), self._natural)
+        x = np.where(known, self._parameters.of_angles(hand.angles_rad), self._natural)
         return hand.T_rig_palm[None], x[None]
 
     def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
@@ -155,7 +164,7 @@ class HandSolver:
         for bend in (0.1, 0.7, 1.3):
             angles = np.zeros((5, 4))
             angles[1:, 1], angles[1:, 2] = 0.6 * bend, bend
-            x = np.clip(self._parameters.free_of(angles), self._parameters.low, self._parameters.high)
+            x = self._parameters.of_angles(angles)
             model = self._attached.place(self.model.chains(self._parameters.angles(x)))
             observed, expected, w = points[seen], model[seen], weight
             if facing is not None:
@@ -167,23 +176,22 @@ class HandSolver:
         return np.array([T for T, _ in seeds]), np.array([x for _, x in seeds])
 
     def _solution(
-        self, problem: HandProblem, habits: AnglePrior, best: Minimum, points_m: Float
+        self, problem: HandProblem, habits: AnglePrior, minima: list[Minimum], points_m: Float
     ) -> HandSolution:
-        T = best.T_rig_palm
-        low, high = self.model.limits_rad[..., 0], self.model.limits_rad[..., 1]
-        # The bounds hold already; what is cut is the rounding of a coupled angle.
-        angles = np.minimum(np.maximum(self._parameters.angles(best.x), low), high)
+        found = Mixture.of(problem, habits, minima)
+        T = found.T_rig_palm
+        # The bounds hold already; what is cut is the rounding of an angle that follows others.
+        angles = self.model.clamp(self._parameters.angles(found.x))
         chains = self.model.chains(angles)
         joints = self.model.joints(T, chains)
         marker = self._attached.place(chains) @ T[:3, :3].T + T[:3, 3]
         local = self._joints.place(chains)
-        count, n = len(local), 6 + len(best.x)
+        count, n = len(local), 6 + len(found.x)
         J = np.empty((count, 3, n))
         J[:, :, :3] = skew(-local @ T[:3, :3].T)
         J[:, :, 3:6] = np.eye(3)
-        J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local)
-        inverse = np.linalg.inv(best.linear.normal)
-        cov = (J.reshape(3 * count, n) @ inverse).reshape(count, 3, n)
+        J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local, found.x)
+        cov = (J.reshape(3 * count, n) @ found.cov).reshape(count, 3, n)
         ends, starts = CHAINS[:, 3], CHAINS[:, 2]
         length = np.sqrt(np.vecdot(local[ends] - local[starts], local[ends] - local[starts]))
         turn = (J[ends] - J[starts]) / length[:, None, None]  # of the last phalanges' directions (5, 3, n)
@@ -192,11 +200,12 @@ class HandSolver:
             angles_rad=angles,
             joints=joints,
             cov_m2=cov @ np.swapaxes(J, 1, 2),
-            tilt_cov_rad2=turn @ covariance_alone(problem, habits, best) @ np.swapaxes(turn, 1, 2),
+            tilt_cov_rad2=turn @ found.alone @ np.swapaxes(turn, 1, 2),
             tilt_walk_rad2_s2=(turn * self._walk_2) @ np.swapaxes(turn, 1, 2),
             residual_m=np.asarray(np.linalg.norm(marker - points_m, axis=1), np.float64),
-            cost=float(best.linear.cost),
-            iterations=best.iterations,
+            cost=found.cost,
+            iterations=minima[0].iterations,
+            natural=found.natural,
         )
 
 
@@ -210,11 +219,14 @@ def _whitening(cov_m2: Float, model_m: float) -> Float:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_m2 + model_m**2 * np.eye(3))), np.float64)
 
 
-def _determined(points: Float, facing: Float | None) -> bool:
-    """Whether points (N, 3) fix an orientation: not all in one line, or in a line across `facing`.
+def _determined(points: Float, facing: Float | None, orientation: Orientation | None) -> bool:
+    """Whether points (N, 3) fix a hand: not all in one line, or in a line across `facing`.
 
-    What faces the cameras turns the hand about a line of markers, but not about one that points at them.
+    What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
+    orientation that is known any one marker is enough.
     """
+    if orientation is not None and np.trace(orientation.cov_rad2) < _ORIENTED_RAD**2:
+        return len(points) > 0
     if len(points) < 2:
         return False
     _, extent, axes = np.linalg.svd(points - points.mean(axis=0))

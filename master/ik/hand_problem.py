@@ -6,12 +6,12 @@ of the step (active set), every other step ends at its limit. So no iterate is e
 seeds go side by side: all arrays may have leading axes, and three cost little more than one.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from common.arrays import Float
-from common.geometry import rotation_vector_to_matrix, skew, unskew
+from common.arrays import Float, Int
+from common.geometry import matrix_to_rotation_vector, rotation_vector_to_matrix, skew, unskew
 from common.hand_model import HandModel
 from master.ik.attached import Attached
 from master.ik.parameters import HandParameters
@@ -29,6 +29,25 @@ class Facing:
 
     direction: Float
     weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Orientation:
+    """The palm's orientation as something else measured it, an IMU for instance.
+
+    Attributes:
+        rotation: (3, 3) palm frame -> rig frame.
+        cov_rad2: (3, 3) [rad^2] of the rotation vector, in rig axes, that turns it to the true one; positive
+            definite, and large about an axis about which nothing is known.
+        information: (3, 3) its inverse.
+    """
+
+    rotation: Float
+    cov_rad2: Float
+    information: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "information", np.linalg.inv(self.cov_rad2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,7 +80,7 @@ class Linear:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """Where the search ended: pose, free angles (n,), and the linearisation there or just before."""
+    """Where a search ended: pose, free angles (n,), and the linearisation there or just before."""
 
     T_rig_palm: Float
     x: Float
@@ -79,10 +98,11 @@ class HandProblem:
         markers: The N seen markers.
         points_m: (N, 3) [m] where they were seen, rig frame.
         whiten: (N, 3, 3) inverse square roots of their covariances.
-        prior: Beliefs about the angles.
+        prior: Beliefs about the angles, of one hypothesis or several.
         palm: Belief about the palm, or None.
         facing: Belief about the side it shows, or None.
-        believed: (6 + n, 6 + n) normal matrix of what is believed of angles and palm.
+        orientation: The palm's orientation as measured otherwise, or None.
+        believed: (..., 6 + n, 6 + n) normal matrix of what is believed of angles and palm; axes as those of `prior`.
     """
 
     model: HandModel
@@ -93,22 +113,47 @@ class HandProblem:
     prior: AnglePrior
     palm: PalmPrior | None
     facing: Facing | None
+    orientation: Orientation | None = None
     believed: Float = field(init=False)
 
     def __post_init__(self) -> None:
-        size = 6 + len(self.parameters.free)
-        believed = np.zeros((size, size))
-        believed[6:, 6:] = self.prior.normal
+        normal = self.prior.normal
+        believed = np.zeros((*normal.shape[:-2], 6 + normal.shape[-1], 6 + normal.shape[-1]))
+        believed[..., 6:, 6:] = normal
         if self.palm is not None:
-            believed.flat[: 6 * size : size + 1] = self.palm.weight * self.palm.weight
+            np.einsum("...ii->...i", believed)[..., :6] = self.palm.weight * self.palm.weight
         object.__setattr__(self, "believed", believed)
 
-    def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> Minimum:
-        """The lowest end of the ways downhill from seeds (S, 4, 4), (S, n) inside the bounds.
+    def of_hypothesis(self, which: Int | int) -> "HandProblem":
+        """The problem under one hypothesis, or under one for each of several searches (S,)."""
+        return replace(self, prior=self.prior.of_hypothesis(which))
+
+    def of_points(self, points_m: Float) -> "HandProblem":
+        """The same markers seen elsewhere (N, 3) [m], and nothing believed of the hand."""
+        size = len(self.parameters.free)
+        nothing = AnglePrior(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
+        return replace(self, points_m=points_m, prior=nothing, palm=None, facing=None, orientation=None)
+
+    def place(self, T_rig_palm: Float, x: Float) -> Float:
+        """Where the markers (..., N, 3) [m] of hands (..., 4, 4), (..., n) are, rig frame."""
+        local = self.markers.place(self.model.chains(self.parameters.angles(x)))
+        return local @ np.swapaxes(T_rig_palm[..., :3, :3], -1, -2) + T_rig_palm[..., None, :3, 3]
+
+    def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> list[Minimum]:
+        """For each of H hypotheses the lowest end of the ways downhill from seeds (S, 4, 4), (S, n) in the bounds.
 
         A way ends where a step gains less than `enough`, and a ten-thousandth of the cost.
         """
-        T, here, iterations = T_rig_palm, self.linearise(T_rig_palm, x), 0
+        hypotheses, seeds = len(self.prior.constant), len(x)
+        search = self.of_hypothesis(np.repeat(np.arange(hypotheses), seeds))
+        T, x = np.tile(T_rig_palm, (hypotheses, 1, 1)), np.tile(x, (hypotheses, 1))
+        T, x, here, iterations = search._descend(T, x, enough)
+        lowest = [k + int(np.argmin(here.cost[k : k + seeds])) for k in range(0, len(x), seeds)]
+        return [Minimum(T[k], x[k], here.of(k), iterations) for k in lowest]
+
+    def _descend(self, T: Float, x: Float, enough: float) -> tuple[Float, Float, Linear, int]:
+        """From seeds (S, 4, 4), (S, n), each under its own hypothesis, to where no step lowers the cost."""
+        here, iterations = self.linearise(T, x), 0
         paces = [_Pace(enough) for _ in x]
         while iterations < MAX_ITERATIONS and any(pace.going for pace in paces):
             iterations += 1
@@ -122,18 +167,17 @@ class HandProblem:
             steps = zip(paces, costs, there.cost.tolist(), gains, strict=True)
             lower = [pace.improves(*step) for pace, *step in steps]
             T, x, here = _either(lower, T_new, T), _either(lower, x_new, x), here.or_where(lower, there)
-        best = int(np.argmin(here.cost))
-        return Minimum(T[best], x[best], here.of(best), iterations)
+        return T, x, here, iterations
 
     def linearise(self, T_rig_palm: Float, x: Float) -> Linear:
-        """Cost, gradient and normal matrix at poses (..., 4, 4) and free angles (..., n)."""
+        """Cost, gradient and normal matrix at poses (..., 4, 4) and free angles (..., n); leading axes as `prior`."""
         R, origin = T_rig_palm[..., :3, :3], T_rig_palm[..., None, :3, 3]
         chains = self.model.chains(self.parameters.angles(x))
         local = self.markers.place(chains)
         arm = local @ np.swapaxes(R, -1, -2)
         moved = np.empty((*arm.shape, 6 + x.shape[-1]))  # the markers by turn, shift and angles
         moved[..., :3], moved[..., 3:6] = skew(-arm), _EYE
-        moved[..., 6:] = R[..., None, :, :] @ self.markers.jacobian(chains, local)
+        moved[..., 6:] = R[..., None, :, :] @ self.markers.jacobian(chains, local, x)
         rows = (*x.shape[:-1], 3 * arm.shape[-2])
         J = (self.whiten @ moved).reshape(*rows, moved.shape[-1])
         residual = (self.whiten @ (arm + origin - self.points_m)[..., None]).reshape(rows)
@@ -148,6 +192,13 @@ class HandProblem:
             cost = cost + 0.5 * weight * np.vecdot(off, off)
             gradient[..., :3] += weight * (dorsal @ skew(-direction))
             normal[..., :3, :3] += weight * (_EYE - dorsal[..., :, None] * dorsal[..., None, :])
+        if self.orientation is not None:
+            off = matrix_to_rotation_vector(R @ self.orientation.rotation.T)
+            J = _turn_of_vector(off)
+            weighed, pulled = off @ self.orientation.information, self.orientation.information @ J
+            cost = cost + 0.5 * np.vecdot(weighed, off)
+            gradient[..., :3] += (weighed[..., None, :] @ J)[..., 0, :]
+            normal[..., :3, :3] += np.swapaxes(J, -1, -2) @ pulled
         if self.palm is not None:
             off = self.palm.weight * _moved(T_rig_palm, self.palm.T_rig_palm)
             cost = cost + 0.5 * np.vecdot(off, off)
@@ -225,6 +276,17 @@ def _either(use: list[bool], one: Float, other: Float) -> Float:
     if all(use):
         return one
     return np.where(np.array(use).reshape(-1, *[1] * (one.ndim - 1)), one, other) if any(use) else other
+
+
+def _turn_of_vector(vector: Float) -> Float:
+    """Derivatives (..., 3, 3) of rotation vectors (..., 3) by a small turn in front of them.
+
+    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
+    """
+    angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-4)[..., None, None]
+    k = skew(vector)
+    factor = 1.0 / (angle * angle) - 0.5 / (angle * np.tan(0.5 * angle))
+    return _EYE - 0.5 * k + factor * (k @ k)
 
 
 def _moved(T: Float, T_before: Float) -> Float:

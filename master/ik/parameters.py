@@ -1,7 +1,12 @@
 """What the whole-hand fit is free to choose: the angles that no coupling fixes, and the bounds of each.
 
 A parameter vector is the palm's rotation (3, rotation vector about the wrist, rig frame) and translation (3),
-then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it is not coupled) of each finger.
+then these n angles: four of the thumb; abduction, flexion, PIP (and DIP where it does not follow exactly) of each
+finger. Where flexion narrows the abduction (`common.hand_limits`), the parameter is the abduction before that:
+
+    abduction = share(flexion) parameter
+
+so that a box of parameters is all the legal poses, and habits of spreading fade in a fist as the range does.
 """
 
 from dataclasses import dataclass
@@ -9,7 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Int
+from common.hand_limits import ABDUCTION, FLEXION, spread_left
 from common.hand_model import HandModel
+
+_LEAST_SHARE = 1e-6  # an abduction that is narrowed to nothing may come from any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -18,35 +26,80 @@ class HandParameters:
 
     Attributes:
         free: (n,) their indices in the flat (20,) table of angles.
-        complete: (20, n) all angles = complete @ free ones, couplings included.
+        complete: (20, n) all angles = complete @ free ones, couplings included; abductions before they narrow.
         low, high: (n,) [rad] bounds that keep coupled angles inside their limits, too.
+        abduction, flexion: (K,) columns of the free angles of the K fingers whose abduction narrows.
+        most: (K,) [rad] their highest flexion.
+        left: (K,) share of the abduction left there.
     """
 
     free: Int
     complete: Float
     low: Float
     high: Float
+    abduction: Int
+    flexion: Int
+    most: Float
+    left: Float
 
     @classmethod
     def of(cls, model: HandModel) -> "HandParameters":
-        """The free angles of a hand: 20, or 16 where the DIPs are coupled."""
-        coupled = model.dip_per_pip is not None
-        free = np.array([a for a in range(20) if not (coupled and a >= 4 and a % 4 == 3)])
+        """The free angles of a hand: 20, or 16 where the DIPs follow exactly."""
+        ratio = model.dip_per_pip if model.dip_spread_rad == 0.0 else None
+        free = np.array([a for a in range(20) if not (ratio is not None and a >= 4 and a % 4 == 3)])
         complete = np.zeros((20, len(free)))
         complete[free, np.arange(len(free))] = 1.0
         low, high = model.limits_rad[..., 0].copy(), model.limits_rad[..., 1].copy()
-        if model.dip_per_pip is not None:
+        if ratio is not None:
             for column in np.flatnonzero((free >= 4) & (free % 4 == 2)):
-                complete[free[column] + 1, column] = model.dip_per_pip
-            if model.dip_per_pip > 0:
-                low[1:, 2] = np.maximum(low[1:, 2], low[1:, 3] / model.dip_per_pip)
-                high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / model.dip_per_pip)
-        return cls(free, complete, low.reshape(20)[free], high.reshape(20)[free])
+                complete[free[column] + 1, column] = ratio
+            if ratio > 0:
+                low[1:, 2] = np.maximum(low[1:, 2], low[1:, 3] / ratio)
+                high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / ratio)
+        most = model.limits_rad[:, FLEXION, 1]
+        narrows = np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0))
+        return cls(
+            free,
+            complete,
+            low.reshape(20)[free],
+            high.reshape(20)[free],
+            np.searchsorted(free, 4 * narrows + ABDUCTION),
+            np.searchsorted(free, 4 * narrows + FLEXION),
+            most[narrows],
+            model.spread_at_full_flexion[narrows],
+        )
 
     def angles(self, x: Float) -> Float:
         """Angles (..., 5, 4) of the free ones (..., n)."""
+        if len(self.abduction):
+            x = x.copy()
+            x[..., self.abduction] *= self._share(self._flexed(x))
         return (x @ self.complete.T).reshape(*x.shape[:-1], 5, 4)
 
-    def free_of(self, angles_rad: Float) -> Float:
-        """The free ones (n,) of angles (5, 4)."""
-        return angles_rad.reshape(20)[self.free]
+    def by_parameters(self, J: Float, x: Float) -> Float:
+        """Derivatives (..., P, 3, n) by the free angles as they are -> by the parameters at x (..., n); in place."""
+        if len(self.abduction):
+            flexed = self._flexed(x)
+            slope = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]
+            spread = J[..., self.abduction]
+            J[..., self.flexion] += spread * slope[..., None, None, :]
+            J[..., self.abduction] = spread * self._share(flexed)[..., None, None, :]
+        return J
+
+    def free_of(self, values: Float) -> Float:
+        """Those of values (5, 4), one per angle, that belong to free angles: (n,)."""
+        return values.reshape(20)[self.free]
+
+    def of_angles(self, angles_rad: Float) -> Float:
+        """The parameters (n,) of legal angles (5, 4)."""
+        x = self.free_of(angles_rad)
+        if len(self.abduction):
+            x[self.abduction] /= np.maximum(self._share(self._flexed(x)), _LEAST_SHARE)
+        return np.minimum(np.maximum(x, self.low), self.high)
+
+    def _flexed(self, x: Float) -> Float:
+        """Flexions of the fingers that narrow, as shares (..., K) of the highest."""
+        return np.minimum(np.maximum(x[..., self.flexion], 0.0), self.most) / self.most
+
+    def _share(self, flexed: Float) -> Float:
+        return spread_left(flexed, self.left)

@@ -2,23 +2,48 @@
 
 Every belief is a row of a least-squares problem that is linear in the free angles, divided by its standard
 deviation. The constant ones couple angles; those of one frame concern single angles, so they are weights.
+
+Hands mostly obey habits, and now and then defy them altogether: a gun, horns, a pianist. One width of the habits would
+be too wide for the former or too narrow for the latter. So there are two hypotheses of every hand, *natural* and
+*free*, and the markers tell by their evidence which of the two, or how much of each, to believe (MacKay 1992, "Bayesian
+interpolation": the width of the habits is what a free hand gains in fit and pays in volume).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.hand_model import HandModel
 from master.ik.parameters import HandParameters
 
 _DIP_PER_PIP = 2.0 / 3.0  # where no coupling fixes the DIP, it still tends to this
+_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 _SHORTEST_S = 1e-3  # a step in time below this would weld the hand to its last pose
 
 
 @dataclass(frozen=True, slots=True)
+class FreeHand:
+    """The habits of a hand that has none [rad]: a flexion anywhere, the rest about the middle, about as wide as limits.
+
+    Fingers are spread either way and the thumb is where it can be; a PIP is rather in the lower half of its range.
+    """
+
+    abduction: float = np.radians(9.0)
+    pip: float = np.radians(40.0)
+    pip_mean: float = np.radians(30.0)
+    thumb: float = np.radians(22.0)
+    thumb_mean: tuple[float, float, float, float] = (
+        float(np.radians(12.0)),
+        float(np.radians(13.0)),
+        float(np.radians(18.0)),
+        float(np.radians(25.0)),
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Priors:
-    """Standard deviations of the priors [rad], and where an unseen finger is believed to be.
+    """Standard deviations of the priors [rad], and where an unseen finger is believed to be; `free` None: all natural.
 
     Round values for hands at work, wide enough that markers overrule them. A handful of alternatives was
     compared on simulated and recorded hands; nothing was fitted. A finger whose tip shows from behind is
@@ -52,6 +77,7 @@ class Priors:
     walk_rad_s: float = 8.0
     palm_walk_rad_s: float = 3.0
     palm_walk_m_s: float = 2.0
+    free: FreeHand | None = FreeHand()
 
     def palm_weight(self, dt_s: float) -> Float:
         """(6,) inverse standard deviations of the palm's turn [rad] and shift [m] in a time."""
@@ -64,36 +90,57 @@ class AnglePrior:
     """Beliefs about the free angles x, summed up: x normal x / 2 - pull x + constant, half a sum of squares.
 
     Attributes:
-        normal: (n, n).
-        pull: (n,).
-        constant: So that the cost is that of the squares.
+        normal: (..., n, n); leading axes: one or several hypotheses.
+        pull: (..., n).
+        constant: (...) so that the cost is that of the squares.
+        log_density: (...) logarithm of the density of the habits at cost 0, but for what hypotheses have in common.
     """
 
     normal: Float
     pull: Float
-    constant: float
+    constant: Float
+    log_density: Float
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters, priors: Priors) -> "AnglePrior":
-        """What holds of every hand in every frame."""
-        rows, means = _natural_rows(model, parameters, priors)
-        return cls(rows.T @ rows, means @ rows, 0.5 * float(means @ means))
+        """What holds of every hand in every frame: (1 or 2, ...), a natural hand and a free one."""
+        tables = [_natural_rows(model, parameters, priors)]
+        if priors.free is not None:
+            tables.append(_free_rows(model, parameters, priors.free, priors.free_dip))
+        habits = cls(
+            np.array([rows.T @ rows for rows, _ in tables]),
+            np.array([means @ rows for rows, means in tables]),
+            np.array([0.5 * float(means @ means) for _, means in tables]),
+            np.zeros(len(tables)),
+        )
+        volume = habits.normal.copy()
+        flexion = np.flatnonzero((parameters.free >= 4) & (parameters.free % 4 == 1))
+        span = np.maximum(parameters.high - parameters.low, _NARROWEST_RAD)[flexion]
+        # The highest density of a normal distribution of this width is that of any angle within the span.
+        volume[1:, flexion, flexion] += 2.0 * np.pi / span**2
+        return replace(habits, log_density=habits.least() + 0.5 * np.linalg.slogdet(volume)[1])
 
     def and_single(self, weight: Float, mean: Float) -> "AnglePrior":
         """With a belief about single angles added: inverse standard deviations and means (n,)."""
         normal, squared = self.normal.copy(), weight * weight
-        normal.flat[:: len(normal) + 1] += squared
+        np.einsum("...ii->...i", normal)[...] += squared
         pull = squared * mean
-        return AnglePrior(normal, self.pull + pull, self.constant + 0.5 * float(pull @ mean))
+        constant = self.constant + 0.5 * float(pull @ mean)
+        return AnglePrior(normal, self.pull + pull, constant, self.log_density)
+
+    def of_hypothesis(self, which: Int | int) -> "AnglePrior":
+        """That of one hypothesis, or of several (S,), one for each search."""
+        return AnglePrior(self.normal[which], self.pull[which], self.constant[which], self.log_density[which])
 
     def cost_and_gradient(self, x: Float) -> tuple[Float, Float]:
         """Half the sum of squares (...) at x (..., n), and its derivative (..., n)."""
-        pushed = x @ self.normal
+        pushed = (x[..., None, :] @ self.normal)[..., 0, :]
         return np.vecdot(0.5 * pushed - self.pull, x) + self.constant, pushed - self.pull
 
-    def least(self) -> float:
-        """The cost where it is least: beliefs that contradict each other."""
-        return self.constant - 0.5 * float(self.pull @ np.linalg.solve(self.normal, self.pull))
+    def least(self) -> Float:
+        """The cost (...) where it is least: beliefs that contradict each other."""
+        natural = np.linalg.solve(self.normal, self.pull[..., None])[..., 0]
+        return self.constant - 0.5 * np.vecdot(self.pull, natural)
 
 
 def hidden_belief(
@@ -115,7 +162,7 @@ def hidden_belief(
     else:
         angles[:], sigma[:] = known[0], known[1][:, None]
     sigma[list(seen)] = np.inf
-    return 1.0 / parameters.free_of(sigma), parameters.free_of(angles)
+    return 1.0 / parameters.free_of(sigma), parameters.of_angles(angles)
 
 
 def last_belief(
@@ -123,36 +170,68 @@ def last_belief(
 ) -> tuple[Float, Float]:
     """Weight and mean (n,) of the angles (5, 4) a hand had `dt_s` ago."""
     walk = 1.0 / (priors.walk_rad_s * max(dt_s, _SHORTEST_S))
-    return np.full(len(parameters.free), walk), parameters.free_of(angles_rad)
+    return np.full(len(parameters.free), walk), parameters.of_angles(angles_rad)
 
 
 def _natural_rows(model: HandModel, parameters: HandParameters, priors: Priors) -> tuple[Float, Float]:
     """Rows (P, n) and means (P,): natural flexion, small abduction, neighbours alike, a loose thumb."""
-    column = {int(angle): c for c, angle in enumerate(parameters.free)}
-    rows: list[Float] = []
-    means: list[float] = []
-
-    def add(terms: dict[int, float], mean: float, sigma: float) -> None:
-        row = np.zeros(len(column))
-        for angle, factor in terms.items():
-            row[column[angle]] = factor / sigma
-        rows.append(row)
-        means.append(mean / sigma)
-
+    rows = _Rows(parameters)
     for k, mean in enumerate(priors.thumb_mean):
-        add({k: 1.0}, mean, priors.thumb)
-    add({2: -1.0, 3: 1.0}, 0.0, priors.thumb)
+        rows.add({k: 1.0}, mean, priors.thumb)
+    rows.add({2: -1.0, 3: 1.0}, 0.0, priors.thumb)
     for f in range(1, 5):
         a = 4 * f
-        add({a: 1.0}, 0.0, priors.abduction)
+        rows.add({a: 1.0}, 0.0, priors.abduction)
         if model.mcp_per_pip is None:
-            add({a + 1: 1.0}, priors.pip_mean, priors.pip)  # as little as is known of the PIP
+            rows.add({a + 1: 1.0}, priors.pip_mean, priors.pip)  # as little as is known of the PIP
         else:
-            add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
-        add({a + 2: 1.0}, priors.pip_mean, priors.pip)
-        if model.dip_per_pip is None:
-            add({a + 3: 1.0, a + 2: -_DIP_PER_PIP}, 0.0, priors.free_dip)
+            rows.add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
+        rows.add({a + 2: 1.0}, priors.pip_mean, priors.pip)
+        rows.add_loose_dip(model, a, priors.free_dip)
         if model.neighbours and f < 4:
-            add({a + 1: 1.0, a + 5: -1.0}, 0.0, priors.neighbour_flexion)
-            add({a + 2: 1.0, a + 6: -1.0}, 0.0, priors.neighbour_pip)
-    return np.array(rows), np.array(means)
+            rows.add({a + 1: 1.0, a + 5: -1.0}, 0.0, priors.neighbour_flexion)
+            rows.add({a + 2: 1.0, a + 6: -1.0}, 0.0, priors.neighbour_pip)
+    return rows.table()
+
+
+def _free_rows(
+    model: HandModel, parameters: HandParameters, free: FreeHand, free_dip: float
+) -> tuple[Float, Float]:
+    """Rows (P, n) and means (P,) of a hand whose joints know nothing of each other."""
+    rows = _Rows(parameters)
+    for k, mean in enumerate(free.thumb_mean):
+        rows.add({k: 1.0}, mean, free.thumb)
+    for f in range(1, 5):
+        a = 4 * f
+        low, high = model.limits_rad[f, 1].tolist()
+        rows.add({a: 1.0}, 0.0, free.abduction)
+        rows.add({a + 1: 1.0}, 0.5 * (low + high), max(2.0 * (high - low), _NARROWEST_RAD))  # next to nothing
+        rows.add({a + 2: 1.0}, free.pip_mean, free.pip)
+        rows.add_loose_dip(model, a, free_dip)
+    return rows.table()
+
+
+class _Rows:
+    """Collects beliefs about sums of angles, numbered as in the flat (20,) table."""
+
+    def __init__(self, parameters: HandParameters) -> None:
+        self._column = {int(angle): c for c, angle in enumerate(parameters.free)}
+        self._rows: list[Float] = []
+        self._means: list[float] = []
+
+    def add(self, terms: dict[int, float], mean: float, sigma: float) -> None:
+        row = np.zeros(len(self._column))
+        for angle, factor in terms.items():
+            row[self._column[angle]] = factor / sigma
+        self._rows.append(row)
+        self._means.append(mean / sigma)
+
+    def add_loose_dip(self, model: HandModel, a: int, free_dip: float) -> None:
+        """That the DIP of the finger whose angles begin at `a` follows its PIP, if it does so at all loosely."""
+        if model.dip_per_pip is None:
+            self.add({a + 3: 1.0, a + 2: -_DIP_PER_PIP}, 0.0, free_dip)
+        elif model.dip_spread_rad > 0.0:
+            self.add({a + 3: 1.0, a + 2: -model.dip_per_pip}, 0.0, model.dip_spread_rad)
+
+    def table(self) -> tuple[Float, Float]:
+        return np.array(self._rows), np.array(self._means)

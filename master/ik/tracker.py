@@ -18,6 +18,7 @@ from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
+from master.ik.hand_problem import Orientation
 from master.ik.priors import Priors
 from master.volume import inside
 
@@ -132,6 +133,7 @@ class HandTracker:
         cov_m2: Float,
         towards_cameras: Float,
         measured: Bool | None = None,
+        orientation: Orientation | None = None,
     ) -> TrackedHand:
         """Solve one instant.
 
@@ -141,6 +143,7 @@ class HandTracker:
             cov_m2: (M, 3, 3) [m^2].
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
             measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
+            orientation: The palm's orientation as an IMU has it; None: not known.
         """
         seen = seen_markers(points_m, cov_m2)
         last, dt_s = self.recent(t_ns)
@@ -151,9 +154,9 @@ class HandTracker:
         if last is not None:
             fingers = frozenset(self._finger[seen].tolist())
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, fingers)
-        solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing)
+        solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing, orientation=orientation)
         if solution is not None and last is not None:
-            fresh = self._afresh(solution, points_m, cov_m2, hidden, facing)
+            fresh = self._afresh(solution, points_m, cov_m2, hidden, facing, orientation)
             if fresh is not None:
                 solution, last, self._memory = fresh, None, _Memory(self.model)  # the leap was no motion
         if solution is not None:
@@ -175,6 +178,7 @@ class HandTracker:
         cov_m2: Float,
         hidden: tuple[Float, Float] | None,
         facing: Float | None,
+        orientation: Orientation | None,
     ) -> HandSolution | None:
         """The hand without the last pose, which may have led into the wrong valley; None: `found` is no worse.
 
@@ -183,7 +187,7 @@ class HandTracker:
         worst_m = self._unexplained_m(found, points_m, cov_m2)
         if worst_m <= _BAD_FIT_M:
             return None
-        fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing)
+        fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation)
         if fresh is None or self._unexplained_m(fresh, points_m, cov_m2) >= 0.5 * worst_m:
             return None
         return fresh

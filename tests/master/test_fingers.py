@@ -20,7 +20,7 @@ def solved(angles: Float) -> tuple[HandSolution, Float]:
     joints = RIGHT.forward(palm(), angles)
     points = RIGHT.marker_points(joints, MARKERS)
     sure = np.zeros((26, 3, 3)), np.zeros((5, 3, 3)), np.zeros((5, 3, 3))
-    return HandSolution(palm(), angles, joints, *sure, np.zeros(6), 0.0, 1), points
+    return HandSolution(palm(), angles, joints, *sure, np.zeros(6), 0.0, 1, 1.0), points
 
 
 @given(seeds)

@@ -18,7 +18,7 @@ from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.attached import Attached
 from master.ik.hand import HandSolution, HandSolver
-from master.ik.hand_problem import Facing, HandProblem, PalmPrior
+from master.ik.hand_problem import Facing, HandProblem, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
 from tests.hand_helpers import (
@@ -75,7 +75,7 @@ def test_points_move_with_the_angles_as_the_jacobian_says(name: str, seed: int) 
             return points.place(model.chains(parameters.angles(x)))
 
         chains = model.chains(parameters.angles(x))
-        J = points.jacobian(chains, points.place(chains))
+        J = points.jacobian(chains, points.place(chains), x)
         h = 1e-6
         for k in range(len(x)):
             e = h * np.eye(len(x))[k]
@@ -91,17 +91,18 @@ def test_gradient_is_the_derivative_of_the_cost(name: str, seed: int) -> None:
     n = len(parameters.free)
     T = rigid(any_rotation(rng), rng.normal(0.0, 0.3, 3))
     x = rng.uniform(parameters.low, parameters.high)
-    prior = AnglePrior.of(model, parameters, Priors()).and_single(rng.uniform(0, 9, n), rng.normal(size=n))
+    beliefs = AnglePrior.of(model, parameters, Priors()).and_single(rng.uniform(0, 9, n), rng.normal(size=n))
     problem = HandProblem(
         model,
         parameters,
         Attached.markers(model, parameters, MARKERS),
         exact(model, T, np.zeros((5, 4))) + rng.normal(0.0, 0.02, (6, 3)),
         rng.normal(0.0, 300.0, (6, 3, 3)),
-        prior,
+        beliefs.of_hypothesis(seed % 2),
         # At the last pose itself the rotation vector is exact; away from it the sine stands for the angle.
         PalmPrior(rigid(T[:3, :3], T[:3, 3] + 0.01), np.repeat([20.0, 30.0], 3)),
         Facing(FACING, 2.0),
+        Orientation(any_rotation(rng), np.diag(rng.uniform(0.01, 4.0, 3))),
     )
 
     def cost(step: Float) -> float:
