@@ -47,7 +47,8 @@ def _targets(
         solver = solvers[k % 5]
         low, high = np.array(solver.limits).T
         a, f, pip, dip = (low + rng.random(4) * (high - low)).tolist()
-        if natural_thumb or solver.chain.coupling is not None:
+        (a, f), (pip,), (dip,) = solver.chain.clamp(((a, f), (pip,), (dip,)))
+        if natural_thumb:
             dip = min(max(solver.ratio * pip, float(low[3])), float(high[3]))
         out.append((k % 5, solver.forward((a, f, pip, dip))))
     return out
@@ -85,11 +86,10 @@ def _fabrik_rows(solvers: list[FingerSolver]) -> list[Row]:
     seeded_us = (time.perf_counter() - start) / len(targets) * 1e6
     misses = [math.dist(r.positions[-1], target) for r, (_, target) in zip(results, targets, strict=True)]
     outside = sum(
-        not low <= q <= high
-        for r, (f, _) in zip(results, targets, strict=True)
-        for q, (low, high) in zip(
-            (q for joint in r.angles for q in joint), prepared[f].chain.spans, strict=True
+        not np.allclose(
+            np.concatenate(prepared[f].chain.clamp(r.angles)), np.concatenate(r.angles), 0.0, 1e-9
         )
+        for r, (f, _) in zip(results, targets, strict=True)
     )
     few = targets[:_UNSEEDED_TARGETS]
 

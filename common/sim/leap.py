@@ -34,7 +34,7 @@ class LeapMotion:
         centre_m: (3,) [m] middle of the volume, rig frame.
         position_m: (N, 3) palm centre [m] around 0, rig axes; quaternion: (N, 4) wxyz; angles_rad: (N, 5, 4).
         middle_m: (3,) the point of the palm frame that follows it, the middle of the flat hand.
-        limits_rad: (5, 4, 2).
+        model: The hand, whose limits are kept.
     """
 
     centre_m: Float
@@ -42,7 +42,7 @@ class LeapMotion:
     quaternion: Float
     angles_rad: Float
     middle_m: Float
-    limits_rad: Float
+    model: HandModel
 
     @property
     def period_s(self) -> float:
@@ -52,7 +52,7 @@ class LeapMotion:
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         place = (max(t_s, 0.0) % self.period_s) / GRID_S
-        angles = np.clip(_hermite(self.angles_rad, place), self.limits_rad[..., 0], self.limits_rad[..., 1])
+        angles = self.model.clamp(_hermite(self.angles_rad, place))
         rotation = quaternion_to_matrix(_hermite(self.quaternion, place))
         centre = self.centre_m + _hermite(self.position_m, place)
         return HandState(rigid(rotation, centre - rotation @ self.middle_m), angles)
@@ -95,7 +95,7 @@ def load_leap(path: Path, model: HandModel, centre_m: Float) -> LeapMotion:
         quaternion=quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True),
         angles_rad=flat.reshape(-1, 5, 4),
         middle_m=np.array([0.0, 0.0, 0.5 * float(model.rest_position_m[:, 2].max())]),
-        limits_rad=model.limits_rad,
+        model=model,
     )
 
 
@@ -133,7 +133,7 @@ def joint_angles(model: HandModel, joints: Float, rotation: Float) -> Float:
         angles[:, :, 1 + k] = np.arccos(
             np.clip((local[:, :, k] * local[:, :, k - 1]).sum(axis=-1), -1.0, 1.0)
         )
-    return np.clip(angles, model.limits_rad[..., 0], model.limits_rad[..., 1])
+    return model.clamp(angles)
 
 
 def _continuous(quaternion: Float) -> Float:

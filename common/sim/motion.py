@@ -143,9 +143,7 @@ def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
     coupling = 2.0 / 3.0 if model.dip_per_pip is None else model.dip_per_pip
     ratio = np.array([0.9, coupling, coupling, coupling, coupling])
     angles[:, 3] = ratio * angles[:, 2] * (1.0 + 0.12 * wobble[:, 3])
-    angles = np.radians(angles)
-    low, high = model.limits_rad[..., 0], model.limits_rad[..., 1]
-    return np.clip(angles, low, high)
+    return model.clamp(np.radians(angles))
 
 
 def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float) -> Float:

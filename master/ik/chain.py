@@ -73,7 +73,7 @@ class Chain:
 
     @property
     def spans(self) -> tuple[tuple[float, float], ...]:
-        """Low and high of every angle of every joint, in order [rad]."""
+        """Low and high of every angle of every joint, in order [rad]; the abduction's where nothing narrows it."""
         spans: list[tuple[float, float]] = []
         for link in self.links:
             joint = link.joint
@@ -118,13 +118,19 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
         model: The hand.
         finger: 0 thumb ... 4 little.
         offset_m: End effector (3,) in the tip joint's frame [m]; zero: the tip joint itself.
-        coupled: Whether the DIP follows the PIP by the model's ratio (never for the thumb).
+        coupled: Whether the DIP follows the PIP where the model keeps their ratio exactly (never for the thumb).
     """
     limits = [(float(low), float(high)) for low, high in model.limits_rad[finger]]
     rest = as_matrix(model.rest_rotation[CHAINS[finger, 0]])
     turn, bone = model.turn[finger], model.bone_m[finger]
     thumb = finger == THUMB
-    root = Rotor(limits[0], limits[1], sign=model.side_sign, rest=IDENTITY if thumb else rest)
+    root = Rotor(
+        limits[0],
+        limits[1],
+        spread_at_full_flexion=float(model.spread_at_full_flexion[finger]),
+        sign=model.side_sign,
+        rest=IDENTITY if thumb else rest,
+    )
     last = bone[2] + turn[2] @ np.asarray(offset_m, dtype=np.float64)
     links = (
         Link(rest if thumb else IDENTITY, root, as_vector(bone[0])),
@@ -132,7 +138,9 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
         Link(as_matrix(turn[1]), Hinge(*limits[3]), as_vector(last)),
     )
     ratio = model.dip_per_pip
-    return Chain(links, Coupling(1, 2, ratio) if coupled and not thumb and ratio is not None else None)
+    if not coupled or thumb or ratio is None or model.dip_spread_rad > 0.0:
+        return Chain(links)
+    return Chain(links, Coupling(1, 2, ratio))
 
 
 def finger_root(model: HandModel, finger: int) -> Vector:

@@ -217,13 +217,15 @@ class Fabrik:
         last = len(links) - 1
         places = list(positions)
         places[last + 1] = goal
-        behind = turned(orientations[last], links[last].bone, minus(goal, positions[last]))
+        behind = self._pointed(last, orientations[last], angles[last], minus(goal, positions[last]))
         places[last] = minus(goal, rotate(behind, links[last].bone))
         for k in range(last - 1, -1, -1):
             wanted = minus(places[k + 1], positions[k])
             next_link, bone = links[k + 1], links[k].bone
             joint = next_link.joint
-            if isinstance(joint, Hinge) and joint.frame == "local":
+            if links[k].joint.frame == "world" or joint.frame == "world":
+                here = self._pointed(k, orientations[k], angles[k], wanted)
+            elif isinstance(joint, Hinge):
                 # seen from the bone behind, this bone turns the other way about the same axis
                 mirrored = Hinge(-joint.high_rad, -joint.low_rad, joint.axis)
                 seen = rotate_back(next_link.turn, bone)
@@ -231,12 +233,18 @@ class Fabrik:
                 undo = product(mirrored.rotation((angle,)), transposed(next_link.turn))
                 here = product(behind, undo)
             else:
-                here = turned(orientations[k], bone, wanted)
-                if joint.frame == "local":
-                    here = self._agree(here, behind, k + 1, angles[k + 1])
+                here = self._agree(turned(orientations[k], bone, wanted), behind, k + 1, angles[k + 1])
             places[k] = minus(places[k + 1], rotate(here, bone))
             behind = here
         return places
+
+    def _pointed(self, k: int, now: Matrix, angles: Angles, wanted: Vector) -> Matrix:
+        """Orientation of link k whose bone points as wanted, as far as a joint with axes of the world allows."""
+        link = self.chain.links[k]
+        if link.joint.frame == "local":
+            return turned(now, link.bone, wanted)
+        fitted = link.joint.fit(link.bone, rotate_back(link.turn, wanted), angles)
+        return product(link.turn, link.joint.rotation(fitted))
 
     def _agree(self, here: Matrix, behind: Matrix, k: int, now: Angles) -> Matrix:
         """Turn a link so that the bone after its rotor k lies in a direction the rotor allows."""

@@ -17,44 +17,23 @@ Targets that no legal pose hits get the bounded least-squares pose (stretched or
 """
 
 from dataclasses import dataclass
-from math import atan2, cos, dist, isfinite, sin, sqrt
-from typing import NamedTuple
+from math import cos, dist, isfinite, sin
 
 from common.arrays import Float
 from common.hand_model import HandModel
 from master.ik.bounded import Four, bounded_least_squares
 from master.ik.chain import THUMB, Chain, finger_chain, finger_root
+from master.ik.finger_table import SLACK_RAD, FingerSolution, Quick, quick_solver
 from master.ik.joints import Hinge, Rotor, swing_and_flex
-from master.ik.reach_table import Branch, ReachCurve, flexed
+from master.ik.reach_table import Branch, ReachCurve
 from master.ik.vectors import Matrix, Vector, dot, rotate, rotate_back
 
 REACHED_M = 1e-6
-_SLACK_RAD = 1e-6
-"""A limit passed by less is the table's rounding: the angle is clamped, which moves the point < 0.2 um."""
-_POLE = 0.004
-"""Squared sine of the angle to the abduction's pole below which the tables alone are not exact enough: there
-their error grows more than 16-fold."""
 _EDGE = 1e-12
 """Relative slack of a squared distance at the end of a branch."""
 _SPREAD_OF_SEEDS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
 """PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
 _NAN = float("nan")
-
-
-class FingerSolution(NamedTuple):
-    """Angles of one finger [rad] (thumb: CMC abduction, CMC flexion, MCP, IP) and how well they fit.
-
-    Attributes:
-        residual_m: Distance of the point to the target; in the closed form the bound of the table's error.
-        reached: Whether legal angles hit the target within 1 um.
-    """
-
-    abduction_rad: float
-    flexion_rad: float
-    pip_rad: float
-    dip_rad: float
-    residual_m: float
-    reached: bool
 
 
 NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
@@ -67,25 +46,22 @@ class FingerSolver:
     Attributes:
         chain: The finger's links and limits, root frame (the palm's axes, origin at the root joint).
         root: MCP (thumb: CMC) in the palm frame [m].
-        ratio: DIP per PIP that makes the closed form exact.
-        branches: Distance -> PIP.
-        bound_m: Largest error of the closed form, from that of the branches' tables.
-        limits: Low and high of the four angles.
+        curve, branches: PIP -> distance, and back.
+        limits: Low and high of the four angles; the abduction's where flexion does not narrow it.
         before: Turn in front of the abduction (thumb), else None.
         rest: Turn between abduction and flexion (identity for the thumb).
-        ahead: Sign of z, in the abduction's frame, where the finger points at rest.
+        quick: For each branch, the usual target's pose or None (`master.ik.finger_table`).
     """
 
     chain: Chain
     root: Vector
-    ratio: float
+    curve: ReachCurve
     branches: tuple[Branch, ...]
-    bound_m: float
     limits: tuple[tuple[float, float], ...]
     before: Matrix | None
     rest: Matrix
     sign: float
-    ahead: float
+    quick: tuple[Quick, ...]
 
     @classmethod
     def of(
@@ -98,35 +74,40 @@ class FingerSolver:
             finger: 0 thumb ... 4 little.
             offset_m: The observed point (3,) in the tip joint's frame [m]; zero: the tip joint.
             free_ratio: DIP (thumb: IP) per PIP (MCP) to prefer where the model leaves it free; None: the
-                ratio of their highest angles.
+                ratio it tends to, else that of their highest angles.
         """
         chain = finger_chain(model, finger, offset_m)
-        root = chain.links[0].joint
-        if not isinstance(root, Rotor):
+        joint = chain.links[0].joint
+        if not isinstance(joint, Rotor):
             raise TypeError("a finger's first joint is a rotor")
         (_, pip_high), (_, dip_high) = chain.spans[2:]
         if chain.coupling is not None:
             ratio = chain.coupling.ratio
         elif free_ratio is not None:
             ratio = free_ratio
+        elif finger != THUMB and model.dip_per_pip is not None:
+            ratio = model.dip_per_pip
         else:
             ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
         curve = ReachCurve.of(chain, ratio)
         branches = curve.branches()
-        thumb = finger == THUMB
-        straight = rotate(root.rest, chain.links[0].bone)
+        root, before = finger_root(model, finger), chain.links[0].turn if finger == THUMB else None
         return cls(
             chain=chain,
-            root=finger_root(model, finger),
-            ratio=ratio,
+            root=root,
+            curve=curve,
             branches=branches,
-            bound_m=_POLE**-0.5 * curve.error(branches) + _SLACK_RAD * sum(chain.lengths),
             limits=chain.spans,
-            before=chain.links[0].turn if thumb else None,
-            rest=root.rest,
-            sign=root.sign,
-            ahead=1.0 if straight[2] > 0.0 else -1.0,
+            before=before,
+            rest=joint.rest,
+            sign=joint.sign,
+            quick=tuple(quick_solver(chain, root, before, curve, branch) for branch in branches),
         )
+
+    @property
+    def ratio(self) -> float:
+        """DIP per PIP that makes the closed form exact."""
+        return self.curve.ratio
 
     def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
         """Angles that bring the point to `target`.
@@ -139,18 +120,19 @@ class FingerSolver:
         Returns:
             Angles inside the limits; NaN where the target is not finite.
         """
-        x, y, z = self._local(target)
         if near is None:
-            quick = self._quick(x, y, z)
-            if quick is not None:
-                return quick
+            for quick in self.quick:
+                found = quick(target)
+                if found is not None:
+                    return found
+        x, y, z = self._local(target)
         if not isfinite(x + y + z):
             return NOT_SEEN
         return self._thorough((x, y, z), near)
 
     def reachable(self, target: Vector) -> FingerSolution | None:
         """The coupled, legal pose that hits `target` (palm frame, [m]), or None: a few microseconds either way."""
-        return self._quick(*self._local(target))
+        return next((found for quick in self.quick if (found := quick(target)) is not None), None)
 
     def _local(self, target: Vector) -> Vector:
         """The target from the root, in the frame the tables are made in."""
@@ -164,58 +146,15 @@ class FingerSolver:
         x, y, z = self.chain.forward(((a, f), (pip,), (dip,)))[0][-1]
         return x + self.root[0], y + self.root[1], z + self.root[2]
 
-    def _quick(self, x: float, y: float, z: float) -> FingerSolution | None:
-        """The usual case, without a loop or a call: most bent branch, legal at once. Else None."""
-        branch = self.branches[0]
-        distance2 = x * x + y * y + z * z
-        if not branch.near2 <= distance2 < branch.far2:
-            return None
-        u = sqrt(branch.far2 - distance2) * branch.per_cell
-        i = int(u)
-        if i >= len(branch.rows):
-            return None
-        u -= i
-        pip, d_pip, wx, dx, wy, dy, wz, dz = branch.rows[i]
-        pip += u * d_pip
-        wx += u * dx
-        wy += u * dy
-        wz += u * dz
-        if x * x + z * z < _POLE * distance2:
-            pip, (wx, wy, wz) = self._exact(branch, distance2)
-        (ax, ay, az), (yx, yy, yz), (zx, zy, zz) = self.rest
-        # as `swing_and_flex`, with one of the two flexions and fewer calls
-        even, odd = yy * wy + yz * wz, yy * wz - yz * wy
-        amplitude2 = even * even + odd * odd
-        level = y - yx * wx
-        side2 = amplitude2 - level * level
-        if side2 <= 0.0:
-            return None
-        side = sqrt(side2) if z * self.ahead > 0.0 else -sqrt(side2)
-        c, s = (even * level - odd * side) / amplitude2, (odd * level + even * side) / amplitude2
-        f = atan2(s, c)
-        py, pz = wy * c + wz * s, wz * c - wy * s
-        vx, vz = ax * wx + ay * py + az * pz, zx * wx + zy * py + zz * pz
-        a = self.sign * atan2(x * vz - z * vx, x * vx + z * vz)
-        (a_low, a_high), (f_low, f_high), _, (dip_low, dip_high) = self.limits
-        if not (a_low <= a <= a_high and f_low <= f <= f_high):
-            if not (
-                a_low - _SLACK_RAD < a < a_high + _SLACK_RAD and f_low - _SLACK_RAD < f < f_high + _SLACK_RAD
-            ):
-                return None
-            a, f = min(max(a, a_low), a_high), min(max(f, f_low), f_high)
-        dip = self.ratio * pip
-        dip = dip_low if dip < dip_low else dip_high if dip > dip_high else dip
-        return FingerSolution(a, f, pip, dip, self.bound_m, True)
-
     def _thorough(self, target: Vector, near: Four | None) -> FingerSolution:
         """Every branch and both flexions; where none is legal or exact enough, bounded least squares."""
         seeds: list[tuple[float, float, Four]] = []
         distance2 = dot(target, target)
         for rank, branch in enumerate(self.branches):
-            pip, w = self._exact(branch, distance2)
+            pip, w = self.curve.exact(branch, distance2)
             off = max(distance2 - branch.far2, branch.near2 - distance2)
             for angles, miss in self._swings(pip, self.ratio * pip, w, target):
-                legal = miss <= _SLACK_RAD and off <= _EDGE * branch.far2
+                legal = miss <= SLACK_RAD and off <= _EDGE * branch.far2
                 close = rank if near is None else sum(abs(p - q) for p, q in zip(angles, near, strict=True))
                 seeds.append((0.0 if legal else 1.0 + miss + 1e2 * max(off, 0.0) ** 0.5, close, angles))
         seeds.sort()
@@ -227,28 +166,6 @@ class FingerSolver:
                 if left < REACHED_M:
                     return FingerSolution(*angles, left, True)
         return self._fallback([angles for _, _, angles in seeds[:2]], target, goal, near)
-
-    def _exact(self, branch: Branch, distance2: float) -> tuple[float, Vector]:
-        """PIP and w without the table's error: two Newton steps with the table's slope."""
-        pip, w = branch.at(distance2)
-        low, high = self.limits[2]
-        for _ in range(2):
-            dw = branch.slope(distance2)
-            slope = 2.0 * dot(w, dw)
-            w = self._point(pip, self.ratio * pip)
-            off = min(max(distance2, branch.near2), branch.far2) - dot(w, w)
-            if abs(slope) > 1e-6 * branch.far2:
-                pip = min(max(pip + off / slope, low), high)
-        return pip, self._point(pip, self.ratio * pip)
-
-    def _point(self, pip: float, dip: float) -> Vector:
-        """w: the point in the root joint's frame [m]; the DIP is cut at its limits."""
-        first, middle, last = self.chain.links
-        low, high = self.limits[3]
-        x, y, z = rotate(last.turn, flexed(min(max(dip, low), high), last.bone))
-        bone = middle.bone
-        x, y, z = rotate(middle.turn, flexed(pip, (bone[0] + x, bone[1] + y, bone[2] + z)))
-        return first.bone[0] + x, first.bone[1] + y, first.bone[2] + z
 
     def _improve(self, seed: Four, goal: Vector) -> FingerSolution:
         angles, left = bounded_least_squares(self.chain, seed, goal, 0.05 * REACHED_M)
@@ -301,5 +218,5 @@ class FingerSolver:
     def _free_pair(self, pip_share: float, dip_share: float, target: Vector) -> list[Four]:
         (p_low, p_high), (d_low, d_high) = self.limits[2:]
         pip, dip = p_low + pip_share * (p_high - p_low), d_low + dip_share * (d_high - d_low)
-        w = self._point(pip, dip)
+        w = self.curve.place(pip, dip)
         return [angles for angles, _ in self._swings(pip, dip, w, target)]

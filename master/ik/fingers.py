@@ -3,8 +3,9 @@
 The fit balances all markers and priors. A finger whose cap is explained within its noise stays as fitted: to pull
 it onto the last millimetre of noise costs 1.4 degrees of PIP a millimetre. Where the balance leaves a finger off by
 more than the noise allows, the palm is kept and the finger solved alone within its limits: closed form for the
-seed, FABRIK to the end. The thumb has four angles for three numbers, so its seed is the fit itself. A cap out of
-reach changes nothing: the fit is already the best compromise, and a search for a better one would cost a frame.
+seed, FABRIK to the end. The thumb, and a finger whose DIP may stray, have four angles for three numbers, so their
+seed is the fit itself. A cap out of reach changes nothing: the fit is already the best compromise, and a search for
+a better one would cost a frame.
 """
 
 from dataclasses import replace
@@ -14,7 +15,6 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import invert, transform
 from common.hand_model import HandModel
-from master.ik.chain import THUMB
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
 from master.ik.hand import EXPLAINED, HandSolution
@@ -60,13 +60,13 @@ class FingerRefiner:
             if not surprise[marker] >= EXPLAINED:  # NaN: not seen
                 continue
             x, y, z = (float(value) for value in transform(T_palm_rig, points_m[marker]))
-            found = _solve(closed_form, fabrik, (x, y, z), angles[finger] if finger == THUMB else None)
+            determined = closed_form.chain.coupling is not None
+            found = _solve(closed_form, fabrik, (x, y, z), None if determined else angles[finger])
             if found is not None:
                 angles[finger] = found
         if np.array_equal(angles, hand.angles_rad):
             return hand
-        limits = self._model.limits_rad
-        angles = np.clip(angles, limits[..., 0], limits[..., 1])
+        angles = self._model.clamp(angles)
         joints = self._model.forward(hand.T_rig_palm, angles)
         residual = np.linalg.norm(self._model.marker_points(joints, self._markers) - points_m, axis=1)
         return replace(hand, angles_rad=angles, joints=joints, residual_m=residual)

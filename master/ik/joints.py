@@ -142,19 +142,21 @@ class Rotor:
     def abduction_span(self, flexion_rad: float) -> tuple[float, float]:
         """Low and high of the abduction at one flexion [rad]."""
         low, high = self.abduction_rad
-        share = self.spread_left(flexion_rad)
+        share, _ = self.narrowing(flexion_rad)
         if self.shape == "ellipse":
             half = self.flexion_rad[flexion_rad > 0.0]
             used = flexion_rad / half if half else 0.0
             share = min(share, sqrt(max(1.0 - used * used, 0.0)))
         return low * share, high * share
 
-    def spread_left(self, flexion_rad: float) -> float:
-        """Share of the abduction range that narrowing leaves at one flexion [rad]."""
+    def narrowing(self, flexion_rad: float) -> tuple[float, float]:
+        """Share of the abduction range that the parabola leaves at one flexion [rad], and its slope [1/rad]."""
         most = self.flexion_rad[1]
         if self.spread_at_full_flexion == 1.0 or not flexion_rad > 0.0 or not most > 0.0:
-            return 1.0
-        return spread_left(min(flexion_rad / most, 1.0), self.spread_at_full_flexion)
+            return 1.0, 0.0
+        flexed = min(flexion_rad / most, 1.0)
+        slope = -2.0 * (1.0 - self.spread_at_full_flexion) * flexed / most
+        return spread_left(flexed, self.spread_at_full_flexion), slope
 
     def fit(self, bone: Vector, direction: Vector, now: Angles) -> Angles:
         """Legal (abduction, flexion) that bring Q bone to `direction`, or near it when it is out of reach.

@@ -15,9 +15,9 @@ import numpy as np
 from common.arrays import Float
 from master.ik.chain import Chain
 from master.ik.joints import Hinge
-from master.ik.vectors import Vector
+from master.ik.vectors import Vector, dot, rotate
 
-_CELLS = 4096
+_CELLS = 2048
 _GRID = 2001
 _BISECTIONS = 52
 _Row = tuple[float, float, float, float, float, float, float, float]
@@ -55,15 +55,17 @@ class Branch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReachCurve:
-    """w(PIP) of one finger, vectorised.
+    """w(PIP) of one finger, for many angles at once and, from the links, for single ones.
 
     Attributes:
+        chain: The finger.
         bones: The three bone vectors (3, 3) [m], each in its joint's frame.
         turns: Rest turns (2, 3, 3) of PIP and DIP.
         ratio: DIP per PIP.
         pip, dip: Low and high [rad].
     """
 
+    chain: Chain
     bones: Float
     turns: Float
     ratio: float
@@ -84,7 +86,7 @@ class ReachCurve:
             spans.append((link.joint.low_rad, link.joint.high_rad))
         bones = np.array([link.bone for link in chain.links])
         turns = np.array([link.turn for link in chain.links[1:]])
-        return cls(bones, turns, ratio, spans[0], spans[1])
+        return cls(chain, bones, turns, ratio, spans[0], spans[1])
 
     def point(self, pip: Float) -> Float:
         """w (N, 3) [m] at PIP angles (N,) [rad]."""
@@ -95,6 +97,28 @@ class ReachCurve:
     def distance2(self, pip: Float) -> Float:
         """|w|^2 (N,) [m^2] at PIP angles (N,) [rad]."""
         return (self.point(pip) ** 2).sum(axis=-1)
+
+    def place(self, pip: float, dip: float) -> Vector:
+        """w [m] of one PIP and any DIP [rad], the DIP cut at its limits."""
+        first, middle, last = self.chain.links
+        low, high = self.dip
+        x, y, z = rotate(last.turn, flexed(min(max(dip, low), high), last.bone))
+        bone = middle.bone
+        x, y, z = rotate(middle.turn, flexed(pip, (bone[0] + x, bone[1] + y, bone[2] + z)))
+        return first.bone[0] + x, first.bone[1] + y, first.bone[2] + z
+
+    def exact(self, branch: Branch, distance2: float) -> tuple[float, Vector]:
+        """PIP and w without the table's error: two Newton steps with the table's slope."""
+        pip, w = branch.at(distance2)
+        low, high = self.pip
+        for _ in range(2):
+            dw = branch.slope(distance2)
+            slope = 2.0 * dot(w, dw)
+            w = self.place(pip, self.ratio * pip)
+            off = min(max(distance2, branch.near2), branch.far2) - dot(w, w)
+            if abs(slope) > 1e-6 * branch.far2:
+                pip = min(max(pip + off / slope, low), high)
+        return pip, self.place(pip, self.ratio * pip)
 
     def branches(self) -> tuple[Branch, ...]:
         """All monotone stretches, the most bent one first."""
@@ -109,15 +133,6 @@ class ReachCurve:
         edges = sorted(cuts)
         spans = list(pairwise(edges)) or [(low, high)]
         return tuple(self._branch(a, b) for a, b in reversed(spans))
-
-    def error(self, branches: tuple[Branch, ...]) -> float:
-        """Largest |w| error of the tables [m], found at the cells' middles."""
-        worst = 0.0
-        for branch in branches:
-            rows = np.array(branch.rows)
-            exact = self.point(rows[:, 0] + 0.5 * rows[:, 1])
-            worst = max(worst, float(np.abs(rows[:, 2::2] + 0.5 * rows[:, 3::2] - exact).max()))
-        return worst
 
     def _extremum(self, low: float, high: float, *, maximum: bool) -> float:
         """By thirds: the curve is smooth and has one extremum inside."""

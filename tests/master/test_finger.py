@@ -19,6 +19,7 @@ from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.bounded import Four
 from master.ik.finger import NOT_SEEN, FingerSolver
+from master.ik.finger_table import FingerSolution
 
 Preset = Literal["K", "D"]
 DEGREE = math.pi / 180
@@ -34,7 +35,26 @@ def _model(side: str, preset: Preset) -> HandModel:
 
 @cache
 def _solver(side: str, preset: Preset, finger: int) -> FingerSolver:
-    model = _model(side, preset)
+    return _prepared(_model(side, preset), finger)
+
+
+@cache
+def _narrowed(share: float, soft: bool) -> HandModel:
+    """A left hand whose fingers, and thumb, keep a share of their abduction; its DIPs fixed or free to stray."""
+    limits = preset_limits("D")
+    fingers = {
+        name: msgspec.structs.replace(getattr(limits, name), spread_at_full_flexion=share) for name in FINGERS
+    }
+    profile = msgspec.structs.replace(
+        generated_profile("narrow", "left"),
+        limits_rad=msgspec.structs.replace(limits, **fingers),
+        couplings=Couplings(dip_spread_rad=0.1 if soft else 0.0),
+    )
+    return HandModel.of(profile)
+
+
+@cache
+def _prepared(model: HandModel, finger: int) -> FingerSolver:
     return FingerSolver.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
 
 
@@ -42,8 +62,24 @@ def _legal(model: HandModel, solver: FingerSolver, finger: int, shares: Float) -
     """Angles (N, 4) inside the limits that obey the coupling, from shares (N, 4) of the ranges."""
     low, high = model.limits_rad[finger, :, 0], model.limits_rad[finger, :, 1]
     angles = low + shares * (high - low)
+    spread = model.abduction_limits_rad(np.repeat(angles[:, 1:2], 5, axis=1))
+    low_a, high_a = spread[0][:, finger], spread[1][:, finger]
+    angles[:, 0] = low_a + shares[:, 0] * (high_a - low_a)
     angles[:, 3] = np.clip(solver.ratio * angles[:, 2], low[3], high[3])
     return angles
+
+
+def _inside(model: HandModel, finger: int, found: FingerSolution) -> bool:
+    """Whether a pose is legal to the last bit, by the hand model's own account."""
+    hand = np.zeros((5, 4))
+    hand[finger] = found[:4]
+    return bool(model.within_limits(hand, 0.0)[finger].all())
+
+
+def _spread(model: HandModel, finger: int, flexion: float) -> tuple[float, float]:
+    """Low and high of the abduction at one flexion [rad]."""
+    low, high = model.abduction_limits_rad(np.full(5, flexion))
+    return float(low[finger]), float(high[finger])
 
 
 def _points(model: HandModel, finger: int, angles: Float, offset: Float) -> Float:
@@ -110,21 +146,23 @@ def test_corners_of_the_limits_are_hit(finger: int, shares: tuple[float, ...], s
     point = _points(model, finger, angles, model.mounts[FINGERS[finger]].offset_m)[0]
     found = solver.solve(_target(point))
     assert math.dist(solver.forward(found[:4]), point) * 1e3 < 1e-3
-    assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+    assert _inside(model, finger, found)
 
 
 def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
     rng = np.random.default_rng(4)
     for finger in range(5):
-        solver = _solver("right", "K", finger)
-        assert solver.bound_m < 1e-6
+        model, solver = _model("right", "K"), _solver("right", "K", finger)
+        straight = solver.reachable(solver.forward((0.0, 0.0, 0.4, 0.4 * solver.ratio)))
+        assert straight is not None
+        assert straight.residual_m < 0.5e-6
         for _ in range(60):
             target = _target(np.array(solver.root) + rng.normal(0.0, 0.06, 3))
             found = solver.solve(target)
             miss = math.dist(solver.forward(found[:4]), target)
             assert miss <= found.residual_m + 1e-9
             assert found.reached == (miss < 1e-6)
-            assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+            assert _inside(model, finger, found)
 
 
 def test_the_flat_index_by_hand() -> None:
@@ -157,6 +195,12 @@ def test_cut_by_a_limit_is_the_bounded_least_squares_pose(finger: int) -> None:
     solver = _solver("right", "K", finger)
     rng = np.random.default_rng(finger)
     low, high = np.array(solver.limits).T
+    left_in_a_fist = float(_model("right", "K").spread_at_full_flexion[finger])
+
+    def angles(q: Float) -> Four:
+        narrowed = 1.0 - (1.0 - left_in_a_fist) * (q[1] / high[1]) ** 2
+        return float(q[0] * narrowed), float(q[1]), float(q[2]), float(solver.ratio * q[2])
+
     for _ in range(12):
         a, f, pip = rng.uniform([25, 10, 10], [35, 60, 80]) * DEGREE
         target = np.array(solver.forward((a, f, pip, solver.ratio * pip)))
@@ -164,7 +208,7 @@ def test_cut_by_a_limit_is_the_bounded_least_squares_pose(finger: int) -> None:
         assert not found.reached
 
         def left(q: Float, target: Float = target) -> Float:
-            return np.array(solver.forward((q[0], q[1], q[2], solver.ratio * q[2]))) - target
+            return np.array(solver.forward(angles(q))) - target
 
         best = least_squares(
             left,
@@ -184,11 +228,51 @@ def test_any_target_gives_a_legal_pose_or_nan(finger: int, target: tuple[float, 
     solver = _solver("right", "D", finger)
     found = solver.solve(target)
     if all(math.isfinite(v) for v in target):
-        assert all(low <= q <= high for q, (low, high) in zip(found[:4], solver.limits, strict=True))
+        assert _inside(_model("right", "D"), finger, found)
         assert math.isfinite(found.residual_m)
     else:
         assert found is NOT_SEEN
         assert np.isnan(found[:5]).all()
+
+
+@given(
+    finger=st.integers(0, 4),
+    share=st.floats(0.0, 1.0),
+    beyond=st.floats(0.0, 1.5),
+    angles=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+    soft=st.booleans(),
+)
+def test_a_spread_fist_is_never_the_answer(
+    finger: int, share: float, beyond: float, angles: tuple[float, float], soft: bool
+) -> None:
+    # whatever is left of the abduction, and wherever the point would be if it could go on
+    model = _narrowed(round(share, 1), soft)
+    solver = _prepared(model, finger)
+    low, high = np.array(solver.limits).T
+    f, pip = (float(low[k] + q * (high[k] - low[k])) for k, q in zip((1, 2), angles, strict=True))
+    edge = _spread(model, finger, f)[1]
+    found = solver.solve(solver.forward((beyond * edge, f, pip, solver.ratio * pip)))
+    assert _inside(model, finger, found)
+    if beyond <= 1.0:
+        assert found.reached
+
+
+def test_a_narrowed_corner_is_the_bounded_least_squares_pose() -> None:
+    # MCP at 70 deg, spread twice as far as is left there: checked on a fine grid of what is legal
+    model = _narrowed(0.0, False)
+    solver = _prepared(model, 1)
+    f, pip = 70 * DEGREE, 30 * DEGREE
+    target = solver.forward((2.0 * _spread(model, 1, f)[1], f, pip, solver.ratio * pip))
+    found = solver.solve(target)
+    assert not found.reached
+    best = math.inf
+    for df in np.linspace(-0.25, 0.25, 61):
+        edge = _spread(model, 1, f + float(df))[1]
+        for dp in np.linspace(-0.25, 0.25, 61):
+            p = pip + float(dp)
+            best = min(best, math.dist(solver.forward((edge, f + float(df), p, solver.ratio * p)), target))
+    assert found.residual_m < best + 1e-6
+    assert found.residual_m > 5e-4
 
 
 def test_target_at_the_root_is_flagged() -> None:
@@ -226,6 +310,8 @@ def test_free_pairs_are_found_where_the_coupling_is_off() -> None:
         solver = FingerSolver.of(model, finger, np.zeros(3))
         low, high = np.array(solver.limits).T
         for _ in range(60):
-            target = solver.forward(_four(rng.uniform(low, high)))
+            _, f, pip, dip = _four(rng.uniform(low, high))
+            target = solver.forward((float(rng.uniform(*_spread(model, finger, f))), f, pip, dip))
             found = solver.solve(target)
             assert math.dist(solver.forward(found[:4]), target) * 1e3 < 1e-3
+            assert _inside(model, finger, found)
