@@ -55,7 +55,7 @@ def matrix_to_quaternion(rotation: Float) -> Float:
 def rotation_vector_to_matrix(vector: Float) -> Float:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) [rad] (Rodrigues' formula)."""
     # A turn too small to be told from none is taken as this small, not divided by.
-    angle = np.maximum(np.sqrt((vector * vector).sum(axis=-1)), 1e-9)[..., None, None]
+    angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-9)[..., None, None]
     k = skew(vector)
     return _EYE + np.sin(angle) / angle * k + (1 - np.cos(angle)) / (angle * angle) * (k @ k)
 
@@ -119,20 +119,24 @@ def rigid(rotation: Float, translation: Float) -> Float:
 
 
 def fit_rigid(points_a: Float, points_b: Float, weight: Float | None = None) -> Float:
-    """Least-squares `T_a_b` (4, 4) with points_a ~ T_a_b points_b, both (N, 3) (Kabsch, 1976).
+    """Least-squares `T_a_b` (..., 4, 4) with points_a ~ T_a_b points_b, both (..., N, 3) (Kabsch, 1976).
 
     Args:
         points_a: Points in frame a.
         points_b: The same points in frame b.
         weight: (N,) non-negative weights; None: all one.
     """
-    w = np.ones(len(points_a)) if weight is None else weight
-    w = w / w.sum()
+    count = points_a.shape[-2]
+    w = np.full(count, 1.0 / count) if weight is None else weight / weight.sum()
     mean_a, mean_b = w @ points_a, w @ points_b
-    u, _, vt = np.linalg.svd(((points_a - mean_a) * w[:, None]).T @ (points_b - mean_b))
-    flip = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
-    rotation = u @ flip @ vt
-    return rigid(rotation, mean_a - rotation @ mean_b)
+    spread = ((points_a - mean_a[..., None, :]) * w[:, None]).swapaxes(-1, -2)
+    u, _, vt = np.linalg.svd(spread @ (points_b - mean_b[..., None, :]))
+    u[..., 2] *= np.sign(np.linalg.det(u @ vt))[..., None]
+    T = np.zeros((*u.shape[:-2], 4, 4))
+    T[..., :3, :3] = rotation = u @ vt
+    T[..., :3, 3] = mean_a - (rotation @ mean_b[..., None])[..., 0]
+    T[..., 3, 3] = 1.0
+    return T
 
 
 def intersect_plane(origin: Float, direction: Float, normal: Float, offset: float) -> Float:

@@ -205,10 +205,8 @@ class HandModel:
         rotation[..., 3, :, :] = frame @ self.turn[:, 2]
         position = np.empty((*local.shape[:-2], 3))
         position[..., 0, :] = self.rest_position_m[CHAINS[:, 0]]
-        link = (rotation[..., :3, :, :] @ self.bone_m[..., None])[..., 0]
-        for k in range(3):
-            position[..., k + 1, :] = position[..., k, :] + link[..., k, :]
-        return Chains(position, rotation)
+        np.matmul(rotation[..., :3, :, :], self.bone_m[..., None], out=position[..., 1:, :, None])
+        return Chains(position.cumsum(axis=-2), rotation)
 
     def marker_points(self, joints: HandJoints, names: tuple[str, ...]) -> Float:
         """Cap centroids (..., M, 3) [m] in the rig frame.

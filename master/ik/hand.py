@@ -26,6 +26,7 @@ _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand abou
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
+_BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins: open to closed
 _ORIENTED_RAD = np.radians(15.0)  # an orientation that is known better than this fixes the hand's
 
 
@@ -75,6 +76,10 @@ class HandSolver:
         self._prior = AnglePrior.of(model, self._parameters, self.priors)
         natural = np.asarray(np.linalg.solve(self._prior.normal[0], self._prior.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(natural, self._parameters.low), self._parameters.high)
+        bent = np.zeros((len(_BENDS), 5, 4))
+        bent[:, 1:, 1:3] = np.multiply.outer(_BENDS, (0.6, 1.0))[:, None]
+        self._postures = np.array([self._parameters.of_angles(angles) for angles in bent])
+        self._shapes_m = self._attached.place(model.chains(self._parameters.angles(self._postures)))
         walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
         self._walk_2 = np.repeat(walks, (3, 3, len(self._parameters.free))) ** 2
 
@@ -159,21 +164,14 @@ class HandSolver:
 
     def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
         """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
-        seeds: list[tuple[Float, Float]] = []
         weight = np.where(self._attached.on_finger[seen, 0], 1.0, 3.0)
-        for bend in (0.1, 0.7, 1.3):
-            angles = np.zeros((5, 4))
-            angles[1:, 1], angles[1:, 2] = 0.6 * bend, bend
-            x = self._parameters.of_angles(angles)
-            model = self._attached.place(self.model.chains(self._parameters.angles(x)))
-            observed, expected, w = points[seen], model[seen], weight
-            if facing is not None:
-                # A point above the wrist stands for "the back of the hand faces the cameras".
-                observed = np.vstack([observed, points[seen].mean(axis=0) + 0.05 * facing])
-                expected = np.vstack([expected, model[seen].mean(axis=0) + np.array([0.0, 0.05, 0.0])])
-                w = np.append(weight, 0.3)
-            seeds.append((fit_rigid(observed, expected, w), x))
-        return np.array([T for T, _ in seeds]), np.array([x for _, x in seeds])
+        observed, expected = points[seen], self._shapes_m[:, seen]
+        if facing is not None:
+            # A point above the wrist stands for "the back of the hand faces the cameras".
+            above = expected.mean(axis=1, keepdims=True) + np.array([0.0, 0.05, 0.0])
+            observed = np.vstack([observed, observed.mean(axis=0) + 0.05 * facing])
+            expected, weight = np.concatenate([expected, above], axis=1), np.append(weight, 0.3)
+        return fit_rigid(observed, expected, weight), self._postures
 
     def _solution(
         self, problem: HandProblem, habits: AnglePrior, minima: list[Minimum], points_m: Float
@@ -202,7 +200,7 @@ class HandSolver:
             cov_m2=cov @ np.swapaxes(J, 1, 2),
             tilt_cov_rad2=turn @ found.alone @ np.swapaxes(turn, 1, 2),
             tilt_walk_rad2_s2=(turn * self._walk_2) @ np.swapaxes(turn, 1, 2),
-            residual_m=np.asarray(np.linalg.norm(marker - points_m, axis=1), np.float64),
+            residual_m=np.sqrt(np.vecdot(marker - points_m, marker - points_m)),
             cost=found.cost,
             iterations=minima[0].iterations,
             natural=found.natural,

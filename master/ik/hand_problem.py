@@ -19,6 +19,7 @@ from master.ik.priors import AnglePrior
 
 MAX_ITERATIONS = 25
 ENOUGH = 1e-7  # of half chi square: what a search may leave
+_ROUGH = 1.0  # the same where one of several seeds is to be chosen
 _FIRST_DAMPING, _MAX_DAMPING = 1e-3, 1e6
 _EYE = np.eye(3)
 
@@ -140,19 +141,29 @@ class HandProblem:
         return local @ np.swapaxes(T_rig_palm[..., :3, :3], -1, -2) + T_rig_palm[..., None, :3, 3]
 
     def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> list[Minimum]:
-        """For each of H hypotheses the lowest end of the ways downhill from seeds (S, 4, 4), (S, n) in the bounds.
+        """For each of H hypotheses the end of a way downhill from the best of seeds (S, 4, 4), (S, n) in the bounds.
 
-        A way ends where a step gains less than `enough`, and a ten-thousandth of the cost.
+        Which seed is the best is found roughly, under the widest hypothesis, which is the last. A way ends where a
+        step gains less than `enough`, and a ten-thousandth of the cost.
         """
-        hypotheses, seeds = len(self.prior.constant), len(x)
-        search = self.of_hypothesis(np.repeat(np.arange(hypotheses), seeds))
+        hypotheses, before = len(self.prior.constant), 0
+        if len(x) > 1:
+            rough = self.of_hypothesis(np.full(len(x), hypotheses - 1))
+            T_rig_palm, x, here, before = rough._descend(T_rig_palm, x, max(enough, _ROUGH), rivals=True)
+            lowest = int(np.argmin(here.cost))
+            T_rig_palm, x = T_rig_palm[lowest], x[lowest]
+        search = self.of_hypothesis(np.arange(hypotheses))
         T, x = np.tile(T_rig_palm, (hypotheses, 1, 1)), np.tile(x, (hypotheses, 1))
-        T, x, here, iterations = search._descend(T, x, enough)
-        lowest = [k + int(np.argmin(here.cost[k : k + seeds])) for k in range(0, len(x), seeds)]
-        return [Minimum(T[k], x[k], here.of(k), iterations) for k in lowest]
+        T, x, here, iterations = search._descend(T, x, enough, rivals=False)
+        return [Minimum(T[h], x[h], here.of(h), before + iterations) for h in range(hypotheses)]
 
-    def _descend(self, T: Float, x: Float, enough: float) -> tuple[Float, Float, Linear, int]:
-        """From seeds (S, 4, 4), (S, n), each under its own hypothesis, to where no step lowers the cost."""
+    def _descend(
+        self, T: Float, x: Float, enough: float, *, rivals: bool
+    ) -> tuple[Float, Float, Linear, int]:
+        """From seeds (S, 4, 4), (S, n), each under its own hypothesis, to where no step lowers the cost.
+
+        Of `rivals` only the lowest end counts: a way that does not hope to come below one that has ended stops.
+        """
         here, iterations = self.linearise(T, x), 0
         paces = [_Pace(enough) for _ in x]
         while iterations < MAX_ITERATIONS and any(pace.going for pace in paces):
@@ -161,6 +172,8 @@ class HandProblem:
             costs, gains = here.cost.tolist(), hoped.tolist()
             last = [pace.arrives(*step) for pace, *step in zip(paces, costs, gains, strict=True)]
             T, x = _either(last, T_new, T), _either(last, x_new, x)
+            if rivals:
+                _give_up(paces, costs, gains)
             if not any(pace.going for pace in paces):
                 break
             there = self.linearise(T_new, x_new)
@@ -175,13 +188,17 @@ class HandProblem:
         chains = self.model.chains(self.parameters.angles(x))
         local = self.markers.place(chains)
         arm = local @ np.swapaxes(R, -1, -2)
-        moved = np.empty((*arm.shape, 6 + x.shape[-1]))  # the markers by turn, shift and angles
-        moved[..., :3], moved[..., 3:6] = skew(-arm), _EYE
-        moved[..., 6:] = R[..., None, :, :] @ self.markers.jacobian(chains, local, x)
-        rows = (*x.shape[:-1], 3 * arm.shape[-2])
-        J = (self.whiten @ moved).reshape(*rows, moved.shape[-1])
-        residual = (self.whiten @ (arm + origin - self.points_m)[..., None]).reshape(rows)
-        gradient, normal = (residual[..., None, :] @ J)[..., 0, :], np.swapaxes(J, -1, -2) @ J
+        rows, size = (*x.shape[:-1], 3 * arm.shape[-2]), 6 + x.shape[-1]
+        J = np.empty((*arm.shape, size))  # the whitened markers by turn, shift and angles
+        np.matmul(self.whiten, skew(-arm), out=J[..., :3])
+        J[..., 3:6] = self.whiten
+        turned = self.whiten @ R[..., None, :, :]
+        np.matmul(turned, self.markers.jacobian(chains, local, x), out=J[..., 6:])
+        J = J.reshape(*rows, size)
+        off = arm + (origin - self.points_m)
+        residual = (self.whiten @ off[..., None]).reshape(rows)
+        J_t = J.swapaxes(-1, -2)
+        gradient, normal = (J_t @ residual[..., None])[..., 0], J_t @ J
         normal += self.believed
         cost, prior_gradient = self.prior.cost_and_gradient(x)
         gradient[..., 6:] += prior_gradient
@@ -220,13 +237,14 @@ class HandProblem:
         diagonal = damped.reshape(seeds, -1)[:, :: size + 1]  # a view
         diagonal *= 1.0 + damping[:, None]
         pulled = downhill[:, 6:]
-        stays = ((x <= low) & (pulled < 0)) | ((x >= high) & (pulled > 0))
+        stays = np.where(pulled < 0.0, x <= low, x >= high)
         if stays.any():  # its row and column become those of a parameter that nothing moves
-            held = np.zeros(downhill.shape, dtype=bool)
-            held[:, 6:] = stays
-            damped[held[:, :, None] | held[:, None, :]] = 0.0
-            diagonal += held
-            downhill[held] = 0.0
+            moves = np.ones(downhill.shape)
+            moves[:, 6:] -= stays
+            damped *= moves[:, :, None]
+            damped *= moves[:, None, :]
+            diagonal += 1.0 - moves
+            downhill *= moves
         step = np.asarray(np.linalg.solve(damped, downhill[..., None])[..., 0], np.float64)
         T_new = T.copy()
         T_new[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
@@ -269,6 +287,13 @@ class _Pace:
 
     def _little(self, cost: float) -> float:
         return self.enough + 1e-4 * cost
+
+
+def _give_up(paces: list[_Pace], costs: list[float], hoped: list[float]) -> None:
+    """End the ways whose own model of the cost lies above the end of another."""
+    lowest = min((cost for pace, cost in zip(paces, costs, strict=True) if not pace.going), default=np.inf)
+    for pace, cost, gain in zip(paces, costs, hoped, strict=True):
+        pace.going = pace.going and cost - gain <= lowest
 
 
 def _either(use: list[bool], one: Float, other: Float) -> Float:

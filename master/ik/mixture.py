@@ -19,7 +19,7 @@ from master.ik.hand_problem import HandProblem, Minimum
 from master.ik.priors import AnglePrior
 
 _STIFF = 1e-2  # how much less than the markers the mean of the hypotheses holds
-_NEGLIGIBLE = 1e-3  # a hypothesis of less weight changes nothing that one could see
+_NEGLIGIBLE = 0.01  # a hypothesis of less weight changes next to nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,21 +46,22 @@ class Mixture:
         """From what each hypothesis found; one that explains the markers far worse than another is left out."""
         weight = _evidence(problem, minima)
         best = int(np.argmax(weight))
-        top = minima[best]
-        kept = [h for h in range(len(minima)) if weight[h] > _NEGLIGIBLE]
-        off = np.array([_between(minima[h], top) for h in kept])
-        share = weight[kept] / weight[kept].sum()
-        mean = share @ off
-        apart = (off - mean).T * share @ (off - mean)
-        cov, alone = apart.copy(), apart.copy()
-        for h, w in zip(kept, share.tolist(), strict=True):
-            cov += w * np.linalg.inv(minima[h].linear.normal)
-            alone += w * covariance_alone(problem.of_hypothesis(h), habits.of_hypothesis(h), minima[h])
-        T, x = _moved(top.T_rig_palm, top.x, mean)
-        if len(kept) > 1:
-            each = np.array([problem.place(minima[h].T_rig_palm, minima[h].x) for h in kept])
-            T, x = _onto(problem.of_points(np.tensordot(share, each, 1)), T, x, cov)
-        return cls(T, x, cov, alone, float(top.linear.cost), float(weight[0]))
+        top, natural = minima[best], float(weight[0])
+        if weight[best] > 1.0 - _NEGLIGIBLE:
+            alone = covariance_alone(problem.of_hypothesis(best), habits.of_hypothesis(best), top)
+            cov = np.asarray(np.linalg.inv(top.linear.normal), np.float64)
+            return cls(top.T_rig_palm, top.x, cov, alone, float(top.linear.cost), natural)
+        off = np.array([_between(found, top) for found in minima])
+        mean: Float = weight @ off
+        apart = (off - mean).T * weight @ (off - mean)
+        inverse = np.linalg.inv(np.array([found.linear.normal for found in minima]))
+        cov, alone = apart + np.einsum("h,hij->ij", weight, inverse), apart.copy()
+        for h, found in enumerate(minima):
+            alone += weight[h] * covariance_alone(problem.of_hypothesis(h), habits.of_hypothesis(h), found)
+        markers = np.array([problem.place(found.T_rig_palm, found.x) for found in minima])
+        between = problem.of_points(np.einsum("h,hmi->mi", weight, markers))
+        T, x = _onto(between, *_moved(top.T_rig_palm, top.x, mean), top.linear.normal)
+        return cls(T, x, cov, alone, float(top.linear.cost), natural)
 
 
 def _evidence(problem: HandProblem, minima: list[Minimum]) -> Float:
@@ -90,12 +91,12 @@ def _moved(T_rig_palm: Float, x: Float, step: Float) -> tuple[Float, Float]:
     return T, x + step[6:]
 
 
-def _onto(problem: HandProblem, T: Float, x: Float, cov: Float) -> tuple[Float, Float]:
-    """One step from a mean (4, 4), (n,) of hands to where the mean of their markers is, the shortest by `cov`.
+def _onto(problem: HandProblem, T: Float, x: Float, normal: Float) -> tuple[Float, Float]:
+    """One step from a mean (4, 4), (n,) of hands to where the mean of their markers is, the shortest by `normal`.
 
     What is between two hands that explain the markers does so a little worse, since fingers move on arcs.
     """
     there = problem.linearise(T, x)
-    step = -np.linalg.solve(there.normal + _STIFF * np.linalg.inv(cov), there.gradient)
-    T, x = _moved(T, x, step)
+    step = -np.linalg.solve(there.normal + _STIFF * normal, there.gradient)
+    T, x = _moved(T, x, np.asarray(step, np.float64))
     return T, np.minimum(np.maximum(x, problem.parameters.low), problem.parameters.high)
