@@ -190,7 +190,11 @@ def test_presets_hold_the_published_limits(preset: str) -> None:
         np.testing.assert_allclose(np.degrees(of.abduction_rad), middle if finger == "middle" else abduction)
         np.testing.assert_allclose(np.degrees(of.pip_rad), pip)
         np.testing.assert_allclose(np.degrees(of.dip_rad), dip)
+        assert (
+            of.spread_at_full_flexion == 15 / 24
+        )  # Lutsky et al. 2014: 15 deg at 90 deg of flexion, 24 at 0
     thumb = limits.thumb
+    assert thumb.spread_at_full_flexion == 1.0
     np.testing.assert_allclose(np.degrees(thumb.flexion_rad), (-15, 50))
     np.testing.assert_allclose(np.degrees(thumb.abduction_rad), (-20, 50))
     np.testing.assert_allclose(np.degrees(thumb.pip_rad), (-10, 60))
@@ -228,6 +232,7 @@ def test_abduction_narrows_by_a_parabola() -> None:
     # 20 deg, of which 60 % go with the square of the flexion: half way a quarter of them.
     np.testing.assert_allclose(np.degrees(high[:, 1]), [20, 20, 20 * (1 - 0.6 / 4), 8, 8])
     np.testing.assert_allclose(low[:, 1], -high[:, 1])
+    np.testing.assert_allclose(np.degrees(high[:, 2]), [20, 20, 20 * (1 - 9 / 24 / 4), 12.5, 12.5])
     still = HandModel.of(msgspec.structs.replace(RIGHT.profile, limits_rad=preset_limits("D")))
     np.testing.assert_allclose(np.degrees(narrowed(1.0).abduction_limits_rad(flexion)[1][:, 1]), 20.0)
     np.testing.assert_allclose(high[:, 0], still.limits_rad[0, 0, 1])  # the thumb's stays
