@@ -1,114 +1,142 @@
-"""Finger solvers: closed form, FABRIK with and without seed and restarts, least squares from scratch; triangulation."""
+"""One finger at a time, the palm known: our solvers and others on the same targets, every one of them reachable.
 
-import math
-import statistics
+Targets are the caps of hands whose angles are independent and uniform within the limits, the DIP coupled exactly.
+Those that search begin at their last pose, which is another random one, unless they take no start.
+"""
+
 import time
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
+from bench import peers_mink, peers_scipy
+from bench.hand_draws import Draw, bench_model, draw, posed
+from bench.hand_score import Score, score
+from bench.peers_paper import Angles, Fingers, PaperFingers, closed_form, finger_solvers, tips_in_palm
+from bench.row import Row, median_us
 from common.camera_model import CameraModel
 from common.geometry import axis_rotation, rigid
-from common.hand_model import FINGERS, HandModel
-from common.hand_profiles import generated_profile
-from master.ik.bounded import bounded_least_squares
+from common.hand_model import HandModel
 from master.ik.fabrik import Fabrik, solve_finger
 from master.ik.finger import FingerSolver
 from master.ik.vectors import Vector
 from master.stereo.triangulate import Triangulator
 
-_HANDS = 200
-_FABRIK_TARGETS = 10_000
-_UNSEEDED_TARGETS = 250
-_ROUNDS = 9
+HANDS = 2000
+_SEED = 2
+_PARTS = 10
 
-Row = tuple[str, float, str, str]
-T = TypeVar("T")
-
-
-def _median_us(run: Callable[[T], object], items: Sequence[T], rounds: int = _ROUNDS) -> float:
-    times: list[float] = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        for item in items:
-            run(item)
-        times.append((time.perf_counter() - start) / len(items) * 1e6)
-    return statistics.median(times)
+CLOSED, SEEDED, UNSEEDED, PAPER = "closed form", "FABRIK, seeded", "FABRIK, no seed, restarts", "papers' way"
+_SLOW = {PAPER: 10, UNSEEDED: 20, "scipy": 40, "mink": 10}  # one hand in so many
+_STRICT_MM = {CLOSED: 1e-3, SEEDED: 0.1}  # by how much these two may miss
 
 
-def _targets(
-    solvers: list[FingerSolver], count: int, seed: int, *, natural_thumb: bool
-) -> list[tuple[int, Vector]]:
-    """Finger and reachable target, from random legal angles; couplings obeyed, the thumb's natural one if asked."""
-    rng = np.random.default_rng(seed)
-    out: list[tuple[int, Vector]] = []
-    for k in range(count):
-        solver = solvers[k % 5]
-        low, high = np.array(solver.limits).T
-        a, f, pip, dip = (low + rng.random(4) * (high - low)).tolist()
-        (a, f), (pip,), (dip,) = solver.chain.clamp(((a, f), (pip,), (dip,)))
-        if natural_thumb:
-            dip = min(max(solver.ratio * pip, float(low[3])), float(high[3]))
-        out.append((k % 5, solver.forward((a, f, pip, dip))))
+def rows(hands: int = HANDS) -> list[Row]:
+    """Time per hand of five fingers, targets missed, limits passed, error of the PIP, for each way."""
+    model = bench_model()
+    truth = draw(model, _SEED, hands, coupling_off_rad=0.0)
+    out: list[Row] = []
+    us: dict[str, float] = {}
+    for name, way in ways(model).items():
+        found, us[name], spread = timed(model, way, every(truth, _SLOW.get(name, 1)))
+        out += way_rows(name, found, us[name], spread)
+        if name in _STRICT_MM:
+            out.append(_strict_row(name, found, _STRICT_MM[name]))
+    if not peers_mink.installed():
+        out.append(Row("mink: hand of five fingers", float("nan"), "us", peers_mink.INSTALL))
+    natural, one, spread = timed(model, ways(model)[CLOSED], _natural_thumb(model, truth))
+    return [
+        *out,
+        Row(f"{CLOSED}, thumb's IP in its ratio: hand", one, "us", f"± {spread:.3g}; goal 10"),
+        _strict_row(f"{CLOSED}, thumb's IP in its ratio", natural, _STRICT_MM[CLOSED]),
+        Row(f"{CLOSED}, times faster than scipy", us["scipy"] / us[CLOSED], "x", ""),
+        _triangulation_row(),
+    ]
+
+
+def way_rows(name: str, found: Score, us: float, spread_us: float) -> list[Row]:
+    """Time, and what was missed."""
+    pip = f"PIP {found.pip_rms_deg:.2g} deg RMS, limits passed by {found.worst_deg:.1g} deg"
+    return [
+        Row(f"{name}: hand of five fingers", us, "us", f"± {spread_us:.3g}; {pip}"),
+        Row(f"{name}: missed by > 1 mm", found.missed_percent, "%", f"of {found.miss_mm.size}"),
+    ]
+
+
+def _natural_thumb(model: HandModel, truth: Draw) -> Draw:
+    """The same hands with a thumb that the closed form needs no search for."""
+    angles = truth.angles_rad.copy()
+    angles[:, 0, 3] = finger_solvers(model)[0].ratio * angles[:, 0, 2]
+    return posed(model, truth.T_rig_palm, model.clamp(angles))
+
+
+def ways(model: HandModel) -> dict[str, Fingers]:
+    """Every solver that is there, by name; each begins afresh."""
+    fingers = finger_solvers(model)
+    out: dict[str, Fingers] = {
+        CLOSED: partial(closed_form, fingers),
+        SEEDED: _seeded(fingers),
+        UNSEEDED: _unseeded(fingers),
+        PAPER: PaperFingers(fingers).push,
+        "scipy": lambda tips: [
+            peers_scipy.finger(solver, tip) for solver, tip in zip(fingers, tips, strict=True)
+        ],
+    }
+    if peers_mink.installed():
+        mink = peers_mink.MinkHand(model)
+        out["mink"] = lambda tips: mink.push(np.array(tips))[1].tolist()
     return out
 
 
-def _finger_rows(solvers: list[FingerSolver]) -> list[Row]:
-    targets = _targets(solvers, 5 * _HANDS, 1, natural_thumb=True)
+def _seeded(fingers: Sequence[FingerSolver]) -> Fingers:
+    prepared = [Fabrik.of(solver.chain) for solver in fingers]
 
-    def closed(item: tuple[int, Vector]) -> object:
-        return solvers[item[0]].solve(item[1])
+    def way(tips: Sequence[Vector]) -> Angles:
+        found = [solve_finger(f, solver, tip) for f, solver, tip in zip(prepared, fingers, tips, strict=True)]
+        return [[q for joint in one.angles for q in joint] for one in found]
 
-    def scratch(item: tuple[int, Vector]) -> object:
-        solver = solvers[item[0]]
-        x, y, z = item[1]
-        rx, ry, rz = solver.root
-        return bounded_least_squares(solver.chain, (0.0, 0.5, 0.5, 0.3), (x - rx, y - ry, z - rz), 1e-6)
-
-    exact, slow = 5 * _median_us(closed, targets), 5 * _median_us(scratch, targets[:250], 3)
-    found = [(solvers[f], solvers[f].solve(target), target) for f, target in targets]
-    missed = sum(math.dist(s.forward(angles[:4]), target) > 1e-6 for s, angles, target in found)
-    return [
-        ("hand of five fingers, damped least squares (baseline)", slow, "µs", ""),
-        ("hand of five fingers, closed form, all legal poses", exact, "µs", "<= 10"),
-        ("closed form, ratio", slow / exact, "x", ""),
-        ("closed form, reachable targets missed by > 1 µm", float(missed), f"of {len(targets)}", "0"),
-    ]
+    return way
 
 
-def _fabrik_rows(solvers: list[FingerSolver]) -> list[Row]:
-    prepared = [Fabrik.of(s.chain) for s in solvers]
-    published = [Fabrik.of(s.chain, restarts=0) for s in solvers]
-    targets = _targets(solvers, _FABRIK_TARGETS, 2, natural_thumb=False)
-    start = time.perf_counter()
-    results = [solve_finger(prepared[f], solvers[f], target) for f, target in targets]
-    seeded_us = (time.perf_counter() - start) / len(targets) * 1e6
-    misses = [math.dist(r.positions[-1], target) for r, (_, target) in zip(results, targets, strict=True)]
-    outside = sum(
-        not np.allclose(
-            np.concatenate(prepared[f].chain.clamp(r.angles)), np.concatenate(r.angles), 0.0, 1e-9
-        )
-        for r, (f, _) in zip(results, targets, strict=True)
+def _unseeded(fingers: Sequence[FingerSolver]) -> Fingers:
+    prepared = [Fabrik.of(solver.chain) for solver in fingers]
+
+    def way(tips: Sequence[Vector]) -> Angles:
+        found = [
+            f.solve(tip, None, solver.root) for f, solver, tip in zip(prepared, fingers, tips, strict=True)
+        ]
+        return [[q for joint in one.angles for q in joint] for one in found]
+
+    return way
+
+
+def every(truth: Draw, step: int) -> Draw:
+    """One hand in `step` of a draw."""
+    return Draw(
+        truth.T_rig_palm[::step], truth.angles_rad[::step], truth.joints_m[::step], truth.caps_m[::step]
     )
-    few = targets[:_UNSEEDED_TARGETS]
 
-    def unseeded(solver: list[Fabrik]) -> tuple[float, float]:
+
+def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float, float]:
+    """Errors of a way, its median time per hand, and half the distance of the quartiles over ten parts [us]."""
+    targets = [tips_in_palm(T, caps) for T, caps in zip(truth.T_rig_palm, truth.caps_m, strict=True)]
+    found: list[Angles] = []
+    times: list[float] = []
+    size = max(1, len(targets) // _PARTS)
+    for k in range(0, len(targets), size):
+        part = targets[k : k + size]
         start = time.perf_counter()
-        found = [solver[f].solve(target, None, solvers[f].root).residual_m for f, target in few]
-        return (time.perf_counter() - start) / len(few) * 5e6, 100.0 * sum(r > 1e-3 for r in found) / len(few)
+        found += [way(tips) for tips in part]
+        times.append(1e6 * (time.perf_counter() - start) / len(part))
+    low, middle, high = np.percentile(times, (25, 50, 75)).tolist()
+    return score(model, truth, truth.T_rig_palm, np.array(found), truth.caps_m), middle, (high - low) / 2
 
-    plain_us, plain_missed = unseeded(published)
-    healed_us, healed_missed = unseeded(prepared)
-    return [
-        ("FABRIK, no seed, no restart (baseline): missed by > 1 mm", plain_missed, "%", ""),
-        ("FABRIK, no seed, no restart (baseline), hand", plain_us, "µs", ""),
-        ("FABRIK, no seed, restarts: missed by > 1 mm", healed_missed, "%", ""),
-        ("FABRIK, no seed, restarts, hand", healed_us, "µs", ""),
-        ("FABRIK, seeded, hand", 5 * seeded_us, "µs", ""),
-        ("FABRIK, seeded: missed by > 0.1 mm", float(sum(not m < 1e-4 for m in misses)), "of 10000", "0"),
-        ("FABRIK, seeded: limit violations", float(outside), "of 10000", "0"),
-    ]
+
+def _strict_row(name: str, found: Score, bound_mm: float) -> Row:
+    missed = float((~(found.miss_mm <= bound_mm)).sum())
+    note = f"of {found.miss_mm.size}, goal 0; limit violations {found.violations}, goal 0"
+    return Row(f"{name}: missed by > {1e3 * bound_mm:g} um", missed, "targets", note)
 
 
 def _triangulation_row() -> Row:
@@ -118,16 +146,5 @@ def _triangulation_row() -> Row:
     rig = Triangulator.of([CameraModel(matrix, lens, pose, 640, 480, 0.0) for pose in poses])
     points = np.random.default_rng(4).uniform([-0.15, -0.15, 0.45], [0.15, 0.15, 0.8], (6, 3))
     uv = np.stack([camera.project(points) for camera in rig.cameras])
-    return (
-        "triangulation with covariance, 6 markers, 2 cameras",
-        _median_us(rig.triangulate, [uv] * 100),
-        "µs",
-        "<= 150",
-    )
-
-
-def rows() -> list[Row]:
-    """(name, value, unit, goal) of each measurement."""
-    model = HandModel.of(generated_profile("bench", "right"))
-    solvers = [FingerSolver.of(model, f, model.mounts[name].offset_m) for f, name in enumerate(FINGERS)]
-    return [*_finger_rows(solvers), *_fabrik_rows(solvers), _triangulation_row()]
+    one, spread = median_us(lambda: rig.triangulate(uv))
+    return Row("triangulation with covariance, 6 markers, 2 cameras", one, "us", f"± {spread:.3g}; goal 150")

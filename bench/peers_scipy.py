@@ -1,0 +1,98 @@
+"""The hand for scipy's general least squares, which knows residuals and bounds and nothing of hands."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
+
+from bench.hand_draws import MARKERS, Noise
+from common.arrays import Float
+from common.geometry import rigid, rotation_vector_to_matrix
+from common.hand_model import HandModel
+from master.ik.finger import FingerSolver
+from master.ik.parameters import HandParameters
+from master.ik.priors import AnglePrior, Priors
+from master.ik.vectors import Vector
+
+_INSIDE_RAD = 1e-6  # it refuses a start on a bound, and bounds that leave no room
+_IN_MM = 1e3  # metres make its gradient tolerance end too early
+
+
+def finger(solver: FingerSolver, target: Vector) -> list[float]:
+    """Angles (4,) [rad] of one finger whose cap is to be at `target` [m], palm frame; from the middle of the limits."""
+    low, high = (np.array(v) for v in zip(*solver.limits, strict=True))
+    coupled = solver.chain.coupling is not None
+    free = [k for k in range(4) if high[k] - low[k] > 2 * _INSIDE_RAD and not (coupled and k == 3)]
+    angles = np.clip(np.zeros(4), low, high)
+
+    def complete(x: Float) -> tuple[float, float, float, float]:
+        angles[free] = x
+        if coupled:
+            angles[3] = np.clip(solver.ratio * angles[2], low[3], high[3])
+        a, f, pip, dip = angles.tolist()
+        return a, f, pip, dip
+
+    def residual(x: Float) -> Float:
+        return _IN_MM * np.subtract(solver.forward(complete(x)), target)
+
+    start = 0.5 * (low + high)[free]
+    x = np.asarray(least_squares(residual, start, bounds=(low[free], high[free])).x, np.float64)
+    return list(complete(x))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WholeHand:
+    """The same residuals as the whole-hand fit of a natural hand: whitened caps, habits, limits. Numerical Jacobian.
+
+    Attributes:
+        model: The hand.
+        parameters: Its free angles and their bounds.
+        whiten: (M, 3, 3) inverse square roots of the caps' covariances [1/m].
+        rows, mean: (n, n) and (n,): habits are the residuals rows @ (x - mean).
+    """
+
+    model: HandModel
+    parameters: HandParameters
+    whiten: Float
+    rows: Float
+    mean: Float
+
+    @classmethod
+    def of(cls, model: HandModel, noise: Noise) -> "WholeHand":
+        """For caps with this noise, and the default habits."""
+        priors = Priors(free=None)
+        parameters = HandParameters.of(model)
+        prior = AnglePrior.of(model, parameters, priors)
+        normal, pull = prior.normal[0], prior.pull[0]
+        cov = noise.cov_m2 + priors.model_m**2 * np.eye(3)
+        return cls(
+            model,
+            parameters,
+            np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64),
+            np.asarray(np.linalg.cholesky(normal).T, np.float64),
+            np.asarray(np.linalg.solve(normal, pull), np.float64),
+        )
+
+    def solve(self, points_m: Float, T_rig_palm: Float, angles_rad: Float) -> tuple[Float, Float]:
+        """Palm (4, 4) and angles (5, 4) [rad] for caps (M, 3) [m], from a palm and angles to start with."""
+        R, low, high = T_rig_palm[:3, :3], self.parameters.low, self.parameters.high
+        room = high - low > 2 * _INSIDE_RAD
+        angles = np.clip(np.zeros(len(low)), low, high)
+
+        def hand(v: Float) -> tuple[Float, Float]:
+            angles[room] = v[6:]
+            return rigid(rotation_vector_to_matrix(v[:3]) @ R, v[3:6]), angles
+
+        def residual(v: Float) -> Float:
+            T, x = hand(v)
+            joints = self.model.forward(T, self.parameters.angles(x))
+            off = self.model.marker_points(joints, MARKERS) - points_m
+            return np.concatenate([(self.whiten @ off[..., None]).ravel(), self.rows @ (x - self.mean)])
+
+        inside = np.clip(self.parameters.of_angles(angles_rad), low + _INSIDE_RAD, high - _INSIDE_RAD)[room]
+        start = np.concatenate([np.zeros(3), T_rig_palm[:3, 3], inside])
+        anywhere = np.full(6, np.inf)
+        bounds = np.concatenate([-anywhere, low[room]]), np.concatenate([anywhere, high[room]])
+        end = np.asarray(least_squares(residual, start, bounds=bounds, x_scale="jac").x, np.float64)
+        T, x = hand(end)
+        return T, self.model.clamp(self.parameters.angles(x))
