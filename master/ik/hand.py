@@ -61,7 +61,7 @@ class HandSolution:
 
 
 class HandSolver:
-    """Bounded least squares for one hand model and one set of marker names. Holds no state between calls."""
+    """Bounded least squares for one hand model and one set of marker names. Holds no state between calls but tables."""
 
     def __init__(self, model: HandModel, markers: tuple[str, ...], priors: Priors | None = None) -> None:
         """Prepare what is the same in every frame.
@@ -73,8 +73,9 @@ class HandSolver:
         self._parameters = HandParameters.of(model)
         self._attached = Attached.markers(model, self._parameters, markers)
         self._joints = Attached.joints(model, self._parameters)
-        self._prior = AnglePrior.of(model, self._parameters, self.priors)
-        natural = np.asarray(np.linalg.solve(self._prior.normal[0], self._prior.pull[0]), np.float64)
+        self._priors = {frozenset[int](): AnglePrior.of(model, self._parameters, self.priors)}
+        habits = self._priors[frozenset()]
+        natural = np.asarray(np.linalg.solve(habits.normal[0], habits.pull[0]), np.float64)
         self._natural = np.minimum(np.maximum(natural, self._parameters.low), self._parameters.high)
         bent = np.zeros((len(_BENDS), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS, (0.6, 1.0))[:, None]
@@ -146,7 +147,15 @@ class HandSolver:
     def _habits(self, seen: Bool, hidden: tuple[Float, Float] | None) -> AnglePrior:
         on_finger = self._attached.on_finger[:, 0]
         fingers = frozenset(self._attached.finger[seen & on_finger].tolist())
-        return self._prior.and_single(*hidden_belief(self._parameters, self.priors, fingers, hidden))
+        # A finger that is out of sight because it is curled is bent unlike one that shows.
+        prior = self._prior_of(frozenset(range(5)) - fingers if hidden is None else frozenset())
+        return prior.and_single(*hidden_belief(self._parameters, self.priors, fingers, hidden))
+
+    def _prior_of(self, unlike: frozenset[int]) -> AnglePrior:
+        """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
+        if unlike not in self._priors:
+            self._priors[unlike] = AnglePrior.of(self.model, self._parameters, self.priors, unlike)
+        return self._priors[unlike]
 
     def _and_last(self, habits: AnglePrior, last: HandSolution | None, dt_s: float) -> AnglePrior:
         if last is None:

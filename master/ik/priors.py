@@ -102,9 +102,20 @@ class AnglePrior:
     log_density: Float
 
     @classmethod
-    def of(cls, model: HandModel, parameters: HandParameters, priors: Priors) -> "AnglePrior":
-        """What holds of every hand in every frame: (1 or 2, ...), a natural hand and a free one."""
-        tables = [_natural_rows(model, parameters, priors)]
+    def of(
+        cls,
+        model: HandModel,
+        parameters: HandParameters,
+        priors: Priors,
+        unlike: frozenset[int] = frozenset(),
+    ) -> "AnglePrior":
+        """What holds of every hand in every frame: (1 or 2, ...), a natural hand and a free one.
+
+        Args:
+            model, parameters, priors: The hand.
+            unlike: Fingers of which it is known that they are not bent as the others: those are no neighbours.
+        """
+        tables = [_natural_rows(model, parameters, priors, unlike)]
         if priors.free is not None:
             tables.append(_free_rows(model, parameters, priors.free, priors.free_dip))
         habits = cls(
@@ -173,7 +184,9 @@ def last_belief(
     return np.full(len(parameters.free), walk), parameters.of_angles(angles_rad)
 
 
-def _natural_rows(model: HandModel, parameters: HandParameters, priors: Priors) -> tuple[Float, Float]:
+def _natural_rows(
+    model: HandModel, parameters: HandParameters, priors: Priors, unlike: frozenset[int]
+) -> tuple[Float, Float]:
     """Rows (P, n) and means (P,): natural flexion, small abduction, neighbours alike, a loose thumb."""
     rows = _Rows(parameters)
     for k, mean in enumerate(priors.thumb_mean):
@@ -188,7 +201,7 @@ def _natural_rows(model: HandModel, parameters: HandParameters, priors: Priors) 
             rows.add({a + 1: 1.0, a + 2: -model.mcp_per_pip}, 0.0, priors.natural_flexion)
         rows.add({a + 2: 1.0}, priors.pip_mean, priors.pip)
         rows.add_loose_dip(model, a, priors.free_dip)
-        if model.neighbours and f < 4:
+        if model.neighbours and f < 4 and (f in unlike) == (f + 1 in unlike):
             rows.add({a + 1: 1.0, a + 5: -1.0}, 0.0, priors.neighbour_flexion)
             rows.add({a + 2: 1.0, a + 6: -1.0}, 0.0, priors.neighbour_pip)
     return rows.table()
