@@ -26,9 +26,10 @@ from master.ik.vectors import IDENTITY, Matrix, Vector, product
 
 SLACK_RAD = 1e-6
 """A limit passed by less is the table's rounding: the angle is clamped, which moves the point < 0.2 um."""
-_POLE = 0.004
-"""Squared share of v_z in the length below which the tables alone are not exact enough: near the abduction's pole
-an error of w_x grows 1 / 0.063 = 16-fold."""
+_POLE_M = 2e-7
+"""Error of the point that an error of w_x may grow to near the abduction's pole, where it grows by |w| / v_z; nearer
+to the pole the tables alone are not exact enough."""
+_LEAST_POLE = 1e-12
 _HALF_TURN: Matrix = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 
 
@@ -73,8 +74,8 @@ def quick_solver(
     heading, roll, tip = _euler(joint.rest)
     if cos(heading) < 0.0:  # so that the abduction is within a quarter turn of where the target is
         heading, before = heading - copysign(pi, heading), product(before or IDENTITY, _HALF_TURN)
-    nodes, bound_m = _table(curve, branch, roll, tip)
-    rows: list[tuple[float, ...]] = nodes.tolist()
+    nodes, bound_m, pole = _table(curve, branch, roll, tip)
+    rows = [tuple(row) for row in nodes.tolist()]
     root_x, root_y, root_z = root
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = before or IDENTITY
     turned = before is not None
@@ -82,10 +83,10 @@ def quick_solver(
     sin_roll, tan_roll, per_cos = sin(roll), tan(roll), 1.0 / cos(roll)
     sign, offset, bound_m = joint.sign, joint.sign * heading, bound_m + SLACK_RAD * sum(chain.lengths)
     (low, high), (f_low, f_high) = joint.abduction_rad, joint.flexion_rad
-    # the abductions that no flexion forbids
-    a_low, a_high = (joint.spread_at_full_flexion * low, joint.spread_at_full_flexion * high)
+    share = joint.spread_at_full_flexion
+    a_low, a_high = share * low, share * high  # legal at any flexion
     dip_low, dip_high = curve.dip
-    ratio, exact, cut = curve.ratio, curve.exact, joint.clamp
+    ratio, exact, clamp, narrowing = curve.ratio, curve.exact, joint.clamp, joint.narrowing
     # a tuple's own constructor takes half the time
     new: _New = tuple.__new__  # pyright: ignore[reportUnknownVariableType]
 
@@ -109,7 +110,7 @@ def quick_solver(
         side += u * d_side
         v_x = side - tan_roll * y
         v_z = across2 - v_x * v_x
-        if v_z < _POLE * distance2:
+        if v_z < pole * distance2:
             pip, (wx, wy, wz) = exact(branch, distance2)
             turn, side = _near(atan2(wz, wy) + tip, turn), wx * per_cos
             v_x = side - tan_roll * y
@@ -125,10 +126,12 @@ def quick_solver(
             a = sign * (atan2(-x, -z) - atan2(-v_x, v_z)) - offset
             f = turn - atan2(-v_z, v_y)
         if not (a_low <= a <= a_high and f_low <= f <= f_high):
-            legal_a, legal_f = cut((a, f))
-            if abs(legal_a - a) > SLACK_RAD or abs(legal_f - f) > SLACK_RAD:
-                return None
-            a, f = legal_a, legal_f
+            left, _ = narrowing(f)
+            if not (left * low <= a <= left * high and f_low <= f <= f_high):
+                legal_a, legal_f = clamp((a, f))
+                if abs(legal_a - a) > SLACK_RAD or abs(legal_f - f) > SLACK_RAD:
+                    return None
+                a, f = legal_a, legal_f
         dip = ratio * pip
         if not dip_low <= dip <= dip_high:
             dip = dip_low if dip < dip_low else dip_high
@@ -148,11 +151,15 @@ def _euler(m: Matrix) -> tuple[float, float, float]:
     return atan2(-s * m[2][0], s * m[0][0]), atan2(sin_roll, cos_roll), atan2(-s * m[1][2], s * m[1][1])
 
 
-def _table(curve: ReachCurve, branch: Branch, roll: float, tip: float) -> tuple[Float, float]:
-    """Value and step (cells + 1, 6) of PIP, angle of w and w_x / cos r, and the largest error of w [m] they make."""
+def _table(curve: ReachCurve, branch: Branch, roll: float, tip: float) -> tuple[Float, float, float]:
+    """What is tabulated, how exact it is, and where it is not.
+
+    Returns:
+        Value and step (cells + 1, 6) of PIP [rad], angle of w [rad] and w_x / cos r [m]; the largest error of the
+        point [m]; the squared share of v_z in |w| below which it may be larger.
+    """
     rows = np.array(branch.rows)
     pip = np.append(rows[:, 0], rows[-1, 0] + rows[-1, 1])
-
     _, y0, z0 = curve.point(pip[:1])[0]
     first = _near(atan2(z0, y0) + tip, 0.0)
 
@@ -169,9 +176,11 @@ def _table(curve: ReachCurve, branch: Branch, roll: float, tip: float) -> tuple[
     exact = values(middle[:, 0])
     s = (np.arange(len(middle)) + 0.5) / branch.per_cell if branch.per_cell > 0.0 else np.zeros(1)
     length = np.sqrt(branch.far2 - s * s)
-    off = np.abs(middle - exact) * np.column_stack([np.zeros(len(s)), length, np.full(len(s), _POLE**-0.5)])
-    off[:, 0] = np.abs(np.sqrt(curve.distance2(middle[:, 0])) - length)
-    return np.stack([nodes, steps], axis=2).reshape(len(nodes), 6), float(off.sum(axis=1).max())
+    along = np.abs(np.sqrt(curve.distance2(middle[:, 0])) - length)
+    _, turn, side = np.abs(middle - exact).T
+    pole = max((float(side.max()) / _POLE_M) ** 2, _LEAST_POLE)
+    error = float((along + length * turn).max() + _POLE_M)
+    return np.stack([nodes, steps], axis=2).reshape(len(nodes), 6), error, pole
 
 
 def _near(angle: float, other: float) -> float:

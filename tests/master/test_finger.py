@@ -111,6 +111,8 @@ def _round_trip(model: HandModel, solver: FingerSolver, finger: int, shares: Flo
     assert all(s.reached for s in found)
     solved = np.array([s[:4] for s in found])
     assert model.within_limits(np.repeat(solved[:, None], 5, axis=1))[:, finger].all()
+    at_once = np.abs(solved - angles).max(axis=1) / DEGREE
+    assert np.quantile(at_once, 0.8) < 1e-3  # all but hyperextended thumbs, which another legal pose matches
     # the straight finger and the abduction's pole have two legal answers each: tell which is meant
     near = np.array(
         [solver.solve(_target(p), _four(a + 0.001))[:4] for p, a in zip(points, angles, strict=True)]
@@ -163,6 +165,23 @@ def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
             assert miss <= found.residual_m + 1e-9
             assert found.reached == (miss < 1e-6)
             assert _inside(model, finger, found)
+
+
+@pytest.mark.parametrize("finger", [1, 4])
+def test_a_finger_out_of_plane_near_the_pole_is_hit(datasets: Path, finger: int) -> None:
+    # at the abduction's pole an error of the tables would grow without bound
+    model = HandModel.of(load(datasets / "hands" / "webxr-right.json", HandProfile))
+    solver, rng = _prepared(model, finger), np.random.default_rng(11)
+    near_pole = 0
+    for _ in range(400):
+        a, f, pip = rng.uniform([-8, 40, 5], [8, 89, 70]) * DEGREE
+        target = solver.forward((a, f, pip, solver.ratio * pip))
+        local = np.subtract(target, solver.root)
+        near_pole += bool(np.hypot(local[0], local[2]) < 0.08 * np.linalg.norm(local))
+        found = solver.solve(target)
+        assert found.reached
+        assert math.dist(solver.forward(found[:4]), target) <= found.residual_m + 1e-9 < 1e-6
+    assert near_pole > 10
 
 
 def test_the_flat_index_by_hand() -> None:
