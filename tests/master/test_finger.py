@@ -174,7 +174,7 @@ def test_a_finger_out_of_plane_near_the_pole_is_hit(datasets: Path, finger: int)
     solver, rng = _prepared(model, finger), np.random.default_rng(11)
     near_pole = 0
     for _ in range(400):
-        a, f, pip = rng.uniform([-8, 40, 5], [8, 89, 70]) * DEGREE
+        a, f, pip = rng.uniform([-8, 60, 5], [8, 89, 40]) * DEGREE
         target = solver.forward((a, f, pip, solver.ratio * pip))
         local = np.subtract(target, solver.root)
         near_pole += bool(np.hypot(local[0], local[2]) < 0.08 * np.linalg.norm(local))
