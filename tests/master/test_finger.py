@@ -174,14 +174,16 @@ def test_a_finger_out_of_plane_near_the_pole_is_hit(datasets: Path, finger: int)
     solver, rng = _prepared(model, finger), np.random.default_rng(11)
     near_pole = 0
     for _ in range(400):
-        a, f, pip = rng.uniform([-8, 60, 5], [8, 89, 40]) * DEGREE
+        a, f, pip = rng.uniform([-8, 40, 20], [8, 80, 60]) * DEGREE
         target = solver.forward((a, f, pip, solver.ratio * pip))
         local = np.subtract(target, solver.root)
-        near_pole += bool(np.hypot(local[0], local[2]) < 0.08 * np.linalg.norm(local))
+        hinge = np.array(solver.chain.links[0].joint.rotation((float(a), float(f))))[:, 0]
+        ahead = np.cross(hinge, (0.0, 1.0, 0.0))
+        near_pole += bool(abs(ahead @ local) < 0.02 * np.linalg.norm(local))
         found = solver.solve(target)
         assert found.reached
         assert math.dist(solver.forward(found[:4]), target) <= found.residual_m + 1e-9 < 1e-6
-    assert near_pole > 10
+    assert near_pole > 5
 
 
 def test_the_flat_index_by_hand() -> None:
