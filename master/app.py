@@ -7,8 +7,9 @@ from typing import Protocol
 import msgspec
 import numpy as np
 
+from common.arrays import Float
 from common.clock import Clock
-from common.messages import Health, MarkerDetections
+from common.messages import Health, ImuSample, MarkerDetections
 from master.outputs.sink import Sink
 from master.rates import CameraRates
 from master.stereo.pipeline import SolvedPose
@@ -18,9 +19,9 @@ _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour wo
 
 
 class Source(Protocol):
-    """Where detections come from: the network, or a test."""
+    """Where detections and samples come from: the network, or a test."""
 
-    def get(self, timeout_s: float) -> MarkerDetections | None:
+    def get(self, timeout_s: float) -> MarkerDetections | ImuSample | None:
         """The next message, or None when none came in time."""
         ...
 
@@ -30,6 +31,10 @@ class Solver(Protocol):
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
+        ...
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+        """Take what the IMU says of its own orientation (4,)."""
         ...
 
 
@@ -72,10 +77,13 @@ def run(
     stop: threading.Event,
     watch: Callable[[MarkerDetections], None] = lambda _message: None,
 ) -> None:
-    """Solve and publish until `stop` is set; `watch` is shown every message once its poses are out."""
+    """Solve and publish until `stop` is set; `watch` is shown every camera's message once its poses are out."""
     while not stop.is_set():
         message = source.get(timeout_s=0.1)
         if message is None:
+            continue
+        if isinstance(message, ImuSample):
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
             continue
         figures.rates.push(message)
         for solved in pipeline.push(message):

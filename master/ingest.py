@@ -1,7 +1,7 @@
-"""Where datagrams become detections on the master's clock: decoded, checked, counted.
+"""Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
 
 A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
-pipeline takes detections from a queue that drops the oldest, so a slow pipeline sees what is new.
+pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new.
 """
 
 import os
@@ -14,10 +14,9 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
-from common.messages import MarkerDetections
 from common.session import Random
 from common.udp import UdpSocket
-from master.link import MasterLink
+from master.link import MasterLink, Taken
 from master.sequence import CameraCounts
 
 QUEUE = 64
@@ -39,6 +38,7 @@ class Ingest:
         zenoh_endpoint: str,
         start_timeout_s: float = 5.0,
         random: Random = os.urandom,
+        imus: tuple[str, ...] = (),
     ) -> None:
         """Begin to call the slaves.
 
@@ -51,19 +51,20 @@ class Ingest:
             zenoh_endpoint: Where this master's bus listens, told to the slaves; may be empty.
             start_timeout_s: How long the first slave waits for the others.
             random: Source of nonces.
+            imus: Names of IMUs that may take part.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
-            ValueError: Key of wrong length, no camera or too many.
+            ValueError: Key of wrong length, no camera, too many senders, or one name for two.
         """
         _check_address(beacon[0])
         self._clock = clock
         timeout_ns = round(start_timeout_s * 1e9)
-        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random)
-        self._cameras = cameras
+        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus)
+        self._cameras, self._senders = cameras, (*cameras, *imus)
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
-        self._queue: deque[MarkerDetections] = deque(maxlen=QUEUE)
+        self._queue: deque[Taken] = deque(maxlen=QUEUE)
         self._changed = threading.Condition()
         self._overflowed = 0
         self._closing = threading.Event()
@@ -83,7 +84,7 @@ class Ingest:
 
     @property
     def connected(self) -> frozenset[str]:
-        """The cameras heard within the last second."""
+        """The cameras and IMUs heard within the last second."""
         with self._lock:
             return self._link.connected()
 
@@ -105,28 +106,28 @@ class Ingest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Event -> how often, as `Health.counts` wants it: <camera>.<event>, refused.<reason>, queue.*"""
+        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, queue.*"""
         counts = {
             "queue.dropped": self._overflowed,
             "would_block": self._socket.would_block,
             "send_failed": self._socket.failed,
             "unsynchronised": self._link.unsynchronised,
         }
-        for camera in self._cameras:
-            of = asdict(self.counts_of(camera))
-            counts |= {f"{camera}.{event}": number for event, number in of.items()}
+        for sender in self._senders:
+            of = asdict(self.counts_of(sender))
+            counts |= {f"{sender}.{event}": number for event, number in of.items()}
             with self._lock:
-                counts[f"{camera}.clock_steps"] = self._link.clock_steps_of(camera)
+                counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
-    def counts_of(self, camera: str) -> CameraCounts:
-        """Return what became of the frames of `camera`.
+    def counts_of(self, sender: str) -> CameraCounts:
+        """Return what became of the frames or samples of `sender`.
 
         Raises:
-            KeyError: The rig has no such camera.
+            KeyError: The rig has no such sender.
         """
         with self._lock:
-            return self._link.counts_of(camera)
+            return self._link.counts_of(sender)
 
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """Return how the clock of `camera` runs against this one; None while unknown.
@@ -137,8 +138,8 @@ class Ingest:
         with self._lock:
             return self._link.clock_of(camera)
 
-    def get(self, timeout_s: float) -> MarkerDetections | None:
-        """Return the oldest waiting detections, times on the master's clock; None after `timeout_s`."""
+    def get(self, timeout_s: float) -> Taken | None:
+        """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
             return self._queue.popleft() if self._queue else None
@@ -156,18 +157,18 @@ class Ingest:
             arrived = self._socket.receive()
             t_ns = self._clock.now_ns()
             with self._lock:
-                detections = None if arrived is None else self._link.receive(*arrived, t_ns)
+                message = None if arrived is None else self._link.receive(*arrived, t_ns)
                 outbox = self._link.due()
             for datagram, address in outbox:
                 self._socket.send(datagram, address)
-            if detections is not None:
-                self._put(detections)
+            if message is not None:
+                self._put(message)
 
-    def _put(self, detections: MarkerDetections) -> None:
+    def _put(self, message: Taken) -> None:
         with self._changed:
             if len(self._queue) == self._queue.maxlen:
                 self._overflowed += 1
-            self._queue.append(detections)
+            self._queue.append(message)
             self._changed.notify()
 
 

@@ -5,13 +5,14 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
   something with the new keys. So a replayed or late hello never ends a live session.
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
-  first one; then to each camera that joins, again and again until acknowledged.
-- Everything held is bounded: two sessions and 64 old nonces per camera of the rig.
+  first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU.
+- Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
 
 from collections import Counter, deque
 from dataclasses import dataclass, field, replace
 from math import hypot
+from typing import TypeAlias
 
 import msgspec
 
@@ -19,7 +20,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
-from common.messages import MarkerDetections, decode
+from common.messages import ImuSample, MarkerDetections, decode
 from common.session import (
     MAX_CAMERAS,
     NONCE_BYTES,
@@ -50,12 +51,14 @@ START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it i
 START_AGAIN_NS = 50_000_000
 OLD_NONCES = 64
 
+Taken: TypeAlias = MarkerDetections | ImuSample
+
 
 @dataclass(slots=True)
 class _Session:
     """One session of one slave, pending or live."""
 
-    camera: str
+    name: str
     hello: Hello
     session_nonce: bytes
     key_id: int
@@ -71,8 +74,8 @@ class _Session:
 
 
 @dataclass(slots=True)
-class _Camera:
-    """What is kept of one camera of the rig."""
+class _Sender:
+    """What is kept of one camera or IMU of the rig."""
 
     live: _Session | None = None
     pending: _Session | None = None
@@ -83,9 +86,9 @@ class _Camera:
 
 
 class MasterLink:
-    """Takes datagrams, gives detections on the master's clock, and says what to send.
+    """Takes datagrams, gives what they brought on the master's clock, and says what to send.
 
-    Holds the sessions of the rig's cameras, the moment of the start, the counters of refusals.
+    Holds the sessions of the rig's cameras and IMUs, the moment of the start, the counters of refusals.
     """
 
     def __init__(
@@ -97,14 +100,17 @@ class MasterLink:
         zenoh_endpoint: str,
         start_timeout_ns: int,
         random: Random,
+        imus: tuple[str, ...] = (),
     ) -> None:
-        """Begin a new life of the master, with a nonce from `random`.
+        """Begin a new life of the master, with a nonce from `random`; `imus` may take part, and nobody waits for them.
 
         Raises:
-            ValueError: Key of wrong length, no camera, or more than 32.
+            ValueError: Key of wrong length, no camera, more than 32 senders, or an IMU with the name of a camera.
         """
-        if not 1 <= len(set(cameras)) <= MAX_CAMERAS:
-            raise ValueError(f"{len(set(cameras))} cameras, expected 1 to {MAX_CAMERAS}")
+        if not cameras or not len({*cameras, *imus}) <= MAX_CAMERAS:
+            raise ValueError(f"{len({*cameras, *imus})} cameras and IMUs, expected 1 to {MAX_CAMERAS}")
+        if both := set(cameras) & set(imus):
+            raise ValueError(f"{min(both)!r} is a camera and an IMU")
         self._keys = RigKeys(key)
         self._clock = clock
         self._random = random
@@ -113,7 +119,8 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
-        self._cameras = {name: _Camera() for name in cameras}
+        self._senders = {name: _Sender() for name in (*cameras, *imus)}
+        self._awaited, self._imus = tuple(self._senders[name] for name in cameras), frozenset(imus)
         self._sessions: dict[int, _Session] = {}
         self._first_ns: int | None = None
         self._start_ns: int | None = None
@@ -122,7 +129,7 @@ class MasterLink:
         self.refused: Counter[Refusal] = Counter()
         self.unsynchronised = 0
 
-    def receive(self, datagram: bytes, address: Address, t_ns: int) -> MarkerDetections | None:
+    def receive(self, datagram: bytes, address: Address, t_ns: int) -> Taken | None:
         """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
@@ -144,18 +151,18 @@ class MasterLink:
         if t_ns >= self._next_beacon_ns:
             self._next_beacon_ns = max(self._next_beacon_ns + BEACON_NS, t_ns)
             self._outbox.append((seal(self._sealer, self._beacon()), self._beacon_to))
-        for camera in self._cameras.values():
-            pending = camera.pending
+        for sender in self._senders.values():
+            pending = sender.pending
             if pending is not None and t_ns - pending.since_ns > PENDING_NS:
                 # Its nonce stays usable: the slave may be there, only unheard.
                 del self._sessions[pending.key_id]
-                camera.pending = pending = None
-            for session in (camera.live, pending):
+                sender.pending = pending = None
+            for session in (sender.live, pending):
                 if session is not None:
                     self._ask_clock(session)
         self._open_barrier(t_ns)
-        for camera in self._cameras.values():
-            self._send_start(camera, t_ns)
+        for sender in self._senders.values():
+            self._send_start(sender, t_ns)
         outbox, self._outbox = self._outbox, []
         return outbox
 
@@ -165,30 +172,30 @@ class MasterLink:
         return self._start_ns is not None
 
     def connected(self) -> frozenset[str]:
-        """Return the cameras heard in a live session within the last second."""
+        """Return the senders heard in a live session within the last second."""
         t_ns = self._clock.now_ns()
-        live = ((name, camera.live) for name, camera in self._cameras.items())
+        live = ((name, sender.live) for name, sender in self._senders.items())
         return frozenset(name for name, link in live if link is not None and t_ns - link.heard_ns < SILENT_NS)
 
-    def clock_of(self, camera: str) -> ClockEstimate | None:
-        """Return how the clock of `camera` runs, or None before its first echo."""
-        live = self._cameras[camera].live
+    def clock_of(self, sender: str) -> ClockEstimate | None:
+        """Return how the clock of `sender` runs, or None before its first echo."""
+        live = self._senders[sender].live
         return None if live is None else live.clock.estimate()
 
-    def clock_steps_of(self, camera: str) -> int:
-        """Return how often the clock of `camera` was seen to jump since this master began."""
-        of = self._cameras[camera]
+    def clock_steps_of(self, sender: str) -> int:
+        """Return how often the clock of `sender` was seen to jump since this master began."""
+        of = self._senders[sender]
         return of.steps_before + (0 if of.live is None else of.live.clock.steps)
 
-    def counts_of(self, camera: str) -> CameraCounts:
-        """Return what was counted of `camera` since this master began."""
-        of = self._cameras[camera]
+    def counts_of(self, sender: str) -> CameraCounts:
+        """Return what was counted of `sender` since this master began."""
+        of = self._senders[sender]
         gaps = of.sequence.counts.lost
         lost = min(gaps, of.missing_before + (of.live.opener.missing if of.live is not None else 0))
         return replace(of.sequence.counts, lost=lost, skipped=gaps - lost)
 
     def _beacon(self) -> Beacon:
-        live = {name: camera.live for name, camera in self._cameras.items()}
+        live = {name: sender.live for name, sender in self._senders.items()}
         known = {name: session.key_id for name, session in live.items() if session is not None}
         return Beacon(self._nonce, self._zenoh_endpoint, known)
 
@@ -198,21 +205,21 @@ class MasterLink:
             return hello
         if hello.master_nonce != self._nonce:
             return Refusal.REPLAYED
-        camera = self._cameras.get(hello.name)
-        if camera is None:
+        sender = self._senders.get(hello.name)
+        if sender is None:
             return Refusal.UNKNOWN
-        for session in (camera.live, camera.pending):
+        for session in (sender.live, sender.pending):
             if session is not None and session.hello.slave_nonce == hello.slave_nonce:
                 self._welcome(session)  # ours was lost; always to the address of the first hello
                 return None
-        if hello.slave_nonce in camera.old_nonces:
+        if hello.slave_nonce in sender.old_nonces:
             return Refusal.REPLAYED
-        if camera.pending is not None:  # a newer attempt of the slave, which has given that one up
-            camera.old_nonces.append(camera.pending.hello.slave_nonce)
-            del self._sessions[camera.pending.key_id]
-        camera.pending = self._new_session(hello, address, t_ns)
-        self._sessions[camera.pending.key_id] = camera.pending
-        self._welcome(camera.pending)
+        if sender.pending is not None:  # a newer attempt of the slave, which has given that one up
+            sender.old_nonces.append(sender.pending.hello.slave_nonce)
+            del self._sessions[sender.pending.key_id]
+        sender.pending = self._new_session(hello, address, t_ns)
+        self._sessions[sender.pending.key_id] = sender.pending
+        self._welcome(sender.pending)
         return None
 
     def _new_session(self, hello: Hello, address: Address, t_ns: int) -> _Session:
@@ -228,23 +235,23 @@ class MasterLink:
         welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
-    def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> MarkerDetections | Refusal | None:
+    def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
         session = self._sessions.get(header.key_id)
         if session is None:
             return Refusal.STALE
-        camera = self._cameras[session.camera]
+        sender = self._senders[session.name]
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
-                camera.sequence.duplicate()
+                sender.sequence.duplicate()
             return opened
         session.heard_ns = t_ns
-        if camera.pending is session:
-            self._confirm(camera, session, t_ns)
+        if sender.pending is session:
+            self._confirm(sender, session, t_ns)
         if opened.reordered:
-            camera.sequence.reordered()
+            sender.sequence.reordered()
         if header.kind is Kind.DATA:
-            return self._take_data(session, camera.sequence, opened)
+            return self._take_data(session, sender.sequence, opened)
         message = read(header.kind, opened.body)
         if isinstance(message, EchoAnswer):
             session.clock.push(message.t1_ns, message.t2_ns, message.t3_ns, t_ns)
@@ -254,26 +261,28 @@ class MasterLink:
             return Refusal.UNDECODABLE
         return None
 
-    def _confirm(self, camera: _Camera, session: _Session, t_ns: int) -> None:
-        if camera.live is not None:
-            camera.missing_before += camera.live.opener.missing
-            camera.steps_before += camera.live.clock.steps
-            del self._sessions[camera.live.key_id]
-        camera.live, camera.pending = session, None
-        camera.old_nonces.append(session.hello.slave_nonce)
-        if self._first_ns is None:
+    def _confirm(self, sender: _Sender, session: _Session, t_ns: int) -> None:
+        if sender.live is not None:
+            sender.missing_before += sender.live.opener.missing
+            sender.steps_before += sender.live.clock.steps
+            del self._sessions[sender.live.key_id]
+        sender.live, sender.pending = session, None
+        sender.old_nonces.append(session.hello.slave_nonce)
+        if self._first_ns is None and session.name not in self._imus:
             self._first_ns = t_ns
 
-    def _take_data(
-        self, session: _Session, sequence: Sequence, opened: Opened
-    ) -> MarkerDetections | Refusal | None:
+    def _take_data(self, session: _Session, sequence: Sequence, opened: Opened) -> Taken | Refusal | None:
         try:
             message = decode(opened.body)
         except MessageError:
             return Refusal.UNDECODABLE
-        if not isinstance(message, MarkerDetections):
+        if isinstance(message, MarkerDetections):
+            imu, name = False, message.camera
+        elif isinstance(message, ImuSample):
+            imu, name = True, message.source
+        else:
             return Refusal.UNDECODABLE
-        if message.camera != session.camera:
+        if name != session.name or imu != (name in self._imus):
             return Refusal.IMPOSTOR
         session.started = True
         if not sequence.take(message.session, message.seq):
@@ -282,11 +291,13 @@ class MasterLink:
         if clock is None:  # data before the start, of a slave that did not wait for it
             self.unsynchronised += 1
             return None
-        t_ns, ready_t_ns = clock.to_local(message.t_ns), clock.to_local(message.ready_t_ns)
+        t_ns = clock.to_local(message.t_ns)
+        if isinstance(message, ImuSample):
+            return msgspec.structs.replace(message, t_ns=t_ns)
         return msgspec.structs.replace(
             message,
             t_ns=t_ns,
-            ready_t_ns=ready_t_ns,
+            ready_t_ns=clock.to_local(message.ready_t_ns),
             t_sigma_ns=hypot(message.t_sigma_ns, clock.sigma_at(t_ns)),
         )
 
@@ -307,12 +318,12 @@ class MasterLink:
     def _open_barrier(self, t_ns: int) -> None:
         if self._start_ns is not None or self._first_ns is None:
             return
-        ready = all(camera.live is not None and camera.live.clock.ready for camera in self._cameras.values())
+        ready = all(sender.live is not None and sender.live.clock.ready for sender in self._awaited)
         if ready or t_ns - self._first_ns > self._start_timeout_ns:
             self._start_ns = t_ns + START_LEAD_NS
 
-    def _send_start(self, camera: _Camera, t_ns: int) -> None:
-        session = camera.live
+    def _send_start(self, sender: _Sender, t_ns: int) -> None:
+        session = sender.live
         if self._start_ns is None or session is None or session.started or t_ns < session.next_start_ns:
             return
         clock = session.clock.estimate()

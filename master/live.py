@@ -86,6 +86,7 @@ def run_live(
             settings.bind,
             settings.bus,
             settings.start_timeout_s,
+            imus=setup.imus,
         )
         stack.callback(ingest.close)
         sinks: list[Sink] = [BusSink(bus)]
@@ -199,7 +200,9 @@ class _Reporter:
 
 
 def cameras_line(cameras: tuple[str, ...], connected: frozenset[str]) -> str:
-    """What a person is told when a camera comes or goes: who is there, and who is waited for."""
+    """What a person is told when a camera or an IMU comes or goes: who is there, and who is waited for."""
     here = ", ".join(name for name in cameras if name in connected) or "none yet"
     absent = ", ".join(name for name in cameras if name not in connected)
-    return f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
+    line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
+    imus = ", ".join(sorted(connected.difference(cameras)))
+    return f"{line}; IMU: {imus}" if imus else line

@@ -39,6 +39,11 @@ class RigSetup:
         """The rig's markers that sit on the hand, in the rig's order."""
         return tuple(name for name in self.rig.markers if name not in self.rig.free_markers)
 
+    @property
+    def imus(self) -> tuple[str, ...]:
+        """The rig's IMU, if it has one."""
+        return () if self.rig.imu is None else (self.rig.imu.name,)
+
     @classmethod
     def of(cls, rig: RigCalibration, cameras: dict[str, CameraCalibration], hand: HandModel) -> "RigSetup":
         """Join the files.
@@ -138,5 +143,6 @@ def build_pipeline(
         else tracker,
         stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
+        imu=setup.rig.imu,
         stage=stage,
     )

@@ -4,6 +4,8 @@ No clock is read for the poses: messages are pushed in the order of their captur
 same bytes. Only the stage times of the summary are measured.
 """
 
+import heapq
+import logging
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -12,7 +14,8 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording
-from common.messages import HandPose, MarkerDetections
+from common.imu_recording import IMU, read_imu
+from common.messages import HandPose, ImuSample, MarkerDetections
 from common.npz import read_npz
 from master.outputs.files import PosesFile
 from master.outputs.poses import Poses
@@ -26,6 +29,7 @@ _CLEAR_PX, _DOUBT_PX = (
     0.1,
     0.6,
 )  # sigma of detections that state none: of full quality, and added where it is 0
+_LOG = logging.getLogger(__name__)
 
 
 def solve(
@@ -38,7 +42,7 @@ def solve(
     """Solve a marker recording and write poses.npz and summary.json into `out`.
 
     Args:
-        recording: The raw frames' manifest; gives `continuous`, clicks and, where there is one, the truth.
+        recording: The raw frames' manifest; gives `continuous`, clicks and, where there are, the IMU and the truth.
         setup: Rig, cameras and hand.
         detections: Folder with detections_<camera>.npz of every camera of the rig.
         out: Existing folder for the results.
@@ -48,7 +52,7 @@ def solve(
         The summary.
 
     Raises:
-        RecordingError: A detections file is missing or broken, or the results cannot be written.
+        RecordingError: A detections file is missing or broken, imu.csv is, or the results cannot be written.
         CalibrationError: The depth model does not fit the rig.
     """
     stages = StageTimes()
@@ -57,10 +61,14 @@ def solve(
     poses: list[HandPose] = []
     rates = CameraRates()
     sink = PosesFile(out / "poses.npz", setup.hand.profile.name, len(setup.rig.markers))
-    for number, message in enumerate(messages, 1):
+    done = 0
+    for message in heapq.merge(_samples(recording, setup), messages, key=lambda message: message.t_ns):
+        if isinstance(message, ImuSample):
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
+            continue
         poses += [solved.pose for solved in pipeline.push(message)]
         rates.push(message)
-        progress(number, len(messages))
+        progress(done := done + 1, len(messages))
     poses += [solved.pose for solved in pipeline.flush()]
     for pose in poses:
         sink.write(pose)
@@ -101,6 +109,21 @@ def _messages(setup: RigSetup, folder: Path) -> list[MarkerDetections]:
     ]
     order = {camera: index for index, camera in enumerate(setup.rig.cameras)}
     return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
+
+
+def _samples(recording: FrameRecording, setup: RigSetup) -> tuple[ImuSample, ...]:
+    """What the recording's IMU measured; nothing, with a warning, where the rig does not say how that lies."""
+    imu = setup.rig.imu
+    if imu is not None and imu.placed:
+        return read_imu(recording.folder, imu.name)
+    if (path := recording.folder / IMU).exists():
+        _LOG.warning(
+            "%s: not used: rig %r: imu.q_palm_imu and imu.q_rig_world do not both say how the IMU is mounted and how "
+            "its world lies to the rig",
+            path,
+            setup.rig.name,
+        )
+    return ()
 
 
 def _gaps(messages: list[MarkerDetections]) -> int:

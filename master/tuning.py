@@ -11,6 +11,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from common.arrays import Float
 from common.errors import CalibrationError, PhalanxError
 from common.messages import MarkerDetections
 from common.watching import WatchedFiles
@@ -92,6 +93,10 @@ class LivePipeline:
         if solved:
             self._last_ns = solved[-1].pose.t_ns
         return solved
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+        """Take what the IMU says of its orientation (4,); a pipeline that takes over begins without."""
+        self._now.push_orientation(t_ns, orientation_wxyz)
 
     def change(self, setup: RigSetup) -> None:
         """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.
@@ -210,6 +215,11 @@ def _refuse_restart(old: RigSetup, new: RigSetup) -> None:
         raise CalibrationError(
             f"{where}: hand: {old.hand.profile.name} cannot become {new.hand.profile.name} while it runs: restart "
             "the master"
+        )
+    if old.imus != new.imus:
+        raise CalibrationError(
+            f"{where}: imu.name: {', '.join(old.imus) or 'none'} cannot become {', '.join(new.imus) or 'none'} while "
+            "it runs: restart the master"
         )
     for name, camera in new.cameras.items():
         for key in _NEEDS_RESTART:

@@ -13,12 +13,13 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.calibration import Volume
+from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
 from master.filters import PointFilter
 from master.ik.hand import HandSolution
+from master.ik.orientation import OrientationTrack
 from master.ik.tracker import HandTracker, pose_of
 from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
@@ -60,6 +61,7 @@ class MarkerPipeline:
         tracker: HandTracker,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
+        imu: ImuCalibration | None = None,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
@@ -75,6 +77,7 @@ class MarkerPipeline:
             tracker: Solves the hand from its own markers, some or all of these.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
+            imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
             stage: Opens a timer by stage name.
         """
         self.model, self.markers = model, markers
@@ -89,6 +92,7 @@ class MarkerPipeline:
         self._caps = CapModel(model, markers)
         self._located = CapLocator(self._cameras, self._caps, self._place)
         self._stage, self._volume = stage, volume
+        self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
@@ -102,12 +106,20 @@ class MarkerPipeline:
             instants = self._pairing.push(message)
         return [self._solve(instant) for instant in instants]
 
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+        """Take what the IMU says of its own orientation (4,), for the instants about `t_ns`."""
+        if self._orientation is None:
+            self.counts["orientation.unplaced"] += 1
+        else:
+            self._orientation.push(t_ns, orientation_wxyz)
+
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: the poses that still wait for a camera."""
         return [self._solve(instant) for instant in self._pairing.flush()]
 
     def _solve(self, instant: Instant) -> SolvedPose:
         last, age_s = self._tracker.recent(instant.t_ns)
+        near = last
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 instant = replace(instant, uv=self._lens_shift.centres(instant.uv, instant.area))
@@ -116,12 +128,12 @@ class MarkerPipeline:
         if last is None:
             # The caps' tilt is not known yet: a first solution tells it.
             with self._stage("hand"):
-                first = self._tracker.peek(
+                near = self._tracker.peek(
                     *self._with_rays(instant, found.points, found.cov, None, 0.0),
                     self._towards(found.points, instant),
                 )
             with self._stage("triangulate"):
-                found = self._locate(instant, first, 0.0, as_seen=first is None)
+                found = self._locate(instant, near, 0.0, as_seen=near is None)
         raw, cov, apart = found.points, found.cov, found.apart
         with self._stage("filter"):
             markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw, found.noise)
@@ -129,7 +141,10 @@ class MarkerPipeline:
             # The covariances are those of the points before the filter, which do not lag: the fit takes these.
             aims = self._with_rays(instant, raw, cov + found.repeated, last, age_s)
             measured = np.isfinite(raw[self._on_hand, 0])
-            hand = self._tracker.push(instant.t_ns, *aims, self._towards(raw, instant), measured)
+            turned = None if self._orientation is None else self._orientation.at(instant.t_ns, near)
+            hand = self._tracker.push(
+                instant.t_ns, *aims, self._towards(raw, instant), measured, orientation=turned
+            )
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)

@@ -12,7 +12,7 @@ import pytest
 
 from common.clock import SkewedClock
 from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
-from common.messages import Command, MarkerDetections, encode
+from common.messages import Command, ImuSample, MarkerDetections, encode
 from common.session import Hello, RigKeys, seal
 from master.link import MasterLink
 from slave.link import SlaveLink
@@ -37,16 +37,22 @@ class Wires:
     slaves: dict[Address, SlaveLink] = field(default_factory=dict[Address, SlaveLink])
     seen: list[tuple[bytes, Address, Address]] = field(default_factory=list[tuple[bytes, Address, Address]])
     got: list[MarkerDetections] = field(default_factory=list[MarkerDetections])
+    samples: list[ImuSample] = field(default_factory=list[ImuSample])
     lives: int = 0
 
     def __post_init__(self) -> None:
         self.random = random.Random(self.seed)
 
-    def new_master(self, cameras: tuple[str, ...] = ("left", "right"), timeout_s: float = 5.0) -> MasterLink:
+    def new_master(
+        self,
+        cameras: tuple[str, ...] = ("left", "right"),
+        timeout_s: float = 5.0,
+        imus: tuple[str, ...] = (),
+    ) -> MasterLink:
         self.lives += 1
         source = seeded(1000 * self.seed + self.lives)
         self.master = MasterLink(
-            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", round(timeout_s * S), source
+            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", round(timeout_s * S), source, imus
         )
         return self.master
 
@@ -72,7 +78,9 @@ class Wires:
                 slave.hear_beacon(datagram, source, slave._clock.now_ns())
         elif to == MASTER and self.master is not None:
             message = self.master.receive(datagram, source, t_ns)
-            if message is not None:
+            if isinstance(message, ImuSample):
+                self.samples.append(message)
+            elif message is not None:
                 self.got.append(message)
         elif to in self.slaves:
             slave = self.slaves[to]
@@ -99,7 +107,7 @@ class Wires:
     def all_started(self) -> bool:
         return all(slave.started for slave in self.slaves.values())
 
-    def send(self, slave: SlaveLink, message: MarkerDetections | Command) -> bytes | None:
+    def send(self, slave: SlaveLink, message: MarkerDetections | ImuSample | Command) -> bytes | None:
         sealed = slave.seal(message)
         if sealed is None:
             return None
@@ -253,12 +261,12 @@ def test_a_hello_that_was_kept_back_cannot_end_the_session_of_the_restarted_slav
     swallowed.hear_beacon(beacon, MASTER, wires.clock.now_ns())
     hello = swallowed.due()[0][0]
     wires.remove(swallowed)
-    live = master._cameras["left"].live
+    live = master._senders["left"].live
     wires.carry(hello, ("6.6.6.6", 6), MASTER, keep=False)
-    assert master._cameras["left"].pending is not None
+    assert master._senders["left"].pending is not None
     wires.run(1.5)
-    assert master._cameras["left"].live is live
-    assert master._cameras["left"].pending is None
+    assert master._senders["left"].live is live
+    assert master._senders["left"].pending is None
     assert len(master._sessions) == 2
     assert left.started
 
@@ -311,10 +319,10 @@ def test_a_session_that_the_master_lost_is_made_again() -> None:
     wires = Wires()
     master, left, _ = started_pair(wires)
     session = left._session
-    live = master._cameras["left"].live
+    live = master._senders["left"].live
     assert live is not None
     del master._sessions[live.key_id]
-    master._cameras["left"].live = None
+    master._senders["left"].live = None
     assert wires.run(2.0, lambda: left._session is not session and left.started)
 
 
@@ -416,7 +424,7 @@ def test_a_flood_of_hellos_grows_nothing() -> None:
         master.receive(seal(sealer, hello), ("6.6.6.6", 6), wires.clock.now_ns())
         master._outbox.clear()
     assert len(master._sessions) <= 4
-    assert all(len(camera.old_nonces) <= 64 for camera in master._cameras.values())
+    assert all(len(camera.old_nonces) <= 64 for camera in master._senders.values())
     assert wires.run(1.5, lambda: len(master._sessions) == 2)
     assert wires.all_started()
 

@@ -69,6 +69,7 @@ def rig() -> Iterator[Rig]:
 def drain(ingest: Ingest, wait_s: float = 0.2) -> list[MarkerDetections]:
     messages: list[MarkerDetections] = []
     while (message := ingest.get(wait_s)) is not None:
+        assert isinstance(message, MarkerDetections)
         messages.append(message)
     return messages
 
@@ -107,7 +108,7 @@ def test_a_clean_network_loses_nothing(rig: Rig) -> None:
     rig.send("right", slaves["right"])
     last = ingest.get(1.0)
     estimate = ingest.clock_of("right")
-    assert last is not None
+    assert isinstance(last, MarkerDetections)
     assert estimate is not None
     assert last.t_sigma_ns == pytest.approx(estimate.sigma_at(last.t_ns), rel=0.5)  # their stamps are exact
     assert ingest.counts["right.clock_steps"] == 0
