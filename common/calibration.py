@@ -264,8 +264,14 @@ class Couplings(_File, frozen=True):
     neighbours: bool = True
 
 
+Preset = Literal["K", "D"]
+
+
 class HandProfile(_File, frozen=True):
-    """hands/<name>.json: bones and markers of one hand, optionally radii, limits and couplings."""
+    """hands/<name>.json: bones and markers of one hand, optionally radii, limits and couplings.
+
+    Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
+    """
 
     version: Literal[1]
     name: Name
@@ -273,8 +279,8 @@ class HandProfile(_File, frozen=True):
     rest_joints: dict[str, RestJoint]
     markers: dict[Name, MarkerMount]
     radius_m: dict[str, Positive] | None = None
-    limits_rad: Limits | None = None
-    couplings: Couplings | None = None
+    limits_rad: Limits | Preset | None = None
+    couplings: Couplings | Preset | None = None
 
 
 def load(path: Path, kind: type[StructT]) -> StructT:

@@ -23,7 +23,7 @@ from common.calibration import Couplings, HandProfile
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix
 from common.hand_limits import ABDUCTION, FLEXION, limit_table, spread_left, spread_table
-from common.hand_presets import preset_limits, radius_share
+from common.hand_presets import preset_couplings, preset_limits, radius_share
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
 WEBXR_JOINTS = (
@@ -156,7 +156,8 @@ class HandModel:
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
         couplings = _couplings(profile, where)
-        limits = profile.limits_rad or preset_limits("K")
+        limits = profile.limits_rad or "K"
+        limits = preset_limits(limits) if isinstance(limits, str) else limits
         side_sign = 1.0 if profile.side == "right" else -1.0
         return cls(
             profile=profile,
@@ -312,7 +313,8 @@ def _radii(profile: HandProfile, where: str) -> Float:
 
 
 def _couplings(profile: HandProfile, where: str) -> Couplings:
-    couplings = profile.couplings or Couplings()
+    couplings = profile.couplings or "K"
+    couplings = preset_couplings(couplings) if isinstance(couplings, str) else couplings
     if couplings.dip_per_pip is None and couplings.dip_spread_rad > 0.0:
         raise CalibrationError(
             f"{where}: couplings.dip_spread_rad: there is no ratio to stray from while dip_per_pip is null; give"

@@ -6,11 +6,9 @@ Walinchus, Ross & Beredjiklian, J. Hand Surg. Am. 39, 2014). Their ratio is take
 stop a finger. Of their own force people spread a fist even less.
 """
 
-from typing import Literal
-
 import numpy as np
 
-from common.calibration import Couplings, FingerLimits, Limits
+from common.calibration import Couplings, FingerLimits, Limits, Preset
 
 # Radii by place in the finger [share of the middle finger's proximal bone], for profiles without radius_m.
 _RADIUS_SHARE = {
@@ -26,7 +24,7 @@ _RADIUS_SHARE = {
 SPREAD_AT_FULL_FLEXION = 15.0 / 24.0
 
 
-def preset_limits(preset: Literal["K", "D"]) -> Limits:
+def preset_limits(preset: Preset) -> Limits:
     """Joint limits of Kalbfleisch (K) or Digits (D), relative to the rest pose."""
     k = preset == "K"
     abduction = 15.0 if k else 20.0
@@ -40,7 +38,7 @@ def preset_limits(preset: Literal["K", "D"]) -> Limits:
     return Limits(thumb=thumb, index=side, middle=finger(0.0 if k else abduction), ring=side, little=side)
 
 
-def preset_couplings(preset: Literal["K", "D"]) -> Couplings:
+def preset_couplings(preset: Preset) -> Couplings:
     """DIP per PIP: 2/3 in K, 0.84 in D (Kamper's ratio); MCP = 0.54 PIP is D's natural flexion."""
     return Couplings(dip_per_pip=2.0 / 3.0 if preset == "K" else 0.84, mcp_per_pip=0.54)
 

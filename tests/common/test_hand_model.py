@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
-from common.calibration import Couplings, HandProfile, MarkerMount
+from common.calibration import Couplings, HandProfile, MarkerMount, parse
 from common.errors import CalibrationError
 from common.geometry import quaternion_to_matrix, rigid
 from common.hand_model import (
@@ -206,6 +206,23 @@ def test_presets_hold_the_published_couplings() -> None:
     assert preset_couplings("D") == Couplings(dip_per_pip=0.84, mcp_per_pip=0.54)
     assert RIGHT.dip_per_pip == pytest.approx(2 / 3)  # K is what a profile without limits gets
     np.testing.assert_allclose(np.degrees(RIGHT.limits_rad[1, 2]), (0, 110))
+
+
+@pytest.mark.parametrize("preset", ["K", "D"])
+def test_a_profile_may_name_a_preset(preset: str) -> None:
+    text = msgspec.json.encode(RIGHT.profile).decode()
+    named = text.replace(
+        '"limits_rad":null,"couplings":null', f'"limits_rad":"{preset}","couplings":"{preset}"'
+    )
+    model = HandModel.of(parse(named.encode(), HandProfile, "named.json"))
+    written = preset_limits("K" if preset == "K" else "D")
+    spelt = HandModel.of(msgspec.structs.replace(RIGHT.profile, limits_rad=written))
+    np.testing.assert_array_equal(model.limits_rad, spelt.limits_rad)
+    assert model.dip_per_pip == pytest.approx(2 / 3 if preset == "K" else 0.84)
+    with pytest.raises(CalibrationError, match=r"named.json.*limits_rad"):
+        parse(
+            named.replace(f'"limits_rad":"{preset}"', '"limits_rad":"Q"').encode(), HandProfile, "named.json"
+        )
 
 
 def test_limits_are_checked_angle_by_angle() -> None:
