@@ -24,21 +24,13 @@ _SHORTEST_S = 1e-3  # a step in time below this would weld the hand to its last 
 
 @dataclass(frozen=True, slots=True)
 class FreeHand:
-    """The habits of a hand that has none [rad]: a flexion anywhere, the rest about the middle, about as wide as limits.
+    """The habits of a hand that has none [rad]: flexions anywhere within limits, the rest as if drawn evenly from them.
 
-    Fingers are spread either way and the thumb is where it can be; a PIP is rather in the lower half of its range.
+    But a PIP is rather in the lower half of its range.
     """
 
-    abduction: float = np.radians(9.0)
     pip: float = np.radians(40.0)
     pip_mean: float = np.radians(30.0)
-    thumb: float = np.radians(22.0)
-    thumb_mean: tuple[float, float, float, float] = (
-        float(np.radians(12.0)),
-        float(np.radians(13.0)),
-        float(np.radians(18.0)),
-        float(np.radians(25.0)),
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +109,7 @@ class AnglePrior:
         """
         tables = [_natural_rows(model, parameters, priors, unlike)]
         if priors.free is not None:
-            tables.append(_free_rows(model, parameters, priors.free, priors.free_dip))
+            tables.append(_free_rows(model, parameters, priors, priors.free))
         habits = cls(
             np.array([rows.T @ rows for rows, _ in tables]),
             np.array([means @ rows for rows, means in tables]),
@@ -208,19 +200,23 @@ def _natural_rows(
 
 
 def _free_rows(
-    model: HandModel, parameters: HandParameters, free: FreeHand, free_dip: float
+    model: HandModel, parameters: HandParameters, priors: Priors, free: FreeHand
 ) -> tuple[Float, Float]:
     """Rows (P, n) and means (P,) of a hand whose joints know nothing of each other."""
     rows = _Rows(parameters)
-    for k, mean in enumerate(free.thumb_mean):
-        rows.add({k: 1.0}, mean, free.thumb)
+    low, high = model.limits_rad[..., 0], model.limits_rad[..., 1]
+    middle, span = (0.5 * (low + high)).tolist(), high - low
+    even = (span / np.sqrt(12.0)).tolist()  # standard deviation of an even distribution
+    for k in range(4):
+        rows.add({k: 1.0}, middle[0][k], even[0][k] or priors.thumb)
     for f in range(1, 5):
         a = 4 * f
-        low, high = model.limits_rad[f, 1].tolist()
-        rows.add({a: 1.0}, 0.0, free.abduction)
-        rows.add({a + 1: 1.0}, 0.5 * (low + high), max(2.0 * (high - low), _NARROWEST_RAD))  # next to nothing
+        rows.add(
+            {a: 1.0}, middle[f][0], even[f][0] or priors.abduction
+        )  # none that cannot move tells them apart
+        rows.add({a + 1: 1.0}, middle[f][1], 2.0 * span[f, 1] or priors.pip)  # next to nothing
         rows.add({a + 2: 1.0}, free.pip_mean, free.pip)
-        rows.add_loose_dip(model, a, free_dip)
+        rows.add_loose_dip(model, a, priors.free_dip)
     return rows.table()
 
 
