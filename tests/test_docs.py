@@ -3,9 +3,12 @@
 import re
 from pathlib import Path
 
+import msgspec
 import pytest
 
-from common.hand_model import FINGERS, JOINTS
+from common.calibration import HandProfile, parse
+from common.hand_model import FINGERS, JOINTS, HandModel
+from common.hand_profiles import generated_profile
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted({*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "calib_json").rglob("*.md")})
@@ -36,3 +39,22 @@ def test_the_joint_table_is_the_joint_order() -> None:
 
 def test_the_finger_order_is_written_as_it_is() -> None:
     assert f"rows {', '.join(FINGERS)}" in (ROOT / "docs" / "frames.md").read_text()
+
+
+def test_the_examples_of_a_hand_profile_load() -> None:
+    examples: list[str] = re.findall(
+        r"```json\n(.*?)\n```", (ROOT / "docs" / "hand.md").read_text(), re.DOTALL
+    )
+    assert len(examples) == 3
+    profile = msgspec.json.decode(
+        msgspec.json.encode(generated_profile("mine", "right")), type=dict[str, object]
+    )
+    models: list[HandModel] = []
+    for example in examples:
+        keys = msgspec.json.decode(f"{{{example}}}", type=dict[str, object])
+        if "index" in keys:
+            keys = {"limits_rad": {finger: keys["index"] for finger in FINGERS}}
+        models.append(HandModel.of(parse(msgspec.json.encode(profile | keys), HandProfile, "hand.md")))
+    assert [model.dip_per_pip for model in models] == [0.84, 0.6667, 2 / 3]
+    assert [model.neighbours for model in models] == [True, False, True]
+    assert models[2].spread_at_full_flexion.tolist() == [0.625] * 5
