@@ -1,115 +1,159 @@
-"""The whole-hand solver on a moving hand: time, accuracy, and what a fixed palm would cost."""
+"""The whole hand on a moving hand: ours warm and afresh, and others on the same caps; what a fixed palm costs.
 
-import itertools
-from pathlib import Path
+A hand bends its fingers while its palm turns by 20 degrees, 60 frames a second, caps with the noise of good centroids.
+Ours, scipy and mink weigh the same caps and the same habits of natural hands and keep the same limits, but mink weighs
+all directions alike and takes each habit for itself, and neither of the two knows the last frame but as a start.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
 
-from bench.row import Row, median_us
+from bench import peers_mink, peers_scipy
+from bench.hand_draws import FACING_ROTATION, MARKERS, Draw, Noise, bench_model, posed
+from bench.hand_score import Score, score
+from bench.peers_paper import Fingers, PaperFingers, closed_form, finger_solvers, fixed_palm, tips_in_palm
+from bench.row import Row
 from common.arrays import Float
-from common.calibration import HandProfile, load
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
 from master.ik.hand import HandSolution, HandSolver
+from master.ik.parameters import HandParameters
+from master.ik.priors import AnglePrior, Priors
 
-_MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
-_FRAMES = 240
-_SIGMA_M = np.array([0.15e-3, 0.15e-3, 1.0e-3])
+FRAMES = 240
+_PERIOD_S = 1 / 60
+_NOISE = Noise((0.15e-3, 0.15e-3, 1.0e-3))
+_SEED = 7
+_TURN_RAD = np.radians(20.0)
+_SLOW = {"scipy": 20, "mink": 4, "papers' way": 2}  # one frame in so many
+WARM = "whole hand, warm"
 
-
-def rows() -> list[Row]:
-    """Warm solves along a smooth motion at 60 Hz with centroid-like noise."""
-    model = HandModel.of(
-        load(Path(__file__).parent.parent / "calib_json/hands/default-right.json", HandProfile)
-    )
-    solver = HandSolver(model, _MARKERS)
-    poses, angles, points = _motion(model)
-    cov = np.repeat(np.diag(_SIGMA_M**2)[None], len(_MARKERS), axis=0)
-    last: HandSolution | None = None
-    joint_mm: list[float] = []
-    pip_deg: list[float] = []
-    for T, truth, seen in zip(poses, angles, points, strict=True):
-        last = solver.solve(seen, cov, last, 1 / 60)
-        assert last is not None
-        error = last.joints.position_m - model.forward(T, truth).position_m
-        joint_mm.append(1e3 * float(np.linalg.norm(error, axis=1).mean()))
-        pip_deg.append(float(np.degrees(np.abs(last.angles_rad[1:, 2] - truth[1:, 2])).mean()))
-    frames = itertools.cycle(points)
-    state = [last]
-
-    def warm() -> object:
-        state[0] = solver.solve(next(frames), cov, state[0], 1 / 60)
-        return state[0]
-
-    one, spread = median_us(warm, 300)
-    general, general_spread = median_us(lambda: _general(model, points[0], poses[0]), 5, 1)
-    fixed = _fixed_palm_mm(model, poses, angles, points)
-    return [
-        Row("whole hand, warm", one, "us", f"± {spread:.0f}; goal 1500"),
-        Row(
-            "general least squares on the same markers (scipy)",
-            general,
-            "us",
-            f"± {general_spread:.0f}; baseline",
-        ),
-        Row("times faster", general / one, "x", ""),
-        Row("joint error, palm turning ± 20 deg", float(np.mean(joint_mm)), "mm", "goal 6"),
-        Row("the same with the palm's rotation taken as fixed", fixed, "mm", "baseline (about 15)"),
-        Row("PIP error", float(np.mean(pip_deg)), "deg", "goal 7.5"),
-    ]
+Hand = tuple[Float, Float]  # palm (4, 4), angles (5, 4) [rad]
+Way = Callable[[Float], Hand]  # caps (M, 3) [m] -> hand
 
 
-def _motion(model: HandModel) -> tuple[Float, Float, Float]:
-    """Palm poses (T, 4, 4), angles (T, 5, 4) and noisy caps (T, M, 3)."""
-    rng = np.random.default_rng(7)
-    t = np.arange(_FRAMES) / 60.0
-    facing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-    turn = np.radians(20.0) * np.stack(
-        [np.sin(1.1 * t), np.sin(0.8 * t + 1.0), np.sin(0.9 * t + 2.0)], axis=1
-    )
-    poses = np.stack(
-        [rigid(rotation_vector_to_matrix(v) @ facing, np.array([0.03, 0.08, 0.5])) for v in turn]
-    )
-    angles = np.zeros((_FRAMES, 5, 4))
-    phase = rng.uniform(0, 2 * np.pi, 5)
-    bend = 0.5 + 0.4 * np.sin(2.0 * t[:, None] + phase)
+def rows(frames: int = FRAMES) -> list[Row]:
+    """Time per hand and errors of every way that is there."""
+    model = bench_model()
+    truth = motion(model, frames)
+    rng = np.random.default_rng(_SEED)
+    points = truth.caps_m + rng.normal(size=truth.caps_m.shape) * _NOISE.place_m
+    out: list[Row] = []
+    us: dict[str, float] = {}
+    for name, way in ways(model).items():
+        step = _SLOW.get(name, 1)
+        found, us[name], spread = timed(model, way, truth.every(step), points[::step])
+        out += way_rows(name, found, us[name], spread)
+    if not peers_mink.installed():
+        out.append(Row("mink: hand", float("nan"), "us", peers_mink.INSTALL))
+    return [*out, Row(f"{WARM}: times faster than scipy", us["scipy"] / us[WARM], "x", "")]
+
+
+def motion(model: HandModel, frames: int) -> Draw:
+    """A hand that bends its fingers, each in its own phase, while the palm turns about all axes."""
+    rng = np.random.default_rng(_SEED)
+    t = _PERIOD_S * np.arange(frames)
+    turn = _TURN_RAD * np.stack([np.sin(1.1 * t), np.sin(0.8 * t + 1.0), np.sin(0.9 * t + 2.0)], axis=1)
+    place = np.array([0.03, 0.08, 0.5])
+    poses = np.stack([rigid(rotation_vector_to_matrix(v) @ FACING_ROTATION, place) for v in turn])
+    angles = np.zeros((frames, 5, 4))
+    bend = 0.5 + 0.4 * np.sin(2.0 * t[:, None] + rng.uniform(0, 2 * np.pi, 5))
     angles[:, :, 2] = bend
     angles[:, 1:, 1] = 0.6 * bend[:, 1:] + 0.1 * np.sin(1.3 * t)[:, None]
     angles[:, 1:, 3] = (model.dip_per_pip or 0.0) * bend[:, 1:]
-    angles[:, 0] = np.stack([0.2 + 0 * t, 0.2 + 0.1 * bend[:, 0], 0.3 * bend[:, 0], 0.4 * bend[:, 0]], axis=1)
-    joints = model.forward(poses, angles)
-    points = model.marker_points(joints, _MARKERS)
-    return poses, angles, points + rng.normal(size=points.shape) * _SIGMA_M
+    thumb = bend[:, 0]
+    angles[:, 0] = np.stack([0.2 + 0 * t, 0.2 + 0.1 * thumb, 0.3 * thumb, 0.4 * thumb], axis=1)
+    return posed(model, poses, angles)
 
 
-def _general(model: HandModel, points: Float, T: Float) -> Float:
-    """The same unknowns for a solver that knows nothing of hands: numerical Jacobian, dense trust region."""
+def ways(model: HandModel) -> dict[str, Way]:
+    """Every solver that is there, by name; each begins afresh."""
+    fingers = finger_solvers(model)
+    habits = _Habits.of(model)
+    out: dict[str, Way] = {
+        WARM: Ours(model, warm=True).push,
+        "whole hand, afresh": Ours(model, warm=False).push,
+        "papers' way": _with_fixed_palm(model, PaperFingers(fingers).push),
+        "closed form, fixed palm": _with_fixed_palm(model, lambda tips: closed_form(fingers, tips)),
+    }
+    scipy = peers_scipy.WholeHand.of(model, _NOISE)
+    out["scipy"] = lambda points: scipy.solve(points, fixed_palm(model, points), habits.mean)
+    if peers_mink.installed():
+        sigma = np.sqrt(np.square(_NOISE.place_m) + Priors().model_m ** 2)
+        mink = peers_mink.MinkHand(model, weight=1.0 / sigma, posture=(habits.mean, habits.per_sigma))
+        mink.begin(rigid(FACING_ROTATION, np.array([0.0, 0.0, 0.5])), habits.mean)
+        out["mink"] = mink.push
+    return out
 
-    def residual(x: Float) -> Float:
-        pose = rigid(rotation_vector_to_matrix(x[:3]) @ T[:3, :3], x[3:6])
-        angles = np.zeros((5, 4))
-        angles[0], angles[1:, :3] = x[6:10], x[10:].reshape(4, 3)
-        angles[1:, 3] = (model.dip_per_pip or 0.0) * angles[1:, 2]
-        model_points = model.marker_points(model.forward(pose, angles), _MARKERS)
-        return np.concatenate([((model_points - points) / _SIGMA_M).ravel(), x[6:]])
 
-    start = np.concatenate([np.zeros(3), T[:3, 3], np.full(16, 0.2)])
-    return np.asarray(least_squares(residual, start).x, np.float64)
+@dataclass(slots=True)
+class Ours:
+    """The whole-hand fit. Holds the last solution where it is `warm`."""
+
+    solver: HandSolver
+    warm: bool
+    last: HandSolution | None = None
+
+    def __init__(self, model: HandModel, *, warm: bool) -> None:
+        self.solver, self.warm, self.last = HandSolver(model, MARKERS), warm, None
+
+    def push(self, points_m: Float) -> Hand:
+        """The hand of caps (M, 3) [m]; NaN where there is none."""
+        found = self.solver.solve(points_m, _NOISE.cov_m2, self.last if self.warm else None, _PERIOD_S)
+        self.last = found
+        if found is None:
+            return np.full((4, 4), np.nan), np.full((5, 4), np.nan)
+        return found.T_rig_palm, found.angles_rad
 
 
-def _fixed_palm_mm(model: HandModel, poses: Float, angles: Float, points: Float) -> float:
-    """Mean joint error when the palm only follows its marker and the fingers are solved exactly to their caps."""
-    from master.ik.finger import FingerSolver
+@dataclass(frozen=True, slots=True, eq=False)
+class _Habits:
+    """Natural angles (5, 4) [rad], and one per sigma (5, 4) [1/rad] of each by itself; 0 for a coupled DIP."""
 
-    solvers = [FingerSolver.of(model, f, model.mount(name).offset_m) for f, name in enumerate(_MARKERS[:5])]
-    facing = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-    back = model.mount("back").offset_m
-    errors: list[float] = []
-    for T, truth, seen in zip(poses[::4], angles[::4], points[::4], strict=True):
-        guess = rigid(facing, seen[5] - facing @ back)
-        local = (seen[:5] - guess[:3, 3]) @ facing
-        found = np.array([solvers[f].solve((p[0], p[1], p[2]))[:4] for f, p in enumerate(local.tolist())])
-        error = model.forward(guess, found).position_m - model.forward(T, truth).position_m
-        errors.append(1e3 * float(np.linalg.norm(error, axis=1).mean()))
-    return float(np.mean(errors))
+    mean: Float
+    per_sigma: Float
+
+    @classmethod
+    def of(cls, model: HandModel) -> "_Habits":
+        parameters = HandParameters.of(model)
+        prior = AnglePrior.of(model, parameters, Priors(free=None))
+        cov: Float = np.asarray(np.linalg.inv(prior.normal[0]), np.float64)
+        per_sigma = np.zeros(20)
+        per_sigma[parameters.free] = 1.0 / np.sqrt(np.diagonal(cov))
+        return cls(model.clamp(parameters.angles(cov @ prior.pull[0])), per_sigma.reshape(5, 4))
+
+
+def _with_fixed_palm(model: HandModel, fingers: Fingers) -> Way:
+    def way(points_m: Float) -> Hand:
+        palm = fixed_palm(model, points_m)
+        return palm, np.array(fingers(tips_in_palm(palm, points_m)))
+
+    return way
+
+
+def timed(model: HandModel, way: Way, truth: Draw, points_m: Float) -> tuple[Score, float, float]:
+    """Errors of a way, its median time per hand, and half the distance of the quartiles [us]."""
+    found: list[Hand] = []
+    times: list[float] = []
+    for points in points_m:
+        start = time.perf_counter()
+        found.append(way(points))
+        times.append(1e6 * (time.perf_counter() - start))
+    low, middle, high = np.percentile(times, (25, 50, 75)).tolist()
+    palms, angles = (np.array(part) for part in zip(*found, strict=True))
+    return score(model, truth, palms, angles, points_m), middle, (high - low) / 2
+
+
+def way_rows(name: str, found: Score, us: float, spread_us: float) -> Sequence[Row]:
+    """Time, joints, PIP; tips missed and limits passed as notes."""
+    ours = name.startswith("whole hand")
+    legal = f"limit violations {found.violations}, not found {found.not_finite}"
+    pip = f"{found.pip_rms_deg:.2g} RMS; {found.missed_percent:.3g} % of tips > 1 mm off"
+    return [
+        Row(f"{name}: hand", us, "us", f"± {spread_us:.3g}{'; goal 1500' if name == WARM else ''}; {legal}"),
+        Row(f"{name}: joints", float(found.joints_mm.mean()), "mm", "goal 6" if ours else ""),
+        Row(f"{name}: PIP", float(found.pip_deg.mean()), "deg", f"goal 7.5; {pip}" if ours else pip),
+    ]

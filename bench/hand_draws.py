@@ -57,6 +57,12 @@ class Draw:
     joints_m: Float
     caps_m: Float
 
+    def every(self, step: int) -> "Draw":
+        """One hand in `step`."""
+        return Draw(
+            self.T_rig_palm[::step], self.angles_rad[::step], self.joints_m[::step], self.caps_m[::step]
+        )
+
 
 def bench_model(*, coupled: bool = True) -> HandModel:
     """The quick-start hand of 19 cm with preset K; `coupled`: the DIP follows the PIP by 2/3 exactly."""

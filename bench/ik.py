@@ -39,7 +39,7 @@ def rows(hands: int = HANDS) -> list[Row]:
     out: list[Row] = []
     us: dict[str, float] = {}
     for name, way in ways(model).items():
-        found, us[name], spread = timed(model, way, every(truth, _SLOW.get(name, 1)))
+        found, us[name], spread = timed(model, way, truth.every(_SLOW.get(name, 1)))
         out += way_rows(name, found, us[name], spread)
         if name in _STRICT_MM:
             out.append(_strict_row(name, found, _STRICT_MM[name]))
@@ -109,13 +109,6 @@ def _unseeded(fingers: Sequence[FingerSolver]) -> Fingers:
         return [[q for joint in one.angles for q in joint] for one in found]
 
     return way
-
-
-def every(truth: Draw, step: int) -> Draw:
-    """One hand in `step` of a draw."""
-    return Draw(
-        truth.T_rig_palm[::step], truth.angles_rad[::step], truth.joints_m[::step], truth.caps_m[::step]
-    )
 
 
 def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float, float]:
