@@ -53,7 +53,7 @@ def test_the_examples_of_a_hand_profile_load() -> None:
     for example in examples:
         keys = msgspec.json.decode(f"{{{example}}}", type=dict[str, object])
         if "index" in keys:
-            keys = {"limits_rad": {finger: keys["index"] for finger in FINGERS}}
+            keys = {"limits_rad": dict.fromkeys(FINGERS, keys["index"])}
         models.append(HandModel.of(parse(msgspec.json.encode(profile | keys), HandProfile, "hand.md")))
     assert [model.dip_per_pip for model in models] == [0.84, 0.6667, 2 / 3]
     assert [model.neighbours for model in models] == [True, False, True]
