@@ -47,7 +47,7 @@ def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -
 def chi_square_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> float:
     """Squared misfit of markers and habits, without the last pose and what habits cost anyway."""
     past = problem.palm_cost(found.T_rig_palm) + float(problem.prior.cost_and_gradient(found.x)[0])
-    habit = float(habits.cost_and_gradient(found.x)[0]) - habits.least()
+    habit = float(habits.cost_and_gradient(found.x)[0]) - float(habits.least())
     return max(2.0 * (float(found.linear.cost) - past + habit), 0.0)
 
 

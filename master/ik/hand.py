@@ -17,8 +17,9 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
-from master.ik.hand_problem import ENOUGH, Facing, HandProblem, Minimum, Orientation, PalmPrior
+from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
+from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
 
@@ -139,7 +140,7 @@ class HandSolver:
             found = self._solution(problem, habits, way, points_m)
             off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
             whitened = (problem.whiten @ off[..., None])[..., 0]
-            if (np.vecdot(whitened, whitened) < EXPLAINED).all():
+            if (np.vecdot(whitened, whitened) < EXPLAINED).all() and found.iterations < MAX_ITERATIONS:
                 return found
         best = problem.minimise(*self._seeds(points_m, seen, facing), enough)
         return self._solution(problem, habits, best, points_m)

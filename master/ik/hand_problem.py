@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from common.arrays import Float, Int
-from common.geometry import matrix_to_rotation_vector, rotation_vector_to_matrix, skew, unskew
+from common.geometry import rotation_vector_to_matrix, skew
 from common.hand_model import HandModel
 from master.ik.attached import Attached
+from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
 
@@ -22,41 +23,6 @@ ENOUGH = 1e-7  # of half chi square: what a search may leave
 _ROUGH = 1.0  # the same where one of several seeds is to be chosen
 _FIRST_DAMPING, _MAX_DAMPING = 1e-3, 1e6
 _EYE = np.eye(3)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Facing:
-    """The back of the hand is believed to look along `direction` (3,), unit, rig frame; `weight`: one per sigma."""
-
-    direction: Float
-    weight: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Orientation:
-    """The palm's orientation as something else measured it, an IMU for instance.
-
-    Attributes:
-        rotation: (3, 3) palm frame -> rig frame.
-        cov_rad2: (3, 3) [rad^2] of the rotation vector, in rig axes, that turns it to the true one; positive
-            definite, and large about an axis about which nothing is known.
-        information: (3, 3) its inverse.
-    """
-
-    rotation: Float
-    cov_rad2: Float
-    information: Float = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "information", np.linalg.inv(self.cov_rad2))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PalmPrior:
-    """The palm is believed near `T_rig_palm` (4, 4); `weight` (6,): one per sigma of turn and shift."""
-
-    T_rig_palm: Float
-    weight: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,30 +170,16 @@ class HandProblem:
         gradient[..., 6:] += prior_gradient
         cost = cost + 0.5 * np.vecdot(residual, residual)
         if self.facing is not None:
-            dorsal, direction, weight = R[..., :, 1], self.facing.direction, self.facing.weight**2
-            off = dorsal - direction
-            cost = cost + 0.5 * weight * np.vecdot(off, off)
-            gradient[..., :3] += weight * (dorsal @ skew(-direction))
-            normal[..., :3, :3] += weight * (_EYE - dorsal[..., :, None] * dorsal[..., None, :])
+            cost = cost + self.facing.add_to(R, gradient, normal)
         if self.orientation is not None:
-            off = matrix_to_rotation_vector(R @ self.orientation.rotation.T)
-            J = _turn_of_vector(off)
-            weighed, pulled = off @ self.orientation.information, self.orientation.information @ J
-            cost = cost + 0.5 * np.vecdot(weighed, off)
-            gradient[..., :3] += (weighed[..., None, :] @ J)[..., 0, :]
-            normal[..., :3, :3] += np.swapaxes(J, -1, -2) @ pulled
+            cost = cost + self.orientation.add_to(R, gradient, normal)
         if self.palm is not None:
-            off = self.palm.weight * _moved(T_rig_palm, self.palm.T_rig_palm)
-            cost = cost + 0.5 * np.vecdot(off, off)
-            gradient[..., :6] += self.palm.weight * off
+            cost = cost + self.palm.add_to(T_rig_palm, gradient)
         return Linear(cost, gradient, normal)
 
     def palm_cost(self, T_rig_palm: Float) -> float:
         """What a palm (4, 4) costs by the belief about it."""
-        if self.palm is None:
-            return 0.0
-        off = self.palm.weight * _moved(T_rig_palm, self.palm.T_rig_palm)
-        return 0.5 * float(off @ off)
+        return 0.0 if self.palm is None else self.palm.cost(T_rig_palm)
 
     def _step(self, here: Linear, T: Float, x: Float, damping: Float) -> tuple[Float, Float, Float]:
         """The next poses (S, 4, 4) and angles (S, n), and how much lower the cost (S,) should be there."""
@@ -301,20 +253,3 @@ def _either(use: list[bool], one: Float, other: Float) -> Float:
     if all(use):
         return one
     return np.where(np.array(use).reshape(-1, *[1] * (one.ndim - 1)), one, other) if any(use) else other
-
-
-def _turn_of_vector(vector: Float) -> Float:
-    """Derivatives (..., 3, 3) of rotation vectors (..., 3) by a small turn in front of them.
-
-    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
-    """
-    angle = np.maximum(np.sqrt(np.vecdot(vector, vector)), 1e-4)[..., None, None]
-    k = skew(vector)
-    factor = 1.0 / (angle * angle) - 0.5 / (angle * np.tan(0.5 * angle))
-    return _EYE - 0.5 * k + factor * (k @ k)
-
-
-def _moved(T: Float, T_before: Float) -> Float:
-    """Turn (..., 3) (sine of the angle times the axis) and shift (..., 3) [m] from one pose to the other: (..., 6)."""
-    turned = unskew(T[..., :3, :3] @ T_before[:3, :3].T)
-    return np.concatenate([turned, T[..., :3, 3] - T_before[:3, 3]], axis=-1)

@@ -18,7 +18,7 @@ from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
-from master.ik.hand_problem import Orientation
+from master.ik.palm import Orientation
 from master.ik.priors import Priors
 from master.volume import inside
 

@@ -18,7 +18,8 @@ from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
 from master.ik.attached import Attached
 from master.ik.hand import HandSolution, HandSolver
-from master.ik.hand_problem import Facing, HandProblem, Orientation, PalmPrior
+from master.ik.hand_problem import HandProblem
+from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
 from tests.hand_helpers import (
