@@ -23,7 +23,7 @@ from bench.row import Row
 from common.arrays import Float
 from common.hand_model import HandModel
 from master.ik.hand import HandSolver
-from master.ik.hand_problem import Orientation
+from master.ik.palm import Orientation
 
 POSES = 2000
 BATCHES = 10

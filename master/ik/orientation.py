@@ -20,7 +20,7 @@ from common.calibration import UNIT_WITHIN, ImuCalibration, Quaternion
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix
 from master.ik.hand import HandSolution
-from master.ik.hand_problem import Orientation
+from master.ik.palm import Orientation
 
 REACH_NS = 50_000_000  # farther from an instant a sample tells nothing of it
 _KEPT = 512  # half a second of the fastest sensors; instants lie at most two camera periods behind

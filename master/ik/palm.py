@@ -78,7 +78,7 @@ class PalmPrior:
         return 0.5 * float(off @ off)
 
     def _off(self, T: Float) -> Float:
-        """Turn (sine of the angle times the axis) and shift from the belief to poses (..., 4, 4), in sigmas (..., 6)."""
+        """Turn (sine of the angle times the axis) and shift from the belief to poses (..., 4, 4): (..., 6), sigmas."""
         turned = unskew(T[..., :3, :3] @ self.T_rig_palm[:3, :3].T)
         return self.weight * np.concatenate([turned, T[..., :3, 3] - self.T_rig_palm[:3, 3]], axis=-1)
 
