@@ -4,21 +4,24 @@ In the root joint's frame the point lies at w(PIP), and |w| gives PIP (`master.i
 R_y(a) rest R_x(-f) w = target. With rest = R_y(h) R_z(r) R_x(t), which every rotation is, t is added to the
 angle of w in the y, z plane and h is taken from the abduction, and only r stays between the two:
 
-    R_y(a + h) R_z(r) R_x(t - f) w = target
-    v = R_x(t - f) w:  (v_x, v_y) from w_x and the target's y, v_z from the length
-    f = angle of w - angle of v in the y, z plane          a = angle of the target - angle of R_z(r) v in x, z
+    u = R_x(t - f) w        v = R_z(r) u        R_y(a + h) v = target
+    v_y = y of the target,  v_x = w_x / cos r - tan r v_y,  u_y = v_y / cos r - tan r w_x,  u_z = v_z by the length
+    f = t + angle of w - angle of u in y, z        a = angle of the target - angle of v in x, z - h
 
 so a table per PIP needs three numbers: PIP, the angle of w, and w_x. The constants of a finger are cells of a
-closure: as attributes they would cost a third of the time.
+closure: as attributes they would cost a third of the time. The table is packed, because in a running pipeline it is
+never in the processor's cache: a list of tuples is five times as large.
 """
 
 from collections.abc import Callable
 from math import atan2, copysign, cos, floor, hypot, pi, sin, sqrt, tan
+from struct import Struct
 from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Float
+from common.hand_limits import spread_left
 from master.ik.chain import Chain
 from master.ik.joints import Rotor
 from master.ik.reach_table import Branch, ReachCurve
@@ -30,6 +33,7 @@ _POLE_M = 2e-7
 """Error of the point that an error of w_x may grow to near the abduction's pole, where it grows by |w| / v_z; nearer
 to the pole the tables alone are not exact enough."""
 _LEAST_POLE = 1e-12
+_ROW = Struct("6d")
 _HALF_TURN: Matrix = ((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0))
 
 
@@ -75,7 +79,7 @@ def quick_solver(
     if cos(heading) < 0.0:  # so that the abduction is within a quarter turn of where the target is
         heading, before = heading - copysign(pi, heading), product(before or IDENTITY, _HALF_TURN)
     nodes, bound_m, pole = _table(curve, branch, roll, tip)
-    rows = [tuple(row) for row in nodes.tolist()]
+    table, row_at = nodes.tobytes(), _ROW.unpack_from
     root_x, root_y, root_z = root
     (ax, ay, az), (bx, by, bz), (cx, cy, cz) = before or IDENTITY
     turned = before is not None
@@ -86,7 +90,7 @@ def quick_solver(
     share = joint.spread_at_full_flexion
     a_low, a_high = share * low, share * high  # legal at any flexion
     dip_low, dip_high = curve.dip
-    ratio, exact, clamp, narrowing = curve.ratio, curve.exact, joint.clamp, joint.narrowing
+    ratio, exact, clamp = curve.ratio, curve.exact, joint.clamp
     # a tuple's own constructor takes half the time
     new: _New = tuple.__new__  # pyright: ignore[reportUnknownVariableType]
 
@@ -104,7 +108,7 @@ def quick_solver(
         u = sqrt(far2 - distance2) * per_cell
         i = floor(u)
         u -= i
-        pip, d_pip, turn, d_turn, side, d_side = rows[i]
+        pip, d_pip, turn, d_turn, side, d_side = row_at(table, 48 * i)
         pip += u * d_pip
         turn += u * d_turn
         side += u * d_side
@@ -118,15 +122,15 @@ def quick_solver(
             if v_z <= 0.0:
                 return None
         v_z = sqrt(v_z)
-        v_y = y * per_cos - sin_roll * side
+        u_y = y * per_cos - sin_roll * side
         if z > 0.0:
             a = sign * (atan2(x, z) - atan2(v_x, v_z)) - offset
-            f = turn - atan2(v_z, v_y)
+            f = turn - atan2(v_z, u_y)
         else:
             a = sign * (atan2(-x, -z) - atan2(-v_x, v_z)) - offset
-            f = turn - atan2(-v_z, v_y)
+            f = turn - atan2(-v_z, u_y)
         if not (a_low <= a <= a_high and f_low <= f <= f_high):
-            left, _ = narrowing(f)
+            left = spread_left(f / f_high, share) if 0.0 < f <= f_high else 1.0
             if not (left * low <= a <= left * high and f_low <= f <= f_high):
                 legal_a, legal_f = clamp((a, f))
                 if abs(legal_a - a) > SLACK_RAD or abs(legal_f - f) > SLACK_RAD:
