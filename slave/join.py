@@ -1,4 +1,4 @@
-"""Join recordings of single cameras, made side by side, into one recording of the rig.
+"""Join recordings of single cameras, and of the IMU, made side by side, into one recording of the rig.
 
 Every camera is recorded by a process of its own, into a folder of its own. Their times can be compared as they are
 when they are on one clock: one start of one machine. Between machines only the wall clocks say how the clocks lie
@@ -14,9 +14,11 @@ import msgspec
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, RecordedClock, open_recording
 from common.frame_writing import RecordingWriter, refuse_occupied
+from common.imu_recording import IMU, read_imu, write_imu
+from common.messages import ImuSample
 from slave.progress import megabytes
 
-NOT_FRAMES = ("imu.csv", "truth.npz")
+TRUTH = "truth.npz"
 
 
 def join_recordings(
@@ -46,6 +48,7 @@ def join_recordings(
     owners = _owners(parts)
     shifts_ns = [_shift_ns(first, part, by_wall_clock) for part in parts]
     _check_overlap(parts, shifts_ns)
+    samples = _imu(parts, shifts_ns)
     manifest = msgspec.structs.replace(
         first.manifest,
         cameras={name: owners.get(name, first).manifest.cameras[name] for name in first.manifest.cameras},
@@ -64,7 +67,24 @@ def join_recordings(
     )
     _check_room(output, [path for _, _, path in frames])
     _write(RecordingWriter(output, manifest), frames, progress)
+    if samples:
+        write_imu(output, samples)
     return {name: len(part.frames_of(name)) for name, part in owners.items()}
+
+
+def _imu(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> tuple[ImuSample, ...]:
+    """The samples of the one part that has an IMU, on the clock of the first; none where no part has."""
+    both = zip(parts, shifts_ns, strict=True)
+    having = [(part.folder, shift_ns) for part, shift_ns in both if (part.folder / IMU).exists()]
+    if len(having) > 1:
+        raise RecordingError(
+            f"{having[1][0] / IMU}: {having[0][0]} has an IMU as well; move one of the files away"
+        )
+    return tuple(
+        msgspec.structs.replace(sample, t_ns=sample.t_ns + shift_ns)
+        for folder, shift_ns in having
+        for sample in read_imu(folder, "imu")
+    )
 
 
 def _write(
@@ -85,9 +105,8 @@ def _write(
 
 
 def _check_alike(first: FrameRecording, other: FrameRecording) -> None:
-    for name in NOT_FRAMES:
-        if (other.folder / name).exists():
-            raise RecordingError(f"{other.folder / name}: join takes frames only; move this file away")
+    if (other.folder / TRUTH).exists():
+        raise RecordingError(f"{other.folder / TRUTH}: a truth cannot be joined; move this file away")
     if not other.rows:
         raise RecordingError(f"{other.folder}/frames.csv: no frame in it")
     ours, theirs = (msgspec.to_builtins(part.manifest) for part in (first, other))

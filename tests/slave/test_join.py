@@ -12,6 +12,8 @@ from common.calibration import RigCalibration
 from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest, RecordedClock, open_recording
 from common.frame_writing import RecordingWriter, encode_png
+from common.imu_recording import read_imu, write_imu
+from common.messages import ImuSample
 from slave.__main__ import main
 from slave.join import join_recordings
 from slave.offline import detect_recording
@@ -74,6 +76,20 @@ def test_frames_of_all_cameras_in_the_order_of_time(tmp_path: Path) -> None:
     for offset, name in enumerate(("left", "right")):
         found = detect_recording(tmp_path / "wave", name)
         np.testing.assert_allclose(found.uv[1], CENTRES + np.array([304.0 + offset, 200.0]), atol=0.3)
+
+
+def test_the_imu_of_one_part_comes_along_on_the_clock_of_the_first(tmp_path: Path) -> None:
+    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050 - 7_000_000_250, clock=THERE)]
+    nothing = np.full(3, np.nan)
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    write_imu(
+        parts[1],
+        [ImuSample("x", 0, k, 50 * k - 7_000_000_250, nothing, nothing, nothing, turn) for k in range(9)],
+    )
+    join_recordings(parts, tmp_path / "wave", by_wall_clock=True)
+    assert [one.t_ns for one in read_imu(tmp_path / "wave", "x")] == [50 * k for k in range(9)]
+    join_recordings(parts[:1], tmp_path / "alone")
+    assert not (tmp_path / "alone" / "imu.csv").exists()
 
 
 def test_joined_recordings_can_be_joined_again(tmp_path: Path) -> None:
@@ -147,8 +163,15 @@ def no_frame(folder: Path) -> list[Path]:
 
 
 def with_more_than_frames(folder: Path) -> list[Path]:
-    (part(folder, "left") / "imu.csv").write_text("t_ns\n")
+    (part(folder, "left") / "truth.npz").write_bytes(b"")
     return [folder / "left", part(folder, "right")]
+
+
+def with_two_imus(folder: Path) -> list[Path]:
+    parts = [part(folder, "left"), part(folder, "right")]
+    for one in parts:
+        write_imu(one, [])
+    return parts
 
 
 def a_file_gone(folder: Path) -> list[Path]:
@@ -173,7 +196,8 @@ def not_there(folder: Path) -> list[Path]:
         (other_cameras, r"right/recording\.json: cameras: 'attic' is in only one"),
         (no_clock, r"right/recording\.json: clock: missing"),
         (no_frame, r"right/frames\.csv: no frame in it"),
-        (with_more_than_frames, r"left/imu\.csv: join takes frames only"),
+        (with_more_than_frames, r"left/truth\.npz: a truth cannot be joined"),
+        (with_two_imus, r"right/imu\.csv: .*left has an IMU as well"),
         (a_file_gone, r"right/000001\.png: cannot read: No such file"),
         (not_there, r"right/recording\.json: cannot read"),
     ],
