@@ -135,13 +135,13 @@ def _with_fixed_palm(model: HandModel, fingers: Fingers) -> Way:
 
 
 def timed(model: HandModel, way: Way, truth: Draw, points_m: Float) -> tuple[Score, float, float]:
-    """Errors of a way, its median time per hand, and half the distance of the quartiles [us]."""
+    """Errors of a way, its median processor time per hand, and half the distance of the quartiles [us]."""
     found: list[Hand] = []
     times: list[float] = []
     for points in points_m:
-        start = time.perf_counter()
+        start = time.thread_time()
         found.append(way(points))
-        times.append(1e6 * (time.perf_counter() - start))
+        times.append(1e6 * (time.thread_time() - start))
     low, middle, high = np.percentile(times, (25, 50, 75)).tolist()
     palms, angles = (np.array(part) for part in zip(*found, strict=True))
     return score(model, truth, palms, angles, points_m), middle, (high - low) / 2

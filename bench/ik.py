@@ -112,16 +112,16 @@ def _unseeded(fingers: Sequence[FingerSolver]) -> Fingers:
 
 
 def timed(model: HandModel, way: Fingers, truth: Draw) -> tuple[Score, float, float]:
-    """Errors of a way, its median time per hand, and half the distance of the quartiles over ten parts [us]."""
+    """Errors of a way, its median processor time per hand, and half the distance of the quartiles of ten parts [us]."""
     targets = [tips_in_palm(T, caps) for T, caps in zip(truth.T_rig_palm, truth.caps_m, strict=True)]
     found: list[Angles] = []
     times: list[float] = []
     size = max(1, len(targets) // _PARTS)
     for k in range(0, len(targets), size):
         part = targets[k : k + size]
-        start = time.perf_counter()
+        start = time.thread_time()
         found += [way(tips) for tips in part]
-        times.append(1e6 * (time.perf_counter() - start) / len(part))
+        times.append(1e6 * (time.thread_time() - start) / len(part))
     low, middle, high = np.percentile(times, (25, 50, 75)).tolist()
     return score(model, truth, truth.T_rig_palm, np.array(found), truth.caps_m), middle, (high - low) / 2
 
