@@ -281,6 +281,7 @@ class HandProfile(_File, frozen=True):
     radius_m: dict[str, Positive] | None = None
     limits_rad: Limits | Preset | None = None
     couplings: Couplings | Preset | None = None
+    provenance: dict[str, Provenance] = {}
 
 
 def load(path: Path, kind: type[StructT]) -> StructT:
