@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, PhalanxError
 from slave.arguments import CAMERAS, parser
@@ -96,14 +96,10 @@ def _source(
 
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
     if kind == "synthetic" and not folder:
-        from common.sim.scenes import view_by_name
         from slave.cameras.synthetic import SyntheticCamera
+        from slave.simulated import scene_of
 
-        hand = load(options.calibration / "hands" / f"{rig.hand}.json", HandProfile)
-        cameras = {
-            n: load(options.calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras
-        }
-        scene = view_by_name(options.scene, rig, cameras, hand, options.seed)
+        scene = scene_of(options.calibration, rig, options.scene, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
         return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock)
@@ -115,6 +111,7 @@ def _record(options: argparse.Namespace) -> int:
     from common.frame_writing import refuse_occupied
     from slave.progress import Length, ProgressDisplay
     from slave.recorder import Recorder, clock_of, feed
+    from slave.simulated import add_imu, imu_of
 
     rig, camera = _calibration(options)
     files = {n: options.calibration / "cameras" / f"{n}.json" for n in rig.cameras}
@@ -131,6 +128,10 @@ def _record(options: argparse.Namespace) -> int:
         clock=clock_of(clock, skewed),
     )
     refuse_occupied(options.output)  # before a camera is opened
+    if options.scene_epoch_ns is None:
+        options.scene_epoch_ns = true_clock.now_ns()
+    scene = (options.calibration, rig, options.scene, options.seed)
+    imu = imu_of(str(options.camera), *scene) if options.imu else None
     display = ProgressDisplay(options.name, sys.stderr)
     source = _source(options, rig, camera, clock, true_clock)
     try:
@@ -152,6 +153,8 @@ def _record(options: argparse.Namespace) -> int:
             display.end(done)
     finally:
         source.close()
+    if imu is not None and done.frames:
+        add_imu(options.output, imu, options.scene_epoch_ns, clock)
     os.sync()  # what was said to be recorded is there, also when the power goes now
     if recorder.failure is not None:
         raise recorder.failure

@@ -116,6 +116,9 @@ def _record(record: argparse.ArgumentParser) -> None:
     )
     record.add_argument("--seconds", type=_positive, metavar="S", help="default: until Ctrl-C")
     record.add_argument("--frames", type=_count, metavar="N", help="end after so many recorded frames")
+    record.add_argument(
+        "--imu", action="store_true", help="with a synthetic camera: what the rig's IMU says, too, as imu.csv"
+    )
     record.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
     record.add_argument(
         "--reserve-mb", type=_megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"

@@ -16,10 +16,12 @@ from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix, unskew
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
+from common.sim.scene import Scene
 
 _NEW_SHARE = 0.25  # of the standard deviation, new in every sample
 _HALF_STEP_S = 1e-3  # for rates and accelerations
 _GRAVITY_M_S2 = 9.81
+_MORE_S = 0.1
 _NOTHING = np.full(3, np.nan)
 
 
@@ -52,10 +54,21 @@ class SimulatedImu:
     def _up(self) -> Float:
         return self._rig_world[:, 2]
 
-    def over(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
-        """All samples of a span of scene time [s]; `t_ns` counts from scene time 0 at `zero_ns`."""
+    @classmethod
+    def of(cls, scene: Scene) -> "SimulatedImu":
+        """The IMU of a scene's rig.
+
+        Raises:
+            CalibrationError: The rig has none, or it is not known how that is mounted.
+        """
+        if scene.rig.imu is None:
+            raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to simulate")
+        return cls(scene.motion, scene.rig.imu, scene.seed)
+
+    def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
+        """All samples of a span of scene time [s] and a little more; `t_ns` counts from scene time 0 at `zero_ns`."""
         rate = self._imu.rate_hz
-        for seq in range(max(ceil(start_s * rate), 0), floor(stop_s * rate) + 1):
+        for seq in range(max(ceil((start_s - _MORE_S) * rate), 0), floor((stop_s + _MORE_S) * rate) + 1):
             t_s = seq / rate
             yield self.sample(seq, t_s, zero_ns + round(t_s * 1e9))
 

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.errors import CalibrationError, RecordingError
+from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest
 from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
@@ -25,7 +25,6 @@ from common.sim.scene import Scene, SceneTruth
 TRUTH = "truth.npz"
 TRUTH_META = "truth_meta.json"
 FIRST_NS = 10**9  # scene time 0 in frames.csv
-_AROUND_S = 0.1
 ANGLE_NAMES = (
     *("thumb_cmc_flex", "thumb_cmc_abd", "thumb_cmc_twist", "thumb_mcp", "thumb_ip"),
     *(f"{f}_{a}" for f in FINGERS[1:] for a in ("mcp_flex", "mcp_abd", "pip", "dip")),
@@ -74,7 +73,7 @@ def record_scene(
         raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
     period = 1.0 / rates.pop()
     count = max(round(seconds / period), 1)
-    sensor = _imu_of(scene) if imu else None
+    sensor = SimulatedImu.of(scene) if imu else None
     renderers = [Renderer(scene, name) for name in names]
     offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
     lead = scene.cameras[names[0]]
@@ -97,19 +96,12 @@ def record_scene(
     finally:
         writer.close()
     if sensor is not None:
-        span = rows[0].t_row0[0] - _AROUND_S, max(rows[-1].t_row0) + _AROUND_S
-        write_imu(folder, sensor.over(*span, FIRST_NS))
+        write_imu(folder, sensor.around(rows[0].t_row0[0], max(rows[-1].t_row0), FIRST_NS))
     try:
         _write_truth(folder, scene, rows)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
     return count
-
-
-def _imu_of(scene: Scene) -> SimulatedImu:
-    if scene.rig.imu is None:
-        raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to simulate")
-    return SimulatedImu(scene.motion, scene.rig.imu, scene.seed)
 
 
 def _manifest(scene: Scene, first: list[MarkerView], continuous: bool) -> Manifest:

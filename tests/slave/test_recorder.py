@@ -13,15 +13,17 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from shutil import copytree
 
 import msgspec
 import numpy as np
 import pytest
 
-from common.calibration import RigCalibration, save
+from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.clock import SystemClock
 from common.errors import CameraError, RecordingError
 from common.frame_recording import Illumination, Manifest, open_recording
+from common.imu_recording import read_imu
 from slave.__main__ import main
 from slave.cameras.replay import ReplayCamera
 from slave.cameras.source import Frame
@@ -371,6 +373,40 @@ def test_the_command_records_the_simulated_camera(tmp_path: Path) -> None:
     assert check_whole(out) == 3
     assert set(open_recording(out).manifest.cameras) == {"left", "right"}
     assert np.isfinite(detect_recording(out, "left").uv[..., 0]).any(axis=1).all()
+
+
+def test_the_command_records_the_simulated_imu_on_the_clock_of_the_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = tmp_path / "calib_json"
+    copytree(ROOT / "calib_json", files)
+    arguments = [
+        "record",
+        "--name",
+        "left",
+        "--calibration",
+        str(files),
+        "--reserve-mb",
+        "0",
+        "--frames",
+        "6",
+    ]
+    arguments += ["--imu", "--clock-offset-ms", "7000", "--camera"]
+    assert main([*arguments, "synthetic", "-o", str(tmp_path / "none")]) == 1
+    assert "rig 'desk': imu: missing" in capsys.readouterr().err
+    imu = ImuCalibration(name="palm", q_palm_imu=(1.0, 0.0, 0.0, 0.0), q_rig_world=(0.6, 0.8, 0.0, 0.0))
+    rig = load(files / "rigs" / "desk.json", RigCalibration)
+    save(files / "rigs" / "desk.json", msgspec.structs.replace(rig, imu=imu))
+    out = tmp_path / "wave"
+    assert main([*arguments, "synthetic", "-o", str(out)]) == 0
+    frames, samples = open_recording(out).rows, read_imu(out, "palm")
+    assert samples[0].t_ns <= frames[0].t_ns
+    assert samples[-1].t_ns >= frames[-1].t_ns
+    assert np.diff([one.t_ns for one in samples]) == pytest.approx(1e9 / imu.rate_hz, abs=2)
+    assert main([*arguments, "replay:nowhere", "-o", str(tmp_path / "no")]) == 1
+    assert "--imu: only a hand before a synthetic camera" in capsys.readouterr().err
+    assert main([*arguments, "synthetic", "--scene", "board", "-o", str(tmp_path / "no")]) == 1
+    assert not (tmp_path / "no").exists()
 
 
 def test_the_command_refuses_what_it_should_not_touch(

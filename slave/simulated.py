@@ -1,0 +1,52 @@
+"""What a simulated sensor beside this slave senses: the scene before its camera, and the IMU on the hand in it."""
+
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.clock import SkewedClock
+from common.errors import CameraError
+from common.frame_recording import open_recording
+from common.imu_recording import write_imu
+from common.sim.board import BoardScene
+from common.sim.imu import SimulatedImu
+from common.sim.scene import Scene
+from common.sim.scenes import view_by_name
+
+
+def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene:
+    """The scene `name` before the cameras of a rig, from the files of a calib_json tree.
+
+    Raises:
+        PhalanxError: As `view_by_name`; a file is missing or broken.
+    """
+    hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
+    cameras = {n: load(calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras}
+    return view_by_name(name, rig, cameras, hand, seed)
+
+
+def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed: int) -> SimulatedImu:
+    """The IMU on the hand that a camera, given by its driver, sees in the scene `name`.
+
+    Raises:
+        CameraError: The camera is not synthetic, or there is no hand before it.
+        PhalanxError: As `scene_of`, and `SimulatedImu.of`.
+    """
+    scene = scene_of(calibration, rig, name, seed) if camera == "synthetic" else None
+    if not isinstance(scene, Scene):
+        raise CameraError(
+            f"--imu: only a hand before a synthetic camera has one, not {camera} with scene {name}"
+        )
+    return SimulatedImu.of(scene)
+
+
+def add_imu(folder: Path, imu: SimulatedImu, epoch_ns: int, clock: SkewedClock) -> None:
+    """Write into a recording what the IMU said meanwhile, on the clock of the frames; scene time 0 is at `epoch_ns`.
+
+    Raises:
+        RecordingError: The recording is broken, or the file cannot be written.
+    """
+    taken_s = [(clock.to_true(row.t_ns) - epoch_ns) * 1e-9 for row in open_recording(folder).rows]
+    samples = imu.around(min(taken_s), max(taken_s), epoch_ns)
+    write_imu(folder, (replace(one, t_ns=clock.from_true(one.t_ns)) for one in samples))
