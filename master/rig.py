@@ -11,6 +11,7 @@ from common.errors import CalibrationError
 from common.geometry import cross
 from common.hand_model import HandModel
 from master.filters import OneEuroParameters, PointFilter
+from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
@@ -115,6 +116,12 @@ def point_filter(setup: RigSetup) -> PointFilter:
     )
 
 
+def hand_filter(setup: RigSetup) -> HandFilter:
+    """The filter of the solved hand, which leaves no more jitter than that of the points may."""
+    settings = setup.rig.filter
+    return HandFilter(setup.hand, setup.hand_markers, settings.jitter_m, settings.d_cutoff_hz)
+
+
 def build_pipeline(
     setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
 ) -> MarkerPipeline:
@@ -141,6 +148,7 @@ def build_pipeline(
         tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous)
         if tracker is None
         else tracker,
+        steady=hand_filter(setup) if continuous else None,
         stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
         imu=setup.rig.imu,

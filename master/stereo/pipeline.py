@@ -19,6 +19,7 @@ from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
 from master.filters import PointFilter
 from master.ik.hand import HandSolution
+from master.ik.hand_filter import HandFilter
 from master.ik.orientation import OrientationTrack
 from master.ik.tracker import HandTracker, pose_of
 from master.stereo.blob_bias import LensShift
@@ -46,7 +47,7 @@ class SolvedPose:
 
 
 class MarkerPipeline:
-    """Push machine. Holds pairing, filter and tracker, each with its own state."""
+    """Push machine. Holds pairing, filters and tracker, each with its own state."""
 
     def __init__(
         self,
@@ -59,6 +60,7 @@ class MarkerPipeline:
         residual: CalibrationResidual = EXACT,
         smooth: PointFilter | None = None,
         tracker: HandTracker,
+        steady: HandFilter | None = None,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
@@ -75,6 +77,7 @@ class MarkerPipeline:
             residual: What the calibration is known to leave.
             smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
             tracker: Solves the hand from its own markers, some or all of these.
+            steady: Filters the solved hand; None: as `smooth`.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
             imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
@@ -83,7 +86,7 @@ class MarkerPipeline:
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter()
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
-        self._pairing, self._smooth, self._tracker = pairing, smooth, tracker
+        self._pairing, self._smooth, self._tracker, self._steady = pairing, smooth, tracker, steady
         self._lens_shift = LensShift(self._cameras)
         self._place = Placement(self._cameras, law, residual)
         self._choose = RivalChooser(self._cameras, self._place)
@@ -145,6 +148,10 @@ class MarkerPipeline:
             hand = self._tracker.push(
                 instant.t_ns, *aims, self._towards(raw, instant), measured, orientation=turned
             )
+        with self._stage("filter"):
+            if self._steady is not None:
+                hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand])
+        with self._stage("hand"):
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
