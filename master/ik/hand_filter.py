@@ -1,0 +1,196 @@
+"""Smooths the solved hand as it arrives, and leads it over where it would leap.
+
+**Noise.** Place and turn of the palm and the angles go through a low pass that measures their noise and follows their
+motion (`master.ik.part_filter`), the palm and each finger as a part. All 26 signals are in metres, so that the jitter
+which the rig's file allows its points holds here too: an angle counts by how far it moves the end of its finger, the
+turn by how far it moves the ends of the fingers. The palm's place is that of its middle knuckle, about which its turn
+is unsure: at the wrist the noise of the turn would shake the place as well. A turn is filtered as the sum of the
+filter's own steps and the rotation vector from there to what was solved, so it is never near half a turn.
+
+The joints come from forward kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the
+PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
+limits; what has to be cut is an abduction that the filtered flexion does not allow.
+
+**Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held. The difference between what was
+shown last and what is solved now is added to the solution and fades within a tenth of a second, as networked games
+lead a player over to where the server says it is: the motion goes on, the error goes. While it fades, the covariance
+of a joint contains the square of what the difference moves the joint by.
+
+Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
+"""
+
+from dataclasses import dataclass, replace
+from math import atan2
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, unskew
+from common.hand_model import CHAINS, MIDDLE_PROXIMAL, PALM, TIPS, HandJoints, HandModel
+from master.ik.hand import HandSolution
+from master.ik.part_filter import PartFilter
+from master.ik.tracker import TrackedHand
+
+LEAD_OVER_S = 0.1
+_FORGET_S = 0.5  # after this long without a hand the next one begins anew
+_PLACE, _TURN, _ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
+_PARTS = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
+_SEEN_BY = np.append(TIPS, PALM)  # part -> joint that is tracked when it is
+
+
+@dataclass(slots=True, eq=False)
+class _Shown:
+    """What was shown last, and what is left of leaps; renewed when a hand begins anew.
+
+    Attributes:
+        smooth: The filter of the 26 signals: place (3), turn (3), angles (5, 4), all [m].
+        t_ns: When.
+        seen: (6,) which fingers, and the palm, had a marker.
+        values: (26,) [m] the filtered signals.
+        rotation: (3, 3) palm to rig, as filtered.
+        offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
+        since_ns: (6,) when that was.
+        until_ns: When nothing is left of any.
+    """
+
+    smooth: PartFilter
+    t_ns: int
+    seen: Bool
+    values: Float
+    rotation: Float
+    offset: Float
+    since_ns: Int
+    until_ns: int
+
+    def leap(self, t_ns: int, parts: Bool, solved: Float) -> None:
+        """Parts (6,) are seen again, at signals (26,)."""
+        self.offset = np.where(parts[_PARTS], self.values - solved, self.offset)
+        self.since_ns = np.where(parts, t_ns, self.since_ns)
+        self.until_ns = t_ns + round(LEAD_OVER_S * 1e9)
+
+    def left(self, t_ns: int) -> Float | None:
+        """What is left of the leaps (26,) [m]; None: nothing."""
+        if t_ns >= self.until_ns:
+            return None
+        x = np.minimum((t_ns - self.since_ns) * (1e-9 / LEAD_OVER_S), 1.0)
+        return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[_PARTS]  # smooth at both ends
+
+
+class HandFilter:
+    """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
+
+    def __init__(
+        self, model: HandModel, markers: tuple[str, ...], jitter_m: float, d_cutoff_hz: float
+    ) -> None:
+        """Set up.
+
+        Args:
+            model: The hand.
+            markers: Names of its markers in the order of the covariances.
+            jitter_m: Standard deviation that may be left of a signal's noise at rest [m].
+            d_cutoff_hz: Cut-off of the speeds by which motion is told.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self._model, self._jitter_m, self._d_cutoff_hz = model, jitter_m, d_cutoff_hz
+        rest = model.rest_position_m
+        self._knuckle = rest[MIDDLE_PROXIMAL]
+        fingers = [model.mount(name).finger for name in markers]
+        self._marker_of = np.array([fingers.index(f) if f in fingers else -1 for f in range(5)])
+        self._dip_per_pip = model.dip_per_pip or 0.0
+        # The DIP bends with the PIP, so it counts as far.
+        self._reach_m = np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2)
+        self._across_m = float(np.linalg.norm(rest[TIPS[1:]] - self._knuckle, axis=1).mean())
+        self._shown: _Shown | None = None
+
+    def push(self, t_ns: int, hand: TrackedHand, cov_m2: Float) -> TrackedHand:
+        """The hand as it is to be shown: palm, angles, joints and their covariance; the rest of it stays.
+
+        Args:
+            t_ns: The instant; a hand that is not after the last one is passed on as it is.
+            hand: As solved. One that is not valid is passed on, and what follows begins anew.
+            cov_m2: (M, 3, 3) [m^2] noise of the markers; NaN: not measured. What rests on none is filtered by
+                the noise it shows.
+        """
+        solution, shown = hand.solution, self._shown
+        if solution is None or not hand.valid.any():
+            self._shown = None
+            return hand
+        seen = hand.tracked[_SEEN_BY]
+        gap_s = 0.0 if shown is None else (t_ns - shown.t_ns) * 1e-9
+        if shown is None or gap_s > _FORGET_S:
+            shown = self._shown = self._begin(t_ns, solution, seen)
+        elif gap_s <= 0.0:
+            return hand
+        else:
+            again = seen if gap_s > LEAD_OVER_S else seen & ~shown.seen  # without frames, nothing was seen
+            if again.any():
+                shown.leap(t_ns, again, self._signals(solution, shown))
+        left = shown.left(t_ns)
+        signals = self._signals(solution, shown)
+        if left is not None:
+            signals += left
+        signals = shown.smooth.push(gap_s, signals, self._noise(cov_m2, seen))
+        rotation = (
+            rotation_vector_to_matrix((signals - shown.values)[_TURN] / self._across_m) @ shown.rotation
+        )
+        joints, angles = self._posed(signals, rotation)
+        cov = solution.cov_m2
+        if left is not None:
+            back = rotation_vector_to_matrix(-left[_TURN] / self._across_m) @ rotation
+            off = joints.position_m - self._posed(signals - left, back)[0].position_m
+            cov = cov + off[:, :, None] * off[:, None, :]
+        shown.t_ns, shown.seen, shown.values, shown.rotation = t_ns, seen, signals, rotation
+        T = joints.T_rig_palm
+        return replace(
+            hand, solution=replace(solution, T_rig_palm=T, angles_rad=angles, joints=joints, cov_m2=cov)
+        )
+
+    def _begin(self, t_ns: int, solution: HandSolution, seen: Bool) -> _Shown:
+        smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m, self._d_cutoff_hz)
+        rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
+        return _Shown(smooth, t_ns, seen, np.zeros(26), rotation, np.zeros(26), never, t_ns)
+
+    def _signals(self, solution: HandSolution, shown: _Shown) -> Float:
+        """What is filtered (26,) [m]."""
+        rotation, angles = solution.T_rig_palm[:3, :3], solution.angles_rad.copy()
+        angles[1:, 3] -= self._dip_per_pip * angles[1:, 2]
+        signals = np.empty(26)
+        signals[_PLACE] = rotation @ self._knuckle + solution.T_rig_palm[:3, 3]
+        signals[_TURN] = shown.values[_TURN] + self._across_m * _turn(rotation @ shown.rotation.T)
+        signals[_ANGLES] = (angles * self._reach_m).ravel()
+        return signals
+
+    def _posed(self, signals: Float, rotation: Float) -> tuple[HandJoints, Float]:
+        """Joints and angles (5, 4) [rad] of filtered signals (26,) [m]."""
+        angles = signals[_ANGLES].reshape(5, 4) / self._reach_m
+        angles[1:, 3] += self._dip_per_pip * angles[1:, 2]
+        angles = self._model.clamp(angles)
+        wrist = signals[_PLACE] - rotation @ self._knuckle
+        return self._model.joints(rigid(rotation, wrist), self._model.chains(angles)), angles
+
+    def _noise(self, cov_m2: Float, seen: Bool) -> Float:
+        """Variances (26,) [m^2] of the markers each part rests on, a finger on its own and the palm's; NaN: none."""
+        noise = np.full(26, np.nan)
+        axes = cov_m2.reshape(-1, 9)[:, ::4]
+        measured = axes[axes[:, 0] > 0.0]  # NaN is not
+        if not len(measured):
+            return noise
+        place = measured.sum(axis=0) / len(measured)
+        turn = place.sum() / 3.0
+        if seen[5]:
+            noise[_PLACE], noise[_TURN] = place, turn
+        finger = axes[self._marker_of].sum(axis=1) / 3.0 + turn
+        finger[~seen[:5] | (self._marker_of < 0)] = np.nan
+        noise[_ANGLES] = finger.repeat(4)
+        return noise
+
+
+def _turn(rotation: Float) -> Float:
+    """Rotation vector (3,) of a rotation (3, 3), as `matrix_to_rotation_vector` in a third of the time."""
+    vector = unskew(rotation)
+    sine = float(vector @ vector) ** 0.5
+    if sine < 1e-6:  # none, or half a turn
+        return matrix_to_rotation_vector(rotation)
+    return vector * (atan2(sine, 0.5 * (float(rotation.trace()) - 1.0)) / sine)
