@@ -163,7 +163,7 @@ def _table(curve: ReachCurve, branch: Branch, roll: float, tip: float) -> tuple[
         point [m]; the squared share of v_z in |w| below which it may be larger.
     """
     rows = np.array(branch.rows)
-    pip = np.append(rows[:, 0], rows[-1, 0] + rows[-1, 1])
+    pip = np.clip(np.append(rows[:, 0], rows[-1, 0] + rows[-1, 1]), *curve.pip)
     _, y0, z0 = curve.point(pip[:1])[0]
     first = _near(atan2(z0, y0) + tip, 0.0)
 
