@@ -65,7 +65,7 @@ class Mixture:
 
 
 def _evidence(problem: HandProblem, minima: list[Minimum]) -> Float:
-    """Probability (H,) of each hypothesis, all alike before the markers are seen."""
+    """Probability (H,) of each hypothesis."""
     if len(minima) == 1:
         return np.ones(1)
     cost = np.array([found.linear.cost for found in minima])

@@ -37,6 +37,9 @@ class FreeHand:
 class Priors:
     """Standard deviations of the priors [rad], and where an unseen finger is believed to be; `free` None: all natural.
 
+    `natural_share` is the probability of a natural hand before a marker is seen: a small one, since habits that fit
+    win by their narrowness anyhow.
+
     Round values for hands at work, wide enough that markers overrule them. A handful of alternatives was
     compared on simulated and recorded hands; nothing was fitted. A finger whose tip shows from behind is
     rather straight than bent, and a marker on the back that is seen well faces the cameras.
@@ -47,7 +50,7 @@ class Priors:
     neighbour_flexion: float = np.radians(30.0)
     neighbour_pip: float = np.radians(35.0)
     pip: float = np.radians(45.0)
-    pip_mean: float = np.radians(18.0)
+    pip_mean: float = np.radians(12.0)
     free_dip: float = np.radians(15.0)
     thumb: float = np.radians(20.0)
     thumb_mean: tuple[float, float, float, float] = (
@@ -70,6 +73,7 @@ class Priors:
     palm_walk_rad_s: float = 3.0
     palm_walk_m_s: float = 2.0
     free: FreeHand | None = FreeHand()
+    natural_share: float = 1 / 3
 
     def palm_weight(self, dt_s: float) -> Float:
         """(6,) inverse standard deviations of the palm's turn [rad] and shift [m] in a time."""
@@ -121,7 +125,8 @@ class AnglePrior:
         span = np.maximum(parameters.high - parameters.low, _NARROWEST_RAD)[flexion]
         # The highest density of a normal distribution of this width is that of any angle within the span.
         volume[1:, flexion, flexion] += 2.0 * np.pi / span**2
-        return replace(habits, log_density=habits.least() + 0.5 * np.linalg.slogdet(volume)[1])
+        share = np.log([priors.natural_share, 1.0 - priors.natural_share][: len(tables)])
+        return replace(habits, log_density=share + habits.least() + 0.5 * np.linalg.slogdet(volume)[1])
 
     def and_single(self, weight: Float, mean: Float) -> "AnglePrior":
         """With a belief about single angles added: inverse standard deviations and means (n,)."""

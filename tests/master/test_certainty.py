@@ -43,7 +43,7 @@ def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
     hand = first
     for _ in range(20):
         hand = solved(NATURAL, hand, dt_s)
-    np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.05)
+    np.testing.assert_allclose(tilt_deg(hand), tilt_deg(first), rtol=0.15)
 
 
 def test_a_hand_against_habits_is_less_sure_than_a_relaxed_one() -> None:
