@@ -33,6 +33,16 @@ def _finger(side: str, preset: Preset, finger: int) -> tuple[Fabrik, FingerSolve
     return Fabrik.of(solver.chain), solver
 
 
+@cache
+def _narrowing(finger: int, left: float, coupled: bool) -> Fabrik:
+    """A finger of preset D, that keeps a share of its abduction in a fist."""
+    limits = preset_limits("D")
+    of = msgspec.structs.replace(getattr(limits, FINGERS[finger]), spread_at_full_flexion=left)
+    limits = msgspec.structs.replace(limits, **{FINGERS[finger]: of})
+    model = HandModel.of(msgspec.structs.replace(generated_profile("made", "left"), limits_rad=limits))
+    return Fabrik.of(finger_chain(model, finger, np.zeros(3), coupled=coupled))
+
+
 def _random_target(solver: FingerSolver, rng: np.random.Generator) -> Vector:
     """Where the point is at random legal angles; every tenth lies in a corner of the limits."""
     shares = rng.random(4)
@@ -97,6 +107,33 @@ def test_without_a_seed_restarts_heal_the_deadlock() -> None:
         assert _consistent(fabrik.chain, result, closed_form.root)
     assert missed == 0
     assert plain > 60  # published FABRIK misses most reachable targets from the rest pose
+
+
+@settings(max_examples=60)
+@given(
+    finger=st.integers(0, 4),
+    left=st.sampled_from([0.0, 0.2, 0.625, 1.0]),
+    local=st.tuples(*[st.floats(-0.12, 0.12)] * 3),
+    coupled=st.booleans(),
+    seeded=st.booleans(),
+)
+def test_whatever_flexion_leaves_of_the_abduction_is_kept(
+    finger: int, left: float, local: Vector, coupled: bool, seeded: bool
+) -> None:
+    fabrik = _narrowing(finger, left, coupled)
+    seed = ((0.3, 1.5), (0.5,), (0.4,)) if seeded else None  # itself outside
+    result = fabrik.solve(local, seed)
+    assert not _violated(fabrik.chain, result.angles)
+    assert result.residual_m == pytest.approx(math.dist(result.positions[-1], local), abs=1e-12)
+
+
+def test_the_limit_test_sees_a_planted_violation() -> None:
+    chain = _narrowing(1, 0.2, True).chain
+    low, high = chain.spans[0]
+    assert not _violated(chain, ((high, 0.0), (0.3,), (0.2,)))
+    assert _violated(chain, ((high, 1.0), (0.3,), (0.2,)))
+    assert _violated(chain, ((low, 1.0), (0.3,), (0.2,)))
+    assert _violated(chain, ((0.0, 1.0), (0.3,), (0.4,)))  # the coupling
 
 
 WIDE = Hinge(-2.8, 2.8)
