@@ -1,7 +1,7 @@
 """One finger at a time, the palm known: our solvers and others on the same targets, every one of them reachable.
 
 Targets are the caps of hands whose angles are independent and uniform within the limits, the DIP coupled exactly.
-Those that search begin at their last pose, which is another random one, unless they take no start.
+The papers' way and mink begin at their last pose, which is another random one, scipy amid the limits.
 """
 
 import time
@@ -27,8 +27,9 @@ HANDS = 2000
 _SEED = 2
 _PARTS = 10
 
-CLOSED, SEEDED, UNSEEDED, PAPER = "closed form", "FABRIK, seeded", "FABRIK, no seed, restarts", "papers' way"
-_SLOW = {PAPER: 10, UNSEEDED: 20, "scipy": 40, "mink": 10}  # one hand in so many
+CLOSED, SEEDED, PAPER = "closed form", "FABRIK, seeded", "papers' way"
+FROM_REST, RESTARTED = "FABRIK, from rest", "FABRIK, from rest, restarts"
+_SLOW = {PAPER: 10, FROM_REST: 10, RESTARTED: 20, "scipy": 40, "mink": 10}  # one hand in so many
 _STRICT_MM = {CLOSED: 1e-3, SEEDED: 0.1}  # by how much these two may miss
 
 
@@ -77,7 +78,8 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     out: dict[str, Fingers] = {
         CLOSED: partial(closed_form, fingers),
         SEEDED: _seeded(fingers),
-        UNSEEDED: _unseeded(fingers),
+        RESTARTED: _from_rest(fingers, 3),
+        FROM_REST: _from_rest(fingers, 0),
         PAPER: PaperFingers(fingers).push,
         "scipy": lambda tips: [
             peers_scipy.finger(solver, tip) for solver, tip in zip(fingers, tips, strict=True)
@@ -99,8 +101,8 @@ def _seeded(fingers: Sequence[FingerSolver]) -> Fingers:
     return way
 
 
-def _unseeded(fingers: Sequence[FingerSolver]) -> Fingers:
-    prepared = [Fabrik.of(solver.chain) for solver in fingers]
+def _from_rest(fingers: Sequence[FingerSolver], restarts: int) -> Fingers:
+    prepared = [Fabrik.of(solver.chain, restarts=restarts) for solver in fingers]
 
     def way(tips: Sequence[Vector]) -> Angles:
         found = [
