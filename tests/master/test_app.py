@@ -2,25 +2,30 @@
 
 import threading
 
+import msgspec
 import numpy as np
 import pytest
 
-from common.messages import HandPose, MarkerDetections
+from common.arrays import Float
+from common.calibration import ImuCalibration
+from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from common.hand_model import WRIST
+from common.messages import HandPose, ImuSample, MarkerDetections
 from master.app import RunFigures, health, run
 from master.live import cameras_line
 from master.rig import build_pipeline
 from master.stages import StageTimes
 from tests.hand_helpers import detections
-from tests.synthetic_run import SyntheticRun, synthetic_run
+from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
 
 class ScriptedSource:
     """Gives messages in turn, with pauses (None), then sets `stop`."""
 
-    def __init__(self, messages: list[MarkerDetections | None], stop: threading.Event) -> None:
+    def __init__(self, messages: list[MarkerDetections | ImuSample | None], stop: threading.Event) -> None:
         self._messages, self._stop = iter(messages), stop
 
-    def get(self, timeout_s: float) -> MarkerDetections | None:
+    def get(self, timeout_s: float) -> MarkerDetections | ImuSample | None:
         assert timeout_s > 0
         try:
             return next(self._messages)
@@ -57,7 +62,7 @@ def short_run() -> SyntheticRun:
 def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun) -> None:
     stop, clock, figures = threading.Event(), ScriptedClock(), RunFigures()
     sinks = [Collector(), Collector()]
-    script: list[MarkerDetections | None] = [
+    script: list[MarkerDetections | ImuSample | None] = [
         m for pair in zip(short_run.messages, strict=True) for m in (*pair, None)
     ]
     source = ScriptedSource(script, stop)
@@ -67,6 +72,39 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     assert [p.t_ns for p in sinks[0].poses] == [p.t_ns for p in sinks[1].poses]
     last = sinks[0].poses[-1]
     assert last.latency_ns == 1_000_000  # handed over 2 ms after its capture, published after 3 ms
+
+
+def turned(t_ns: int, turn: Float) -> ImuSample:
+    """A sample of an IMU whose axes are the palm's and whose world is the rig's, `turn` (3, 3) off the truth."""
+    q = matrix_to_quaternion(turn @ hand_at(t_ns * 1e-9).T_rig_palm[:3, :3])
+    return ImuSample("imu", 1, t_ns // 8_000_000, t_ns, np.zeros(3), np.zeros(3), np.full(3, np.nan), q)
+
+
+def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticRun) -> None:
+    same = (1.0, 0.0, 0.0, 0.0)
+    imu = ImuCalibration(
+        q_palm_imu=same, q_rig_world=same, orientation_sigma_rad=1e-3, heading_sigma_rad=1e-3
+    )
+    setup, off = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu)), axis_rotation(0, 0.1)
+    first, last = short_run.messages[0].t_ns, short_run.messages[-1].t_ns
+    samples = [turned(t_ns, off) for t_ns in range(first, last, 8_000_000)]
+    script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
+    stop, sink, figures = threading.Event(), Collector(), RunFigures()
+    pipeline, watched = build_pipeline(setup, StageTimes()), list[MarkerDetections]()
+    run(ScriptedSource([*script], stop), pipeline, [sink], ScriptedClock(), figures, stop, watched.append)
+    assert watched == short_run.messages
+    assert set(figures.rates.camera_hz) == {"left", "right"}
+    assert pipeline.counts["orientation.used"] == len(sink.poses) >= 5
+    for pose in sink.poses:  # so narrow a belief outweighs the markers: where it is wrong, the palm follows
+        truth = off @ hand_at(pose.t_ns * 1e-9).rotation[WRIST]
+        found = quaternion_to_matrix(pose.orientation_wxyz[WRIST])
+        assert np.degrees(np.arccos((np.trace(found @ truth.T) - 1.0) / 2.0)) < 1.5
+
+
+def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
+    stop, pipeline = threading.Event(), build_pipeline(short_run.setup, StageTimes())
+    run(ScriptedSource([turned(0, np.eye(3))], stop), pipeline, [], ScriptedClock(), RunFigures(), stop)
+    assert pipeline.counts == {"orientation.unplaced": 1}
 
 
 def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.calibration import FilterCalibration, RigCalibration, save
+from common.calibration import FilterCalibration, ImuCalibration, RigCalibration, save
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
+from common.geometry import matrix_to_quaternion
 from common.keys import new_key
 from common.messages import Command, HandPose, MarkerDetections
 from common.zenoh_bus import ZenohBus
@@ -84,6 +85,23 @@ def test_poses_follow_the_new_geometry(exact_run: SyntheticRun) -> None:
     assert abs(off[:20]).max() < 5e-3
     assert abs(off[-15:] - ASIDE_M).max() < 5e-3
     assert not ((off > 0.01) & (off < ASIDE_M - 0.01)).any(), "no pose is of both"
+
+
+def test_an_imu_goes_on_in_the_new_pipeline_and_into_the_same_counts(exact_run: SyntheticRun) -> None:
+    same = (1.0, 0.0, 0.0, 0.0)
+    setup = setup_of(
+        msgspec.structs.replace(exact_run.setup.rig, imu=ImuCalibration(q_palm_imu=same, q_rig_world=same))
+    )
+    pipeline = LivePipeline(setup, StageTimes())
+    for number, message in enumerate(exact_run.messages[:60]):
+        if number == 30:
+            pipeline.change(aside_setup := setup_of(aside(setup.rig)))
+            assert aside_setup.imus == ("imu",)
+        palm = hand_at(message.t_ns * 1e-9).T_rig_palm[:3, :3]
+        pipeline.push_orientation(message.t_ns, matrix_to_quaternion(palm))
+        pipeline.push(message)
+    counts = pipeline.counts
+    assert counts["poses"] - 4 <= counts["orientation.used"] <= counts["poses"]
 
 
 def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
@@ -187,6 +205,12 @@ def test_a_broken_file_is_said_once_and_the_old_pipeline_stays(told: Told) -> No
         ("rigs/bench.json", "markers", ["thumb", "index", "back"], "markers: thumb, index, .* cannot become"),
         ("rigs/bench.json", "cameras", ["right", "left"], "cameras: left, right cannot become right, left"),
         ("rigs/bench.json", "cameras", ["left"], "two or more are needed"),
+        (
+            "rigs/bench.json",
+            "imu",
+            {"name": "palm"},
+            "imu.name: none cannot become palm .*: restart the master",
+        ),
         ("rigs/bench.json", "depth_model", "power_law", "the key 'power_law' is missing"),
         (
             "cameras/left.json",
