@@ -245,21 +245,22 @@ class HandModel:
         left = spread_left(np.maximum(flexed, 0.0), self.spread_at_full_flexion)
         return left * self.limits_rad[:, ABDUCTION, 0], left * self.limits_rad[:, ABDUCTION, 1]
 
+    def limits_at(self, flexion_rad: Float) -> tuple[Float, Float]:
+        """Low and high (..., 5, 4) [rad] of every angle at flexions (..., 5) [rad]."""
+        shape = (*np.shape(flexion_rad), 4)
+        low, high = (np.broadcast_to(self.limits_rad[..., k], shape).copy() for k in (0, 1))
+        low[..., ABDUCTION], high[..., ABDUCTION] = self.abduction_limits_rad(flexion_rad)
+        return low, high
+
     def within_limits(self, angles_rad: Float, slack_rad: float = 1e-9) -> Bool:
         """Whether each of the angles (..., 5, 4) is inside its limits; the abduction inside those of its flexion."""
-        low, high = self.limits_rad[..., 0], self.limits_rad[..., 1]
-        inside = (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
-        low, high = self.abduction_limits_rad(angles_rad[..., FLEXION])
-        spread = angles_rad[..., ABDUCTION]
-        inside[..., ABDUCTION] &= (spread >= low - slack_rad) & (spread <= high + slack_rad)
-        return inside
+        low, high = self.limits_at(angles_rad[..., FLEXION])
+        return (angles_rad >= low - slack_rad) & (angles_rad <= high + slack_rad)
 
     def clamp(self, angles_rad: Float) -> Float:
         """Angles (..., 5, 4) cut at their limits, the abduction at those of the flexion that is left."""
-        legal = np.clip(angles_rad, self.limits_rad[..., 0], self.limits_rad[..., 1])
-        low, high = self.abduction_limits_rad(legal[..., FLEXION])
-        legal[..., ABDUCTION] = np.clip(legal[..., ABDUCTION], low, high)
-        return legal
+        flexion = np.clip(angles_rad[..., FLEXION], *self.limits_rad[:, FLEXION].T)
+        return np.clip(angles_rad, *self.limits_at(flexion))
 
 
 def _swing(root: Float, turn: Float, side_sign: float) -> Float:

@@ -29,6 +29,7 @@ from common.arrays import Bool, Float, Image, Int
 from common.calibration import CameraCalibration, RigCalibration, Volume
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
+from common.hand_limits import FLEXION
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
 from common.messages import Health, MarkerDetections, Source
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
@@ -180,7 +181,7 @@ class RerunScene:
 
     def _at_limit(self, angles_rad: Float) -> Bool:
         """Joints (T, 26) one of whose angles has reached its limit; a fixed angle does not count."""
-        low, high = self._hand.limits_rad[..., 0], self._hand.limits_rad[..., 1]
+        low, high = self._hand.limits_at(angles_rad[..., FLEXION])
         reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
         reached &= high - low > 2 * _AT_LIMIT_RAD
         joints = np.zeros((len(angles_rad), 26), np.bool_)

@@ -184,6 +184,18 @@ def test_a_joint_at_its_limit_is_marked_and_one_inside_is_not(tmp_path: Path) ->
     np.testing.assert_allclose(np.array(at[0][0]), pose.position_m[pip], atol=1e-6)
 
 
+def test_a_spread_is_at_its_limit_earlier_in_a_fist(tmp_path: Path) -> None:
+    pose = moving_hand(1)[0]
+    fist = np.zeros((5, 4)) + 0.02
+    fist[1, :2] = np.radians([12.0, 80.0])  # of the 15 that a straight finger may, it has 10.6
+    flat = fist.copy()
+    flat[1, 1] = 0.1
+    poses = Poses.of([replace(pose, angles_rad=angles) for angles in (fist, flat)])
+    write_rrd(tmp_path / "run.rrd", poses, RIG, CAMERAS, MODEL)
+    _, at = column(tmp_path / "run.rrd", "/world/hand/test-hand/at_limit", "positions")
+    assert [len(frame) for frame in at] == [1, 0]
+
+
 def test_an_offline_run_has_no_latency_plot_and_an_empty_run_is_a_valid_file(tmp_path: Path) -> None:
     pose = moving_hand(1)[0]
     offline = replace(pose, latency_ns=0)
