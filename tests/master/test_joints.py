@@ -2,11 +2,16 @@
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from common.hand_model import HandModel
+from common.hand_presets import preset_limits
+from common.hand_profiles import generated_profile
+from master.ik.chain import finger_chain
 from master.ik.joints import Hinge, Joint, Rotor, clamp_direction, swing_and_flex
 from master.ik.vectors import IDENTITY, Matrix, Vector, between, length, product, rotate, rotation_about
 
@@ -19,9 +24,12 @@ TILTED = rotation_about((0.6, 0.8, 0.0), 0.1)
 SHRINKING = Rotor(
     (-20 * DEGREE, 20 * DEGREE), (0.0, 90 * DEGREE), spread_at_full_flexion=0.2, sign=-1.0, rest=TILTED
 )
+NARROW_CONE = Rotor(
+    (-25 * DEGREE, 10 * DEGREE), (-30 * DEGREE, 80 * DEGREE), shape="ellipse", spread_at_full_flexion=0.5
+)
 MIDDLE = Rotor((0.0, 0.0), (0.0, 90 * DEGREE))
 BONE: Vector = (0.002, -0.001, -0.045)
-JOINTS: list[Joint] = [FINGER, OBLIQUE, BOX, CONE, SHRINKING, MIDDLE]
+JOINTS: list[Joint] = [FINGER, OBLIQUE, BOX, CONE, SHRINKING, NARROW_CONE, MIDDLE]
 ZERO = {True: (0.0,), False: (0.0, 0.0)}
 
 component = st.floats(-1.0, 1.0)
@@ -114,6 +122,28 @@ def test_shapes_by_hand() -> None:
     assert SHRINKING.abduction_span(45 * DEGREE)[1] / DEGREE == pytest.approx(20 * 0.8)
     assert BOX.clamp((1.0, 2.0)) == pytest.approx((15 * DEGREE, 90 * DEGREE))
     assert MIDDLE.clamp((0.2, 0.5)) == (0.0, 0.5)
+
+
+@settings(max_examples=30)
+@given(flexion=st.floats(-0.5, 2.0), left=st.floats(0.0, 1.0))
+def test_rotor_and_hand_model_narrow_by_one_law(flexion: float, left: float) -> None:
+    limits = preset_limits("D")
+    limits = msgspec.structs.replace(
+        limits, ring=msgspec.structs.replace(limits.ring, spread_at_full_flexion=left)
+    )
+    model = HandModel.of(msgspec.structs.replace(generated_profile("one", "right"), limits_rad=limits))
+    low, high = model.abduction_limits_rad(np.full(5, flexion))
+    root = finger_chain(model, 3, np.zeros(3)).links[0].joint
+    assert isinstance(root, Rotor)
+    assert root.abduction_span(flexion) == (low[3], high[3])  # to the last bit
+
+
+@given(flexion=st.floats(0.01, 1.5), left=st.floats(0.0, 1.0))
+def test_the_slope_of_the_narrowing(flexion: float, left: float) -> None:
+    rotor = Rotor((-0.3, 0.3), (0.0, 1.6), spread_at_full_flexion=left)
+    step = 1e-6
+    above, below = rotor.narrowing(flexion + step)[0], rotor.narrowing(flexion - step)[0]
+    assert rotor.narrowing(flexion)[1] == pytest.approx((above - below) / (2 * step), abs=1e-8)
 
 
 def test_hinge_goes_round_the_shorter_way() -> None:
