@@ -22,6 +22,7 @@ SECTIONS = {
     "ik": "Inverse kinematics of fingers, palm known; baseline: the papers' FABRIK with limits, scipy, mink",
     "hand_poses": "Hands of independent joints, palm turned by up to 45 degrees; baseline: the papers' fixed palm",
     "hand": "A moving hand with its palm pose; baseline: the papers' fixed palm, scipy, mink",
+    "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",
     "depth": "Depth at rest, by fitted laws, and on recorded sweeps; baseline: the error budget",

@@ -30,6 +30,7 @@ _RIGS = {"one on the back": "desk", "three on the back": "desk-back3"}
 _SEEDS = (31, 32, 33, 34, 35, 36)
 _SECONDS, _APART_S = 5.0, 9.5  # each seed sees other acts of the scene
 _MOUNT_M = 1e-3
+_REGION = 7.815  # chi square, three degrees, 95 %
 _ZERO_NS = 10**9
 # Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
 _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)
@@ -52,11 +53,13 @@ class _Run:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Errors:
-    """Of every pose: turn of the palm [deg], mean joint [mm], mean PIP of the fingers [deg]."""
+    """Of every pose: turn of the palm [deg], mean joint [mm], mean PIP of the fingers [deg], and the share of joints
+    that lie in their 95 % regions."""
 
     palm_deg: Float
     joint_mm: Float
     pip_deg: Float
+    held: Float
 
 
 def rows() -> Iterator[Row]:
@@ -71,6 +74,8 @@ def rows() -> Iterator[Row]:
             pip = np.concatenate([one.pip_deg for one in found])
             yield Row(f"{name}: palm", float(palm.mean()), "deg", f"95 %: {np.quantile(palm, 0.95):.1f}")
             yield Row(f"{name}: joints", float(joint.mean()), "mm", f"95 %: {np.quantile(joint, 0.95):.1f}")
+            held = 100.0 * float(np.concatenate([one.held for one in found]).mean())
+            yield Row(f"{name}: 95 % regions hold", held, "%", "of the joints")
             yield Row(f"{name}: PIP", float(pip.mean()), "deg", "index to little, seen or not")
 
 
@@ -126,6 +131,7 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
     palm: list[float] = []
     joint: list[float] = []
     pip: list[float] = []
+    held: list[float] = []
     for message in heapq.merge(samples, run.messages, key=lambda one: one.t_ns):
         if isinstance(message, ImuSample):
             pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
@@ -137,7 +143,9 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
             found = quaternion_to_matrix(pose.orientation_wxyz[WRIST])
             turn = matrix_to_quaternion(found.T @ truth.joints.rotation[WRIST])
             palm.append(float(np.degrees(2.0 * np.arccos(min(turn[0], 1.0)))))
-            off = np.linalg.norm(pose.position_m - truth.joints.position_m, axis=1)[WRIST:]
-            joint.append(1e3 * float(off.mean()))
+            off = (pose.position_m - truth.joints.position_m)[WRIST:]
+            joint.append(1e3 * float(np.linalg.norm(off, axis=1).mean()))
+            surprise = np.vecdot(off, np.linalg.solve(pose.cov_m2[WRIST:], off[..., None])[..., 0])
+            held.append(float((surprise < _REGION).mean()))
             pip.append(float(np.degrees(np.abs(pose.angles_rad - truth.angles_rad)[1:, 2].mean())))
-    return _Errors(np.array(palm), np.array(joint), np.array(pip))
+    return _Errors(np.array(palm), np.array(joint), np.array(pip), np.array(held))
