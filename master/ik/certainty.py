@@ -24,6 +24,9 @@ from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
 
 _CLAIMED = 1.0  # observations that the claimed widths of habits count as
+_LEAST_SCALE = (
+    0.5  # markers that fit by chance tell nothing of what they do not touch, such as a hidden finger
+)
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
 _NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
@@ -40,7 +43,7 @@ def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -
     normal.flat[:: len(normal) + 1] += anywhere(problem.parameters)
     normal[6:, 6:] += habits.normal
     free = max(3 * len(problem.points_m) - 6 + (0 if problem.facing is None else 2), 0)
-    scale = (_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free)
+    scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), _LEAST_SCALE)
     return np.asarray(scale * np.linalg.inv(normal), np.float64)
 
 

@@ -2,8 +2,7 @@
 
 Six markers give 18 numbers for 21 unknowns and more (the palm's orientation is not among them), so the
 missing ones come from what hands do: natural flexion, small abduction, neighbours that move alike, and the
-last frame. All of it is one bounded least-squares problem (`master.ik.hand_problem`). The inverse of its normal
-matrix is the posterior covariance of every joint.
+last frame. All of it is one bounded least-squares problem (`master.ik.hand_problem`).
 
 It is solved twice side by side, for a natural hand and for one that is free of habits (`master.ik.priors`), and each
 counts by its evidence (`master.ik.mixture`).
@@ -39,7 +38,8 @@ class HandSolution:
         T_rig_palm: (4, 4).
         angles_rad: (5, 4), inside the limits.
         joints: Forward kinematics of the two.
-        cov_m2: (26, 3, 3) [m^2] posterior covariance of the joint positions.
+        cov_m2: (26, 3, 3) [m^2] covariance of the joint positions: of this solver by this instant alone
+            (`master.ik.certainty`), of a tracker by the past as well (`master.ik.doubt`).
         tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone
             (`master.ik.certainty`).
         tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much the fit expects that to grow, by the time squared.
@@ -47,6 +47,9 @@ class HandSolution:
         cost: Half the sum of squared weighted residuals, of the likeliest hypothesis.
         iterations: Steps taken.
         natural: Probability that the hand obeys habits; 1 where nothing else is considered.
+        alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
+            instant alone.
+        moved: (26, 3, 6 + n) derivatives of the joint positions by these.
     """
 
     T_rig_palm: Float
@@ -59,6 +62,8 @@ class HandSolution:
     cost: float
     iterations: int
     natural: float
+    alone: Float
+    moved: Float
 
 
 class HandSolver:
@@ -122,6 +127,8 @@ class HandSolver:
         if last is None and not _determined(points_m[seen], facing, orientation):
             return None
         habits = self._habits(seen, hidden)
+        # Where a hidden finger was held is a memory, not what this instant tells.
+        alone = habits if hidden is None else self._priors[frozenset()]
         problem = HandProblem(
             self.model,
             self._parameters,
@@ -134,16 +141,16 @@ class HandSolver:
             orientation,
         )
         if last is not None:
-            return self._solution(problem, habits, problem.minimise(*self._seed_of(last), enough), points_m)
+            return self._solution(problem, alone, problem.minimise(*self._seed_of(last), enough), points_m)
         if near is not None:
             way = problem.minimise(*self._seed_near(near, seen), enough)
-            found = self._solution(problem, habits, way, points_m)
+            found = self._solution(problem, alone, way, points_m)
             off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
             whitened = (problem.whiten @ off[..., None])[..., 0]
             if (np.vecdot(whitened, whitened) < EXPLAINED).all() and found.iterations < MAX_ITERATIONS:
                 return found
         best = problem.minimise(*self._seeds(points_m, seen, facing), enough)
-        return self._solution(problem, habits, best, points_m)
+        return self._solution(problem, alone, best, points_m)
 
     def _habits(self, seen: Bool, hidden: tuple[Float, Float] | None) -> AnglePrior:
         on_finger = self._attached.on_finger[:, 0]
@@ -199,7 +206,7 @@ class HandSolver:
         J[:, :, :3] = skew(-local @ T[:3, :3].T)
         J[:, :, 3:6] = np.eye(3)
         J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local, found.x)
-        cov = (J.reshape(3 * count, n) @ found.cov).reshape(count, 3, n)
+        cov = (J.reshape(3 * count, n) @ found.alone).reshape(count, 3, n)
         ends, starts = CHAINS[:, 3], CHAINS[:, 2]
         length = np.sqrt(np.vecdot(local[ends] - local[starts], local[ends] - local[starts]))
         turn = (J[ends] - J[starts]) / length[:, None, None]  # of the last phalanges' directions (5, 3, n)
@@ -214,6 +221,8 @@ class HandSolver:
             cost=found.cost,
             iterations=minima[0].iterations,
             natural=found.natural,
+            alone=found.alone,
+            moved=J,
         )
 
 

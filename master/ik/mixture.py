@@ -28,15 +28,14 @@ class Mixture:
 
     Attributes:
         T_rig_palm, x: Mean pose (4, 4) and angles (n,), inside the bounds.
-        cov: (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and the angles [rad].
-        alone: The same by this instant alone (`master.ik.certainty`).
+        alone: Covariance (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and the angles [rad], by this instant
+            alone (`master.ik.certainty`).
         cost: Of the likeliest.
         natural: Probability of the first hypothesis.
     """
 
     T_rig_palm: Float
     x: Float
-    cov: Float
     alone: Float
     cost: float
     natural: float
@@ -49,19 +48,16 @@ class Mixture:
         top, natural = minima[best], float(weight[0])
         if weight[best] > 1.0 - _NEGLIGIBLE:
             alone = covariance_alone(problem.of_hypothesis(best), habits.of_hypothesis(best), top)
-            cov = np.asarray(np.linalg.inv(top.linear.normal), np.float64)
-            return cls(top.T_rig_palm, top.x, cov, alone, float(top.linear.cost), natural)
+            return cls(top.T_rig_palm, top.x, alone, float(top.linear.cost), natural)
         off = np.array([_between(found, top) for found in minima])
         mean: Float = weight @ off
-        apart = (off - mean).T * weight @ (off - mean)
-        inverse = np.linalg.inv(np.array([found.linear.normal for found in minima]))
-        cov, alone = apart + np.einsum("h,hij->ij", weight, inverse), apart.copy()
+        alone = (off - mean).T * weight @ (off - mean)
         for h, found in enumerate(minima):
             alone += weight[h] * covariance_alone(problem.of_hypothesis(h), habits.of_hypothesis(h), found)
         markers = np.array([problem.place(found.T_rig_palm, found.x) for found in minima])
         between = problem.of_points(np.einsum("h,hmi->mi", weight, markers))
         T, x = _onto(between, *_moved(top.T_rig_palm, top.x, mean), top.linear.normal)
-        return cls(T, x, cov, alone, float(top.linear.cost), natural)
+        return cls(T, x, alone, float(top.linear.cost), natural)
 
 
 def _evidence(problem: HandProblem, minima: list[Minimum]) -> Float:

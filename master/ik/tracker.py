@@ -7,7 +7,7 @@ the last pose is only a wide prior, so the finger is solved from what is seen at
 """
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,14 +16,15 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
+from master.ik.doubt import JointDoubt
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
+from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
+from master.ik.parameters import HandParameters
 from master.ik.priors import Priors
 from master.volume import inside
 
-_COAST_S = 0.12  # a lost finger's motion fades with this time constant
-_DOUBT_RAD, _DOUBT_RAD_S, _DOUBT_MAX_RAD = np.radians(8.0), np.radians(30.0), np.radians(25.0)
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _BAD_FIT_M = 8e-3
 _GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
@@ -37,45 +38,6 @@ class TrackedHand:
     valid: Bool
     tracked: Bool
     source: Code
-
-
-class _Memory:
-    """What a continuous motion teaches: each finger's angular speed, and where and when it was lost."""
-
-    def __init__(self, model: HandModel) -> None:
-        self._low, self._high = model.limits_rad[..., 0], model.limits_rad[..., 1]
-        self._speed = np.zeros((5, 4))
-        self._lost_ns: list[int | None] = [None] * 5
-        self._anchor = np.zeros((5, 4))
-        self._anchor_speed = np.zeros((5, 4))
-
-    def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
-        """Learn from one step of the angles (5, 4)."""
-        self._speed = 0.5 * self._speed + 0.5 * (after_rad - before_rad) / dt_s
-
-    def belief(self, t_ns: int, last_ns: int, last_rad: Float, seen: frozenset[int]) -> tuple[Float, Float]:
-        """Where lost fingers are believed to be (5, 4) [rad], and how uncertain that is (5,) [rad].
-
-        Args:
-            t_ns: The instant, not before any earlier one.
-            last_ns, last_rad: When the last pose held, and its angles (5, 4).
-            seen: Fingers that have a marker now.
-        """
-        angles = last_rad.copy()
-        doubt = np.full(5, _DOUBT_RAD)
-        for f in range(5):
-            if f in seen:
-                self._lost_ns[f] = None
-                continue
-            since = self._lost_ns[f]
-            if since is None:
-                since = self._lost_ns[f] = last_ns
-                self._anchor[f], self._anchor_speed[f] = last_rad[f], self._speed[f]
-            gone_s = (t_ns - since) * 1e-9
-            coast = self._anchor_speed[f] * _COAST_S * (1.0 - np.exp(-gone_s / _COAST_S))
-            angles[f] = np.clip(self._anchor[f] + coast, self._low[f], self._high[f])
-            doubt[f] = min(_DOUBT_RAD + _DOUBT_RAD_S * gone_s, _DOUBT_MAX_RAD)
-        return angles, doubt
 
 
 class HandTracker:
@@ -102,6 +64,7 @@ class HandTracker:
         """
         self.model, self.markers = model, markers
         self._solver = HandSolver(model, markers, priors)
+        self.parameters = HandParameters.of(model)
         self._refine = FingerRefiner(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
@@ -110,14 +73,19 @@ class HandTracker:
         self.last: HandSolution | None = None
         self._last_ns = 0
         self._seen_ns: int | None = None
-        self._memory = _Memory(model)
+        self._forget()
 
     def fresh(self) -> "HandTracker":
         """A tracker of the same hand that has seen nothing yet; shares the tables of its fingers, which take 0.4 s."""
         other = copy(self)
         other._solver = HandSolver(self.model, self.markers, self._solver.priors)
-        other.last, other._last_ns, other._seen_ns, other._memory = None, 0, None, _Memory(self.model)
+        other.last, other._last_ns, other._seen_ns = None, 0, None
+        other._forget()
         return other
+
+    def _forget(self) -> None:
+        self._memory = FingerMemory(self.model)
+        self.doubt = JointDoubt(self.parameters, self._solver.priors)
 
     def recent(self, t_ns: int) -> tuple[HandSolution | None, float]:
         """The last solution, if it still says anything at `t_ns`, and how long ago it held [s]."""
@@ -148,25 +116,30 @@ class HandTracker:
         seen = seen_markers(points_m, cov_m2)
         last, dt_s = self.recent(t_ns)
         if last is None:
-            self._memory = _Memory(self.model)
+            self._forget()
         facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None
         if last is not None:
             fingers = frozenset(self._finger[seen].tolist())
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, fingers)
-        solution = self._solver.solve(points_m, cov_m2, last, dt_s, hidden, facing, orientation=orientation)
+        held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
+        solution = self._solver.solve(points_m, cov_m2, last, dt_s, held, facing, orientation=orientation)
         if solution is not None and last is not None:
-            fresh = self._afresh(solution, points_m, cov_m2, hidden, facing, orientation)
+            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation)
             if fresh is not None:
-                solution, last, self._memory = fresh, None, _Memory(self.model)  # the leap was no motion
+                solution, last = fresh, None  # the leap was no motion
+                self._forget()
+        tells_palm = self._tells_palm(seen, orientation)
         if solution is not None:
             solution = self._refine(solution, points_m, cov_m2)
+            cov = self.doubt.push(solution, last, dt_s, hidden, palm_seen=tells_palm)
+            solution = replace(solution, cov_m2=cov)
             if last is not None:
                 self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)
         if seen.any():
             self._seen_ns = t_ns
         placed = seen if measured is None else seen & measured
-        bits = self._bits(t_ns, solution, seen, placed, held=hidden is not None)
+        bits = self._bits(t_ns, solution, seen, placed, tells_palm=tells_palm, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
@@ -215,8 +188,21 @@ class HandTracker:
         hidden = None if curled else (np.zeros((5, 4)), np.full(5, np.inf))
         return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, _GLANCE, self.last)
 
+    def _tells_palm(self, seen: Bool, orientation: Orientation | None) -> bool:
+        """Whether this instant tells where the palm is and how it is turned."""
+        if orientation is not None:
+            return bool(seen.any())
+        return bool(seen.sum() >= 3 or (seen.sum() == 2 and (seen & self._on_palm).any()))
+
     def _bits(
-        self, t_ns: int, solution: HandSolution | None, seen: Bool, placed: Bool, *, held: bool
+        self,
+        t_ns: int,
+        solution: HandSolution | None,
+        seen: Bool,
+        placed: Bool,
+        *,
+        tells_palm: bool,
+        held: bool,
     ) -> TrackedHand:
         valid = np.zeros(26, dtype=bool)
         tracked = np.zeros(26, dtype=bool)
@@ -227,14 +213,15 @@ class HandTracker:
         valid[:] = recent
         unseen = Source.HELD if held else Source.SOLVED
         source[:] = unseen
-        if seen.sum() >= 3 or (seen & self._on_palm).any():
+        if tells_palm:
             palm = [0, 1, *METACARPALS]
             tracked[palm] = True
             source[palm] = Source.SOLVED
         on_finger = self._finger >= 0
         for f in self._finger[seen & on_finger]:
-            tracked[CHAINS[f]] = True
-            source[CHAINS[f]] = Source.SOLVED
+            told = CHAINS[f] if tells_palm else TIPS[f]
+            tracked[told] = True
+            source[told] = Source.SOLVED
         source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
         return TrackedHand(solution, valid, tracked & valid, source)
 

@@ -31,7 +31,8 @@ def hand(tilt_rad: float, joints: HandJoints | None = None) -> HandSolution:
     ends = joints.rotation[TIPS]
     tilt = tilt_rad**2 * (np.eye(3) - ends[:, :, 2:] @ ends[:, :, 2:].swapaxes(1, 2))
     nothing = np.zeros((26, 3, 3))
-    return HandSolution(palm(), np.zeros((5, 4)), joints, nothing, tilt, 100.0 * tilt, np.zeros(6), 0.0, 1)
+    fitted = np.zeros(6), 0.0, 1, 1.0, np.eye(22), np.zeros((26, 3, 22))
+    return HandSolution(palm(), np.zeros((5, 4)), joints, nothing, tilt, 100.0 * tilt, *fitted)
 
 
 def locate(

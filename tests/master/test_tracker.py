@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.hand_model import CHAINS, TIPS
+from common.hand_model import CHAINS, METACARPALS, TIPS
 from common.messages import Source
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov, within
@@ -74,11 +74,25 @@ def test_a_lost_marker_holds_its_finger_and_never_opens_it() -> None:
 
 
 @pytest.mark.parametrize("speed", [90.0, 200.0, 600.0])
-def test_a_lost_finger_goes_on_a_little_and_stays_inside_its_limits(speed: float) -> None:
+def test_a_finger_that_is_lost_alone_goes_on_with_the_others(speed: float) -> None:
+    tracker = HandTracker(RIGHT, MARKERS)
+    frames = 8
+    run(tracker, range(frames), speed_deg_s=speed)
+    lost = run(tracker, range(frames, frames + 18), gone=(MARKER_INDEX,), speed_deg_s=speed)
+    truth = [min(20.0 + speed * k / 60.0, 110.0) for k in range(frames, frames + 18)]
+    course = [pip_deg(hand) for hand in lost]
+    assert max(course) <= 110.0 + 1e-9
+    moved = truth[-1] - truth[0]
+    # It is the first finger, and follows the second by 0.7 of its way; what it did itself before adds to that.
+    assert abs(course[-1] - truth[-1]) < 0.45 * moved + 3.0
+
+
+@pytest.mark.parametrize("speed", [90.0, 200.0, 600.0])
+def test_a_hand_that_is_lost_goes_on_a_little_and_stays_inside_its_limits(speed: float) -> None:
     tracker = HandTracker(RIGHT, MARKERS)
     frames = 8
     before = run(tracker, range(frames), speed_deg_s=speed)[-1]
-    lost = run(tracker, range(frames, frames + 20), gone=(MARKER_INDEX,), speed_deg_s=speed)
+    lost = run(tracker, range(frames, frames + 20), gone=tuple(range(6)), speed_deg_s=speed)
     course = np.array([pip_deg(before)] + [pip_deg(hand) for hand in lost])
     assert course[4] > course[0] + 1.0
     assert course.max() <= 110.0 + 1e-9
@@ -127,6 +141,26 @@ def test_a_hand_that_nobody_sees_is_held_half_a_second_and_then_not_valid() -> N
     assert all(pip_deg(hand) > 15.0 for hand in hidden)
     again = run(tracker, range(60, 62), speed_deg_s=0.0)[-1]
     assert again.tracked.all()
+
+
+@pytest.mark.parametrize(
+    ("seen", "palm"), [((5,), False), ((1,), False), ((1, 2), False), ((1, 5), True), ((0, 2, 4), True)]
+)
+def test_a_palm_is_tracked_only_where_markers_tell_its_turn_as_well(
+    seen: tuple[int, ...], palm: bool
+) -> None:
+    tracker = HandTracker(RIGHT, MARKERS)
+    run(tracker, range(6), speed_deg_s=0.0)
+    gone = tuple(m for m in range(6) if m not in seen)
+    hand = run(tracker, range(6, 10), gone, speed_deg_s=0.0)[-1]
+    assert hand.valid.all()
+    palm_joints = [0, 1, *METACARPALS]
+    assert hand.tracked[palm_joints].all() == hand.tracked[palm_joints].any() == palm
+    assert (hand.source[palm_joints] == (Source.SOLVED if palm else Source.HELD)).all()
+    for f in set(seen) - {5}:
+        # With a palm that is not told, a marker tells its own place and nothing else of the finger.
+        assert hand.tracked[TIPS[f]]
+        assert hand.tracked[CHAINS[f]].all() == palm
 
 
 def test_unrelated_frames_remember_nothing() -> None:

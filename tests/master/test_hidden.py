@@ -1,0 +1,94 @@
+"""Tests of fingers that nobody sees: they go on a little, follow the others, and the doubt about them grows."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from master.ik.hidden import COAST_S, STRAY_RAD, FingerMemory, HiddenFingers
+from tests.hand_helpers import RIGHT, within
+
+STEP_NS = 16_666_667
+ALL = frozenset({0, 1, 2, 3, 4})
+RING = 3
+
+
+def bent(degrees: Float | float) -> Float:
+    """Fingers index ... little bent by so much at the PIP, half of it at the MCP; the thumb at rest."""
+    angles = np.zeros((5, 4))
+    pip = np.radians(degrees) * np.ones(4)
+    angles[1:, 1], angles[1:, 2], angles[1:, 3] = 0.5 * pip, pip, pip * 2 / 3
+    return angles
+
+
+def after(
+    gone: frozenset[int], course_deg: Sequence[Float | float], before_deg: tuple[float, float] = (40.0, 40.0)
+) -> list[HiddenFingers]:
+    """Beliefs while `gone` are hidden and the last pose is, frame by frame, that of `course_deg`."""
+    memory = FingerMemory(RIGHT)
+    for _ in range(10):
+        memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
+    seen = ALL - gone
+    return [
+        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(course_deg)
+    ]
+
+
+def pip_deg(hidden: HiddenFingers, finger: int = RING) -> float:
+    return float(np.degrees(hidden.angles_rad[finger, 2]))
+
+
+def test_a_hidden_ring_finger_closes_with_its_neighbours() -> None:
+    closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 80.0, 30)]
+    course = [pip_deg(hidden) for hidden in after(frozenset({RING}), closing)]
+    assert np.all(np.diff(course) > 0.0)
+    assert 70.0 < course[-1] < 82.0
+
+
+def test_one_at_the_side_follows_less_and_the_thumb_not_at_all() -> None:
+    closing = [np.array([p, p, p, 40.0]) for p in np.linspace(40.0, 80.0, 30)]
+    last = after(frozenset({0, 4}), closing)[-1]
+    assert 60.0 < pip_deg(last, 4) < 74.0
+    np.testing.assert_array_equal(last.angles_rad[0], np.zeros(4))
+
+
+@pytest.mark.parametrize("speed_deg_s", [90.0, 200.0, -200.0])
+def test_with_all_hidden_a_finger_goes_on_for_a_moment(speed_deg_s: float) -> None:
+    step = speed_deg_s * STEP_NS * 1e-9
+    course = [pip_deg(h) for h in after(ALL, [40.0] * 60, (40.0 - step, 40.0))]
+    assert abs(course[1] - 40.0) > 0.5 * 2 * abs(step)
+    assert course[-1] - 40.0 == pytest.approx(COAST_S * speed_deg_s, rel=0.01)
+
+
+def test_it_stops_where_the_others_stop() -> None:
+    step = 200.0 * STEP_NS * 1e-9
+    course = [pip_deg(h) for h in after(frozenset({RING}), [40.0] * 60, (40.0 - step, 40.0))]
+    assert max(course) < 40.0 + 0.2 * COAST_S * 200.0
+
+
+def test_doubt_grows_with_time_and_less_between_neighbours_that_show() -> None:
+    alone = np.array([h.sigma_rad[RING] for h in after(ALL, [40.0] * 200)])
+    between = np.array([h.sigma_rad[RING] for h in after(frozenset({RING}), [40.0] * 200)])
+    assert (np.diff(alone) > 0.0).all()
+    assert (np.diff(between) > 0.0).all()
+    assert (between < alone).all()
+    assert alone[-1] < 1.01 * STRAY_RAD
+    # what is seen of the other three halves the variance, and more
+    assert between[60] ** 2 < 0.5 * alone[60] ** 2
+
+
+def test_a_marker_that_returns_begins_a_new_time() -> None:
+    memory = FingerMemory(RIGHT)
+    seen = ALL - {RING}
+    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), seen) for k in range(20)]
+    assert gone[-1].gone_s[RING] == pytest.approx(20 * STEP_NS * 1e-9)
+    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
+    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
+    assert hidden.gone_s[RING] == pytest.approx(STEP_NS * 1e-9)
+
+
+def test_nothing_that_is_believed_leaves_the_limits() -> None:
+    closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 110.0, 40)]
+    for hidden in after(frozenset({RING, 0}), closing, (30.0, 40.0)):
+        assert within(RIGHT, hidden.angles_rad)
