@@ -6,7 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from common.calibration import HandProfile, parse
+from common.calibration import HandProfile, RigCalibration, parse
 from common.hand_model import FINGERS, JOINTS, HandModel
 from common.hand_profiles import generated_profile
 
@@ -41,10 +41,24 @@ def test_the_finger_order_is_written_as_it_is() -> None:
     assert f"rows {', '.join(FINGERS)}" in (ROOT / "docs" / "frames.md").read_text()
 
 
-def test_the_examples_of_a_hand_profile_load() -> None:
-    examples: list[str] = re.findall(
-        r"```json\n(.*?)\n```", (ROOT / "docs" / "hand.md").read_text(), re.DOTALL
+def hand_examples() -> list[str]:
+    return re.findall(r"```json\n(.*?)\n```", (ROOT / "docs" / "hand.md").read_text(), re.DOTALL)
+
+
+def test_the_example_of_an_imu_loads() -> None:
+    (example,) = (example for example in hand_examples() if '"imu"' in example)
+    rig = msgspec.json.decode(
+        (ROOT / "calib_json" / "rigs" / "desk.json").read_bytes(), type=dict[str, object]
     )
+    keys = msgspec.json.decode(f"{{{example}}}", type=dict[str, object])
+    imu = parse(msgspec.json.encode(rig | keys), RigCalibration, "hand.md").imu
+    assert imu is not None
+    assert imu.placed
+    assert imu.heading_sigma_rad is None
+
+
+def test_the_examples_of_a_hand_profile_load() -> None:
+    examples = [example for example in hand_examples() if '"imu"' not in example]
     assert len(examples) == 3
     profile = msgspec.json.decode(
         msgspec.json.encode(generated_profile("mine", "right")), type=dict[str, object]
