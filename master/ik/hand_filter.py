@@ -14,7 +14,7 @@ limits; what has to be cut is an abduction that the filtered flexion does not al
 **Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held. The difference between what was
 shown last and what is solved now is added to the solution and fades within a tenth of a second, as networked games
 lead a player over to where the server says it is: the motion goes on, the error goes. While it fades, the covariance
-of a joint contains the square of what the difference moves the joint by.
+of a joint contains the square of how far it is shown from where it is solved to be.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
@@ -138,8 +138,7 @@ class HandFilter:
         joints, angles = self._posed(signals, rotation)
         cov = solution.cov_m2
         if left is not None:
-            back = rotation_vector_to_matrix(-left[_TURN] / self._across_m) @ rotation
-            off = joints.position_m - self._posed(signals - left, back)[0].position_m
+            off = joints.position_m - solution.joints.position_m
             cov = cov + off[:, :, None] * off[:, None, :]
         shown.t_ns, shown.seen, shown.values, shown.rotation = t_ns, seen, signals, rotation
         T = joints.T_rig_palm

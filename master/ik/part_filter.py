@@ -6,8 +6,8 @@ millimetre, it lags 20 mm at 1 m/s, or trembles.
 
 - **What noise is** is not told but measured: with x the values as they come, steps of equal length, noise of standard
   deviation s that is new in every sample makes second differences of 6 s^2. That of a solved hand partly stays, since
-  the last pose is a prior of the next: of noise that keeps seven tenths from frame to frame a quarter shows. So the
-  variance is taken four times. It is at most four times that of the markers: what is more is acceleration.
+  the last pose is a prior of the next: of noise that keeps eight tenths from frame to frame a sixth shows. So the
+  variance is taken six times. It is at most six times that of the markers: what is more is acceleration.
 - **What motion is.** With v the speed, smoothed as in the 1 € filter, and x^ the filtered value, a signal moves by
 
       u^2 = max((v dt / s)^2 - 9 r / (2 + r), ((x - x^) / s)^2 - 9),   r = 2 pi dt d_cutoff
@@ -17,7 +17,7 @@ millimetre, it lags 20 mm at 1 m/s, or trembles.
 - **Parts.** What moves most in a part says how much it moves: noise of a moving hand is not seen, a turn that follows
   later than the place is, and errors of place and turn that cancel have to go on together.
 
-The gain is that of a steady Kalman filter of a walk with steps of u s (Kalman 1960; Friedland 1973), and at least
+The gain is that of a steady Kalman filter of a walk with steps of u s (Kalman 1960), and at least
 that which leaves the given jitter at rest:
 
     a = (sqrt(u^4 + 4 u^2) - u^2) / 2        at rest  a = 2 q / (1 + q),  q = (jitter / s)^2
@@ -30,7 +30,7 @@ import numpy as np
 from common.arrays import Float, Int
 
 _MEMORY_S = 0.4  # of the noise: a few swings of a trembling hand
-_SHOWN = 4.0
+_SHOWN = 6.0
 _BEYOND = 9.0
 _LEAST = 1e-12  # [m^2] below which noise is none
 
