@@ -36,6 +36,7 @@ from master.ik.priors import Priors
 _TURNS_RAD_S, _STARTS_M_S = np.radians(20.0), 0.02
 _GOES_ON = 0.35  # of its speed, along each axis
 _EASE = 0.3  # of a new speed that counts
+_BEFORE = np.tri(3)[:, None, :, None]
 
 
 class JointDoubt:
@@ -83,7 +84,9 @@ class JointDoubt:
         else:
             self._lost_s = self._speed_m_s = 0.0
         self.cov = now
-        return found.moved @ now @ np.swapaxes(found.moved, 1, 2) + self._on_arcs(found, now)
+        moved = found.moved
+        linear = (moved.reshape(-1, len(now)) @ now).reshape(moved.shape) @ np.swapaxes(moved, 1, 2)
+        return linear + self._on_arcs(found, now)
 
     def _without(self, now: Float, hidden: HiddenFingers) -> Float:
         """What this instant tells (6 + n, 6 + n), but of hidden fingers no more than their limits."""
@@ -120,10 +123,11 @@ class JointDoubt:
         variance = np.einsum("fmm->fm", turned)
         fourth = 0.25 * (variance[:, :, None] * variance[:, None] + 2.0 * turned * turned)
         place = found.joints.position_m[CHAINS]
-        bones = np.diff(place, axis=1)
+        before = _BEFORE * (
+            place[:, 1:] - place[:, :-1]
+        )  # bones before joints 1, 2, 3 of a chain: (3, 5, 3, 3)
         out = np.zeros((len(found.moved), 3, 3))
-        for k in (1, 2, 3):
-            out[CHAINS[:, k]] = np.swapaxes(bones[:, :k], 1, 2) @ fourth[:, :k, :k] @ bones[:, :k]
+        out[CHAINS[:, 1:]] = np.swapaxes(np.swapaxes(before, 2, 3) @ fourth @ before, 0, 1)
         return out
 
 

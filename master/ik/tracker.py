@@ -121,7 +121,7 @@ class HandTracker:
         hidden = None
         if last is not None:
             fingers = frozenset(self._finger[seen].tolist())
-            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, fingers)
+            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, fingers)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
         solution = self._solver.solve(points_m, cov_m2, last, dt_s, held, facing, orientation=orientation)
         if solution is not None and last is not None:

@@ -23,7 +23,10 @@ def bent(degrees: Float | float) -> Float:
 
 
 def after(
-    gone: frozenset[int], course_deg: Sequence[Float | float], before_deg: tuple[float, float] = (40.0, 40.0)
+    gone: frozenset[int],
+    course_deg: Sequence[Float | float],
+    before_deg: tuple[float, float] = (40.0, 40.0),
+    natural: float = 1.0,
 ) -> list[HiddenFingers]:
     """Beliefs while `gone` are hidden and the last pose is, frame by frame, that of `course_deg`."""
     memory = FingerMemory(RIGHT)
@@ -31,7 +34,8 @@ def after(
         memory.moved(bent(before_deg[0]), bent(before_deg[1]), STEP_NS * 1e-9)
     seen = ALL - gone
     return [
-        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), seen) for k, pip in enumerate(course_deg)
+        memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(pip), natural, seen)
+        for k, pip in enumerate(course_deg)
     ]
 
 
@@ -51,6 +55,13 @@ def test_one_at_the_side_follows_less_and_the_thumb_not_at_all() -> None:
     last = after(frozenset({0, 4}), closing)[-1]
     assert 60.0 < pip_deg(last, 4) < 74.0
     np.testing.assert_array_equal(last.angles_rad[0], np.zeros(4))
+
+
+def test_a_hand_that_defies_habits_moves_its_fingers_one_by_one() -> None:
+    closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 80.0, 30)]
+    natural, free = (after(frozenset({RING}), closing, natural=p)[-1] for p in (1.0, 0.0))
+    assert pip_deg(free) == pytest.approx(40.0)
+    assert free.sigma_rad[RING] > 1.5 * natural.sigma_rad[RING]
 
 
 @pytest.mark.parametrize("speed_deg_s", [90.0, 200.0, -200.0])
@@ -81,10 +92,10 @@ def test_doubt_grows_with_time_and_less_between_neighbours_that_show() -> None:
 def test_a_marker_that_returns_begins_a_new_time() -> None:
     memory = FingerMemory(RIGHT)
     seen = ALL - {RING}
-    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), seen) for k in range(20)]
+    gone = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(40.0), 1.0, seen) for k in range(20)]
     assert gone[-1].gone_s[RING] == pytest.approx(20 * STEP_NS * 1e-9)
-    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), ALL).gone_s[RING] == 0.0
-    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), seen)
+    assert memory.belief(21 * STEP_NS, 20 * STEP_NS, bent(40.0), 1.0, ALL).gone_s[RING] == 0.0
+    hidden = memory.belief(22 * STEP_NS, 21 * STEP_NS, bent(40.0), 1.0, seen)
     assert hidden.gone_s[RING] == pytest.approx(STEP_NS * 1e-9)
 
 
