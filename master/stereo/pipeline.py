@@ -148,10 +148,8 @@ class MarkerPipeline:
             hand = self._tracker.push(
                 instant.t_ns, *aims, self._towards(raw, instant), measured, orientation=turned
             )
-        with self._stage("filter"):
             if self._steady is not None:
                 hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand])
-        with self._stage("hand"):
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
