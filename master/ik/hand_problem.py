@@ -20,7 +20,7 @@ from master.ik.priors import AnglePrior
 
 MAX_ITERATIONS = 25
 ENOUGH = 1e-7  # of half chi square: what a search may leave
-_ROUGH = 1.0  # the same where one of several seeds is to be chosen
+_ROUGH = 1e-2  # the same where one of several seeds is to be chosen; with 1, poor depth led to wrong hands now and then
 _FIRST_DAMPING, _MAX_DAMPING = 1e-3, 1e6
 _EYE = np.eye(3)
 
