@@ -5,6 +5,7 @@ the palm is a plain fan. Left profiles are the exact mirror image of right ones.
 """
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, MarkerMount, RestJoint, Vector3
@@ -81,6 +82,50 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
         rest_joints={joint: rest(*pose) for joint, pose in joints.items()},
         markers=markers,
         radius_m=radius,
+    )
+
+
+def scaled_profile(profile: HandProfile, factor: float) -> HandProfile:
+    """The same hand, larger or smaller: positions, offsets, radii and painted lengths times `factor`."""
+
+    def scaled(vector: Vector3) -> Vector3:
+        return _vector(factor * np.array(vector))
+
+    return replace(
+        profile,
+        rest_joints={
+            name: replace(joint, position_m=scaled(joint.position_m))
+            for name, joint in profile.rest_joints.items()
+        },
+        markers={
+            name: replace(mount, offset_m=scaled(mount.offset_m), painted_m=factor * mount.painted_m)
+            for name, mount in profile.markers.items()
+        },
+        radius_m=None
+        if profile.radius_m is None
+        else {name: factor * radius for name, radius in profile.radius_m.items()},
+    )
+
+
+def mirrored_profile(profile: HandProfile) -> HandProfile:
+    """The other hand of the same person, under the same name: mirrored in the palm's x."""
+
+    def mirrored(vector: Vector3) -> Vector3:
+        x, y, z = vector
+        return -x + 0.0, y, z
+
+    def turned(joint: RestJoint) -> RestJoint:
+        # M R M of a rotation keeps w and x of its quaternion and flips y and z.
+        w, x, y, z = joint.orientation_wxyz
+        return RestJoint(position_m=mirrored(joint.position_m), orientation_wxyz=(w, x, -y, -z))
+
+    return replace(
+        profile,
+        side="left" if profile.side == "right" else "right",
+        rest_joints={name: turned(joint) for name, joint in profile.rest_joints.items()},
+        markers={
+            name: replace(mount, offset_m=mirrored(mount.offset_m)) for name, mount in profile.markers.items()
+        },
     )
 
 

@@ -12,9 +12,10 @@ from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
 from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
+from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
 
-NAMES = "standard | lights | poses | leap:FILE.npz"
+NAMES = "standard | lights | poses | hand-routine | leap:FILE.npz"
 VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
 
@@ -23,7 +24,8 @@ def scene_by_name(
     name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
 ) -> Scene:
     """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
-    (`poses`), or one that follows a recorded motion.
+    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), or one that follows a
+    recorded motion.
 
     Raises:
         PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
@@ -34,6 +36,9 @@ def scene_by_name(
         return replace(Scene.standard(rig, cameras, hand, seed), light=ROOM)
     if name == "poses":
         motion = StudyPoses(HandModel.of(hand), view_centre(rig), seed)
+        return Scene.of_motion(rig, cameras, hand, motion, seed)
+    if name == "hand-routine":
+        motion = HandRoutine(HandModel.of(hand), view_centre(rig), seed)
         return Scene.of_motion(rig, cameras, hand, motion, seed)
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))

@@ -9,6 +9,7 @@ from master.calibrate.cameras.capture_command import capture_views
 from master.calibrate.cameras.commands import intrinsics, stereo
 from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
+from master.calibrate.hand.commands import hand_command
 from master.calibrate.time.commands import time_command
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -19,6 +20,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "depth": depth,
     "verify": verify_command,
     "time": time_command,
+    "hand": hand_command,
 }
 
 
@@ -31,4 +33,4 @@ def calibrate_app() -> typer.Typer:
 
 
 def _about() -> None:
-    """Measure a rig: lenses, places, depth, time. Every result is a new file with date, residual and source."""
+    """Measure a rig or a hand: each result is a new file with date, residual and source."""

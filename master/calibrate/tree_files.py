@@ -3,7 +3,7 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
-from common.calibration import CameraCalibration, Provenance, RigCalibration, load, save
+from common.calibration import CameraCalibration, HandProfile, Provenance, RigCalibration, load, save
 from common.errors import CalibrationError
 
 
@@ -55,11 +55,16 @@ def write_camera(out: Path, file_name: str, camera: CameraCalibration) -> Path:
     return _write(_path(out, "cameras", file_name), camera)
 
 
+def write_hand(out: Path, hand: HandProfile) -> Path:
+    """Write hands/<name>.json of the tree `out`; as `write_rig`."""
+    return _write(_path(out, "hands", hand.name), hand)
+
+
 def _path(out: Path, folder: str, name: str) -> Path:
     return out / folder / f"{name}.json"
 
 
-def _write(path: Path, value: RigCalibration | CameraCalibration) -> Path:
+def _write(path: Path, value: RigCalibration | CameraCalibration | HandProfile) -> Path:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

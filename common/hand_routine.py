@@ -1,0 +1,118 @@
+"""The guided routine by which a hand is measured: which posture follows which, in 20 s, and how each step is told.
+
+Only some ways of bending tell lengths. A straight finger that bends at the knuckle alone draws a circle about the
+knuckle; one that curls while the knuckle is held draws the arc of its two farther bones. The postures (flat, tabletop,
+hook, fist) are those of the tendon-gliding exercises of hand therapy (Wehbe & Hunter, 1985). Repeating a bend tells it
+from what wanders meanwhile, and all fingers at once use the time four times.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+
+_THUMB, _FINGERS = 0, (1, 2, 3, 4)
+_KNUCKLE_DEG, _CURL_DEG = 88.0, 100.0
+_FLAT = ((10, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0), (0, 0, 0))
+_SPREAD = ((38, 0, 0), (12, 0, 0), (0, 0, 0), (-9, 0, 0), (-14, 0, 0))
+_MOVED_DEG = 1.0
+STRAIGHT_DEG = 5.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Move:
+    """One way of the hand, or a rest.
+
+    Attributes:
+        step: Index of its step.
+        start_s, stop_s: When [s], since the beginning of the routine.
+        before, after: Postures (5, 3) [deg]: rows thumb ... little; columns abduction, flexion (MCP), PIP.
+    """
+
+    step: int
+    start_s: float
+    stop_s: float
+    before: Float
+    after: Float
+
+    @property
+    def moving(self) -> Bool:
+        """(5, 3) which angles change."""
+        return np.abs(self.after - self.before) > _MOVED_DEG
+
+    @property
+    def straight(self) -> Bool:
+        """(5,) which fingers are straight all the way."""
+        return np.maximum(self.before[:, 2], self.after[:, 2]) < STRAIGHT_DEG
+
+    def posture(self, share: float) -> Float:
+        """(5, 3) [deg] when `share` (0 ... 1) of its time is over; smooth, at rest at both ends."""
+        s = min(max(share, 0.0), 1.0)
+        return self.before + (self.after - self.before) * (s * s * s * (s * (6.0 * s - 15.0) + 10.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What the user is asked to do, and for how long [s]."""
+
+    name: str
+    told: str
+    seconds: float
+
+
+def _corners(fingers: tuple[int, ...], knuckle: float, curl: float) -> Float:
+    posture = np.array(_FLAT, dtype=np.float64)
+    posture[list(fingers), 1:] = knuckle, curl
+    return posture
+
+
+def _script() -> Iterator[tuple[Step, list[Float]]]:
+    """Each step with the postures it goes through, evenly in time."""
+    flat, spread = np.array(_FLAT, dtype=np.float64), np.array(_SPREAD, dtype=np.float64)
+    table, hook = _corners(_FINGERS, _KNUCKLE_DEG, 0.0), _corners(_FINGERS, 0.0, _CURL_DEG)
+    fist = _corners(_FINGERS, _KNUCKLE_DEG, _CURL_DEG)
+    yield Step("flat", "hand flat and still", 1.0), [flat]
+    yield Step("spread", "spread the fingers, and close them", 1.2), [spread, flat]
+    yield (
+        Step("knuckles", "six times: bend the straight fingers at the knuckles, and back", 6.0),
+        [table, flat] * 6,
+    )
+    yield Step("curl", "three times: curl the fingers, knuckles still, and open them", 3.0), [hook, flat] * 3
+    yield Step("fist", "make a fist, and open it", 1.6), [fist, flat]
+    for finger, name in zip(_FINGERS, ("index", "middle", "ring", "little"), strict=True):
+        told = f"{name} finger alone: bend it straight at its knuckle, and back"
+        yield Step(name, told, 1.4), [_corners((finger,), _KNUCKLE_DEG, 0.0), flat]
+    across, curled = flat.copy(), flat.copy()
+    across[_THUMB, :2], curled[_THUMB, 2] = (20.0, 40.0), 50.0
+    told = "thumb alone: lay it straight across the palm, back, bend its two joints, back"
+    yield Step("thumb", told, 1.8), [across, flat, curled, flat]
+
+
+def _moves() -> tuple[tuple[Step, ...], tuple[Move, ...]]:
+    steps: list[Step] = []
+    moves: list[Move] = []
+    t, last = 0.0, np.array(_FLAT, dtype=np.float64)
+    for number, (step, postures) in enumerate(_script()):
+        steps.append(step)
+        for posture in postures:
+            stop = t + step.seconds / len(postures)
+            moves.append(Move(number, t, stop, last, posture))
+            t, last = stop, posture
+    return tuple(steps), tuple(moves)
+
+
+STEPS, MOVES = _moves()
+ROUTINE_S = MOVES[-1].stop_s
+
+
+def move_at(t_s: float) -> Move:
+    """The move of routine time `t_s` [s]; the first before the beginning, the last after the end."""
+    return next((move for move in MOVES if t_s < move.stop_s), MOVES[-1])
+
+
+def posture_at(t_s: float) -> Float:
+    """Posture (5, 3) [deg] of routine time `t_s` [s]."""
+    move = move_at(t_s)
+    return move.posture((t_s - move.start_s) / (move.stop_s - move.start_s))

@@ -1,0 +1,151 @@
+"""`phalanx-master calibrate hand`: a hand file from its length alone, or from the guided routine."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from msgspec.structs import replace
+
+from common.calibration import HandProfile, RigCalibration, load
+from common.errors import CalibrationError
+from common.hand_model import HandModel
+from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
+from common.hand_routine import ROUTINE_S, STEPS
+from master.calibrate.hand.measure import hand_length_of, measure_hand
+from master.calibrate.hand.observed import Observed, read_observed
+from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
+from master.calibrate.tree_files import write_hand
+from master.options import CALIB_JSON, Calibration, JsonFile
+from master.summary import write_summary
+
+PosesPath = Annotated[
+    Path | None, typer.Option("--poses", help="poses.npz of the routine, from `replay` or a running master.")
+]
+Name = Annotated[str, typer.Option(help="Name of the new hand file, without .json.")]
+Side = Annotated[Literal["left", "right"], typer.Option(help="Which hand.")]
+LengthMm = Annotated[
+    float | None,
+    typer.Option(help="Millimetres from the wrist crease to the end of the middle finger; alone: a quick start."),
+]
+Base = Annotated[
+    Path | None, typer.Option("--hand", help="Hand file to begin with: proportions, marker places.")
+]
+RigName = Annotated[str, typer.Option("--rig", help="Rig whose markers the poses have.")]
+DipPerPip = Annotated[
+    float | None, typer.Option(help="How far the last joint bends per middle joint, where it was measured.")
+]
+Steps = Annotated[bool, typer.Option("--steps", help="Only tell the steps of the routine.")]
+Out = Annotated[Path | None, typer.Option(help="Tree to write hands/NAME.json into.")]
+Picture = Annotated[Path | None, typer.Option(help="Write a picture of lengths and residuals to this .png.")]
+
+_RATIO_SD = 0.03  # of one that was measured, with a goniometer or in a picture
+
+
+def hand_command(
+    poses: PosesPath = None,
+    name: Name = "me",
+    side: Side = "right",
+    length_mm: LengthMm = None,
+    base: Base = None,
+    rig: RigName = "desk",
+    calibration: Calibration = CALIB_JSON,
+    dip_per_pip: DipPerPip = None,
+    out: Out = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+    steps: Steps = False,
+) -> None:
+    """Make a hand file: from the hand's length, or measured by a guided routine of 20 s.
+
+    Examples:
+
+      phalanx-master calibrate hand --length-mm 190 --side right --name me --out calib_json      a quick start
+
+      phalanx-master calibrate hand --steps                                                      what to do for:
+
+      phalanx-master calibrate hand --poses poses.npz --side right --name me --out calib_json
+    """
+    if steps:
+        for line in step_lines():
+            typer.echo(line)
+        return
+    template = template_of(base, side, name)
+    if poses is None:
+        if length_mm is None:
+            raise CalibrationError("give --poses FILE of the routine (its steps: --steps), or --length-mm")
+        told: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
+        profile = quick_profile(quick(base, template, length_mm), name, 1e-3 * length_mm)
+        typer.echo(f"{side} hand scaled to {length_mm:g} mm; no bone is measured")
+    else:
+        observed = observed_of(poses, calibration, rig, template)
+        ratio = None if dip_per_pip is None else (dip_per_pip, _RATIO_SD)
+        length_m = None if length_mm is None else 1e-3 * length_mm
+        found = measure_hand(observed, template, length_m, ratio, _progress)
+        for line in report_lines(found):
+            typer.echo(line)
+        profile, told = measured_profile(found, name, poses.name), report_json(found)
+        if picture is not None:
+            from master.calibrate.hand.picture import draw_hand
+
+            draw_hand(picture, found)
+    written = None if out is None else write_hand(out, profile)
+    typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
+    if json_file is not None:
+        write_summary(json_file, told | {"written": None if written is None else str(written)})
+
+
+def step_lines() -> list[str]:
+    """The routine for a person."""
+    lines = [
+        f"{ROUTINE_S:.0f} s. Lay the back of the hand on a table and leave it: palm to the cameras, tips in sight.",
+        "Do one step after the other without hurry; exact times do not matter.",
+    ]
+    return lines + [f"{n:3}. {step.seconds:3.1f} s  {step.told}" for n, step in enumerate(STEPS, 1)]
+
+
+def template_of(base: Path | None, side: str, name: str) -> HandProfile:
+    """What a measurement begins with: a file, mirrored if it is of the other hand, or the generated profile.
+
+    Raises:
+        CalibrationError: The file is missing or broken.
+    """
+    if base is None:
+        return generated_profile(name, side)
+    profile = load(base, HandProfile)
+    HandModel.of(profile)
+    return replace(profile if profile.side == side else mirrored_profile(profile), name=name)
+
+
+def quick(base: Path | None, template: HandProfile, length_mm: float) -> HandProfile:
+    """A profile of a length: the generated one, or the given one scaled.
+
+    Raises:
+        CalibrationError: No hand is that long.
+    """
+    try:
+        generated = generated_profile(template.name, template.side, 1e-3 * length_mm)
+    except ValueError as error:
+        raise CalibrationError(
+            f"--length-mm {length_mm:g}: {error}; measure from the wrist crease"
+        ) from error
+    if base is None:
+        return generated
+    return scaled_profile(template, 1e-3 * length_mm / hand_length_of(HandModel.of(template)))
+
+
+def observed_of(poses: Path, calibration: Path, rig: str, template: HandProfile) -> Observed:
+    """Markers of a poses file, named by the rig.
+
+    Raises:
+        PhalanxError: A file is missing, broken, or does not fit the others.
+    """
+    names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
+    return read_observed(poses, names, HandModel.of(template))
+
+
+def _progress(share: float) -> None:
+    if sys.stderr.isatty():
+        typer.echo(f"\rfitting {100 * share:3.0f} % ", nl=False, err=True)
+        if share >= 1.0:
+            typer.echo("\r\033[K", nl=False, err=True)

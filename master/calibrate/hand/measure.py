@@ -1,0 +1,238 @@
+"""From the markers of a routine to a hand: which lengths it tells, how well, and the profile with nothing made up.
+
+A length counts as measured when it is within 1 mm with 99 % certainty, and when the markers and not the beliefs say so.
+With caps on the tips alone the length of a finger is told, and often not its division: then the sum is measured, and
+its parts stay in the proportion of the template.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.calibration import HandProfile
+from common.errors import FitError
+from common.geometry import fit_rigid, transform
+from common.hand_model import FINGERS, TIPS, WRIST, HandModel
+from common.hand_profiles import mirrored_profile, scaled_profile
+from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
+from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.curves import Knots
+from master.calibrate.hand.fit import ShapeFit, fit_shape
+from master.calibrate.hand.observed import Observed
+from master.calibrate.hand.problem import HandRoutineProblem
+from master.calibrate.hand.shape import PER_FINGER, Shape
+
+WITHIN_M = 1e-3
+CERTAIN = 2.576  # standard deviations of 99 %
+TOLD = 0.5  # of the sd before: more is told by beliefs
+BONES = ("proximal", "middle", "distal")
+THUMB_BONES = ("metacarpal", "proximal", "distal")
+_GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
+_SHORTEST_M, _LONGEST_M = 0.1, 0.25
+_OTHER_SIDE = 0.6  # the mirrored hand fits with this share of the distance: it is the other one
+_UNLIKE_M = 0.025
+_PALM_M, _PALM_RAD = 0.012, float(np.radians(8.0))
+_WRIST_TO_CREASE = 1.0246  # the wrist joint of generated profiles lies behind the crease
+_FREE_WITH = 3  # markers on the back that measure the palm's pose
+
+
+@dataclass(frozen=True, slots=True)
+class Length:
+    """One length of the hand: a bone, or neighbouring bones together.
+
+    Attributes:
+        finger: Index, 0 thumb ... 4 little.
+        bones: Which of its three links.
+        length_m: Fitted.
+        scaled_m: As the template, scaled to this hand, has it.
+        sigma_m: Posterior standard deviation.
+        before_m: That of the belief.
+    """
+
+    finger: int
+    bones: tuple[int, ...]
+    length_m: float
+    scaled_m: float
+    sigma_m: float
+    before_m: float
+
+    @property
+    def measured(self) -> bool:
+        """Whether the markers tell it."""
+        return CERTAIN * self.sigma_m <= WITHIN_M and self.sigma_m <= TOLD * self.before_m
+
+    @property
+    def name(self) -> str:
+        """Such as `index middle + distal`."""
+        parts = THUMB_BONES if self.finger == 0 else BONES
+        return f"{FINGERS[self.finger]} {' + '.join(parts[bone] for bone in self.bones)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandMeasurement:
+    """What a routine tells of a hand.
+
+    Attributes:
+        observed: What was seen.
+        alignment: When the user did what.
+        template: The hand it began with, scaled.
+        fit: The least-squares result.
+        lengths: Every bone, and the sums of neighbours.
+    """
+
+    observed: Observed
+    alignment: Alignment
+    template: HandModel
+    fit: ShapeFit
+    lengths: tuple[Length, ...]
+
+    @property
+    def rms_m(self) -> float:
+        """Root mean square of the markers' residuals, per axis."""
+        return float(np.sqrt(np.nanmean(self.fit.residual_m**2)))
+
+    def parted(self, finger: int) -> tuple[Length, ...]:
+        """The measured lengths of a finger, as finely divided as they are measured; none overlap."""
+        found: list[Length] = []
+        for length in (length for length in self.lengths if length.finger == finger and length.measured):
+            if not any(set(length.bones) & set(other.bones) for other in found):
+                found.append(length)
+        return tuple(found)
+
+
+def measure_hand(
+    observed: Observed,
+    template: HandProfile,
+    hand_length_m: float | None = None,
+    dip_per_pip: tuple[float, float] | None = None,
+    progress: Callable[[float], None] = lambda share: None,
+) -> HandMeasurement:
+    """Fit a hand to a routine.
+
+    Args:
+        observed: Its markers.
+        template: Proportions to begin with, and where the markers sit; its size does not matter.
+        hand_length_m: Length of the hand, if it was measured; None: from the flat hand's markers.
+        dip_per_pip: Mean and standard deviation of the DIP's ratio, if it was measured.
+        progress: Told the share that is done.
+
+    Raises:
+        FitError: A step is missing, the palm moved, it is the other hand, or none at all; the text says what to do.
+    """
+    model = _scaled(observed, template, hand_length_m)
+    alignment = align(observed, model)
+    _check_side(observed, template, alignment)
+    if gaps := missing_steps(observed, alignment, model):
+        raise FitError(
+            "the routine is not complete: " + "; ".join(gaps[:6]) + ". Do these steps again, in full"
+        )
+    progress(0.1)
+    beliefs = Beliefs() if dip_per_pip is None else Beliefs(dip_ratio=dip_per_pip)
+    problem = problem_of(observed, model, alignment, beliefs)
+    fit = fit_shape(problem, lambda share: progress(0.1 + 0.9 * share))
+    if not problem.palm_free:
+        _check_palm(fit)
+    return HandMeasurement(observed, alignment, model, fit, lengths_of(problem, fit))
+
+
+def problem_of(
+    observed: Observed, model: HandModel, alignment: Alignment, beliefs: Beliefs
+) -> HandRoutineProblem:
+    """The least-squares problem of an aligned routine."""
+    knots = Knots.over(observed.t_s, GRID_S)
+    names = observed.names
+    seen_back = np.isfinite(observed.points_m[:, 5:, 0]).sum(axis=1)
+    return HandRoutineProblem(
+        model=model,
+        cap_m=np.array([model.mount(name).offset_m for name in names[:5]]),
+        prior=Shape.of(model, names[5:], beliefs.dip_ratio[0], beliefs.thumb_ratio[0]),
+        points_m=observed.points_m,
+        whiten=whitening(observed.cov_m2, beliefs.model_m),
+        knots=knots,
+        course=Course.of(alignment.at(knots.time_s)),
+        start=alignment.T_rig_palm,
+        palm_free=bool(np.quantile(seen_back, 0.1) >= _FREE_WITH),
+        beliefs=beliefs,
+    )
+
+
+def whitening(cov_m2: Float, model_m: float) -> Float:
+    """(..., 3, 3) inverse square roots of covariances with the model's own error added; nought where NaN."""
+    known = np.asarray(np.isfinite(cov_m2).all(axis=(-2, -1)), np.bool_)
+    filled = np.where(known[..., None, None], cov_m2, np.eye(3)) + model_m**2 * np.eye(3)
+    value, vector = np.linalg.eigh(filled)
+    root = (vector / np.sqrt(value)[..., None, :]) @ np.swapaxes(vector, -1, -2)
+    return root * known[..., None, None]
+
+
+def lengths_of(problem: HandRoutineProblem, fit: ShapeFit) -> tuple[Length, ...]:
+    """Every bone, then sums, with what is known of each."""
+    before = problem.shape_sd()
+    out: list[Length] = []
+    for finger in range(5):
+        at = PER_FINGER * finger
+        cov, prior = fit.cov[at : at + 3, at : at + 3], before[at : at + 3]
+        for bones in _GROUPS:
+            pick: Bool = np.isin(np.arange(3), bones)
+            out.append(
+                Length(
+                    finger,
+                    bones,
+                    float(fit.shape.length_m[finger, pick].sum()),
+                    float(problem.prior.length_m[finger, pick].sum()),
+                    float(np.sqrt(pick @ cov @ pick)),
+                    float(np.sqrt((prior[pick] ** 2).sum())),
+                )
+            )
+    return tuple(out)
+
+
+def _scaled(observed: Observed, template: HandProfile, hand_length_m: float | None) -> HandModel:
+    model = HandModel.of(template)
+    own = hand_length_of(model)
+    length = own * flat_scale(observed, model) if hand_length_m is None else hand_length_m
+    if not _SHORTEST_M <= length <= _LONGEST_M:
+        raise FitError(
+            f"the flat hand would be {1e3 * length:.0f} mm long: these are not the five tips of a hand; check the"
+            " markers' colours and the rig's calibration"
+        )
+    return HandModel.of(scaled_profile(template, length / own))
+
+
+def hand_length_of(model: HandModel) -> float:
+    """Wrist crease to the end of the middle finger [m]."""
+    tip = TIPS[2]
+    whole = np.linalg.norm(model.rest_position_m[tip] - model.rest_position_m[WRIST]) + model.radius_m[tip]
+    return float(whole) / _WRIST_TO_CREASE
+
+
+def _check_side(observed: Observed, template: HandProfile, alignment: Alignment) -> None:
+    mirrored = _scaled(observed, mirrored_profile(template), None)
+    other = align(observed, mirrored).cost_m
+    if other < _OTHER_SIDE * alignment.cost_m:
+        raise FitError(
+            f"this is a {mirrored.profile.side} hand: mirrored, the routine fits to {1e3 * other:.0f} mm, as a"
+            f" {template.side} one to {1e3 * alignment.cost_m:.0f} mm; give --side {mirrored.profile.side}"
+        )
+    if alignment.cost_m > _UNLIKE_M:
+        raise FitError(
+            f"the markers are {1e3 * alignment.cost_m:.0f} mm off the routine (rms): the palm did not rest, or"
+            " the steps were others; lay the hand down and follow the steps"
+        )
+
+
+def _check_palm(fit: ShapeFit) -> None:
+    turn, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
+    if shift > _PALM_M or turn > _PALM_RAD:
+        raise FitError(
+            f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(turn):.0f} degrees; lay"
+            " the back of the hand on a table, or paint three markers on it and show them"
+        )
+
+
+def aligned_places(shape: Shape, prior: Shape) -> tuple[Float, Float]:
+    """Knuckles (5, 3) and markers of the back (B, 3), moved so that the four knuckles lie as those of the template."""
+    move = fit_rigid(prior.root_m[1:], shape.root_m[1:])
+    return transform(move, shape.root_m), transform(move, shape.back_m)

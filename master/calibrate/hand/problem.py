@@ -1,0 +1,233 @@
+"""The whole routine as one least-squares problem: one shape, and curves of 26 numbers (palm pose and angles).
+
+Channels of the curves: palm turn (3, rotation vector about the palm's middle, against the first pose), palm shift (3),
+then the angles (20). Deviations from what the routine asks for are Ornstein-Uhlenbeck processes: they live for about a
+second, so that many frames of one bend count as one trial and not as many.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import rotation_vector_to_matrix, skew, transform
+from common.hand_model import HandModel
+from master.calibrate.hand.beliefs import Beliefs, Course
+from master.calibrate.hand.curves import BorderedNormal, Knots
+from master.calibrate.hand.shape import BIAS, LENGTH, PER_FINGER, RATIO, ROOT, TURN, Shape, caps_of
+
+CHANNELS = 26
+_PALM, _ANGLES = 6, 20
+_PIP, _DIP = 2, 3
+_OUTLIER = 3.0  # whitened length from which a marker counts less (Huber)
+_SLACK_RAD = float(np.radians(10.0))  # hands bend farther than the published limits
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """A guess: the shape and the coefficients (K, 26)."""
+
+    shape: Shape
+    coefficients: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandRoutineProblem:
+    """What was seen and what is believed.
+
+    Attributes:
+        model: Template.
+        cap_m: (5, 3) offsets of the caps in the frames of the tip joints.
+        prior: Shape that is believed.
+        points_m: (T, 5 + B, 3) caps thumb ... little, then the markers on the back, rig frame; NaN: not seen.
+        whiten: (T, 5 + B, 3, 3): whiten @ off has unit covariance.
+        knots: Of the curves.
+        course: What the routine asks for at each of them.
+        start: (4, 4) palm pose about which the curves are.
+        palm_free: The palm may move, since it is measured.
+        beliefs: Widths.
+    """
+
+    model: HandModel
+    cap_m: Float
+    prior: Shape
+    points_m: Float
+    whiten: Float
+    knots: Knots
+    course: Course
+    start: Float
+    palm_free: bool
+    beliefs: Beliefs
+
+    def guess(self) -> State:
+        """The routine as it is asked for, by the believed shape."""
+        coefficients = np.zeros((len(self.knots.time_s), CHANNELS))
+        angles = coefficients[:, _PALM:].reshape(-1, 5, 4)
+        angles[..., :3] = self.course.posture_rad
+        angles[..., 3] = self.prior.dip_ratio * angles[..., 2]
+        return State(self.prior, coefficients)
+
+    def stepped(self, state: State, coefficients: Float, constants: Float) -> State:
+        """With a step, kept where hands can be."""
+        moved = state.coefficients + coefficients
+        low, high = (self.model.limits_rad[..., i].ravel() for i in (0, 1))
+        np.clip(moved[:, _PALM:], low - _SLACK_RAD, high + _SLACK_RAD, out=moved[:, _PALM:])
+        return State(state.shape.stepped(constants), moved)
+
+    def normal(self, state: State) -> tuple[BorderedNormal, float]:
+        """Normal equations at a guess, and half the sum of squares there."""
+        size = state.shape.size
+        out = BorderedNormal(len(self.knots.time_s), CHANNELS, size)
+        jacobian, by_shape, off = self._markers(state)
+        seen = weigh(off)
+        rows = len(off), -1
+        scale = np.sqrt(seen)[..., None]
+        off = off * scale
+        out.add_instants(
+            self.knots,
+            (jacobian * scale[..., None]).reshape(*rows, CHANNELS),
+            (by_shape * scale[..., None]).reshape(*rows, size),
+            off.reshape(rows),
+        )
+        links = self._links(state)
+        out.add_links(*links)
+        weight, away = self._shape_belief(state.shape)
+        out.corner += np.diag(weight**2)
+        out.pull_constants -= weight**2 * away
+        cost = 0.5 * (float((off**2).sum() + (links[2] ** 2).sum()) + float(((weight * away) ** 2).sum()))
+        return out, cost
+
+    def residuals(self, state: State) -> Float:
+        """(T, 5 + B, 3) [m] observed less predicted, NaN where not seen."""
+        return self.points_m - self._predicted(state)[0]
+
+    def angles(self, state: State) -> Float:
+        """(T, 5, 4) [rad] at the instants."""
+        return self.knots.at(state.coefficients)[:, _PALM:].reshape(-1, 5, 4)
+
+    def shape_sd(self) -> Float:
+        """(size,) of the believed shape."""
+        return 1.0 / self._shape_belief(self.prior)[0]
+
+    def _predicted(self, state: State) -> tuple[Float, Float, Float]:
+        """Markers (T, M, 3), their Jacobians by the curves (T, M, 3, 26) and the shape (T, M, 3, size)."""
+        curves = self.knots.at(state.coefficients)
+        count, markers = self.points_m.shape[:2]
+        caps = caps_of(self.model, self.cap_m, state.shape, curves[:, _PALM:].reshape(-1, 5, 4))
+        back = np.broadcast_to(state.shape.back_m, (count, markers - 5, 3))
+        palm = np.concatenate([caps.place_m, back], axis=1)
+        turn = rotation_vector_to_matrix(curves[:, :3])
+        rotation = turn @ self.start[:3, :3]
+        middle = 0.5 * self.model.rest_position_m.max(axis=0) * [0.0, 0.0, 1.0]
+        arm = (palm - middle) @ np.swapaxes(rotation, -1, -2)
+        predicted = arm + (transform(self.start, middle) + curves[:, 3:6])[:, None]
+        by_curve = np.zeros((count, markers, 3, CHANNELS))
+        by_shape = np.zeros((count, markers, 3, state.shape.size))
+        by_curve[..., :3] = -skew(arm) @ _left_jacobian(curves[:, :3])[:, None]
+        by_curve[..., 3:6] = np.eye(3)
+        rotated = rotation[:, None]
+        by_angle, by_own = rotated @ caps.by_angle, rotated @ caps.by_shape
+        for f in range(5):
+            by_curve[:, f, :, _PALM + 4 * f : _PALM + 4 * f + 4] = by_angle[:, f]
+            by_shape[:, f, :, PER_FINGER * f : PER_FINGER * (f + 1)] = by_own[:, f]
+        for b in range(markers - 5):
+            at = 5 * PER_FINGER + 3 * b
+            by_shape[:, 5 + b, :, at : at + 3] = rotation
+        return predicted, by_curve, by_shape
+
+    def _markers(self, state: State) -> tuple[Float, Float, Float]:
+        """Whitened Jacobians and differences; nought where nothing was seen."""
+        predicted, by_curve, by_shape = self._predicted(state)
+        off = np.nan_to_num(self.points_m - predicted)
+        return self.whiten @ by_curve, self.whiten @ by_shape, (self.whiten @ off[..., None])[..., 0]
+
+    def _links(self, state: State) -> tuple[Float, Float, Float]:
+        """Rows between neighbouring coefficients: palm, angles about the routine, DIPs about their PIPs."""
+        x, shape = state.coefficients, state.shape
+        change, mean, level = self._widths()
+        dip = _PALM + np.arange(5) * 4 + _DIP
+        pip = dip - 1
+        plain = np.setdiff1d(np.arange(CHANNELS), dip)
+        count, rows = len(x) - 1, 2 * CHANNELS
+        jacobian = np.zeros((count, rows, 2, CHANNELS))
+        by_shape = np.zeros((count, rows, shape.size))
+        off = np.zeros((count, rows))
+        for c in plain:
+            jacobian[:, c, 0, c], jacobian[:, c, 1, c] = -change[:, c], change[:, c]
+            off[:, c] = -change[:, c] * (x[1:, c] - x[:-1, c])
+            jacobian[:, CHANNELS + c, 0, c] = level[:, c]
+            off[:, CHANNELS + c] = level[:, c] * (mean[:, c] - x[:-1, c])
+        stray = x[:, dip] - shape.dip_ratio * x[:, pip] - shape.dip_bias_rad
+        for f, (d, p) in enumerate(zip(dip, pip, strict=True)):
+            ratio, own = shape.dip_ratio[f], PER_FINGER * f
+            jacobian[:, d, 0, d], jacobian[:, d, 1, d] = -change[:, d], change[:, d]
+            jacobian[:, d, 0, p], jacobian[:, d, 1, p] = ratio * change[:, d], -ratio * change[:, d]
+            by_shape[:, d, own + RATIO] = -change[:, d] * (x[1:, p] - x[:-1, p])
+            off[:, d] = -change[:, d] * (stray[1:, f] - stray[:-1, f])
+            row = CHANNELS + d
+            jacobian[:, row, 0, d], jacobian[:, row, 0, p] = level[:, d], -ratio * level[:, d]
+            by_shape[:, row, own + RATIO] = -level[:, d] * x[:-1, p]
+            by_shape[:, row, own + BIAS] = -level[:, d]
+            off[:, row] = -level[:, d] * stray[:-1, f]
+        return jacobian, by_shape, off
+
+    def _widths(self) -> tuple[Float, Float, Float]:
+        """Inverse sd of changes (K - 1, 26), means (K - 1, 26), and inverse sd of levels (K - 1, 26)."""
+        b, h = self.beliefs, self.knots.spacing_s
+        count = len(self.knots.time_s) - 1
+        moving = (self.course.moving[1:] | self.course.moving[:-1]).reshape(count, 5, 3)
+        straight = self.course.straight[:-1]
+        wander = np.empty((count, CHANNELS))  # [1/sqrt(s)]
+        mean, sigma = np.zeros((count, CHANNELS)), np.full((count, CHANNELS), np.inf)
+        wander[:, :3] = b.free_palm_rad_s if self.palm_free else b.palm_rad_s
+        wander[:, 3:6] = b.free_palm_m_s if self.palm_free else b.palm_m_s
+        angles, means, sigmas = (a[:, _PALM:].reshape(count, 5, 4) for a in (wander, mean, sigma))
+        angles[..., :3] = np.where(moving, b.moving_rad_s, b.held_rad_s)
+        means[..., :3] = self.course.posture_rad[:-1]
+        sigmas[..., :3] = np.where(moving, b.moving_level_rad, b.level_rad)
+        means[..., _PIP] = np.where(straight, b.straight_rad[0], means[..., _PIP])
+        sigmas[..., _PIP] = np.where(straight, b.straight_rad[1], sigmas[..., _PIP])
+        dip = np.array([b.thumb_dip_rad, *[b.dip_rad] * 4])
+        angles[..., _DIP], sigmas[..., _DIP] = dip * np.sqrt(2.0 / b.slow_s), dip
+        return 1.0 / (wander * np.sqrt(h)), mean, np.sqrt(h / (2.0 * b.slow_s)) / sigma
+
+    def _shape_belief(self, shape: Shape) -> tuple[Float, Float]:
+        """Inverse sd (size,) and how far a shape (size,) is from the believed one."""
+        b, prior = self.beliefs, self.prior
+        sd, away = np.empty(shape.size), np.empty(shape.size)
+        own_sd, own = (a[: 5 * PER_FINGER].reshape(5, PER_FINGER) for a in (sd, away))
+        own_sd[:, LENGTH], own[:, LENGTH] = b.bone * prior.length_m, shape.length_m - prior.length_m
+        own_sd[:, ROOT], own[:, ROOT] = b.root_m, shape.root_m - prior.root_m
+        own_sd[:, TURN] = np.array([b.thumb_rad, *[b.root_rad] * 4])[:, None]
+        own[:, TURN] = _turn_between(shape.root_rotation, prior.root_rotation)
+        own_sd[:, RATIO] = np.array([b.thumb_ratio[1], *[b.dip_ratio[1]] * 4])
+        own[:, RATIO] = shape.dip_ratio - prior.dip_ratio
+        own_sd[:, BIAS], own[:, BIAS] = b.dip_bias_rad, shape.dip_bias_rad - prior.dip_bias_rad
+        sd[5 * PER_FINGER :] = b.back_m
+        away[5 * PER_FINGER :] = (shape.back_m - prior.back_m).ravel()
+        return 1.0 / sd, away
+
+
+def weigh(whitened: Float) -> Float:
+    """Huber's weights (...) of whitened differences (..., 3)."""
+    return np.minimum(1.0, _OUTLIER / np.maximum(np.linalg.norm(whitened, axis=-1), 1e-12))
+
+
+def _turn_between(rotation: Float, other: Float) -> Float:
+    """(5, 3) small turns about the palm's axes from `other` to `rotation` (5, 3, 3)."""
+    relative = rotation @ np.swapaxes(other, -1, -2)
+    return 0.5 * np.stack(
+        [
+            relative[:, 2, 1] - relative[:, 1, 2],
+            relative[:, 0, 2] - relative[:, 2, 0],
+            relative[:, 1, 0] - relative[:, 0, 1],
+        ],
+        axis=1,
+    )
+
+
+def _left_jacobian(vector: Float) -> Float:
+    """(T, 3, 3): turns of rotation_vector_to_matrix(vector) by changes of the vector (Barfoot, 2017, eq. 7.77)."""
+    angle = np.maximum(np.linalg.norm(vector, axis=-1), 1e-6)[:, None, None]
+    k = skew(vector)
+    return np.eye(3) + (1 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)

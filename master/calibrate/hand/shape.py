@@ -1,0 +1,136 @@
+"""The shape of a hand as numbers to be found, and where it puts the caps for given angles, with derivatives.
+
+Of each finger: three bone lengths, the place and the rest orientation of its root (knuckle; thumb: CMC), and how its
+DIP follows its PIP. Directions of bones in their joints, rest turns and the caps' offsets from the tip joints stay
+those of the template. With them the places of the markers on the back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import cross, rotation_vector_to_matrix, skew
+from common.hand_model import CHAINS, HandModel
+
+PER_FINGER = 11
+LENGTH, ROOT, TURN, RATIO, BIAS = slice(0, 3), slice(3, 6), slice(6, 9), 9, 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shape:
+    """One hand's shape.
+
+    Attributes:
+        length_m: (5, 3) bones of the chains, proximal to distal.
+        root_m: (5, 3) roots of the chains, palm frame.
+        root_rotation: (5, 3, 3) rest orientation of the root joints, joint -> palm frame.
+        dip_ratio, dip_bias_rad: (5,) DIP = ratio PIP + bias (thumb: IP and MCP).
+        back_m: (B, 3) markers of the back, palm frame.
+    """
+
+    length_m: Float
+    root_m: Float
+    root_rotation: Float
+    dip_ratio: Float
+    dip_bias_rad: Float
+    back_m: Float
+
+    @classmethod
+    def of(cls, model: HandModel, back: tuple[str, ...], dip_ratio: float, thumb_ratio: float) -> "Shape":
+        """That of a profile."""
+        return cls(
+            length_m=np.linalg.norm(model.bone_m, axis=-1),
+            root_m=model.rest_position_m[CHAINS[:, 0]],
+            root_rotation=model.rest_rotation[CHAINS[:, 0]],
+            dip_ratio=np.array([thumb_ratio, *[dip_ratio] * 4]),
+            dip_bias_rad=np.zeros(5),
+            back_m=np.array([model.mount(name).offset_m for name in back]).reshape(-1, 3),
+        )
+
+    @property
+    def size(self) -> int:
+        """How many numbers it has: 11 of each finger, then 3 of each marker of the back."""
+        return 5 * PER_FINGER + self.back_m.size
+
+    def stepped(self, step: Float) -> "Shape":
+        """With a step (size,) [m, rad] added; turns are about the palm's axes."""
+        own, back = step[: 5 * PER_FINGER].reshape(5, PER_FINGER), step[5 * PER_FINGER :]
+        turns = np.stack([rotation_vector_to_matrix(turn) for turn in own[:, TURN]])
+        return Shape(
+            length_m=self.length_m + own[:, LENGTH],
+            root_m=self.root_m + own[:, ROOT],
+            root_rotation=turns @ self.root_rotation,
+            dip_ratio=self.dip_ratio + own[:, RATIO],
+            dip_bias_rad=self.dip_bias_rad + own[:, BIAS],
+            back_m=self.back_m + back.reshape(-1, 3),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Caps:
+    """Where the caps of the tips are in the palm frame, for T instants.
+
+    Attributes:
+        place_m: (T, 5, 3).
+        by_angle: (T, 5, 3, 4) [m/rad] change with abduction, flexion, PIP, DIP.
+        by_shape: (T, 5, 3, 11) change with the numbers of the own finger.
+    """
+
+    place_m: Float
+    by_angle: Float
+    by_shape: Float
+
+
+def caps_of(model: HandModel, cap_m: Float, shape: Shape, angles_rad: Float) -> Caps:
+    """Caps of a shape.
+
+    Args:
+        model: Template: rest turns, directions of bones, side.
+        cap_m: (5, 3) offsets of the caps in the frames of the tip joints [m].
+        shape: The shape.
+        angles_rad: (T, 5, 4) abduction, flexion, PIP, DIP.
+    """
+    count = len(angles_rad)
+    abduct = _about(1, model.side_sign * angles_rad[..., 0])
+    bend = _about(0, -angles_rad[..., 1:])
+    before = np.tile(np.eye(3), (count, 5, 1, 1))  # what turns the rest orientation as a whole
+    before[:, 1:] = abduct[:, 1:]
+    first = before @ shape.root_rotation
+    first[:, 0] = first[:, 0] @ abduct[:, 0]
+    rotations = [first @ bend[:, :, 0]]
+    for k in (1, 2):
+        rotations.append(rotations[-1] @ model.turn[:, k - 1] @ bend[:, :, k])
+    along = model.bone_m / np.linalg.norm(model.bone_m, axis=-1, keepdims=True)
+    ways = [_turned(rotation, along[:, k]) for k, rotation in enumerate(rotations)]  # (T, 5, 3) unit
+    joints = [np.broadcast_to(shape.root_m, (count, 5, 3))]
+    for k in range(3):
+        joints.append(joints[-1] + shape.length_m[:, k, None] * ways[k])
+    tip = joints[3] + _turned(rotations[2], (model.turn[:, 2] @ cap_m[..., None])[..., 0])
+    axis = np.empty((count, 5, 4, 3))
+    axis[:, :, 0] = model.side_sign * np.array([0.0, 1.0, 0.0])
+    axis[:, 0, 0] = model.side_sign * (first[:, 0] @ np.array([0.0, 1.0, 0.0]))
+    for k, rotation in enumerate(rotations):
+        axis[:, :, k + 1] = -rotation[..., 0]
+    pivot = np.stack([joints[0], joints[0], joints[1], joints[2]], axis=2)
+    by_angle = np.swapaxes(cross(axis, tip[:, :, None] - pivot), -1, -2)
+    by_shape = np.zeros((count, 5, 3, PER_FINGER))
+    by_shape[..., LENGTH] = np.stack(ways, axis=-1)
+    by_shape[..., ROOT] = np.eye(3)
+    by_shape[..., TURN] = -skew(tip - joints[0]) @ before
+    return Caps(tip, by_angle, by_shape)
+
+
+def _turned(rotation: Float, vector: Float) -> Float:
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def _about(axis: int, angle: Float) -> Float:
+    """Rotations (..., 3, 3) about a coordinate axis."""
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    out = np.zeros((*angle.shape, 3, 3))
+    out[..., axis, axis] = 1.0
+    out[..., i, i] = out[..., j, j] = np.cos(angle)
+    out[..., j, i] = np.sin(angle)
+    out[..., i, j] = -out[..., j, i]
+    return out
