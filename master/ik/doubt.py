@@ -48,6 +48,7 @@ class JointDoubt:
 
     def __init__(self, parameters: HandParameters, priors: Priors) -> None:
         self._finger, self._priors = parameters.free // 4, priors
+        self._parameters = parameters
         self._anywhere = 1.0 / anywhere(parameters)
         complete = parameters.complete.reshape(5, 4, -1)
         self._bent = np.zeros(
@@ -80,7 +81,7 @@ class JointDoubt:
             past = self.cov.copy()
             np.einsum("ii->i", past)[...] += self._grown(last, found, dt_s, hidden, palm_seen=palm_seen)
             if not palm_seen or hidden.gone_s.any():
-                now = surer(self._without(now, hidden), past)
+                now = surer(self._without(found, hidden), past)
         else:
             self._lost_s = self._speed_m_s = 0.0
         self.cov = now
@@ -88,13 +89,16 @@ class JointDoubt:
         linear = (moved.reshape(-1, len(now)) @ now).reshape(moved.shape) @ np.swapaxes(moved, 1, 2)
         return linear + self._on_arcs(found, now)
 
-    def _without(self, now: Float, hidden: HiddenFingers) -> Float:
+    def _without(self, found: HandSolution, hidden: HiddenFingers) -> Float:
         """What this instant tells (6 + n, 6 + n), but of hidden fingers no more than their limits."""
-        column = 6 + np.flatnonzero(hidden.gone_s[self._finger] > 0.0)
+        now, column = found.alone, 6 + np.flatnonzero(hidden.gone_s[self._finger] > 0.0)
         if len(column):
             now = now.copy()
             now[column] = now[:, column] = 0.0
-            now[column, column] = self._anywhere[column]
+            # Anywhere within the limits, seen from where it is believed to be.
+            x = self._parameters.of_angles(found.angles_rad)
+            off = 0.5 * (self._parameters.low + self._parameters.high) - x
+            now[column, column] = self._anywhere[column] + np.square(off)[column - 6]
         return now
 
     def _grown(
