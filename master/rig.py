@@ -118,8 +118,7 @@ def point_filter(setup: RigSetup) -> PointFilter:
 
 def hand_filter(setup: RigSetup) -> HandFilter:
     """The filter of the solved hand, which leaves no more jitter than that of the points may."""
-    settings = setup.rig.filter
-    return HandFilter(setup.hand, setup.hand_markers, settings.jitter_m, settings.d_cutoff_hz)
+    return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m)
 
 
 def build_pipeline(

