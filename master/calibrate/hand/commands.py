@@ -12,11 +12,12 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
 from common.hand_routine import ROUTINE_S, STEPS
+from master.calibrate.hand.live import observe_live
 from master.calibrate.hand.measure import hand_length_of, measure_hand
-from master.calibrate.hand.observed import Observed, read_observed
+from master.calibrate.hand.observed import read_observed
 from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
 from master.calibrate.tree_files import write_hand
-from master.options import CALIB_JSON, Calibration, JsonFile
+from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JsonFile
 from master.summary import write_summary
 
 PosesPath = Annotated[
@@ -26,7 +27,9 @@ Name = Annotated[str, typer.Option(help="Name of the new hand file, without .jso
 Side = Annotated[Literal["left", "right"], typer.Option(help="Which hand.")]
 LengthMm = Annotated[
     float | None,
-    typer.Option(help="Millimetres from the wrist crease to the end of the middle finger; alone: a quick start."),
+    typer.Option(
+        help="Millimetres from the wrist crease to the end of the middle finger; alone: a quick start."
+    ),
 ]
 Base = Annotated[
     Path | None, typer.Option("--hand", help="Hand file to begin with: proportions, marker places.")
@@ -36,6 +39,7 @@ DipPerPip = Annotated[
     float | None, typer.Option(help="How far the last joint bends per middle joint, where it was measured.")
 ]
 Steps = Annotated[bool, typer.Option("--steps", help="Only tell the steps of the routine.")]
+Live = Annotated[bool, typer.Option("--live", help="Do the routine now, before the running master.")]
 Out = Annotated[Path | None, typer.Option(help="Tree to write hands/NAME.json into.")]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of lengths and residuals to this .png.")]
 
@@ -55,6 +59,8 @@ def hand_command(
     json_file: JsonFile = None,
     picture: Picture = None,
     steps: Steps = False,
+    live: Live = False,
+    bus: BusEnd = HERE_BUS,
 ) -> None:
     """Make a hand file: from the hand's length, or measured by a guided routine of 20 s.
 
@@ -65,26 +71,37 @@ def hand_command(
       phalanx-master calibrate hand --steps                                                      what to do for:
 
       phalanx-master calibrate hand --poses poses.npz --side right --name me --out calib_json
+
+      phalanx-master calibrate hand --live --side right --name me --out calib_json               step by step
     """
     if steps:
         for line in step_lines():
             typer.echo(line)
         return
     template = template_of(base, side, name)
-    if poses is None:
+    if live and poses is not None:
+        raise CalibrationError("--poses has no meaning with --live: leave it out")
+    if poses is None and not live:
         if length_mm is None:
-            raise CalibrationError("give --poses FILE of the routine (its steps: --steps), or --length-mm")
+            raise CalibrationError(
+                "give --live, --poses FILE of the routine (its steps: --steps), or --length-mm"
+            )
         told: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
         profile = quick_profile(quick(base, template, length_mm), name, 1e-3 * length_mm)
         typer.echo(f"{side} hand scaled to {length_mm:g} mm; no bone is measured")
     else:
-        observed = observed_of(poses, calibration, rig, template)
+        names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
+        model = HandModel.of(template)
+        observed = observe_live(bus, names, model) if poses is None else read_observed(poses, names, model)
         ratio = None if dip_per_pip is None else (dip_per_pip, _RATIO_SD)
         length_m = None if length_mm is None else 1e-3 * length_mm
         found = measure_hand(observed, template, length_m, ratio, _progress)
         for line in report_lines(found):
             typer.echo(line)
-        profile, told = measured_profile(found, name, poses.name), report_json(found)
+        profile, told = (
+            measured_profile(found, name, "live" if poses is None else poses.name),
+            report_json(found),
+        )
         if picture is not None:
             from master.calibrate.hand.picture import draw_hand
 
@@ -132,16 +149,6 @@ def quick(base: Path | None, template: HandProfile, length_mm: float) -> HandPro
     if base is None:
         return generated
     return scaled_profile(template, 1e-3 * length_mm / hand_length_of(HandModel.of(template)))
-
-
-def observed_of(poses: Path, calibration: Path, rig: str, template: HandProfile) -> Observed:
-    """Markers of a poses file, named by the rig.
-
-    Raises:
-        PhalanxError: A file is missing, broken, or does not fit the others.
-    """
-    names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
-    return read_observed(poses, names, HandModel.of(template))
 
 
 def _progress(share: float) -> None:

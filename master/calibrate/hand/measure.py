@@ -13,7 +13,6 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.calibration import HandProfile
 from common.errors import FitError
-from common.geometry import fit_rigid, transform
 from common.hand_model import FINGERS, TIPS, WRIST, HandModel
 from common.hand_profiles import mirrored_profile, scaled_profile
 from master.calibrate.hand.align import GRID_S, Alignment, align, flat_scale, missing_steps
@@ -33,7 +32,7 @@ _GROUPS = ((0,), (1,), (2,), (1, 2), (0, 1), (0, 1, 2))
 _SHORTEST_M, _LONGEST_M = 0.1, 0.25
 _OTHER_SIDE = 0.6  # the mirrored hand fits with this share of the distance: it is the other one
 _UNLIKE_M = 0.025
-_PALM_M, _PALM_RAD = 0.012, float(np.radians(8.0))
+_RESTLESS = 1.2  # times the wandering that is believed of a palm that rests
 _WRIST_TO_CREASE = 1.0246  # the wrist joint of generated profiles lies behind the crease
 _FREE_WITH = 3  # markers on the back that measure the palm's pose
 
@@ -133,7 +132,7 @@ def measure_hand(
     problem = problem_of(observed, model, alignment, beliefs)
     fit = fit_shape(problem, lambda share: progress(0.1 + 0.9 * share))
     if not problem.palm_free:
-        _check_palm(fit)
+        _check_palm(problem, fit)
     return HandMeasurement(observed, alignment, model, fit, lengths_of(problem, fit))
 
 
@@ -223,16 +222,14 @@ def _check_side(observed: Observed, template: HandProfile, alignment: Alignment)
         )
 
 
-def _check_palm(fit: ShapeFit) -> None:
-    turn, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
-    if shift > _PALM_M or turn > _PALM_RAD:
+def _check_palm(problem: HandRoutineProblem, fit: ShapeFit) -> None:
+    """Curves that are smoothed by a belief stay within it, unless the palm really moved more than that."""
+    beliefs, step_s = problem.beliefs, np.sqrt(problem.knots.spacing_s)
+    believed = np.repeat([beliefs.palm_rad_s, beliefs.palm_m_s], 3) * step_s
+    wander = np.sqrt((np.diff(fit.palm, axis=0) ** 2).mean(axis=0)) / believed
+    if wander.max() > _RESTLESS:
+        turn, shift = (float(np.ptp(part, axis=0).max()) for part in (fit.palm[:, :3], fit.palm[:, 3:]))
         raise FitError(
             f"the palm did not rest: it moved by {1e3 * shift:.0f} mm and turned by {np.degrees(turn):.0f} degrees; lay"
             " the back of the hand on a table, or paint three markers on it and show them"
         )
-
-
-def aligned_places(shape: Shape, prior: Shape) -> tuple[Float, Float]:
-    """Knuckles (5, 3) and markers of the back (B, 3), moved so that the four knuckles lie as those of the template."""
-    move = fit_rigid(prior.root_m[1:], shape.root_m[1:])
-    return transform(move, shape.root_m), transform(move, shape.back_m)

@@ -134,6 +134,12 @@ def test_a_palm_that_moves_is_refused() -> None:
         measure_hand(seen(run, "right", run.points_m + shift), template("right"))
 
 
+def test_a_hand_in_the_air_is_refused() -> None:
+    run = routine(401, "left", rest=1.0)  # 6 mm to and fro: lengths would come out a millimetre wrong
+    with pytest.raises(FitError, match="palm did not rest"):
+        measure_hand(seen(run, "left"), template("left"))
+
+
 def test_gaps_do_not_spoil_it() -> None:
     run = routine(21, "right")
     points = run.points_m.copy()

@@ -1,0 +1,115 @@
+"""The routine with a person: steps are told one by one, and a step whose markers were not seen is done again.
+
+What was seen in a step that is done again is dropped and its time taken out, so that the rest is one routine.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.clock import Clock
+from common.errors import FitError
+from common.hand_routine import MOVES, STEPS, Step
+from common.messages import HandPose
+
+SEEN = 0.6  # of a step's poses each tip must be in
+_LATE_S = 0.4  # users begin after they have read
+_TRIES = 3
+_WAIT_S = 0.05
+_COUNT_DOWN_S = 3
+_GAP_NS = 20_000_000
+
+Receive = Callable[[float], HandPose | None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """Markers of the kept steps.
+
+    Attributes:
+        t_ns: Rising [ns], without the time of dropped steps.
+        points_m: For each, (M, 3) [m].
+        cov_m2: For each, (M, 3, 3).
+    """
+
+    t_ns: list[int] = field(default_factory=list[int])
+    points_m: list[Float] = field(default_factory=list[Float])
+    cov_m2: list[Float] = field(default_factory=list[Float])
+
+    def keep(self, poses: Sequence[HandPose]) -> None:
+        """Add the poses of one step."""
+        shift = (self.t_ns[-1] + _GAP_NS - poses[0].t_ns) if self.t_ns else 0
+        for pose in poses:
+            if self.t_ns and pose.t_ns + shift <= self.t_ns[-1]:
+                continue  # a pose that came twice
+            self.t_ns.append(pose.t_ns + shift)
+            self.points_m.append(pose.markers_raw_m)
+            self.cov_m2.append(pose.markers_cov_m2)
+
+    def arrays(self) -> tuple[Int, Float, Float]:
+        """Times (T,) [ns], places (T, M, 3) [m] and covariances (T, M, 3, 3)."""
+        return np.array(self.t_ns, np.int64), np.array(self.points_m), np.array(self.cov_m2)
+
+
+def lead(
+    receive: Receive, tips: Sequence[int], names: Sequence[str], clock: Clock, say: Callable[[str], None]
+) -> Track:
+    """Lead a person through the routine.
+
+    Args:
+        receive: The next pose of the running master, waiting at most so long [s].
+        tips: Rows of the five tips among the markers.
+        names: Of the markers.
+        clock: For the steps.
+        say: Told one line at a time.
+
+    Raises:
+        FitError: No pose comes, or a step was not seen three times.
+    """
+    track = Track()
+    say("lay the back of the hand on the table, palm to the cameras; it stays there until the end")
+    for count in range(_COUNT_DOWN_S, 0, -1):
+        say(f"{count} ...")
+        _during(receive, clock, 1.0)
+    for number, step in enumerate(STEPS):
+        for _ in range(_TRIES):
+            say(f"{number + 1} of {len(STEPS)}: {step.told} ({step.seconds:.0f} s)")
+            poses = _during(receive, clock, step.seconds + _LATE_S)
+            lacking = unseen(step, number, poses, tips, names)
+            if not lacking:
+                track.keep(poses)
+                break
+            say(f"{lacking}; back to the flat hand, and this step again")
+            _during(receive, clock, 1.0)
+        else:
+            raise FitError(
+                f"{step.name}: not seen in {_TRIES} tries; turn the hand or a camera, and begin again"
+            )
+    say("done")
+    return track
+
+
+def unseen(
+    step: Step, number: int, poses: Sequence[HandPose], tips: Sequence[int], names: Sequence[str]
+) -> str:
+    """What a step lacks, or nothing."""
+    if not poses:
+        return f"{step.name}: no pose came; is `phalanx-master run` running, on this --bus, with this hand in sight"
+    moving = np.any([move.moving.any(axis=1) for move in MOVES if move.step == number], axis=0)
+    wanted = [f for f in range(5) if moving[f] or not moving.any()]
+    seen = np.isfinite([pose.markers_raw_m[list(tips), 0] for pose in poses]).mean(axis=0)
+    poor = [f"{names[tips[f]]} in {100 * seen[f]:.0f} %" for f in wanted if seen[f] < SEEN]
+    return f"{step.name}: markers are seen too little: {', '.join(poor)}" if poor else ""
+
+
+def _during(receive: Receive, clock: Clock, seconds: float) -> list[HandPose]:
+    """The poses that come within a time."""
+    until = clock.now_ns() + round(1e9 * seconds)
+    poses: list[HandPose] = []
+    while clock.now_ns() < until:
+        pose = receive(_WAIT_S)
+        if pose is not None:
+            poses.append(pose)
+    return poses
