@@ -1,0 +1,60 @@
+"""Recorded hands as the truth: what is cut, what is kept, and that errors are seen where there are some."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.real_motion import Recorded, held_poses, jitter, play, recordings, wide_limits
+from common.hand_model import HandModel
+from common.hand_profiles import generated_profile
+from master.ik.hand import HandSolver
+from tests.hand_helpers import FACING, MARKERS, palm, small_cov
+
+
+def named(folder: Path, name: str) -> Recorded:
+    return next(recorded for recorded in recordings(folder / "leapjs") if recorded.name == name)
+
+
+def test_a_hand_that_changes_its_size_is_cut(datasets: Path) -> None:
+    parts = [
+        recorded for recorded in recordings(datasets / "leapjs") if recorded.name.startswith("confidence")
+    ]
+    assert len(parts) == 2
+    for part in parts:
+        bones = np.linalg.norm(np.diff(part.fingers_m, axis=2), axis=3)
+        assert bones.std(axis=0).max() < 1e-5
+        roots = part.fingers_m[:, :, 0]
+        assert roots.std(axis=0).max() < 1e-5  # the palm frame is fixed to the palm
+
+
+def test_a_profile_that_is_another_hand_is_seen(datasets: Path) -> None:
+    whole = named(datasets, "pinch")
+    short = replace(
+        whole, t_ns=whole.t_ns[:90], T_rig_palm=whole.T_rig_palm[:90], fingers_m=whole.fingers_m[:90]
+    )
+    own = play(short, whole.model(), seed=1)
+    larger = replace(whole, fingers_m=whole.fingers_m * 1.3).model()
+    assert own.shown_m.mean() < 5e-3
+    assert play(short, larger, seed=1).shown_m.mean() > 2.0 * own.shown_m.mean()
+
+
+def test_jitter_is_what_differs_over_time() -> None:
+    model = HandModel.of(generated_profile("held", "right"))
+    angles = held_poses(model)["relaxed"]
+    assert model.within_limits(angles).all()
+    solver = HandSolver(model, MARKERS)
+    caps = model.marker_points(model.forward(palm(), angles), MARKERS)
+    near = [solver.solve(caps + np.array([x, 0.0, 0.0]), small_cov(), facing=FACING) for x in (-1e-3, 1e-3)]
+    hands = [hand for hand in near if hand is not None]
+    place, bent, turned = jitter(hands * 4)
+    np.testing.assert_allclose(place, 1.0, atol=0.05)  # 1 mm to either side
+    assert bent < 0.2
+    assert turned < 0.2
+    assert jitter(hands[:1] * 4) == (0.0, 0.0, 0.0)
+
+
+def test_the_limits_are_wide_enough_to_be_no_help() -> None:
+    limits = wide_limits()
+    assert limits.index.flexion_rad[0] < -0.5
+    assert limits.little.pip_rad[1] > 2.0
