@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.calibration import HandProfile, load, save
 from common.geometry import quaternion_to_matrix
 from common.hand_model import CHAINS, FINGER_JOINTS, HandModel
-from common.hand_profiles import generated_profile
+from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
 
 # Buchholz, Armstrong & Goldstein, 1992: proximal and middle bone as shares of hand length.
 BONES = {1: (0.245, 0.143), 2: (0.266, 0.170), 3: (0.244, 0.165), 4: (0.204, 0.117)}
@@ -80,3 +80,28 @@ def test_a_generated_hand_survives_its_file(tmp_path: Path) -> None:
     made = generated_profile("mine", "left", 0.173)
     save(tmp_path / "mine.json", made)
     assert load(tmp_path / "mine.json", HandProfile) == made
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_mirrored_profile_is_the_generated_one_of_the_other_side(side: str) -> None:
+    other = "right" if side == "left" else "left"
+    mirrored, made = mirrored_profile(generated_profile("any", side)), generated_profile("any", other)
+    assert mirrored.side == other
+    assert mirrored.markers == made.markers
+    for name, joint in made.rest_joints.items():
+        assert mirrored.rest_joints[name].position_m == joint.position_m
+        R, L = (
+            quaternion_to_matrix(np.array(of.rest_joints[name].orientation_wxyz)) for of in (mirrored, made)
+        )
+        np.testing.assert_allclose(R, L, atol=1e-7)
+    assert mirrored_profile(mirrored) == generated_profile("any", side)
+
+
+@given(st.floats(0.12, 0.24), st.floats(0.12, 0.24))
+def test_a_scaled_profile_is_the_generated_one_of_that_length(length_m: float, other_m: float) -> None:
+    scaled = scaled_profile(generated_profile("any", "right", length_m), other_m / length_m)
+    made = generated_profile("any", "right", other_m)
+    for name, joint in made.rest_joints.items():
+        np.testing.assert_allclose(scaled.rest_joints[name].position_m, joint.position_m, atol=1e-6)
+    for name, mount in made.markers.items():
+        np.testing.assert_allclose(scaled.markers[name].offset_m, mount.offset_m, atol=2e-6)

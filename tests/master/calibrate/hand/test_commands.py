@@ -1,0 +1,81 @@
+"""`phalanx-master calibrate hand` as a user runs it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from common.calibration import HandProfile, load, save
+from common.errors import CalibrationError, PhalanxError, RecordingError
+from common.hand_model import HandModel
+from common.hand_profiles import generated_profile
+from common.npz import write_npz
+from master.calibrate.cli import calibrate_app
+from tests.master.calibrate.hand.routines import routine
+
+
+def run(*options: str) -> str:
+    result = CliRunner().invoke(calibrate_app(), ["hand", *options], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_quick_start_from_the_length(tmp_path: Path, side: str) -> None:
+    told = run("--length-mm", "183", "--side", side, "--name", "anna", "--out", str(tmp_path))
+    assert "no bone is measured" in told
+    made = load(tmp_path / "hands" / "anna.json", HandProfile)
+    assert made.rest_joints == generated_profile("anna", side, 0.183).rest_joints
+    assert "no bone is measured" in made.provenance["rest_joints"].note
+
+
+def test_a_quick_start_from_another_hand_is_mirrored_and_scaled(tmp_path: Path) -> None:
+    save(tmp_path / "his.json", generated_profile("his", "left", 0.2))
+    run("--length-mm", "180", "--name", "hers", "--hand", str(tmp_path / "his.json"), "--out", str(tmp_path))
+    made = load(tmp_path / "hands" / "hers.json", HandProfile)
+    expected = HandModel.of(generated_profile("hers", "right", 0.18))
+    np.testing.assert_allclose(HandModel.of(made).rest_position_m, expected.rest_position_m, atol=3e-4)
+
+
+def test_a_routine_from_a_file_of_poses(tmp_path: Path, root: Path) -> None:
+    sight = routine(31, "left")
+    poses = {"t_ns": sight.t_ns, "markers_raw_m": sight.points_m, "markers_cov_m2": sight.cov_m2}
+    write_npz(tmp_path / "poses.npz", poses)
+    calibration = ("--rig", "desk", "--calibration", str(root / "calib_json"))
+    given = ("--poses", str(tmp_path / "poses.npz"), "--side", "left", "--name", "ben", *calibration)
+    figures, picture = tmp_path / "hand.json", tmp_path / "hand.png"
+    told = run(*given, "--out", str(tmp_path), "--json", str(figures), "--picture", str(picture))
+    assert "measured" in told
+    assert "undetermined" in told
+    lengths = json.loads(figures.read_text())["lengths"]
+    made = load(tmp_path / "hands" / "ben.json", HandProfile)
+    for finger in ("index", "middle", "ring", "little"):
+        whole = lengths[f"{finger}_proximal_middle_distal"]
+        keys = made.provenance[finger].residual
+        assert whole["measured"] == (f"{finger}_proximal_middle_distal_sigma_mm" in keys)
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_steps_are_told_without_anything_else() -> None:
+    told = run("--steps")
+    assert "lay the back of the hand" in told.lower()
+    assert "thumb alone" in told
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "message"),
+    [
+        ((), CalibrationError, "--length-mm"),
+        (("--length-mm", "300"), CalibrationError, "no hand|expected 0.1 to 0.25"),
+        (("--poses", "nowhere.npz"), RecordingError, "nowhere.npz"),
+        (("--live", "--poses", "a.npz"), CalibrationError, "no meaning with --live"),
+        (("--length-mm", "190", "--hand", "nowhere.json"), CalibrationError, "nowhere.json"),
+    ],
+)
+def test_what_cannot_be_done_is_told(
+    options: tuple[str, ...], kind: type[PhalanxError], message: str, root: Path
+) -> None:
+    with pytest.raises(kind, match=message):
+        run(*options, "--calibration", str(root / "calib_json"))
