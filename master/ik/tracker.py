@@ -1,9 +1,12 @@
 """One hand over time: what to believe about fingers that nobody sees, and what to say about each joint.
 
 A finger whose marker is seen is solved from it. When the marker goes, the finger moves on a little the way it
-was moving and is *held* there while the doubt grows; a finger that was never seen is believed to be curled out
-of sight, because a stretched one would show. It is never put back to an open flat hand. When a marker returns,
-the last pose is only a wide prior, so the finger is solved from what is seen at once.
+was moving, and with its neighbours, and is *held* there while the doubt grows (`master.ik.hidden`, `master.ik.doubt`);
+a finger that was never seen is believed to be curled out of sight, because a stretched one would show. It is never
+put back to an open flat hand. When a marker returns, the last pose is only a wide prior, so the finger is solved from
+what is seen at once.
+
+The bits are those of XR_EXT_hand_tracking: an active hand has all joints valid; tracked is what is seen now.
 """
 
 from copy import copy
