@@ -79,7 +79,7 @@ def report_lines(measurement: HandMeasurement) -> list[str]:
     lines = [
         f"{template.profile.side} hand, about {1e3 * hand_length_of(template):.0f} mm long",
         f"residuals {rms:.2f} mm rms per axis, {times:.2f} times what the markers' covariances expect",
-        f"{'bone':26} {'fitted':>8} {'+- 99 %':>8} {'scaled':>8}",
+        f"{'bone':34} {'fitted':>8} {'+- 99 %':>8} {'scaled':>8}",
     ]
     for finger in range(5):
         parted = measurement.parted(finger)
@@ -94,7 +94,7 @@ def report_lines(measurement: HandMeasurement) -> list[str]:
             else:
                 verdict = "undetermined: keeps the scaled value"
             lines.append(
-                f"{length.name:26} {1e3 * length.length_m:8.1f} {1e3 * CERTAIN * length.sigma_m:8.1f}"
+                f"{length.name:34} {1e3 * length.length_m:8.1f} {1e3 * CERTAIN * length.sigma_m:8.1f}"
                 f" {1e3 * length.scaled_m:8.1f}  {verdict}"
             )
     return lines
