@@ -123,7 +123,9 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument("--rig", default="desk", help="default: %(default)s")
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
     demo.add_argument(
-        "--scene", default="standard", help="standard, lights (it changes), poses, or leap:FILE.npz"
+        "--scene",
+        default="standard",
+        help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz",
     )
     replay = commands.add_parser(
         "replay",

@@ -41,7 +41,7 @@ class DemoSettings:
         calibration: calib_json tree.
         rig: Rig to simulate.
         seed: Seed of the scene.
-        scene: What moves: "standard", or "leap:FILE.npz" for a recorded motion.
+        scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
         master: Module that is run as the master.
     """

@@ -194,7 +194,7 @@ def _camera(command: argparse.ArgumentParser) -> None:
         "--scene",
         default="standard",
         metavar="NAME",
-        help="standard | lights | poses | board | leap:FILE.npz",
+        help="standard | lights | poses | hand-routine | leap:FILE.npz | board",
     )
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(

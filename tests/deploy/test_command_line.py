@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from common.sim.scene import APART_PPM, LATE_NS
+from common.sim.scenes import NAMES
 from deploy import demo
 from deploy.__main__ import main
 
@@ -20,6 +21,16 @@ def test_help_of_a_command_shows_its_own_examples_only(
     examples = capsys.readouterr().out.split("examples:")[1]
     assert f"phalanx {command} " in examples
     assert f"phalanx {other} " not in examples
+
+
+def test_help_of_the_demo_lists_every_scene(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # nothing is broken at its hyphen
+    with pytest.raises(SystemExit):
+        main(["demo", "--help"])
+    text = capsys.readouterr().out
+    assert [scene for scene in NAMES.split(" | ") if scene not in text] == []
 
 
 def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,8 @@ def solved(angles: Float) -> tuple[HandSolution, Float]:
     joints = RIGHT.forward(palm(), angles)
     points = RIGHT.marker_points(joints, MARKERS)
     sure = np.zeros((26, 3, 3)), np.zeros((5, 3, 3)), np.zeros((5, 3, 3))
-    return HandSolution(palm(), angles, joints, *sure, np.zeros(6), 0.0, 1, 1.0), points
+    told = np.eye(22), np.zeros((26, 3, 22))
+    return HandSolution(palm(), angles, joints, *sure, np.zeros(6), 0.0, 1, 1.0, *told), points
 
 
 @given(seeds)

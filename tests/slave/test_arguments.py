@@ -4,6 +4,7 @@ import argparse
 
 import pytest
 
+from common.sim.scenes import VIEWS
 from slave.__main__ import COMMANDS
 from slave.arguments import HELP, parser
 
@@ -21,6 +22,16 @@ def test_help_of_a_command_shows_its_own_examples_only(
     examples = text.split("examples:")[1]
     assert f"phalanx-slave {command} " in examples
     assert not [other for other in HELP if other != command and f"phalanx-slave {other} " in examples]
+
+
+@pytest.mark.parametrize("command", ["run", "record"])
+def test_help_lists_every_scene(
+    command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")  # nothing is broken at its hyphen
+    with pytest.raises(SystemExit):
+        parser().parse_args([command, "--help"])
+    assert VIEWS in " ".join(capsys.readouterr().out.split())
 
 
 def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -117,7 +117,7 @@ def measure(source: Source, meter: Meter, clock: Clock, progress: Callable[[floa
     since_ns = clock.now_ns()
     while clock.now_ns() - since_ns < PATIENCE_S * 1e9:
         message = source.get(0.1)
-        if message is None or message.t_ns < since_ns:
+        if not isinstance(message, MarkerDetections) or message.t_ns < since_ns:
             continue
         reading = meter.push(message)
         progress(meter.progress)

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import pytest
 from common.arrays import Float
 from common.clock import SystemClock
 from common.errors import FitError
-from common.messages import MarkerDetections
+from common.messages import ImuSample, MarkerDetections
 from master.calibrate.depth.session import Meter, Reading, measure, run_session
 from master.calibrate.depth.sweep import Sweep, checked
 from master.calibrate.depth.tables import read_table, write_table
@@ -108,10 +108,10 @@ def test_frames_of_other_cameras_are_not_ours() -> None:
 class Queue:
     """A source that gives what it holds, and lets the clock run meanwhile."""
 
-    def __init__(self, clock: ManualClock, messages: list[MarkerDetections]) -> None:
+    def __init__(self, clock: ManualClock, messages: Sequence[MarkerDetections | ImuSample]) -> None:
         self.clock, self.messages = clock, deque(messages)
 
-    def get(self, timeout_s: float) -> MarkerDetections | None:
+    def get(self, timeout_s: float) -> MarkerDetections | ImuSample | None:
         if timeout_s == 0.0:
             return None
         self.clock.t_ns += round(timeout_s * 1e9)
@@ -123,6 +123,17 @@ def test_nobody_sends_and_the_reason_is_told() -> None:
     with pytest.raises(FitError, match="no frames from left and right"):
         measure(Queue(clock, []), Meter(CAMERAS, INDEX, 8, 1.0), clock, lambda share: None)
     assert clock.t_ns >= 10_000_000_000
+
+
+def test_samples_of_an_imu_between_the_frames_are_passed_over() -> None:
+    clock, uv, zero = ManualClock(), still(100), np.zeros(3)
+    messages: list[MarkerDetections | ImuSample] = []
+    for i in range(100):
+        t_ns = round((1 + i) * 1e8)
+        messages.append(ImuSample("palm-imu", 1, i, t_ns, zero, zero, zero, np.eye(4)[0]))
+        messages += [sees(camera, 1, i, t_ns, uv[camera][i]) for camera in CAMERAS]
+    reading = measure(Queue(clock, messages), Meter(CAMERAS, INDEX, 30, 1.0), clock, lambda share: None)
+    assert (reading.frames >= 30).all()
 
 
 class Desk:
