@@ -112,9 +112,13 @@ class Rotor:
     frame: Literal["local", "world"] = "local"
 
     def __post_init__(self) -> None:
-        for name, (low, high) in (("abduction", self.abduction_rad), ("flexion", self.flexion_rad)):
+        cone = self.shape == "ellipse"
+        for name, (low, high), halves in (
+            ("abduction", self.abduction_rad, cone or self.spread_at_full_flexion < 1.0),
+            ("flexion", self.flexion_rad, cone),
+        ):
             _check_span(f"rotor {name}", low, high)
-            if not low <= 0.0 <= high and (self.shape == "ellipse" or self.spread_at_full_flexion < 1.0):
+            if halves and not low <= 0.0 <= high:
                 raise ValueError(f"rotor: half-angles need 0 inside the {name} range, not {low} ... {high}")
         if not 0.0 <= self.spread_at_full_flexion <= 1.0:
             raise ValueError(f"rotor: spread_at_full_flexion {self.spread_at_full_flexion} is not in 0 ... 1")

@@ -61,8 +61,8 @@ class OrientationTrack:
     def push(self, t_ns: int, orientation_wxyz: Float) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world, q as good as -q.
 
-        What is no rotation is left out. A sample before all that are kept is of a clock that was set back: the others
-        are forgotten.
+        What is no rotation is left out. A sample long before the newest means that a clock was set back, or that the
+        newest came from a time that is not yet: the others are forgotten.
         """
         length = float(np.linalg.norm(orientation_wxyz))
         if np.isnan(length):
@@ -70,14 +70,12 @@ class OrientationTrack:
         elif abs(length - 1.0) > UNIT_WITHIN:
             self.counts["orientation.not_unit"] += 1
         else:
-            if self._samples and t_ns <= self._samples[-1].t_ns:
-                if t_ns >= self._samples[0].t_ns:
+            if self._samples and t_ns <= (newest_ns := self._samples[-1].t_ns):
+                if newest_ns - t_ns <= REACH_NS:
                     self.counts["orientation.late"] += 1
                     return
                 self._samples.clear()
-                self._first_ns = None
-            if self._first_ns is None:
-                self._first_ns = t_ns
+            self._first_ns = t_ns if self._first_ns is None else min(self._first_ns, t_ns)
             self._samples.append(_Sample(t_ns, orientation_wxyz / length))
 
     def at(self, t_ns: int, near: HandSolution | None) -> Orientation | None:

@@ -181,8 +181,24 @@ def test_impossible_limits_are_refused() -> None:
         Hinge(0.0, 1.0, (0.0, 0.0, 2.0))
     with pytest.raises(ValueError, match="0 inside"):
         Rotor((0.1, 0.3), (0.0, 1.0), shape="ellipse")
+    with pytest.raises(ValueError, match="0 inside"):
+        Rotor((-0.1, 0.3), (0.2, 1.0), shape="ellipse")
+    with pytest.raises(ValueError, match="0 inside"):
+        Rotor((0.1, 0.3), (0.0, 1.0), spread_at_full_flexion=0.5)
     with pytest.raises(ValueError, match="0 \\.\\.\\. 1"):
         Rotor((-0.1, 0.3), (0.0, 1.0), spread_at_full_flexion=1.5)
+
+
+@pytest.mark.parametrize("flexion", [(0.2, 0.2), (0.2, 1.0), (-0.5, -0.1)])
+def test_a_stiff_knuckle_narrows_as_the_hand_model_has_it(flexion: tuple[float, float]) -> None:
+    limits = preset_limits("K")
+    limits = msgspec.structs.replace(limits, ring=msgspec.structs.replace(limits.ring, flexion_rad=flexion))
+    model = HandModel.of(msgspec.structs.replace(generated_profile("one", "right"), limits_rad=limits))
+    root = finger_chain(model, 3, np.zeros(3)).links[0].joint
+    assert isinstance(root, Rotor)
+    for f in flexion:
+        low, high = model.abduction_limits_rad(np.full(5, f))
+        assert root.abduction_span(f) == pytest.approx((low[3], high[3]))
 
 
 @given(a=directions, b=directions)

@@ -171,6 +171,16 @@ def test_a_late_sample_is_dropped_and_a_clock_set_back_begins_anew() -> None:
     assert track.at(1040 * MS, None) is None
 
 
+def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
+    track = filled(msgspec.structs.replace(KNOWN, heading_drift_rad_s=0.01))
+    track.push(2**62, said(axis_rotation(2, 1.0)))
+    for k in range(2):
+        track.push((21_000 + 8 * k) * MS, said(axis_rotation(0, 0.3)))
+    found = at(track, 21_004 * MS)
+    assert degrees(found.rotation, axis_rotation(0, 0.3)) < 1e-4
+    assert np.sqrt(UP @ found.cov_rad2 @ UP) == pytest.approx(np.hypot(HEADING_RAD, 0.2), rel=1e-3)
+
+
 def test_what_it_holds_is_bounded() -> None:
     track = OrientationTrack(KNOWN)
     for k in range(3000):
