@@ -27,6 +27,7 @@ _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins: open to closed
+_MIND_S = 0.3  # how fast a hand may change from habits to none
 _ORIENTED_RAD = np.radians(15.0)  # an orientation that is known better than this fixes the hand's
 
 
@@ -141,7 +142,9 @@ class HandSolver:
             orientation,
         )
         if last is not None:
-            return self._solution(problem, alone, problem.minimise(*self._seed_of(last), enough), points_m)
+            before = last.natural, float(np.exp(-dt_s / _MIND_S))
+            way = problem.minimise(*self._seed_of(last), enough)
+            return self._solution(problem, alone, way, points_m, before)
         if near is not None:
             way = problem.minimise(*self._seed_near(near, seen), enough)
             found = self._solution(problem, alone, way, points_m)
@@ -191,9 +194,14 @@ class HandSolver:
         return fit_rigid(observed, expected, weight), self._postures
 
     def _solution(
-        self, problem: HandProblem, habits: AnglePrior, minima: list[Minimum], points_m: Float
+        self,
+        problem: HandProblem,
+        habits: AnglePrior,
+        minima: list[Minimum],
+        points_m: Float,
+        before: tuple[float, float] = (0.5, 0.0),
     ) -> HandSolution:
-        found = Mixture.of(problem, habits, minima)
+        found = Mixture.of(problem, habits, minima, before)
         T = found.T_rig_palm
         # The bounds hold already; what is cut is the rounding of an angle that follows others.
         angles = self.model.clamp(self._parameters.angles(found.x))

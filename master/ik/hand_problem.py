@@ -17,10 +17,12 @@ from master.ik.attached import Attached
 from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
+from master.ik.within import mean_within
 
 MAX_ITERATIONS = 25
 ENOUGH = 1e-7  # of half chi square: what a search may leave
 _ROUGH = 1e-2  # the same where one of several seeds is to be chosen; with 1, poor depth led to wrong hands now and then
+_LITTLE = 1e-4  # of a step: what a difference is taken over
 _FIRST_DAMPING, _MAX_DAMPING = 1e-3, 1e6
 _EYE = np.eye(3)
 
@@ -105,6 +107,19 @@ class HandProblem:
         """Where the markers (..., N, 3) [m] of hands (..., 4, 4), (..., n) are, rig frame."""
         local = self.markers.place(self.model.chains(self.parameters.angles(x)))
         return local @ np.swapaxes(T_rig_palm[..., :3, :3], -1, -2) + T_rig_palm[..., None, :3, 3]
+
+    def mean_step(self, found: Minimum) -> Float:
+        """From the likeliest hand to the mean of those within the limits: turn, shift and angles (6 + n,).
+
+        Straight fingers are no chance: they do rest at their limit, so nothing is piled up there.
+        """
+        low = np.where(self.parameters.rests, -np.inf, self.parameters.low)
+        return mean_within(found.linear.normal, found.linear.gradient, found.x, low, self.parameters.high)
+
+    def marker_step(self, found: Minimum, step: Float) -> Float:
+        """By how much a step (6 + n,) from there moves the markers (N, 3) [m], as if they moved on straight lines."""
+        here = self.place(found.T_rig_palm, found.x)
+        return (self.place(*moved(found.T_rig_palm, found.x, _LITTLE * step)) - here) / _LITTLE
 
     def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> list[Minimum]:
         """For each of H hypotheses the end of a way downhill from the best of seeds (S, 4, 4), (S, n) in the bounds.
@@ -198,11 +213,16 @@ class HandProblem:
             diagonal += 1.0 - moves
             downhill *= moves
         step = np.asarray(np.linalg.solve(damped, downhill[..., None])[..., 0], np.float64)
-        T_new = T.copy()
-        T_new[:, :3, :3] = rotation_vector_to_matrix(step[:, :3]) @ T[:, :3, :3]
-        T_new[:, :3, 3] += step[:, 3:6]
-        hoped = 0.5 * np.vecdot(downhill, step)
-        return T_new, np.minimum(np.maximum(x + step[:, 6:], low), high), hoped
+        T_new, x_new = moved(T, x, step)
+        return T_new, np.minimum(np.maximum(x_new, low), high), 0.5 * np.vecdot(downhill, step)
+
+
+def moved(T_rig_palm: Float, x: Float, step: Float) -> tuple[Float, Float]:
+    """Poses (..., 4, 4) and angles (..., n) after steps (..., 6 + n) of turn [rad], shift [m] and angles [rad]."""
+    T = T_rig_palm.copy()
+    T[..., :3, :3] = rotation_vector_to_matrix(step[..., :3]) @ T[..., :3, :3]
+    T[..., :3, 3] += step[..., 3:6]
+    return T, x + step[..., 6:]
 
 
 @dataclass(slots=True)

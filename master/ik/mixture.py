@@ -6,6 +6,7 @@ The evidence of a hypothesis is the density of the markers under it, by Laplace'
 
 at its solution (MacKay 1992, "Bayesian interpolation", section 4): narrow habits that fit win over wide ones, since
 they promised more. Mean and covariance are those of the mixture: the spread between solutions is doubt as well.
+Of a free hand the mean within its limits is taken, of a natural one the likeliest pose (`master.ik.within`).
 """
 
 from dataclasses import dataclass
@@ -13,12 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector, rotation_vector_to_matrix
+from common.geometry import matrix_to_rotation_vector
 from master.ik.certainty import covariance_alone
-from master.ik.hand_problem import HandProblem, Minimum
+from master.ik.hand_problem import HandProblem, Minimum, moved
 from master.ik.priors import AnglePrior
 
 _STIFF = 1e-2  # how much less than the markers the mean of the hypotheses holds
+_CERTAIN = 12.0  # log odds that count as certain
 _NEGLIGIBLE = 0.01  # a hypothesis of less weight changes next to nothing
 
 
@@ -41,34 +43,58 @@ class Mixture:
     natural: float
 
     @classmethod
-    def of(cls, problem: HandProblem, habits: AnglePrior, minima: list[Minimum]) -> "Mixture":
-        """From what each hypothesis found; one that explains the markers far worse than another is left out."""
-        weight = _evidence(problem, minima)
+    def of(
+        cls, problem: HandProblem, habits: AnglePrior, minima: list[Minimum], before: tuple[float, float]
+    ) -> "Mixture":
+        """From what each hypothesis found; one that explains the markers far worse than another is left out.
+
+        Args:
+            problem: The fit.
+            habits: What it believes of angles by this instant alone.
+            minima: One for each hypothesis, the natural hand first.
+            before: How natural the hand was a moment ago, and what that counts, 0 ... 1.
+        """
+        weight = _weights(problem, minima, *before)
         best = int(np.argmax(weight))
         top, natural = minima[best], float(weight[0])
-        if weight[best] > 1.0 - _NEGLIGIBLE:
-            alone = covariance_alone(problem.of_hypothesis(best), habits.of_hypothesis(best), top)
-            return cls(top.T_rig_palm, top.x, alone, float(top.linear.cost), natural)
-        off = np.array([_between(found, top) for found in minima])
-        mean: Float = weight @ off
-        alone = (off - mean).T * weight @ (off - mean)
-        for h, found in enumerate(minima):
-            alone += weight[h] * covariance_alone(problem.of_hypothesis(h), habits.of_hypothesis(h), found)
-        markers = np.array([problem.place(found.T_rig_palm, found.x) for found in minima])
-        between = problem.of_points(np.einsum("h,hmi->mi", weight, markers))
-        T, x = _onto(between, *_moved(top.T_rig_palm, top.x, mean), top.linear.normal)
+        sure = weight[best] > 1.0 - _NEGLIGIBLE
+        kept = np.array([best]) if sure else np.arange(len(minima))
+        share = np.ones(1) if sure else weight
+        off = np.array([_between(minima[h], top) for h in kept])
+        linear = np.array([problem.place(minima[h].T_rig_palm, minima[h].x) for h in kept])
+        alone = np.zeros((off.shape[1], off.shape[1]))
+        for k, h in enumerate(kept.tolist()):
+            found, one = minima[h], problem.of_hypothesis(h)
+            alone += share[k] * covariance_alone(one, habits.of_hypothesis(h), found)
+            if h > 0:
+                step = one.mean_step(found)
+                off[k] += step
+                linear[k] += one.marker_step(found, step)
+        mean: Float = share @ off
+        alone += (off - mean).T * share @ (off - mean)
+        T, x = top.T_rig_palm, top.x
+        if mean.any():
+            between = problem.of_points(np.einsum("h,hmi->mi", share, linear))
+            T, x = _onto(between, *moved(T, x, mean), top.linear.normal)
         return cls(T, x, alone, float(top.linear.cost), natural)
 
 
-def _evidence(problem: HandProblem, minima: list[Minimum]) -> Float:
-    """Probability (H,) of each hypothesis."""
+def _weights(problem: HandProblem, minima: list[Minimum], natural: float, counts: float) -> Float:
+    """Probability (H,) of each hypothesis, by the evidence of this instant and what it was before.
+
+    Whether a hand obeys habits does not change from frame to frame, while the evidence of one is noise in part: its
+    logarithm is smoothed in time.
+    """
     if len(minima) == 1:
         return np.ones(1)
     cost = np.array([found.linear.cost for found in minima])
     known = np.linalg.slogdet(np.array([found.linear.normal for found in minima]))[1]
     log = problem.prior.log_density - cost - 0.5 * known
-    weight = np.exp(log - log.max())
-    return np.asarray(weight / weight.sum(), np.float64)
+    now = min(max(float(log[0] - log[1]), -_CERTAIN), _CERTAIN)
+    then = np.log(max(natural, 1e-9)) - np.log(max(1.0 - natural, 1e-9))
+    odds = (1.0 - counts) * now + counts * min(max(then, -_CERTAIN), _CERTAIN)
+    first = 1.0 / (1.0 + np.exp(-odds))
+    return np.array([first, 1.0 - first])
 
 
 def _between(one: Minimum, other: Minimum) -> Float:
@@ -80,13 +106,6 @@ def _between(one: Minimum, other: Minimum) -> Float:
     return np.concatenate([turn, T[:3, 3] - T_other[:3, 3], one.x - other.x])
 
 
-def _moved(T_rig_palm: Float, x: Float, step: Float) -> tuple[Float, Float]:
-    T = T_rig_palm.copy()
-    T[:3, :3] = rotation_vector_to_matrix(step[:3]) @ T[:3, :3]
-    T[:3, 3] += step[3:6]
-    return T, x + step[6:]
-
-
 def _onto(problem: HandProblem, T: Float, x: Float, normal: Float) -> tuple[Float, Float]:
     """One step from a mean (4, 4), (n,) of hands to where the mean of their markers is, the shortest by `normal`.
 
@@ -94,5 +113,5 @@ def _onto(problem: HandProblem, T: Float, x: Float, normal: Float) -> tuple[Floa
     """
     there = problem.linearise(T, x)
     step = -np.linalg.solve(there.normal + _STIFF * normal, there.gradient)
-    T, x = _moved(T, x, np.asarray(step, np.float64))
+    T, x = moved(T, x, np.asarray(step, np.float64))
     return T, np.minimum(np.maximum(x, problem.parameters.low), problem.parameters.high)

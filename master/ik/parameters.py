@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
 from common.hand_limits import ABDUCTION, FLEXION, spread_left
 from common.hand_model import HandModel
 
@@ -28,6 +28,7 @@ class HandParameters:
         free: (n,) their indices in the flat (20,) table of angles.
         complete: (20, n) all angles = complete @ free ones, couplings included; abductions before they narrow.
         low, high: (n,) [rad] bounds that keep coupled angles inside their limits, too.
+        rests: (n,) whether it often stands at its low bound: that of a straight finger.
         abduction, flexion: (K,) columns of the free angles of the K fingers whose abduction narrows.
         most: (K,) [rad] their highest flexion.
         left: (K,) share of the abduction left there.
@@ -37,6 +38,7 @@ class HandParameters:
     complete: Float
     low: Float
     high: Float
+    rests: Bool
     abduction: Int
     flexion: Int
     most: Float
@@ -63,6 +65,7 @@ class HandParameters:
             complete,
             low.reshape(20)[free],
             high.reshape(20)[free],
+            (free >= 4) & (free % 4 != ABDUCTION),
             np.searchsorted(free, 4 * narrows + ABDUCTION),
             np.searchsorted(free, 4 * narrows + FLEXION),
             most[narrows],
