@@ -3,11 +3,13 @@
 import argparse
 import importlib
 import json
+import math
 import os
 import platform
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from time import monotonic
 from typing import cast
 
 from bench.row import Row
@@ -22,6 +24,8 @@ SECTIONS = {
     "ik": "Inverse kinematics of fingers, palm known; baseline: the papers' FABRIK with limits, scipy, mink",
     "hand_poses": "Hands of independent joints, palm turned by up to 45 degrees; baseline: the papers' fixed palm",
     "hand": "A moving hand with its palm pose; baseline: the papers' fixed palm, scipy, mink",
+    "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",
+    "joint_certainty": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
     "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",
@@ -36,10 +40,14 @@ SECTIONS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the sections asked for; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m bench", description=__doc__)
-    parser.add_argument(
-        "sections", nargs="*", metavar="SECTION", help=f"{', '.join(SECTIONS)} (default: all)"
+    sections = "\n".join(f"  {name:16s} {what}" for name, what in SECTIONS.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m bench",
+        description=__doc__,
+        epilog=f"sections:\n{sections}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help="one of those below (default: all)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
     options = parser.parse_args(arguments)
     wanted = cast(list[str], options.sections) or list(SECTIONS)
@@ -49,15 +57,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     everything: dict[str, list[Row]] = {}
     for name in wanted:
         print(f"\n{SECTIONS[name]}", flush=True)
-        rows = [Row(*row) for row in importlib.import_module(f"bench.{name}").rows()]
-        everything[name] = rows
-        for row in rows:
+        start_s, everything[name] = monotonic(), []
+        for found in cast(Iterable[Row], importlib.import_module(f"bench.{name}").rows()):
+            row = Row(*found)
+            everything[name].append(row)
             print(f"  {row.name:58s} {_number(row.value):>10s} {row.unit:8s} {row.note}", flush=True)
+        print(f"  ({monotonic() - start_s:.0f} s)", flush=True)
     if options.json is not None:
-        options.json.write_text(
-            json.dumps({k: [r._asdict() for r in v] for k, v in everything.items()}, indent=1)
-        )
+        tables = {name: [_plain(row) for row in rows] for name, rows in everything.items()}
+        options.json.write_text(json.dumps(tables, indent=1, allow_nan=False))
     return 0
+
+
+def _plain(row: Row) -> dict[str, object]:
+    """A row for JSON, which has no number for what could not be measured."""
+    value = float(row.value) if math.isfinite(row.value) else None
+    return {"name": row.name, "value": value, "unit": row.unit, "note": row.note}
 
 
 def _number(value: float) -> str:

@@ -48,7 +48,7 @@ def rows(frames: int = FRAMES) -> list[Row]:
         found, us[name], spread = timed(model, way, truth.every(step), points[::step])
         out += way_rows(name, found, us[name], spread)
     if not peers_mink.installed():
-        out.append(Row("mink: hand", float("nan"), "us", peers_mink.INSTALL))
+        out.append(Row("mink: skipped", 0.0, "", peers_mink.INSTALL))
     return [*out, Row(f"{WARM}: times faster than scipy", us["scipy"] / us[WARM], "x", "")]
 
 

@@ -45,7 +45,7 @@ def rows(hands: int = HANDS) -> list[Row]:
         if name in _STRICT_MM:
             out.append(_strict_row(name, found, _STRICT_MM[name]))
     if not peers_mink.installed():
-        out.append(Row("mink: hand of five fingers", float("nan"), "us", peers_mink.INSTALL))
+        out.append(Row("mink: skipped", 0.0, "", peers_mink.INSTALL))
     natural, one, spread = timed(model, ways(model)[CLOSED], _natural_thumb(model, truth))
     return [
         *out,

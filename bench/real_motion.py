@@ -84,13 +84,15 @@ class Score:
     pip_deg: Float
 
 
-def rows() -> list[Row]:
+def rows() -> Iterator[Row]:
     """All three parts; a row that says so where the data are absent."""
     data = Path(os.environ.get("PHALANX_DATASETS", _ROOT / "../shared/datasets")).resolve()
-    out = list(_held_rows())
+    yield from _held_rows()
     if not (data / "leapjs").is_dir() or not (data / "handy_poses").is_dir():
-        return [*out, Row("skipped", 0.0, "", f"no recordings at {data}: set PHALANX_DATASETS")]
-    return [*_motion_rows(data / "leapjs"), *out, *_pose_rows(data / "handy_poses" / "poses.npz")]
+        yield Row("recorded: skipped", 0.0, "", f"no recordings at {data}: set PHALANX_DATASETS")
+        return
+    yield from _motion_rows(data / "leapjs")
+    yield from _pose_rows(data / "handy_poses" / "poses.npz")
 
 
 def wide_limits() -> Limits:
