@@ -155,7 +155,7 @@ class HandModel:
                 turn[f, k] = rotation[a].T @ rotation[b]
         if (np.linalg.norm(bone, axis=-1) < 1e-3).any():
             raise CalibrationError(f"{where}: rest_joints: a finger bone is shorter than 1 mm")
-        couplings = _couplings(profile, where)
+        couplings = couplings_of(profile)
         limits = profile.limits_rad or "K"
         limits = preset_limits(limits) if isinstance(limits, str) else limits
         side_sign = 1.0 if profile.side == "right" else -1.0
@@ -313,13 +313,18 @@ def _radii(profile: HandProfile, where: str) -> Float:
     return np.array([given.get(name, length * radius_share(name)) for name in JOINTS])
 
 
-def _couplings(profile: HandProfile, where: str) -> Couplings:
+def couplings_of(profile: HandProfile) -> Couplings:
+    """The couplings of a profile, spelled out where it names a preset or nothing.
+
+    Raises:
+        CalibrationError: They contradict each other.
+    """
     couplings = profile.couplings or "K"
     couplings = preset_couplings(couplings) if isinstance(couplings, str) else couplings
     if couplings.dip_per_pip is None and couplings.dip_spread_rad > 0.0:
         raise CalibrationError(
-            f"{where}: couplings.dip_spread_rad: there is no ratio to stray from while dip_per_pip is null; give"
-            " dip_per_pip a ratio, or leave dip_spread_rad out"
+            f"hand {profile.name!r}: couplings.dip_spread_rad: there is no ratio to stray from while dip_per_pip is null;"
+            " give dip_per_pip a ratio, or leave dip_spread_rad out"
         )
     return couplings
 

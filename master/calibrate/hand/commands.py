@@ -36,7 +36,10 @@ Base = Annotated[
 ]
 RigName = Annotated[str, typer.Option("--rig", help="Rig whose markers the poses have.")]
 DipPerPip = Annotated[
-    float | None, typer.Option(help="How far the last joint bends per middle joint, where it was measured.")
+    float | None,
+    typer.Option(
+        min=0.0, max=2.0, help="How far the last joint bends per middle joint, where it was measured."
+    ),
 ]
 Steps = Annotated[bool, typer.Option("--steps", help="Only tell the steps of the routine.")]
 Live = Annotated[bool, typer.Option("--live", help="Do the routine now, before the running master.")]
@@ -98,10 +101,8 @@ def hand_command(
         found = measure_hand(observed, template, length_m, ratio, _progress)
         for line in report_lines(found):
             typer.echo(line)
-        profile, told = (
-            measured_profile(found, name, "live" if poses is None else poses.name),
-            report_json(found),
-        )
+        data = "live" if poses is None else poses.name
+        profile, told = measured_profile(found, name, data, dip_per_pip), report_json(found)
         if picture is not None:
             from master.calibrate.hand.picture import draw_hand
 

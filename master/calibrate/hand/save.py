@@ -7,20 +7,24 @@ from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import HandProfile, Provenance, RestJoint, Vector3
-from common.hand_model import CHAINS, FINGERS, JOINTS, HandModel
+from common.hand_model import CHAINS, FINGERS, JOINTS, HandModel, couplings_of
 from master.calibrate.hand.measure import CERTAIN, HandMeasurement, hand_length_of
 from master.calibrate.tree_files import provenance
 
 TOOL = "calibrate hand"
+_QUICK = "rest_joints"  # says of a whole hand that it is only scaled
 
 
-def measured_profile(measurement: HandMeasurement, name: str, data: str) -> HandProfile:
+def measured_profile(
+    measurement: HandMeasurement, name: str, data: str, dip_per_pip: float | None = None
+) -> HandProfile:
     """The template with every measured length; the parts of a measured sum keep the template's proportions.
 
     Args:
         measurement: What the routine told.
         name: Of the new profile.
         data: Name of what it was measured from.
+        dip_per_pip: The DIP's ratio that the lengths were measured with, if that was measured; None: the template's.
     """
     model = measurement.template
     factor = bone_factors(measurement)
@@ -41,7 +45,10 @@ def measured_profile(measurement: HandMeasurement, name: str, data: str) -> Hand
         note += [f"not measured, scaled from the hand length: {', '.join(scaled)}"] if scaled else []
         note.append("the distal bone ends where the cap's offset puts the tip joint")
         how[label] = provenance(TOOL, (data,), residual, "; ".join(note))
-    return replace(profile, provenance=profile.provenance | how)
+    if dip_per_pip is not None:
+        profile = replace(profile, couplings=replace(couplings_of(profile), dip_per_pip=dip_per_pip))
+    before = {part: told for part, told in profile.provenance.items() if part != _QUICK}
+    return replace(profile, provenance=before | how)
 
 
 def bone_factors(measurement: HandMeasurement) -> Float:
@@ -67,9 +74,7 @@ def stretched(model: HandModel, factor: Float) -> dict[str, RestJoint]:
 def quick_profile(profile: HandProfile, name: str, length_m: float) -> HandProfile:
     """A profile scaled from the length of the hand alone, saying so."""
     note = f"scaled from a hand length of {1e3 * length_m:.0f} mm: no bone is measured, individuals differ by 5 to 8 %"
-    return replace(
-        profile, name=name, provenance={"rest_joints": provenance(TOOL, ("hand length",), {}, note)}
-    )
+    return replace(profile, name=name, provenance={_QUICK: provenance(TOOL, ("hand length",), {}, note)})
 
 
 def report_lines(measurement: HandMeasurement) -> list[str]:

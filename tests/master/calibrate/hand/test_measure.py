@@ -1,20 +1,22 @@
 """A simulated user, 1 mm of noise: what is reported as measured is, and what is not determined is not claimed."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 
 from common.arrays import Float
-from common.calibration import HandProfile
+from common.calibration import Couplings, HandProfile
 from common.errors import FitError
-from common.hand_model import CHAINS, HandModel
+from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.hand_routine import ROUTINE_S
 from master.calibrate.hand.measure import HandMeasurement, measure_hand
 from master.calibrate.hand.observed import Observed
-from master.calibrate.hand.save import measured_profile, report_json, report_lines
+from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
 from tests.master.calibrate.hand.routines import TIPS, SimulatedRoutine, routine, with_back
 
 
@@ -81,6 +83,18 @@ def test_the_profile_holds_what_was_measured_and_says_what_was_not() -> None:
     assert "thumb distal" in table
     assert "undetermined: keeps the scaled value" in table
     assert report_json(found)["side"] == "right"
+
+
+def test_a_ratio_that_was_measured_is_kept_and_a_quick_start_no_longer_speaks_for_the_hand() -> None:
+    _, found = measured(21, "right")
+    begun = quick_profile(found.template.profile, "anna", 0.19)
+    begun = msgspec.structs.replace(begun, couplings=Couplings(dip_spread_rad=0.1, neighbours=False))
+    again = dataclasses.replace(found, template=HandModel.of(begun))
+    profile = measured_profile(again, "anna", "poses.npz", 0.8)
+    assert profile.couplings == Couplings(dip_per_pip=0.8, dip_spread_rad=0.1, neighbours=False)
+    assert measured_profile(again, "anna", "poses.npz").couplings == begun.couplings
+    assert "no bone is measured" in begun.provenance["rest_joints"].note
+    assert profile.provenance.keys() == set(FINGERS)
 
 
 def test_the_other_hand_is_noticed() -> None:
