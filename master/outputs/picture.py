@@ -37,6 +37,7 @@ _SKIN = np.array([1.0, 0.79, 0.67])
 _YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
 _RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
+_LINE = 52  # letters of what was tracked that fit in one line beside the figures
 # Key figures of the summary, in the order of importance: key, what it says, format.
 _FIGURES = (
     ("poses_per_s", "poses / s", "{:.1f}"),
@@ -100,7 +101,11 @@ def best_row(poses: Poses) -> int | None:
 
 def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapping[str, float]) -> None:
     figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
-    what = f"rig {rig.name} · {len(rig.cameras)} cameras · hand {model.profile.name} ({model.profile.side})"
+    cameras, hand = (
+        f"rig {rig.name} · {len(rig.cameras)} cameras",
+        f"hand {model.profile.name} ({model.profile.side})",
+    )
+    what = cameras + (" · " if len(cameras + hand) <= _LINE else "\n") + hand
     figure.text(0.019, 0.897, what, color=INK, alpha=0.75, size=12, va="center")
     shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary]
     for i, (label, value) in enumerate(reversed(shown)):
