@@ -1,7 +1,8 @@
 """Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
 
 A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
-pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new.
+pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Samples of an IMU go
+before frames: there may be ten to a frame, and each tells less.
 """
 
 import os
@@ -14,6 +15,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
+from common.messages import ImuSample
 from common.session import Random
 from common.udp import UdpSocket
 from master.link import MasterLink, Taken
@@ -64,7 +66,7 @@ class Ingest:
         self._cameras, self._senders = cameras, (*cameras, *imus)
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
-        self._queue: deque[Taken] = deque(maxlen=QUEUE)
+        self._queue: deque[Taken] = deque()
         self._changed = threading.Condition()
         self._overflowed = 0
         self._closing = threading.Event()
@@ -166,9 +168,11 @@ class Ingest:
 
     def _put(self, message: Taken) -> None:
         with self._changed:
-            if len(self._queue) == self._queue.maxlen:
-                self._overflowed += 1
             self._queue.append(message)
+            if len(self._queue) > QUEUE:
+                self._overflowed += 1
+                samples = (k for k, waiting in enumerate(self._queue) if isinstance(waiting, ImuSample))
+                del self._queue[next(samples, 0)]
             self._changed.notify()
 
 

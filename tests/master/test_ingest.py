@@ -3,11 +3,13 @@
 import socket
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from common.clock import SystemClock
 from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
+from common.messages import ImuSample, MarkerDetections
 from master.ingest import QUEUE, Ingest
 from tests.network_helpers import detections, free_udp_port, until
 
@@ -52,6 +54,18 @@ def test_a_slow_reader_gets_the_newest_and_a_count(ingest: Ingest) -> None:
     assert first is not None
     assert first.seq == 5
     assert ingest.counts["queue.dropped"] == 5
+
+
+def test_samples_of_an_imu_drive_no_frame_out(ingest: Ingest) -> None:
+    nan = np.full(3, np.nan)
+    for seq in range(QUEUE):
+        ingest._put(detections("left", 1, seq))
+        for k in range(10):
+            ingest._put(ImuSample("palm-imu", 1, 10 * seq + k, 0, nan, nan, nan, np.full(4, np.nan)))
+    taken = [ingest.get(0.0) for _ in range(QUEUE)]
+    assert [one.seq for one in taken if isinstance(one, MarkerDetections)] == list(range(QUEUE))
+    assert ingest.get(0.0) is None
+    assert ingest.counts["queue.dropped"] == 10 * QUEUE
 
 
 def test_close_wakes_a_reader_and_frees_the_port() -> None:
