@@ -27,6 +27,7 @@ _LENGTH_M = 20e-3  # a line shorter than this has no direction
 _ACROSS = 0.9  # cosine to the sight, at most
 EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins: open to closed
+_SHOWS_RAD = np.radians(45.0)  # a finger bent by less in all its joints shows its end from behind
 _MIND_S = 0.3  # how fast a hand may change from habits to none
 _ORIENTED_RAD = np.radians(15.0)  # an orientation that is known better than this fixes the hand's
 
@@ -65,6 +66,23 @@ class HandSolution:
     natural: float
     alone: Float
     moved: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What `HandSolver.solve` is told; `seen` (M,): which markers, `shown`: which fingers have one."""
+
+    points_m: Float
+    cov_m2: Float
+    seen: Bool
+    shown: frozenset[int]
+    last: HandSolution | None
+    dt_s: float
+    hidden: tuple[Float, Float] | None
+    facing: Float | None
+    enough: float
+    near: HandSolution | None
+    orientation: Orientation | None
 
 
 class HandSolver:
@@ -127,40 +145,61 @@ class HandSolver:
         seen = seen_markers(points_m, cov_m2)
         if last is None and not _determined(points_m[seen], facing, orientation):
             return None
-        habits = self._habits(seen, hidden)
+        shown = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
+        told = _Told(points_m, cov_m2, seen, shown, last, dt_s, hidden, facing, enough, near, orientation)
+        # A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
+        like = frozenset(f for f in (2, 3) if hidden is None and f not in shown and {f - 1, f + 1} <= shown)
+        found = self._fit(told, like)
+        straight = frozenset(f for f in like if found.angles_rad[f, 1:].sum() < _SHOWS_RAD)
+        return self._fit(told, like - straight) if straight else found
+
+    def _fit(self, told: _Told, like: frozenset[int]) -> HandSolution:
+        """The solution, while the hidden fingers of `like` are bent as their neighbours."""
+        habits = self._habits(told, like)
         # Where a hidden finger was held is a memory, not what this instant tells.
-        alone = habits if hidden is None else self._priors[frozenset()]
-        problem = HandProblem(
+        alone = habits if told.hidden is None else self._priors[frozenset()]
+        problem = self._problem(told, habits)
+        last, near, points = told.last, told.near, told.points_m
+        if last is not None:
+            before = last.natural, float(np.exp(-told.dt_s / _MIND_S))
+            way = problem.minimise(*self._seed_of(last), told.enough)
+            return self._solution(problem, alone, way, points, before)
+        if near is not None:
+            way = problem.minimise(*self._seed_near(near, told.shown), told.enough)
+            found = self._solution(problem, alone, way, points)
+            if found.iterations < MAX_ITERATIONS and self._explains(found, problem, told):
+                return found
+        best = problem.minimise(*self._seeds(points, told.seen, told.facing), told.enough)
+        return self._solution(problem, alone, best, points)
+
+    def _problem(self, told: _Told, habits: AnglePrior) -> HandProblem:
+        last, seen = told.last, told.seen
+        return HandProblem(
             self.model,
             self._parameters,
             self._attached.only(seen),
-            points_m[seen],
-            _whitening(cov_m2[seen], self.priors.model_m),
-            self._and_last(habits, last, dt_s),
-            None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(dt_s)),
-            None if facing is None else Facing(facing, 1.0 / self.priors.facing),
-            orientation,
+            told.points_m[seen],
+            _whitening(told.cov_m2[seen], self.priors.model_m),
+            self._and_last(habits, last, told.dt_s),
+            None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(told.dt_s)),
+            None if told.facing is None else Facing(told.facing, 1.0 / self.priors.facing),
+            told.orientation,
         )
-        if last is not None:
-            before = last.natural, float(np.exp(-dt_s / _MIND_S))
-            way = problem.minimise(*self._seed_of(last), enough)
-            return self._solution(problem, alone, way, points_m, before)
-        if near is not None:
-            way = problem.minimise(*self._seed_near(near, seen), enough)
-            found = self._solution(problem, alone, way, points_m)
-            off = (self.model.marker_points(found.joints, self.markers) - points_m)[seen]
-            whitened = (problem.whiten @ off[..., None])[..., 0]
-            if (np.vecdot(whitened, whitened) < EXPLAINED).all() and found.iterations < MAX_ITERATIONS:
-                return found
-        best = problem.minimise(*self._seeds(points_m, seen, facing), enough)
-        return self._solution(problem, alone, best, points_m)
 
-    def _habits(self, seen: Bool, hidden: tuple[Float, Float] | None) -> AnglePrior:
-        on_finger = self._attached.on_finger[:, 0]
-        fingers = frozenset(self._attached.finger[seen & on_finger].tolist())
+    def _explains(self, found: HandSolution, problem: HandProblem, told: _Told) -> bool:
+        """Whether every seen marker is where the hand has it, within its noise."""
+        off = (self.model.marker_points(found.joints, self.markers) - told.points_m)[told.seen]
+        whitened = (problem.whiten @ off[..., None])[..., 0]
+        return bool((np.vecdot(whitened, whitened) < EXPLAINED).all())
+
+    def _habits(self, told: _Told, like: frozenset[int]) -> AnglePrior:
+        """Habits, with what is believed of fingers that are not shown."""
+        if told.hidden is not None:
+            belief = hidden_belief(self._parameters, self.priors, told.shown, told.hidden)
+            return self._priors[frozenset()].and_single(*belief)
         # A finger that is out of sight because it is curled is bent unlike one that shows.
-        prior = self._prior_of(frozenset(range(5)) - fingers if hidden is None else frozenset())
-        return prior.and_single(*hidden_belief(self._parameters, self.priors, fingers, hidden))
+        belief = hidden_belief(self._parameters, self.priors, told.shown | like, None)
+        return self._prior_of(frozenset(range(5)) - told.shown - like).and_single(*belief)
 
     def _prior_of(self, unlike: frozenset[int]) -> AnglePrior:
         """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
@@ -176,9 +215,8 @@ class HandSolver:
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self._parameters.of_angles(last.angles_rad)[None]
 
-    def _seed_near(self, hand: HandSolution, seen: Bool) -> tuple[Float, Float]:
-        fingers = self._attached.finger[seen & self._attached.on_finger[:, 0]]
-        known = np.isin(self._parameters.free // 4, fingers)
+    def _seed_near(self, hand: HandSolution, shown: frozenset[int]) -> tuple[Float, Float]:
+        known = np.isin(self._parameters.free // 4, list(shown))
         x = np.where(known, self._parameters.of_angles(hand.angles_rad), self._natural)
         return hand.T_rig_palm[None], x[None]
 

@@ -166,6 +166,16 @@ def test_a_hidden_finger_that_is_curled_does_not_bend_its_neighbour() -> None:
     assert (np.degrees(found.angles_rad[2:, 2]) > 60.0).all()
 
 
+def test_a_hidden_finger_between_two_that_show_bends_as_they_do() -> None:
+    truth = np.zeros((5, 4))
+    truth[1:, 1], truth[1:, 2], truth[1:, 3] = 0.45, 0.6, 0.4
+    points = RIGHT.marker_points(RIGHT.forward(palm(), truth), MARKERS)
+    points[3] = np.nan
+    found = SOLVER.solve(points, small_cov(), facing=FACING)
+    assert found is not None
+    assert np.degrees(abs(found.angles_rad[3, 2] - 0.6)) < 20.0
+
+
 # -- limits -----------------------------------------------------------------------------------------------------
 
 
