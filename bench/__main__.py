@@ -26,6 +26,7 @@ SECTIONS = {
     "hand": "A moving hand with its palm pose; baseline: the papers' fixed palm, scipy, mink",
     "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",
     "joint_certainty": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
+    "hidden_fingers": "Flexion and PIP of a finger without a marker, with its neighbours; baseline: alone",
     "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",

@@ -106,12 +106,13 @@ def motions(profile: HandProfile, seed: int) -> Iterator[tuple[str, HandModel, H
     yield "standard scene", model, ScriptedMotion(model, _CENTRE, seed)
     yield "study poses", model, StudyPoses(model, _CENTRE, seed)
     yield "random poses", model, RandomPoses(model, _CENTRE, seed)
-    if recordings := _recordings():
+    if recordings := leap_recordings():
         leap = HandModel.of(msgspec.structs.replace(profile, couplings=Couplings(dip_per_pip=1.0)))
         yield "recorded motion", leap, load_leap(recordings[seed % len(recordings)], leap, _CENTRE)
 
 
-def _recordings() -> list[Path]:
+def leap_recordings() -> list[Path]:
+    """The recorded motions, none where they are absent."""
     return sorted((_DATASETS / "leapjs").glob("*.npz"))
 
 
@@ -219,7 +220,7 @@ def rows() -> Iterator[Row]:
             ]
             yield from _group(f"{played[0][0]}, {noise}", parts)
             everything += parts
-    if not _recordings():
+    if not leap_recordings():
         yield Row("recorded motion: skipped", 0.0, "", f"no recordings at {_DATASETS}: set PHALANX_DATASETS")
     setup = load_setup(_CALIBRATION, "desk")
     yield from _group("study poses, rendered", [rendered(setup, profile, seed) for seed in _RENDERED_SEEDS])
