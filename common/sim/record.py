@@ -67,11 +67,7 @@ def record_scene(
         RecordingError: The folder holds something already, or cannot be written.
         ValueError: The cameras differ in frame rate.
     """
-    names = scene.rig.cameras
-    rates = {scene.cameras[name].frame_rate_hz for name in names}
-    if len(rates) != 1:
-        raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
-    period = 1.0 / rates.pop()
+    names, period = scene.rig.cameras, _period_s(scene)
     count = max(round(seconds / period), 1)
     sensor = SimulatedImu.of(scene) if imu else None
     renderers = [Renderer(scene, name) for name in names]
@@ -102,6 +98,14 @@ def record_scene(
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
     return count
+
+
+def _period_s(scene: Scene) -> float:
+    """From frame to frame of every camera [s]."""
+    rates = {scene.cameras[name].frame_rate_hz for name in scene.rig.cameras}
+    if len(rates) != 1:
+        raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
+    return 1.0 / rates.pop()
 
 
 def _manifest(scene: Scene, first: list[MarkerView], continuous: bool) -> Manifest:
