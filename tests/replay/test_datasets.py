@@ -130,7 +130,7 @@ def test_a_planted_wrong_blob_is_noticed(replays: dict[str, Replay]) -> None:
 
 
 @pytest.mark.parametrize("name", [*HANDS, *SWEEPS])
-def test_caps_are_within_four_millimetres(replays: dict[str, Replay], name: str) -> None:
+def test_caps_are_within_two_and_a_half_millimetres(replays: dict[str, Replay], name: str) -> None:
     replayed = replays[name]
     truth, raw = replayed.truth(), load_poses(replayed.out / "poses.npz").markers_raw_m
     _, _, frac, _ = seen_and_true(replayed)
@@ -138,17 +138,17 @@ def test_caps_are_within_four_millimetres(replays: dict[str, Replay], name: str)
     centroid = truth["center"][:, None] if "depth" in truth else truth["paint_centroid"]
     error_mm = 1e3 * np.linalg.norm(raw - centroid, axis=-1)[clear]
     assert np.isfinite(error_mm).any()
-    assert np.nanmedian(error_mm) <= 4.0
+    assert np.nanmedian(error_mm) <= 2.5
     assert replayed.summary["marker_raw_mm"] == pytest.approx(np.nanmedian(error_mm), abs=1e-3)
 
 
 @pytest.mark.parametrize("name", HANDS)
-def test_joints_of_visible_fingers_are_within_eight_millimetres(
-    replays: dict[str, Replay], name: str
-) -> None:
+def test_joints_of_visible_fingers_are_within_five_millimetres(replays: dict[str, Replay], name: str) -> None:
     replayed = replays[name]
     summary = replayed.summary
-    assert summary["joint_mm_visible"] <= 8.0
+    assert summary["joint_mm_visible"] <= 5.0
+    # Of the six unrelated poses hardly two tips show in one frame; two more are slivers that are not found.
+    assert summary["pip_deg_visible"] <= (7.0 if name == "poses_left" else 6.0)
     # The score against our own sum: fingers clear in both cameras, and the wrist.
     truth, poses = replayed.truth(), load_poses(replayed.out / "poses.npz")
     _, _, frac, _ = seen_and_true(replayed)
