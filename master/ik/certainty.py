@@ -6,11 +6,13 @@ of a held pose. Counted as a witness, a hundred times a second, it would make th
 So it is left out here, and an angle that nothing else tells is somewhere within its limits.
 
 What is left are the markers and habits. Habits hold better of some postures than of others: a pointing hand defies
-them, a relaxed one is nearer to them than they claim. By how much is told by the misfit of the instant itself, which
-scales the covariance (Birge 1932), with the claimed widths as one observation more (a prior of unit information: Kass,
-Wasserman 1995):
+them. By how much is told by the misfit of the instant itself, which scales the covariance (Birge 1932), with the
+claimed widths as one observation more (a prior of unit information: Kass, Wasserman 1995):
 
-    covariance = s^2 (J' J + normal)^-1,   s^2 = (1 + chi^2) / (1 + f),   f = 3 N - 6 + (2 if the back is seen)
+    covariance = s^2 (J' J + normal)^-1,   s^2 = max(1, (1 + chi^2) / (1 + f)),   f = 3 N - 6 + (2 if the back is seen)
+
+A good fit makes nothing surer than it was claimed. The misfit tells of what markers contradict, and most of what is
+unsure, such as the palm's turn about the one marker on its back or a finger that is hidden, leaves none.
 
 N markers are 3 N numbers, and the palm takes six; each angle is as much a number as a belief. Beliefs that contradict
 each other, whatever the markers, tell nothing of the instant: their least cost is no part of chi^2.
@@ -24,9 +26,6 @@ from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
 
 _CLAIMED = 1.0  # observations that the claimed widths of habits count as
-_LEAST_SCALE = (
-    0.5  # markers that fit by chance tell nothing of what they do not touch, such as a hidden finger
-)
 _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
 _NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
@@ -43,7 +42,7 @@ def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -
     normal.flat[:: len(normal) + 1] += anywhere(problem.parameters)
     normal[6:, 6:] += habits.normal
     free = max(3 * len(problem.points_m) - 6 + (0 if problem.facing is None else 2), 0)
-    scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), _LEAST_SCALE)
+    scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), 1.0)
     return np.asarray(scale * np.linalg.inv(normal), np.float64)
 
 

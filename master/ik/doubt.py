@@ -14,18 +14,14 @@ coordinates in which the covariance of this instant is the unit matrix and that 
 each pair. So what is claimed is never surer than one instant was, and grows while nothing is seen, up to a finger that
 is somewhere within its limits. Where every finger is seen this instant tells more than the past, and counts alone.
 
-Joints move on arcs. To second order a bone b that is turned by an angle phi is off by -b phi^2 / 2 besides, and
-
-    E[sum_mn b_m b_n' phi_m^2 phi_n^2 / 4] = sum_mn b_m b_n' (P_mm P_nn + 2 P_mn^2) / 4
-
-for normal angles of covariance P (Isserlis 1918), which is added: without it the region of a finger that may be
-anywhere would be as thin as its abduction is sure.
+Joints move on arcs, which is added to what this covariance says of them (`master.ik.arcs`).
 """
 
 import numpy as np
 
-from common.arrays import Float
-from common.hand_model import CHAINS, PALM
+from common.arrays import Bool, Float
+from common.hand_model import PALM
+from master.ik.arcs import Arcs
 from master.ik.certainty import anywhere
 from master.ik.hand import HandSolution
 from master.ik.hidden import HiddenFingers, strayed_rad2
@@ -36,7 +32,6 @@ from master.ik.priors import Priors
 _TURNS_RAD_S, _STARTS_M_S = np.radians(20.0), 0.02
 _GOES_ON = 0.35  # of its speed, along each axis
 _EASE = 0.3  # of a new speed that counts
-_BEFORE = np.tri(3)[:, None, :, None]
 
 
 class JointDoubt:
@@ -46,15 +41,10 @@ class JointDoubt:
         cov: (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and of the free angles [rad], at the last instant.
     """
 
-    def __init__(self, parameters: HandParameters, priors: Priors) -> None:
-        self._finger, self._priors = parameters.free // 4, priors
+    def __init__(self, parameters: HandParameters, priors: Priors, arcs: Arcs) -> None:
+        self._finger, self._priors, self._arcs = parameters.free // 4, priors, arcs
         self._parameters = parameters
         self._anywhere = 1.0 / anywhere(parameters)
-        complete = parameters.complete.reshape(5, 4, -1)
-        self._bent = np.zeros(
-            (5, 3, 6 + complete.shape[-1])
-        )  # how far each bone is turned in its finger's plane
-        self._bent[:, :, 6:] = np.cumsum(complete[:, 1:], axis=1)
         self.cov: Float | None = None
         self._lost_s = 0.0
         self._speed_m_s = 0.0
@@ -65,6 +55,8 @@ class JointDoubt:
         last: HandSolution | None,
         dt_s: float,
         hidden: HiddenFingers | None,
+        markers_cov_m2: Float,
+        seen: Bool,
         *,
         palm_seen: bool,
     ) -> Float:
@@ -74,6 +66,7 @@ class JointDoubt:
             found: The hand at this instant.
             last, dt_s: That of the instant before and the time since then [s]; None: nothing is taken over.
             hidden: Fingers without a marker; None: nothing is known of what they did.
+            markers_cov_m2, seen: Covariances (M, 3, 3) [m^2] of the markers, and which of them are seen (M,).
             palm_seen: Whether markers tell where the palm is.
         """
         now = found.alone
@@ -87,7 +80,8 @@ class JointDoubt:
         self.cov = now
         moved = found.moved
         linear = (moved.reshape(-1, len(now)) @ now).reshape(moved.shape) @ np.swapaxes(moved, 1, 2)
-        return linear + self._on_arcs(found, now)
+        fitted = markers_cov_m2 + self._priors.model_m**2 * np.eye(3)
+        return linear + self._arcs.covariance(found, now, fitted, seen)
 
     def _without(self, found: HandSolution, hidden: HiddenFingers) -> Float:
         """What this instant tells (6 + n, 6 + n), but of hidden fingers no more than their limits."""
@@ -120,19 +114,6 @@ class JointDoubt:
             rates = (_TURNS_RAD_S, _STARTS_M_S + _GOES_ON * self._speed_m_s)
             grown[:6] = np.repeat(np.square(rates), 3) * (self._lost_s**2 - before**2)
         return grown
-
-    def _on_arcs(self, found: HandSolution, cov: Float) -> Float:
-        """(26, 3, 3) [m^2] that linear covariances leave out."""
-        turned = self._bent @ cov @ np.swapaxes(self._bent, 1, 2)  # (5, 3, 3)
-        variance = np.einsum("fmm->fm", turned)
-        fourth = 0.25 * (variance[:, :, None] * variance[:, None] + 2.0 * turned * turned)
-        place = found.joints.position_m[CHAINS]
-        before = _BEFORE * (
-            place[:, 1:] - place[:, :-1]
-        )  # bones before joints 1, 2, 3 of a chain: (3, 5, 3, 3)
-        out = np.zeros((len(found.moved), 3, 3))
-        out[CHAINS[:, 1:]] = np.swapaxes(np.swapaxes(before, 2, 3) @ fourth @ before, 0, 1)
-        return out
 
 
 def surer(now: Float, past: Float) -> Float:

@@ -19,6 +19,7 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
+from master.ik.arcs import Arcs
 from master.ik.doubt import JointDoubt
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
@@ -68,6 +69,7 @@ class HandTracker:
         self.model, self.markers = model, markers
         self._solver = HandSolver(model, markers, priors)
         self.parameters = HandParameters.of(model)
+        self._arcs = Arcs(model, self.parameters, markers)
         self._refine = FingerRefiner(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
@@ -88,7 +90,7 @@ class HandTracker:
 
     def _forget(self) -> None:
         self._memory = FingerMemory(self.model)
-        self.doubt = JointDoubt(self.parameters, self._solver.priors)
+        self.doubt = JointDoubt(self.parameters, self._solver.priors, self._arcs)
 
     def recent(self, t_ns: int) -> tuple[HandSolution | None, float]:
         """The last solution, if it still says anything at `t_ns`, and how long ago it held [s]."""
@@ -135,7 +137,7 @@ class HandTracker:
         tells_palm = self._tells_palm(seen, orientation)
         if solution is not None:
             solution = self._refine(solution, points_m, cov_m2)
-            cov = self.doubt.push(solution, last, dt_s, hidden, palm_seen=tells_palm)
+            cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
             solution = replace(solution, cov_m2=cov)
             if last is not None:
                 self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)

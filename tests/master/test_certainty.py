@@ -48,7 +48,7 @@ def test_a_pose_that_is_held_makes_its_directions_no_surer(dt_s: float) -> None:
 
 def test_a_hand_against_habits_is_less_sure_than_a_relaxed_one() -> None:
     relaxed, odd = tilt_deg(solved(NATURAL)), tilt_deg(solved(UNNATURAL))
-    assert (relaxed < 12.0).all()
+    assert (relaxed < 17.0).all()
     assert np.median(odd / relaxed) > 1.5
 
 

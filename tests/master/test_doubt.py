@@ -98,7 +98,8 @@ def test_doubt_about_a_hidden_finger_grows_and_stays_within_its_reach() -> None:
 def test_doubt_about_a_lost_hand_grows_the_faster_the_faster_it_went() -> None:
     still, moving = (sigma_m(course(NOBODY, 28, speed), PALM) for speed in (0.0, 0.5))
     for claims in (still, moving):
-        assert (np.diff(claims) > 0.0).all()
+        assert (np.diff(claims)[1:] > 0.0).all()
+        assert claims[1] > 0.95 * claims[0]  # no marker tells any more about which point the palm turns
     assert moving[-1] > 3.0 * still[-1]
     assert moving[-1] > 0.5 * 0.5 * 28 / 60  # half the way it would have gone on
 
