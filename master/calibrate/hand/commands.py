@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import typer
 from msgspec.structs import replace
 
+from common.back_markers import with_three_back_markers
 from common.calibration import HandProfile, RigCalibration, load
 from common.errors import CalibrationError
 from common.hand_model import HandModel
@@ -41,6 +42,9 @@ DipPerPip = Annotated[
         min=0.0, max=2.0, help="How far the last joint bends per middle joint, where it was measured."
     ),
 ]
+ThreeBack = Annotated[
+    bool, typer.Option("--three-back", help="With three markers on the back; only with --length-mm alone.")
+]
 Steps = Annotated[bool, typer.Option("--steps", help="Only tell the steps of the routine.")]
 Live = Annotated[bool, typer.Option("--live", help="Do the routine now, before the running master.")]
 Out = Annotated[Path | None, typer.Option(help="Tree to write hands/NAME.json into.")]
@@ -61,6 +65,7 @@ def hand_command(
     out: Out = None,
     json_file: JsonFile = None,
     picture: Picture = None,
+    three_back: ThreeBack = False,
     steps: Steps = False,
     live: Live = False,
     bus: BusEnd = HERE_BUS,
@@ -82,15 +87,13 @@ def hand_command(
             typer.echo(line)
         return
     template = template_of(base, side, name)
-    if live and poses is not None:
-        raise CalibrationError("--poses has no meaning with --live: leave it out")
-    if poses is None and not live:
-        if length_mm is None:
-            raise CalibrationError(
-                "give --live, --poses FILE of the routine (its steps: --steps), or --length-mm"
-            )
+    _check_together(poses, live, length_mm, three_back)
+    if poses is None and length_mm is not None and not live:
         told: dict[str, object] = {"side": side, "hand_length_mm": length_mm, "lengths": {}}
-        profile = quick_profile(quick(base, template, length_mm), name, 1e-3 * length_mm)
+        scaled = quick(base, template, length_mm)
+        if three_back:
+            scaled = with_three_back_markers(scaled, name)
+        profile = quick_profile(scaled, name, 1e-3 * length_mm)
         typer.echo(f"{side} hand scaled to {length_mm:g} mm; no bone is measured")
     else:
         names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
@@ -111,6 +114,19 @@ def hand_command(
     typer.echo("nothing written: give --out DIR" if written is None else f"wrote {written}")
     if json_file is not None:
         write_summary(json_file, told | {"written": None if written is None else str(written)})
+
+
+def _check_together(poses: Path | None, live: bool, length_mm: float | None, three_back: bool) -> None:
+    if live and poses is not None:
+        raise CalibrationError("--poses has no meaning with --live: leave it out")
+    if poses is None and not live and length_mm is None:
+        raise CalibrationError(
+            "give --live, --poses FILE of the routine (its steps: --steps), or --length-mm"
+        )
+    if three_back and (live or poses is not None):
+        raise CalibrationError(
+            "--three-back makes a hand from its length; to measure one, give its file with --hand"
+        )
 
 
 def step_lines() -> list[str]:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
+from common.errors import FitError
 from master.calibrate.hand.problem import HandRoutineProblem
 from master.calibrate.hand.shape import Shape
 
@@ -42,8 +43,12 @@ class ShapeFit:
 def fit_shape(
     problem: HandRoutineProblem, progress: Callable[[float], None] = lambda share: None
 ) -> ShapeFit:
-    """Minimise from the routine as it was asked for."""
-    state = problem.guess()
+    """Minimise from the routine as it was asked for.
+
+    Raises:
+        FitError: The search does not settle.
+    """
+    state, settled = problem.guess(), False
     normal, cost = problem.normal(state)
     damping, taken, refused = 1e-3, 0, 0
     while taken < _STEPS and refused < _REFUSED:
@@ -54,10 +59,16 @@ def fit_shape(
             gain, state, normal, cost = cost - next_cost, tried, next_normal, next_cost
             damping, taken, refused = max(damping / 5.0, 1e-9), taken + 1, 0
             progress(min(taken / 15.0, 0.99))
-            if gain < _ENOUGH:
+            settled = gain < _ENOUGH
+            if settled:
                 break
         else:
             damping, refused = damping * 8.0, refused + 1
+    if not settled and refused < _REFUSED:
+        raise FitError(
+            f"the fit does not settle in {_STEPS} steps: what was recorded is not this routine, or not this hand;"
+            " record it again, or begin with --length-mm"
+        )
     residual = problem.residuals(state)
     spread, alike = _spread(problem, residual)
     cov = np.asarray(np.linalg.inv(normal.solve(0.0)[2]), np.float64) * (max(spread, 1.0) * alike) ** 2

@@ -31,6 +31,12 @@ def test_a_quick_start_from_the_length(tmp_path: Path, side: str) -> None:
     assert "no bone is measured" in made.provenance["rest_joints"].note
 
 
+def test_a_quick_start_with_three_markers_on_the_back(tmp_path: Path) -> None:
+    run("--length-mm", "183", "--three-back", "--name", "eve", "--out", str(tmp_path))
+    mounts = HandModel.of(load(tmp_path / "hands" / "eve.json", HandProfile)).mounts
+    assert [name for name, mount in mounts.items() if mount.joint is None] == ["back", "back2", "back3"]
+
+
 def test_a_quick_start_from_another_hand_is_mirrored_and_scaled(tmp_path: Path) -> None:
     save(tmp_path / "his.json", generated_profile("his", "left", 0.2))
     run("--length-mm", "180", "--name", "hers", "--hand", str(tmp_path / "his.json"), "--out", str(tmp_path))
@@ -71,6 +77,7 @@ def test_the_steps_are_told_without_anything_else() -> None:
         (("--length-mm", "300"), CalibrationError, "no hand|expected 0.1 to 0.25"),
         (("--poses", "nowhere.npz"), RecordingError, "nowhere.npz"),
         (("--live", "--poses", "a.npz"), CalibrationError, "no meaning with --live"),
+        (("--three-back", "--poses", "a.npz"), CalibrationError, "--three-back"),
         (("--length-mm", "190", "--hand", "nowhere.json"), CalibrationError, "nowhere.json"),
     ],
 )
