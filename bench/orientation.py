@@ -75,7 +75,7 @@ def rows() -> Iterator[Row]:
             yield Row(f"{name}: palm", float(palm.mean()), "deg", f"95 %: {np.quantile(palm, 0.95):.1f}")
             yield Row(f"{name}: joints", float(joint.mean()), "mm", f"95 %: {np.quantile(joint, 0.95):.1f}")
             held = 100.0 * float(np.concatenate([one.held for one in found]).mean())
-            yield Row(f"{name}: 95 % regions hold", held, "%", "of the joints")
+            yield Row(f"{name}: inside 95 %", held, "%", "of the joints in their regions")
             yield Row(f"{name}: PIP", float(pip.mean()), "deg", "index to little, seen or not")
 
 
