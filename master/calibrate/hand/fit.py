@@ -66,7 +66,7 @@ def fit_shape(
             damping, refused = damping * 8.0, refused + 1
     if not settled and refused < _REFUSED:
         raise FitError(
-            f"the fit does not settle in {_STEPS} steps: the palm did not rest, or this is not the routine, or not this hand;"
+            f"the fit does not settle in {_STEPS} steps: the palm did not rest, or it is not this routine or hand;"
             " record it again, or begin with --length-mm"
         )
     residual = problem.residuals(state)
