@@ -30,6 +30,7 @@ from master.ik.hand import HandSolution
 from master.ik.parameters import HandParameters
 
 _STRAIGHT_RAD = np.radians(3.0)  # a turn by less is straight: 0.2 mm off the tangent at the far end of a hand
+_ANYWHERE_RAD = 1.0  # a turn that is less sure than this leads nowhere farther
 _PALM_POINTS = np.setdiff1d(np.arange(26), CHAINS)
 _CHAIN_BONES = CHAINS.size
 
@@ -68,7 +69,8 @@ class Arcs:
         if not bent.any():
             return np.zeros((26, 3, 3))
         bone, turned = self._bones(found)
-        w = np.moveaxis(turned @ (axes[:, bent] * np.sqrt(variance[bent])), -1, 0)  # (K, S, 3)
+        size = np.minimum(np.sqrt(variance[bent]), _ANYWHERE_RAD)
+        w = np.moveaxis(turned @ (axes[:, bent] * size), -1, 0)  # (K, S, 3)
         h = self._second_order(bone, w)
         joints = h[:, :26].reshape(len(h), 78)
         if seen.any():
