@@ -17,6 +17,8 @@ is somewhere within its limits. Where every finger is seen this instant tells mo
 Joints move on arcs, which is added to what this covariance says of them (`master.ik.arcs`).
 """
 
+from math import exp
+
 import numpy as np
 
 from common.arrays import Bool, Float
@@ -31,7 +33,7 @@ from master.ik.priors import Priors
 # A palm without markers: about each axis, and along it beside what it was moving at.
 _TURNS_RAD_S, _STARTS_M_S = np.radians(20.0), 0.02
 _GOES_ON = 0.35  # of its speed, along each axis
-_EASE = 0.3  # of a new speed that counts
+_EASE_S = 0.047  # of the speed: three tenths of a new one count at 60 frames a second
 
 
 class JointDoubt:
@@ -107,7 +109,8 @@ class JointDoubt:
         if palm_seen:
             self._lost_s = 0.0
             step = found.joints.position_m[PALM] - last.joints.position_m[PALM]
-            self._speed_m_s += _EASE * (float(np.sqrt(step @ step)) / dt_s - self._speed_m_s)
+            share = 1.0 - exp(-dt_s / _EASE_S)  # a short step is mostly noise
+            self._speed_m_s += share * (float(np.sqrt(step @ step)) / dt_s - self._speed_m_s)
             grown[:6] = self._priors.palm_weight(dt_s) ** -2.0
         else:
             before, self._lost_s = self._lost_s, self._lost_s + dt_s

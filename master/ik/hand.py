@@ -29,7 +29,6 @@ EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins: open to closed
 _SHOWS_RAD = np.radians(45.0)  # a finger bent by less in all its joints shows its end from behind
 _MIND_S = 0.3  # how fast a hand may change from habits to none
-_ORIENTED_RAD = np.radians(15.0)  # an orientation that is known better than this fixes the hand's
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +77,7 @@ class _Told:
     shown: frozenset[int]
     last: HandSolution | None
     dt_s: float
+    age_s: Float
     hidden: tuple[Float, Float] | None
     facing: Float | None
     enough: float
@@ -120,6 +120,7 @@ class HandSolver:
         enough: float = ENOUGH,
         near: HandSolution | None = None,
         orientation: Orientation | None = None,
+        age_s: Float | None = None,
     ) -> HandSolution | None:
         """Fit the hand to its markers.
 
@@ -137,6 +138,7 @@ class HandSolver:
                 ends where all markers are explained. Nothing else is taken from it, and fingers without a marker
                 begin at a natural posture.
             orientation: The palm's orientation as an IMU has it; None: not known.
+            age_s: (6,) [s] how long ago markers told of each finger, and of the palm, what `last` says; None: `dt_s`.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
@@ -146,7 +148,10 @@ class HandSolver:
         if last is None and not _determined(points_m[seen], facing, orientation):
             return None
         shown = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
-        told = _Told(points_m, cov_m2, seen, shown, last, dt_s, hidden, facing, enough, near, orientation)
+        age_s = np.full(6, dt_s) if age_s is None else age_s
+        told = _Told(
+            points_m, cov_m2, seen, shown, last, dt_s, age_s, hidden, facing, enough, near, orientation
+        )
         # A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         like = frozenset(f for f in (2, 3) if hidden is None and f not in shown and {f - 1, f + 1} <= shown)
         found = self._fit(told, like)
@@ -180,8 +185,10 @@ class HandSolver:
             self._attached.only(seen),
             told.points_m[seen],
             _whitening(told.cov_m2[seen], self.priors.model_m),
-            self._and_last(habits, last, told.dt_s),
-            None if last is None else PalmPrior(last.T_rig_palm, self.priors.palm_weight(told.dt_s)),
+            self._and_last(habits, last, told.age_s[:5]),
+            None
+            if last is None
+            else PalmPrior(last.T_rig_palm, self.priors.palm_weight(float(told.age_s[5]))),
             None if told.facing is None else Facing(told.facing, 1.0 / self.priors.facing),
             told.orientation,
         )
@@ -207,10 +214,10 @@ class HandSolver:
             self._priors[unlike] = AnglePrior.of(self.model, self._parameters, self.priors, unlike)
         return self._priors[unlike]
 
-    def _and_last(self, habits: AnglePrior, last: HandSolution | None, dt_s: float) -> AnglePrior:
+    def _and_last(self, habits: AnglePrior, last: HandSolution | None, age_s: Float) -> AnglePrior:
         if last is None:
             return habits
-        return habits.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, dt_s))
+        return habits.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, age_s))
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self._parameters.of_angles(last.angles_rad)[None]
@@ -288,7 +295,7 @@ def _determined(points: Float, facing: Float | None, orientation: Orientation | 
     What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
     orientation that is known any one marker is enough.
     """
-    if orientation is not None and np.trace(orientation.cov_rad2) < _ORIENTED_RAD**2:
+    if orientation is not None and orientation.sure:
         return len(points) > 0
     if len(points) < 2:
         return False

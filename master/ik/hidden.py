@@ -24,6 +24,7 @@ from common.arrays import Float
 from common.hand_model import HandModel
 
 COAST_S = 0.12  # a lost finger's own motion fades with this time constant
+_LEARN_S = 0.024  # of the speeds: half of a new one counts at 60 frames a second
 STRAY_RAD, STRAY_S = np.radians(40.0), 1.2
 ALIKE = 0.7
 _APART = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
@@ -64,7 +65,8 @@ class FingerMemory:
 
     def moved(self, before_rad: Float, after_rad: Float, dt_s: float) -> None:
         """Learn from one step of the angles (5, 4)."""
-        self._speed = 0.5 * self._speed + 0.5 * (after_rad - before_rad) / dt_s
+        share = 1.0 - np.exp(-dt_s / _LEARN_S)  # a short step is mostly noise
+        self._speed = self._speed + share * ((after_rad - before_rad) / dt_s - self._speed)
 
     def belief(
         self, t_ns: int, last_ns: int, last_rad: Float, natural: float, seen: frozenset[int]

@@ -174,11 +174,11 @@ def hidden_belief(
 
 
 def last_belief(
-    parameters: HandParameters, priors: Priors, angles_rad: Float, dt_s: float
+    parameters: HandParameters, priors: Priors, angles_rad: Float, age_s: Float
 ) -> tuple[Float, Float]:
-    """Weight and mean (n,) of the angles (5, 4) a hand had `dt_s` ago."""
-    walk = 1.0 / (priors.walk_rad_s * max(dt_s, _SHORTEST_S))
-    return np.full(len(parameters.free), walk), parameters.of_angles(angles_rad)
+    """Weight and mean (n,) of the angles (5, 4) of a hand whose fingers were last told `age_s` (5,) ago."""
+    walk = 1.0 / (priors.walk_rad_s * np.maximum(age_s, _SHORTEST_S))
+    return walk[parameters.free // 4], parameters.of_angles(angles_rad)
 
 
 def _natural_rows(

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Bool, Code, Float
+from common.arrays import Bool, Code, Float, Int
 from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
@@ -30,6 +30,7 @@ from master.ik.priors import Priors
 from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
+_NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
 _GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
 
@@ -45,7 +46,7 @@ class TrackedHand:
 
 
 class HandTracker:
-    """Push machine. Holds the last solution, when it and any marker were last seen, and what its motion taught."""
+    """Push machine. Holds the last solution, when it and each part of it were seen, and what its motion taught."""
 
     def __init__(
         self,
@@ -78,6 +79,7 @@ class HandTracker:
         self.last: HandSolution | None = None
         self._last_ns = 0
         self._seen_ns: int | None = None
+        self._told_ns: Int = np.full(6, _NEVER_NS)
         self._forget()
 
     def fresh(self) -> "HandTracker":
@@ -85,6 +87,7 @@ class HandTracker:
         other = copy(self)
         other._solver = HandSolver(self.model, self.markers, self._solver.priors)
         other.last, other._last_ns, other._seen_ns = None, 0, None
+        other._told_ns = np.full(6, _NEVER_NS)
         other._forget()
         return other
 
@@ -119,6 +122,7 @@ class HandTracker:
             orientation: The palm's orientation as an IMU has it; None: not known.
         """
         seen = seen_markers(points_m, cov_m2)
+        tells_palm = self._tells_palm(seen, orientation)
         last, dt_s = self.recent(t_ns)
         if last is None:
             self._forget()
@@ -128,13 +132,15 @@ class HandTracker:
             fingers = frozenset(self._finger[seen].tolist())
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, fingers)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
-        solution = self._solver.solve(points_m, cov_m2, last, dt_s, held, facing, orientation=orientation)
+        age_s = self._ages_s(t_ns, dt_s, seen, tells_palm=tells_palm)
+        solution = self._solver.solve(
+            points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s
+        )
         if solution is not None and last is not None:
             fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation)
             if fresh is not None:
                 solution, last = fresh, None  # the leap was no motion
                 self._forget()
-        tells_palm = self._tells_palm(seen, orientation)
         if solution is not None:
             solution = self._refine(solution, points_m, cov_m2)
             cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
@@ -148,6 +154,16 @@ class HandTracker:
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
+
+    def _ages_s(self, t_ns: int, dt_s: float, seen: Bool, *, tells_palm: bool) -> Float:
+        """(6,) [s] how old what the last pose says of each finger and of the palm is, where markers now tell of it.
+
+        A finger that was hidden, or a palm, moved on for as long as nobody saw it, not since the last frame.
+        """
+        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
+        ages = np.where(told, (t_ns - self._told_ns) * 1e-9, dt_s)
+        self._told_ns = np.where(told, t_ns, self._told_ns)
+        return ages
 
     def _afresh(
         self,
@@ -195,7 +211,7 @@ class HandTracker:
 
     def _tells_palm(self, seen: Bool, orientation: Orientation | None) -> bool:
         """Whether this instant tells where the palm is and how it is turned."""
-        if orientation is not None:
+        if orientation is not None and orientation.sure:
             return bool(seen.any())
         return bool(seen.sum() >= 3 or (seen.sum() == 2 and (seen & self._on_palm).any()))
 

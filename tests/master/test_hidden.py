@@ -103,3 +103,13 @@ def test_nothing_that_is_believed_leaves_the_limits() -> None:
     closing = [np.array([p, p, 40.0, p]) for p in np.linspace(40.0, 110.0, 40)]
     for hidden in after(frozenset({RING, 0}), closing, (30.0, 40.0)):
         assert within(RIGHT, hidden.angles_rad)
+
+
+def test_a_step_of_a_millisecond_throws_no_finger() -> None:
+    """Instants follow that soon where another camera takes the lead; a degree of noise is no 1000 degrees a second."""
+    memory = FingerMemory(RIGHT)
+    for _ in range(10):
+        memory.moved(bent(40.0), bent(40.0), STEP_NS * 1e-9)
+    memory.moved(bent(40.0), bent(41.5), 1e-3)
+    course = [memory.belief((k + 1) * STEP_NS, k * STEP_NS, bent(41.5), 1.0, frozenset()) for k in range(60)]
+    assert max(abs(pip_deg(hidden) - 41.5) for hidden in course) < 10.0

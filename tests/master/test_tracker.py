@@ -6,8 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.hand_model import CHAINS, METACARPALS, TIPS
+from common.hand_model import CHAINS, METACARPALS, PALM, TIPS
 from common.messages import Source
+from master.ik.palm import Orientation
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov, within
 
@@ -246,3 +247,38 @@ def test_a_hand_of_random_markers_never_leaves_its_limits(seed: int) -> None:
         if hand.solution is not None:
             assert within(RIGHT, hand.solution.angles_rad)
             assert np.isfinite(hand.solution.joints.position_m).all()
+
+
+def test_a_hand_that_comes_back_elsewhere_is_as_good_as_one_that_is_new() -> None:
+    """What was known of it before it was lost is as old as that, not as old as the last frame."""
+    off: dict[bool, list[float]] = {True: [], False: []}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        moved = palm(rng.uniform(-30.0, 30.0, 3)), natural_angles(rng)
+        noise = rng.normal(0.0, 1e-3, (6, 3))
+        for known in (True, False):
+            tracker, last = HandTracker(RIGHT, MARKERS), 50
+            if known:
+                run(tracker, range(20))
+                run(tracker, range(20, last), tuple(range(6)))
+            true = RIGHT.forward(*moved)
+            points = RIGHT.marker_points(true, MARKERS) + noise
+            hand = tracker.push(last * STEP_NS, points, small_cov(1e-3), FACING)
+            assert hand.solution is not None
+            error = np.linalg.norm(hand.solution.joints.position_m - true.position_m, axis=1)
+            off[known].append(1e3 * float(error.mean()))
+    assert np.mean(off[True]) < 1.3 * np.mean(off[False])
+
+
+@pytest.mark.parametrize(("heading_rad", "told"), [(0.03, True), (10.0, False)])
+def test_an_orientation_without_heading_does_not_tell_the_palm_by_one_finger(
+    heading_rad: float, told: bool
+) -> None:
+    tracker, up = HandTracker(RIGHT, MARKERS), np.array([0.0, -1.0, 0.0])
+    run(tracker, range(5))
+    cov = 0.03**2 * np.eye(3) + (heading_rad**2 - 0.03**2) * np.outer(up, up)
+    points = points_of(bent(5 / 60.0), tuple(m for m in range(6) if m != MARKER_INDEX))
+    orientation = Orientation(palm()[:3, :3], cov)
+    hand = tracker.push(5 * STEP_NS, points, small_cov(), FACING, orientation=orientation)
+    assert hand.tracked[TIPS[INDEX]]
+    assert hand.tracked[PALM] == told
