@@ -116,10 +116,12 @@ class HandProblem:
         low = np.where(self.parameters.rests, -np.inf, self.parameters.low)
         return mean_within(found.linear.normal, found.linear.gradient, found.x, low, self.parameters.high)
 
-    def marker_step(self, found: Minimum, step: Float) -> Float:
-        """By how much a step (6 + n,) from there moves the markers (N, 3) [m], as if they moved on straight lines."""
+    def marker_end(self, found: Minimum, step: Float) -> Float:
+        """Where a step (6 + n,) from there brings the markers (N, 3) [m], as if they moved on straight lines."""
         here = self.place(found.T_rig_palm, found.x)
-        return (self.place(*moved(found.T_rig_palm, found.x, _LITTLE * step)) - here) / _LITTLE
+        if not step.any():
+            return here
+        return here + (self.place(*moved(found.T_rig_palm, found.x, _LITTLE * step)) - here) / _LITTLE
 
     def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> list[Minimum]:
         """For each of H hypotheses the end of a way downhill from the best of seeds (S, 4, 4), (S, n) in the bounds.

@@ -21,7 +21,8 @@ from master.ik.priors import AnglePrior
 
 _STIFF = 1e-2  # how much less than the markers the mean of the hypotheses holds
 _CERTAIN = 12.0  # log odds that count as certain
-_NEGLIGIBLE = 0.01  # a hypothesis of less weight changes next to nothing
+_NEGLIGIBLE = 0.03  # a hypothesis of less weight changes next to nothing
+_NOTICED = 0.15  # one of less weight is taken where it is likeliest: its mean would change next to nothing
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,20 +62,22 @@ class Mixture:
         kept = np.array([best]) if sure else np.arange(len(minima))
         share = np.ones(1) if sure else weight
         off = np.array([_between(minima[h], top) for h in kept])
-        linear = np.array([problem.place(minima[h].T_rig_palm, minima[h].x) for h in kept])
+        steps = np.zeros_like(off)
         alone = np.zeros((off.shape[1], off.shape[1]))
         for k, h in enumerate(kept.tolist()):
             found, one = minima[h], problem.of_hypothesis(h)
             alone += share[k] * covariance_alone(one, habits.of_hypothesis(h), found)
-            if h > 0:
-                step = one.mean_step(found)
-                off[k] += step
-                linear[k] += one.marker_step(found, step)
+            if h > 0 and share[k] > _NOTICED:
+                steps[k] = one.mean_step(found)
+        off += steps
         mean: Float = share @ off
         alone += (off - mean).T * share @ (off - mean)
         T, x = top.T_rig_palm, top.x
         if mean.any():
-            between = problem.of_points(np.einsum("h,hmi->mi", share, linear))
+            ends = np.array(
+                [problem.marker_end(minima[h], step) for h, step in zip(kept, steps, strict=True)]
+            )
+            between = problem.of_points(np.einsum("h,hmi->mi", share, ends))
             T, x = _onto(between, *moved(T, x, mean), top.linear.normal)
         return cls(T, x, alone, float(top.linear.cost), natural)
 
