@@ -17,11 +17,11 @@ from typing import Any
 import cv2
 import numpy as np
 
+from bench.played import message_of
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import HandProfile, load
 from common.hand_model import HandModel
-from common.messages import MarkerDetections
 from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
@@ -101,10 +101,7 @@ def static(setup: RigSetup, place: int, frames: int = FRAMES) -> Static:
         for c, name in enumerate(rig.cameras):
             found = detectors[c].push(renderers[c].render(t_ns * 1e-9), t_ns)
             seen[0, c, k], seen[1, c, k] = found.uv, found.sigma_px[:, None]
-            message = MarkerDetections(
-                name, 1, k, t_ns, t_ns, found.uv, found.area, found.quality, found.sigma_px, found.rival_uv
-            )
-            for solved in pipeline.push(message):
+            for solved in pipeline.push(message_of(name, k, t_ns, found)):
                 raw.append(solved.pose.markers_raw_m[:, 2])
                 filtered.append(solved.pose.markers_m[:, 2])
     keep = slice(SETTLING, None)

@@ -12,6 +12,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from bench.played import START_NS, message_of, times_of
 from bench.row import Row
 from common.arrays import Float
 from common.calibration import HandProfile, ImuCalibration, MarkerMount
@@ -31,7 +32,6 @@ _SEEDS = (31, 32, 33, 34, 35, 36)
 _SECONDS, _APART_S = 5.0, 9.5  # each seed sees other acts of the scene
 _MOUNT_M = 1e-3
 _REGION = 7.815  # chi square, three degrees, 95 %
-_ZERO_NS = 10**9
 # Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
 _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)
 _TILT_ONLY = ImuCalibration(q_palm_imu=(0.5, 0.5, -0.5, 0.5), q_rig_world=_WORLD)
@@ -87,25 +87,11 @@ def _record(rig: str, seed: int) -> _Run:
     messages: list[MarkerDetections] = []
     for camera in setup.rig.cameras:
         renderer, detector = Renderer(scene, camera), MarkerDetector(setup.cameras[camera], setup.rig.markers)
-        timing, period_s = scene.timing(camera), 1.0 / setup.cameras[camera].frame_rate_hz
-        for seq in range(round(_SECONDS / period_s)):
-            t_s = start_s + seq * period_s + timing.start_offset_ns * 1e-9
-            t_ns = _ZERO_NS + round(t_s * 1e9)
-            found = detector.push(renderer.observe(t_s)[0], t_ns)
-            messages.append(
-                MarkerDetections(
-                    camera,
-                    1,
-                    seq,
-                    t_ns,
-                    t_ns,
-                    found.uv,
-                    found.area,
-                    found.quality,
-                    found.sigma_px,
-                    found.rival_uv,
-                )
-            )
+        times = times_of(scene, camera, _SECONDS, setup.cameras[camera].frame_rate_hz, start_s)
+        for seq, t_s in enumerate(times.tolist()):
+            t_ns = START_NS + round(t_s * 1e9)
+            found = detector.push(renderer.render(t_s), t_ns)
+            messages.append(message_of(camera, seq, t_ns, found))
     known = HandModel.of(_mounted_otherwise(setup.hand.profile, seed))
     return _Run(replace(setup, hand=known), scene, sorted(messages, key=lambda one: one.t_ns))
 
@@ -124,10 +110,10 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
     """Solve a run with an IMU, or without one, and hold every pose against the truth."""
     setup = replace(run.setup, rig=msgspec.structs.replace(run.setup.rig, imu=imu))
     pipeline = build_pipeline(setup, StageTimes())
-    first, last = ((one.t_ns - _ZERO_NS) * 1e-9 for one in (run.messages[0], run.messages[-1]))
+    first, last = ((one.t_ns - START_NS) * 1e-9 for one in (run.messages[0], run.messages[-1]))
     samples: Iterator[ImuSample] = iter(())
     if imu is not None:
-        samples = SimulatedImu(run.scene.motion, imu, seed).around(first, last, _ZERO_NS)
+        samples = SimulatedImu(run.scene.motion, imu, seed).around(first, last, START_NS)
     palm: list[float] = []
     joint: list[float] = []
     pip: list[float] = []
@@ -137,7 +123,7 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
             pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
             continue
         for solved in pipeline.push(message):
-            pose, truth = solved.pose, run.scene.truth((solved.pose.t_ns - _ZERO_NS) * 1e-9)
+            pose, truth = solved.pose, run.scene.truth((solved.pose.t_ns - START_NS) * 1e-9)
             if not pose.valid.any():
                 continue
             found = quaternion_to_matrix(pose.orientation_wxyz[WRIST])

@@ -14,6 +14,7 @@ from common.sim.render import Renderer
 from common.sim.scene import Scene
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
+from slave.markers.detector import Detections
 from slave.markers.following import detector_for
 from slave.markers.workers import Inline
 
@@ -57,22 +58,14 @@ def watch(scene: Scene, camera: str, times_s: Float) -> Watched:
     messages: list[MarkerDetections] = []
     for seq, t in enumerate(times_s.tolist()):
         t_ns = START_NS + round(t * 1e9)
-        found = detector.push(renderer.render(t), t_ns)
-        messages.append(
-            MarkerDetections(
-                camera,
-                1,
-                seq,
-                t_ns,
-                t_ns,
-                found.uv,
-                found.area,
-                found.quality,
-                found.sigma_px,
-                found.rival_uv,
-            )
-        )
+        messages.append(message_of(camera, seq, t_ns, detector.push(renderer.render(t), t_ns)))
     return Watched(tuple(messages), times_s, shown_by(scene, camera, times_s))
+
+
+def message_of(camera: str, seq: int, t_ns: int, found: Detections) -> MarkerDetections:
+    """What a slave would send of frame `seq`, taken at `t_ns` [ns] and handed over at once."""
+    seen = (found.uv, found.area, found.quality, found.sigma_px, found.rival_uv)
+    return MarkerDetections(camera, 1, seq, t_ns, t_ns, *seen)
 
 
 def solve(setup: RigSetup, watched: Sequence[Watched]) -> tuple[list[HandPose], dict[str, int]]:

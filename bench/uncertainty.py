@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from bench.played import message_of
 from bench.row import Row
 from common.arrays import Bool, Float
 from common.calibration import HandProfile, load
@@ -171,9 +172,7 @@ def _seen(scene: Scene, seconds: float) -> tuple[list[MarkerDetections], dict[st
             t_s = seq / camera.frame_rate_hz + late_s
             image, view = renderer.observe(t_s)
             t_ns = round(t_s * 1e9)
-            d = detector.push(image, t_ns)
-            seen = (d.uv, d.area, d.quality, d.sigma_px, d.rival_uv)
-            messages.append(MarkerDetections(name, 1, seq, t_ns, t_ns, *seen))
+            messages.append(message_of(name, seq, t_ns, detector.push(image, t_ns)))
             times.append(t_ns)
             shares.append(np.nan_to_num(view.visible))
         visible[name] = np.array(times, np.float64), np.array(shares)

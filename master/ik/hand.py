@@ -95,19 +95,19 @@ class HandSolver:
             CalibrationError: The profile mounts no marker of one of the names.
         """
         self.model, self.markers, self.priors = model, markers, priors or Priors()
-        self._parameters = HandParameters.of(model)
-        self._attached = Attached.markers(model, self._parameters, markers)
-        self._joints = Attached.joints(model, self._parameters)
-        self._priors = {frozenset[int](): AnglePrior.of(model, self._parameters, self.priors)}
+        self.parameters = HandParameters.of(model)
+        self._attached = Attached.markers(model, self.parameters, markers)
+        self._joints = Attached.joints(model, self.parameters)
+        self._priors = {frozenset[int](): AnglePrior.of(model, self.parameters, self.priors)}
         habits = self._priors[frozenset()]
         natural = np.asarray(np.linalg.solve(habits.normal[0], habits.pull[0]), np.float64)
-        self._natural = np.minimum(np.maximum(natural, self._parameters.low), self._parameters.high)
+        self._natural = np.minimum(np.maximum(natural, self.parameters.low), self.parameters.high)
         bent = np.zeros((len(_BENDS), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS, (0.6, 1.0))[:, None]
-        self._postures = np.array([self._parameters.of_angles(angles) for angles in bent])
-        self._shapes_m = self._attached.place(model.chains(self._parameters.angles(self._postures)))
+        self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
+        self._shapes_m = self._attached.place(model.chains(self.parameters.angles(self._postures)))
         walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
-        self._walk_2 = np.repeat(walks, (3, 3, len(self._parameters.free))) ** 2
+        self._walk_2 = np.repeat(walks, (3, 3, len(self.parameters.free))) ** 2
 
     def solve(
         self,
@@ -181,7 +181,7 @@ class HandSolver:
         last, seen = told.last, told.seen
         return HandProblem(
             self.model,
-            self._parameters,
+            self.parameters,
             self._attached.only(seen),
             told.points_m[seen],
             _whitening(told.cov_m2[seen], self.priors.model_m),
@@ -202,29 +202,29 @@ class HandSolver:
     def _habits(self, told: _Told, like: frozenset[int]) -> AnglePrior:
         """Habits, with what is believed of fingers that are not shown."""
         if told.hidden is not None:
-            belief = hidden_belief(self._parameters, self.priors, told.shown, told.hidden)
+            belief = hidden_belief(self.parameters, self.priors, told.shown, told.hidden)
             return self._priors[frozenset()].and_single(*belief)
         # A finger that is out of sight because it is curled is bent unlike one that shows.
-        belief = hidden_belief(self._parameters, self.priors, told.shown | like, None)
+        belief = hidden_belief(self.parameters, self.priors, told.shown | like, None)
         return self._prior_of(frozenset(range(5)) - told.shown - like).and_single(*belief)
 
     def _prior_of(self, unlike: frozenset[int]) -> AnglePrior:
         """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
         if unlike not in self._priors:
-            self._priors[unlike] = AnglePrior.of(self.model, self._parameters, self.priors, unlike)
+            self._priors[unlike] = AnglePrior.of(self.model, self.parameters, self.priors, unlike)
         return self._priors[unlike]
 
     def _and_last(self, habits: AnglePrior, last: HandSolution | None, age_s: Float) -> AnglePrior:
         if last is None:
             return habits
-        return habits.and_single(*last_belief(self._parameters, self.priors, last.angles_rad, age_s))
+        return habits.and_single(*last_belief(self.parameters, self.priors, last.angles_rad, age_s))
 
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
-        return last.T_rig_palm[None], self._parameters.of_angles(last.angles_rad)[None]
+        return last.T_rig_palm[None], self.parameters.of_angles(last.angles_rad)[None]
 
     def _seed_near(self, hand: HandSolution, shown: frozenset[int]) -> tuple[Float, Float]:
-        known = np.isin(self._parameters.free // 4, list(shown))
-        x = np.where(known, self._parameters.of_angles(hand.angles_rad), self._natural)
+        known = np.isin(self.parameters.free // 4, list(shown))
+        x = np.where(known, self.parameters.of_angles(hand.angles_rad), self._natural)
         return hand.T_rig_palm[None], x[None]
 
     def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
@@ -249,7 +249,7 @@ class HandSolver:
         found = Mixture.of(problem, habits, minima, before)
         T = found.T_rig_palm
         # The bounds hold already; what is cut is the rounding of an angle that follows others.
-        angles = self.model.clamp(self._parameters.angles(found.x))
+        angles = self.model.clamp(self.parameters.angles(found.x))
         chains = self.model.chains(angles)
         joints = self.model.joints(T, chains)
         marker = self._attached.place(chains) @ T[:3, :3].T + T[:3, 3]

@@ -25,7 +25,6 @@ from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
-from master.ik.parameters import HandParameters
 from master.ik.priors import Priors
 from master.volume import inside
 
@@ -69,7 +68,7 @@ class HandTracker:
         """
         self.model, self.markers = model, markers
         self._solver = HandSolver(model, markers, priors)
-        self.parameters = HandParameters.of(model)
+        self.parameters = self._solver.parameters
         self._arcs = Arcs(model, self.parameters, markers)
         self._refine = FingerRefiner(model, markers)
         self._continuous = continuous
