@@ -19,12 +19,12 @@ from common.calibration import Couplings, HandProfile, Limits, MarkerMount, Quat
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM_FRAME, TIPS, WEBXR_JOINTS
+from common.hand_profiles import THUMB_DORSAL, joint_frame
 
 _BENT = np.radians(5.0)  # a finger that never bends further has no plane
 _EXTENDED = 0.1  # share of the frames that counts as most extended
 _BASE = 0.3  # metacarpal joints lie about there on the way from the wrist to the knuckles
 _BACK_M = 0.012  # the skin of the back above the bones
-_THUMB_DORSAL = np.array([0.62, 0.62, -0.10])  # as in generated profiles
 _MARKERS = ("thumb", "index", "middle", "ring", "little")
 
 
@@ -98,7 +98,7 @@ def profile_from_joints(
     bones = steps / lengths[..., None]
     normals = np.cross(bones[:, :, :2], bones[:, :, 1:]).sum(axis=2)  # (T, 5, 3), as long as it is bent
     position, rotation = np.zeros((26, 3)), np.tile(np.eye(3), (26, 1, 1))
-    rotation[:] = _frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
+    rotation[:] = joint_frame(np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]))
     for f, chain in enumerate(CHAINS):
         if np.linalg.norm(normals[:, f], axis=1).max() < 2.0 * np.sin(_BENT):
             raise CalibrationError(
@@ -114,7 +114,7 @@ def profile_from_joints(
         rotation[chain] = rest
     for base, knuckle in zip(METACARPALS, CHAINS[1:, 0], strict=True):
         position[base] = _BASE * position[knuckle]
-        rotation[base] = _frame(position[knuckle], np.array([0.0, 1.0, 0.0]))
+        rotation[base] = joint_frame(position[knuckle], np.array([0.0, 1.0, 0.0]))
     from_palm = np.diag([-1.0, 1.0, -1.0])
     return profile_from_rest(
         name, side, position[1:] @ from_palm, from_palm @ rotation[1:], limits, couplings
@@ -139,9 +139,9 @@ def _thumb_rest(bones: Float, normals: Float, right: bool) -> Float:
     heading = bones[_extended(bones), 0].mean(axis=0)
     # Without a motion of the CMC, any axis across the one hinge would do: that across the rest direction.
     dorsal = axes[2] if spread[1] > 5.0 * spread[2] else np.cross(axes[0], heading)
-    dorsal = dorsal * np.sign(dorsal @ (_THUMB_DORSAL * [1.0 if right else -1.0, 1.0, 1.0]))
+    dorsal = dorsal * np.sign(dorsal @ (np.array(THUMB_DORSAL) * [1.0 if right else -1.0, 1.0, 1.0]))
     dorsal /= np.linalg.norm(dorsal)
-    return _frame(heading - (heading @ dorsal) * dorsal, dorsal)
+    return joint_frame(heading - (heading @ dorsal) * dorsal, dorsal)
 
 
 def _extended(bones: Float) -> Int:
@@ -149,14 +149,6 @@ def _extended(bones: Float) -> Int:
     straight = (bones[:, 0] * bones[:, 1]).sum(axis=1)
     level = 1.0 - np.abs(bones[:, 0, 1])
     return np.argsort(-(straight + level))[: max(1, round(_EXTENDED * len(bones)))]
-
-
-def _frame(heading: Float, dorsal: Float) -> Float:
-    """Joint frame (3, 3): -z along the heading, +y as dorsal as that allows."""
-    z = -heading / np.linalg.norm(heading)
-    y = dorsal - (dorsal @ z) * z
-    y = y / np.linalg.norm(y)
-    return np.stack([np.cross(y, z), y, z], axis=1)
 
 
 def _vector(value: Float) -> Vector3:

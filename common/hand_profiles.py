@@ -27,7 +27,7 @@ _METACARPAL_BASE = {
 }
 _THUMB_BASE = (0.145, -0.100, 0.190)
 _THUMB_HEADING = (0.55, -0.42, 0.72)
-_THUMB_DORSAL = (0.62, 0.62, -0.10)
+THUMB_DORSAL = (0.62, 0.62, -0.10)  # right hand, palm frame: the way the back of a resting thumb faces
 _THUMB_BONES = (0.180, 0.165, 0.075)
 _TIP_RADIUS = {"thumb": 0.044, "index": 0.038, "middle": 0.038, "ring": 0.036, "pinky": 0.033}
 _CAP_AHEAD = 0.15  # cap centroid ahead of the tip joint, share of the tip radius
@@ -52,7 +52,7 @@ def generated_profile(name: str, side: str, hand_length_m: float = 0.19) -> Hand
     if not 0.1 <= hand_length_m <= 0.25:
         raise ValueError(f"hand length {hand_length_m} m: expected 0.1 to 0.25 m")
     joints: dict[str, tuple[Float, Float]] = {
-        "wrist": (np.zeros(3), _frame(np.array([0, 0, 1.0]), np.array([0, 1.0, 0])))
+        "wrist": (np.zeros(3), joint_frame(np.array([0, 0, 1.0]), np.array([0, 1.0, 0])))
     }
     joints |= _thumb() | _fingers()
     mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
@@ -134,8 +134,8 @@ def _vector(value: Float) -> Vector3:
     return x, y, z
 
 
-def _frame(heading: Float, dorsal: Float) -> Float:
-    """Joint frame (3, 3): -z along the heading, +y as dorsal as that allows."""
+def joint_frame(heading: Float, dorsal: Float) -> Float:
+    """Joint frame (3, 3) -> the frame of its arguments: -z along heading (3,), +y as near to dorsal (3,) as that allows."""
     z = -heading / np.linalg.norm(heading)
     y = dorsal - (dorsal @ z) * z
     y = y / np.linalg.norm(y)
@@ -144,7 +144,7 @@ def _frame(heading: Float, dorsal: Float) -> Float:
 
 def _thumb() -> dict[str, tuple[Float, Float]]:
     heading = np.array(_THUMB_HEADING) / np.linalg.norm(_THUMB_HEADING)
-    frame = _frame(heading, np.array(_THUMB_DORSAL))
+    frame = joint_frame(heading, np.array(THUMB_DORSAL))
     ends = np.array(_THUMB_BASE) + np.cumsum([0.0, *_THUMB_BONES])[:, None] * heading
     names = ("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal", "thumb-tip")
     return {name: (end, frame) for name, end in zip(names, ends, strict=True)}
@@ -155,9 +155,9 @@ def _fingers() -> dict[str, tuple[Float, Float]]:
     for finger, (mcp, degrees, bones) in _FINGER_LAYOUT.items():
         a = np.radians(degrees)
         heading = np.array([np.sin(a), 0.0, np.cos(a)])
-        frame = _frame(heading, np.array([0.0, 1.0, 0.0]))
+        frame = joint_frame(heading, np.array([0.0, 1.0, 0.0]))
         base, knuckle = np.array(_METACARPAL_BASE[finger]), np.array(mcp)
-        joints[f"{finger}-finger-metacarpal"] = (base, _frame(knuckle - base, np.array([0.0, 1.0, 0.0])))
+        joints[f"{finger}-finger-metacarpal"] = (base, joint_frame(knuckle - base, np.array([0.0, 1.0, 0.0])))
         ends = knuckle + np.cumsum([0.0, *bones])[:, None] * heading
         for part, end in zip(
             ("phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"), ends, strict=True
