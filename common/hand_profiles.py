@@ -135,7 +135,7 @@ def _vector(value: Float) -> Vector3:
 
 
 def joint_frame(heading: Float, dorsal: Float) -> Float:
-    """Joint frame (3, 3) -> the frame of its arguments: -z along heading (3,), +y as near to dorsal (3,) as that allows."""
+    """Joint frame (3, 3) in the frame of its arguments: -z along heading (3,), +y as near to dorsal (3,) as may be."""
     z = -heading / np.linalg.norm(heading)
     y = dorsal - (dorsal @ z) * z
     y = y / np.linalg.norm(y)
