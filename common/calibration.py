@@ -15,17 +15,20 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from common.arrays import Float
+from common.calibration_parts import (
+    Matrix4,
+    NonNegative,
+    Number,
+    Part,
+    Positive,
+    Quaternion,
+    Vector3,
+)
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
 from common.replacing import replacing
+from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, check_flat_field, check_wrist
 
-Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
-Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
-Vector3 = tuple[Number, Number, Number]
-Quaternion = tuple[Number, Number, Number, Number]
-Row4 = tuple[Number, Number, Number, Number]
-Matrix4 = tuple[Row4, Row4, Row4, Row4]
 Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
@@ -36,11 +39,7 @@ UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one
 StructT = TypeVar("StructT", bound=Struct)
 
 
-class _File(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=False):
-    """Base of every calibration type."""
-
-
-class Intrinsics(_File, frozen=True):
+class Intrinsics(Part, frozen=True):
     """Pinhole and distortion, OpenCV's convention; distortion = k1, k2, p1, p2, k3."""
 
     fx_px: Positive
@@ -50,7 +49,7 @@ class Intrinsics(_File, frozen=True):
     distortion: tuple[Number, Number, Number, Number, Number] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-class HsvRange(_File, frozen=True):
+class HsvRange(Part, frozen=True):
     """Colour of one marker in OpenCV's HSV (H 0-179); hsv_low[0] > hsv_high[0] wraps through 0.
 
     `reference_bgr_linear` is the mean colour of the paint in linear light, blue first, 1 = white, at calibration; with
@@ -62,7 +61,7 @@ class HsvRange(_File, frozen=True):
     reference_bgr_linear: tuple[LinearLight, LinearLight, LinearLight] | None = None
 
 
-class Provenance(_File, frozen=True):
+class Provenance(Part, frozen=True):
     """Where a measured part of a file comes from: when, by what, from which data, and how well the fit agrees.
 
     `residual`: quantity with its unit -> value, such as rms_px.
@@ -75,7 +74,7 @@ class Provenance(_File, frozen=True):
     note: str = ""
 
 
-class CameraCalibration(_File, frozen=True):
+class CameraCalibration(Part, frozen=True):
     """cameras/<name>.json: mode, exposure, optics and marker colours of one camera."""
 
     version: Literal[1]
@@ -93,38 +92,21 @@ class CameraCalibration(_File, frozen=True):
     provenance: dict[str, Provenance] = {}
 
 
-class PowerLawCalibration(_File, frozen=True):
+class PowerLawCalibration(Part, frozen=True):
     """Depth D = k x^z with x = u_left - u_right [px] (Kalbfleisch's corrected depth)."""
 
     k_m: Positive
     z: Annotated[float, Meta(ge=-3.0, lt=0.0)]
 
 
-class AffineDisparityCalibration(_File, frozen=True):
+class AffineDisparityCalibration(Part, frozen=True):
     """Disparity x = a / D + x0 [px]."""
 
     a_m_px: Positive
     x0_px: Number
 
 
-class LaserPlane(_File, frozen=True):
-    """Plane normal . X = offset in the wrist camera's frame."""
-
-    normal: Vector3
-    offset_m: Number
-
-
-class Laser(_File, frozen=True):
-    """Laser line of the wrist device, as far as known, in the wrist camera's frame."""
-
-    origin: Vector3 | None = None
-    forward: Vector3 | None = None
-    right: Vector3 | None = None
-    fan_rad: Positive | None = None
-    baseline: Positive | None = None
-
-
-class FilterCalibration(_File, frozen=True):
+class FilterCalibration(Part, frozen=True):
     """The 1 € filter of the 3D markers: cut-off at rest, its rise per speed [Hz per m/s], cut-off of the speed.
 
     `jitter_m`: what may be left of the noise of a marker at rest, per axis; noisier axes are filtered more.
@@ -136,14 +118,14 @@ class FilterCalibration(_File, frozen=True):
     jitter_m: Positive = 3e-4
 
 
-class Volume(_File, frozen=True):
+class Volume(Part, frozen=True):
     """A box in the rig frame, sides along its axes: where the rig was tested."""
 
     low_m: Vector3
     high_m: Vector3
 
 
-class ImuCalibration(_File, frozen=True):
+class ImuCalibration(Part, frozen=True):
     """An IMU fixed to the palm, as far as known; its orientation is used where mounting and world are.
 
     `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
@@ -165,11 +147,14 @@ class ImuCalibration(_File, frozen=True):
         return self.q_palm_imu is not None and self.q_rig_world is not None
 
 
-class RigCalibration(_File, frozen=True):
+class RigCalibration(Part, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
+    From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
+    finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
+    -> the line along which its laser point moves.
     """
 
     version: Literal[1]
@@ -192,6 +177,9 @@ class RigCalibration(_File, frozen=True):
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
     led: tuple[Vector3, ...] | None = None
+    flat_field: FlatField | None = None
+    finger_lines: dict[Name, FingerLine] = {}
+    forward: Literal["table", "cubic"] = "table"
     imu: ImuCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
@@ -208,14 +196,14 @@ class RigCalibration(_File, frozen=True):
         return np.array(self.T_rig_camera[camera], dtype=np.float64)
 
 
-class RestJoint(_File, frozen=True):
+class RestJoint(Part, frozen=True):
     """One joint of the flat hand, palm frame; OpenXR axes: -z along the bone to the tip, +y dorsal."""
 
     position_m: Vector3
     orientation_wxyz: Quaternion
 
 
-class MarkerMount(_File, frozen=True):
+class MarkerMount(Part, frozen=True):
     """Where a painted cap sits: the joint it is fixed to (or palm_frame), its centroid there, its painted length."""
 
     joint: str
@@ -227,7 +215,7 @@ Span = tuple[Number, Number]
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
-class FingerLimits(_File, frozen=True):
+class FingerLimits(Part, frozen=True):
     """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
 
     `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
@@ -241,7 +229,7 @@ class FingerLimits(_File, frozen=True):
     spread_at_full_flexion: Share = 1.0
 
 
-class Limits(_File, frozen=True):
+class Limits(Part, frozen=True):
     """Limits of the five fingers."""
 
     thumb: FingerLimits
@@ -251,7 +239,7 @@ class Limits(_File, frozen=True):
     little: FingerLimits
 
 
-class Couplings(_File, frozen=True):
+class Couplings(Part, frozen=True):
     """Natural relations between the angles of index ... little; each can be switched off.
 
     `dip_per_pip` None: the DIP is free. `dip_spread_rad`: standard deviation of the DIP about that ratio; 0: it is
@@ -267,7 +255,7 @@ class Couplings(_File, frozen=True):
 Preset = Literal["K", "D"]
 
 
-class HandProfile(_File, frozen=True):
+class HandProfile(Part, frozen=True):
     """hands/<name>.json: bones and markers of one hand, optionally radii, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
@@ -346,7 +334,11 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
     if rig.imu is not None:
         _check_imu(rig.imu, rig.cameras, where)
+    check_wrist(rig.laser_plane, rig.finger_lines, where)
+    check_flat_field(rig.flat_field, where)
     if rig.kind == "wrist":
+        if len(rig.cameras) != 1:
+            raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")
         return
     # None at all: a rig that is still to be measured.
     for camera in rig.cameras if rig.T_rig_camera else ():

@@ -76,10 +76,21 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         Raises:
             RecordingError: There is none.
         """
+        return self._rig_of("markers")
+
+    def wrist_rig(self) -> RigCalibration:
+        """The wrist rig of this recording.
+
+        Raises:
+            RecordingError: There is none.
+        """
+        return self._rig_of("wrist")
+
+    def _rig_of(self, kind: str) -> RigCalibration:
         for rig in (self.rig, *self.rigs):
-            if rig is not None and rig.kind == "markers":
+            if rig is not None and rig.kind == kind:
                 return rig
-        raise RecordingError(f"{MANIFEST}: no rig of kind 'markers'")
+        raise RecordingError(f"{MANIFEST}: no rig of kind {kind!r}")
 
 
 @dataclass(frozen=True, slots=True)

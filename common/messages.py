@@ -14,12 +14,12 @@ from typing import Annotated, TypeAlias, cast
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 4
+WIRE_VERSION = 5
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
@@ -100,6 +100,56 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
             raise ValueError("rival_uv: a rival of a marker that is not seen")
 
 
+class WristDetections(Message, frozen=True, eq=False, tag=True):
+    """What the camera of a wrist device saw in one strobed triple (ambient, laser, LED), fingers thumb ... little.
+
+    Pixels are of the distorted image, (0, 0) = centre of the top-left pixel; NaN: not seen.
+
+    Attributes:
+        camera: Camera name, the rig's only one.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of the laser frame. It rises by more than one from triple to triple.
+        t_ns: Middle of the exposure of row 0 of the laser frame [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the last frame of the triple was handed to the slave [ns], same clock as `t_ns`.
+        laser_uv: (5, 2) centroids of the part of the laser line that lies on each finger and is seen.
+        laser_sigma_px: (5,) their standard deviation per axis; positive where `laser_uv` is seen, NaN elsewhere.
+        laser_px: (5,) length of that part in the image.
+        tip_uv: (5, 2) fingertips.
+        tip_sigma_px: (5,) their standard deviation per axis; positive where `tip_uv` is seen, NaN elsewhere.
+        tip_depth: (5,) distance of the fingertips by the fall-off of the LED light, relative: the unit is the rig's
+            own and constant, not the metre.
+        t_sigma_ns: Standard deviation of `t_ns` [ns], as in `MarkerDetections`.
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    laser_uv: Float
+    laser_sigma_px: Float
+    laser_px: Float
+    tip_uv: Float
+    tip_sigma_px: Float
+    tip_depth: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("laser_uv", "tip_uv"):
+            _freeze(self, name, np.float64, (FINGER_COUNT, 2))
+        for name in ("laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth"):
+            _freeze(self, name, np.float64, (FINGER_COUNT,))
+        for what, uv, sigma in (
+            ("laser", self.laser_uv, self.laser_sigma_px),
+            ("tip", self.tip_uv, self.tip_sigma_px),
+        ):
+            unseen = np.isnan(uv).any(axis=1)
+            if (np.isnan(sigma) != unseen).any() or (sigma <= 0.0).any():
+                raise ValueError(
+                    f"{what}_sigma_px: must be positive where {what}_uv is seen and NaN elsewhere"
+                )
+
+
 class ImuSample(Message, frozen=True, eq=False, tag=True):
     """What one inertial sensor measured at one instant, in its own axes. NaN: it has no such sensor, or no value.
 
@@ -153,6 +203,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             accuracy is not known; that alone does not clear `valid`.
         latency_ns: From the hand-over of the last contributing frame to its slave, to
             the publication of this pose [ns]; 0 in an offline run.
+        laser_m: (5, 3) where the laser of a wrist device meets thumb ... little [m], frame of its camera. NaN: not
+            seen, or no such device.
     """
 
     hand: Name
@@ -170,6 +222,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     markers_cov_m2: Float
     inside_volume: Bool
     latency_ns: TimeNs = 0
+    laser_m: Float = field(default_factory=lambda: _NO_LASER)
 
     def __post_init__(self) -> None:
         j = JOINT_COUNT
@@ -190,6 +243,7 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "markers_raw_m", np.float64, (m, 3))
         _freeze(self, "markers_cov_m2", np.float64, (m, 3, 3))
         _freeze(self, "inside_volume", np.bool_, (j,))
+        _freeze(self, "laser_m", np.float64, (FINGER_COUNT, 3))
 
 
 class Health(Message, frozen=True, eq=False, tag=True):
@@ -262,13 +316,17 @@ class Still(Message, frozen=True, eq=False, tag=True):
             raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_STILL_BYTES}")
 
 
-AnyMessage: TypeAlias = MarkerDetections | ImuSample | HandPose | Health | Command | Preview | Still
+AnyMessage: TypeAlias = (
+    MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still
+)
 
 _JPEG_START = b"\xff\xd8\xff"
 _NONE = np.empty((0, 2))
+_NO_LASER = np.full((FINGER_COUNT, 3), np.nan)
+_NO_LASER.flags.writeable = False
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
-    MarkerDetections | ImuSample | HandPose | Health | Command | Preview | Still,
+    MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still,
     dec_hook=lambda kind, raw: _from_bytes(kind, raw),
 )
 

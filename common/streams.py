@@ -3,7 +3,17 @@
 from dataclasses import dataclass
 from enum import StrEnum
 
-from common.messages import Command, HandPose, Health, ImuSample, MarkerDetections, Message, Preview, Still
+from common.messages import (
+    Command,
+    HandPose,
+    Health,
+    ImuSample,
+    MarkerDetections,
+    Message,
+    Preview,
+    Still,
+    WristDetections,
+)
 
 
 class Path(StrEnum):
@@ -32,6 +42,7 @@ class Stream:
 
 STREAMS = {
     "markers": Stream(MarkerDetections, Path.DATAGRAM, None, True),
+    "wrist": Stream(WristDetections, Path.DATAGRAM, None, True),
     "imu": Stream(ImuSample, Path.DATAGRAM, None, True),
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),

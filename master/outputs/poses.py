@@ -27,6 +27,7 @@ class Poses:
         markers_cov_m2: (T, M, 3, 3) [m^2], of `markers_raw_m`.
         inside_volume: (T, 26).
         latency_ns: (T,) [ns]; 0 in an offline run.
+        laser_m: (T, 5, 3) laser points of a wrist device [m], frame of its camera.
     """
 
     hand: str
@@ -44,6 +45,7 @@ class Poses:
     markers_cov_m2: Float
     inside_volume: Bool
     latency_ns: Int
+    laser_m: Float
 
     def __post_init__(self) -> None:
         """Refuse arrays that do not fit together.
@@ -119,5 +121,6 @@ def record(marker_count: int) -> np.dtype[np.void]:
             ("markers_cov_m2", "<f8", (m, 3, 3)),
             ("inside_volume", "?", (j,)),
             ("latency_ns", "<i8"),
+            ("laser_m", "<f8", (FINGER_COUNT, 3)),
         ]
     )

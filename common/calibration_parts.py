@@ -1,0 +1,17 @@
+"""What the types of calibration files are made of: their base, and numbers with their bounds."""
+
+from typing import Annotated
+
+from msgspec import Meta, Struct
+
+Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
+NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
+Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
+Vector3 = tuple[Number, Number, Number]
+Quaternion = tuple[Number, Number, Number, Number]
+Row4 = tuple[Number, Number, Number, Number]
+Matrix4 = tuple[Row4, Row4, Row4, Row4]
+
+
+class Part(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=False):
+    """Base of every calibration type."""

@@ -1,0 +1,88 @@
+"""What is measured of a wrist device, in the frame of its camera (OpenCV axes): parts of its rig file."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+from msgspec import Meta
+
+from common.calibration_parts import NonNegative, Number, Part, Positive, Vector3
+from common.errors import CalibrationError
+
+FLAT_FIELD_TERMS = (1, 3, 6, 10, 15, 21, 28)  # of polynomials in two variables, by degree
+_UNIT_WITHIN = 1e-2  # of the length of a direction: what rounding leaves of one
+_FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+
+class LaserPlane(Part, frozen=True):
+    """Plane normal . X = offset in the wrist camera's frame."""
+
+    normal: Vector3
+    offset_m: Number
+
+
+class Laser(Part, frozen=True):
+    """Laser line of the wrist device, as far as known, in the wrist camera's frame."""
+
+    origin: Vector3 | None = None
+    forward: Vector3 | None = None
+    right: Vector3 | None = None
+    fan_rad: Positive | None = None
+    baseline: Positive | None = None
+
+
+class FlatField(Part, frozen=True):
+    """How bright one white surface at one distance, seen along its normal, looks across the image; 1 on the axis.
+
+    A polynomial in the normalised image point (x, y) = (X / Z, Y / Z); `coefficients` of 1, x, y, x^2, x y, y^2, x^3,
+    x^2 y, ..., every degree whole.
+    """
+
+    coefficients: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=FLAT_FIELD_TERMS[-1])]
+
+
+class FingerLine(Part, frozen=True):
+    """The line along which the laser point of one finger moves while it bends (its principal axis of motion).
+
+    Attributes:
+        origin_m: A point of the line, where the finger is straightest.
+        direction: Unit vector, towards what a bent finger reflects.
+        range_m: How far along it the finger's points lie, from the straightest to the most bent.
+        residual_m: RMS distance of the points from the line.
+    """
+
+    origin_m: Vector3
+    direction: Vector3
+    range_m: tuple[Number, Number]
+    residual_m: NonNegative
+
+
+def check_wrist(plane: LaserPlane | None, lines: Mapping[str, FingerLine], where: str) -> None:
+    """Refuse what the types alone cannot see.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    if plane is not None and abs(math.hypot(*plane.normal) - 1.0) > _UNIT_WITHIN:
+        raise CalibrationError(f"{where}: laser_plane.normal: length {math.hypot(*plane.normal):.4g}, not 1")
+    for finger, line in lines.items():
+        if finger not in _FINGERS:
+            raise CalibrationError(f"{where}: finger_lines: {finger!r} is none of {', '.join(_FINGERS)}")
+        if abs(math.hypot(*line.direction) - 1.0) > _UNIT_WITHIN:
+            length = math.hypot(*line.direction)
+            raise CalibrationError(f"{where}: finger_lines.{finger}.direction: length {length:.4g}, not 1")
+        if line.range_m[0] >= line.range_m[1]:
+            raise CalibrationError(f"{where}: finger_lines.{finger}.range_m: must rise")
+
+
+def check_flat_field(field: FlatField | None, where: str) -> None:
+    """Refuse a flat field whose polynomial is not whole.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    if field is not None and len(field.coefficients) not in FLAT_FIELD_TERMS:
+        raise CalibrationError(
+            f"{where}: flat_field.coefficients: {len(field.coefficients)} of them; a polynomial of whole degrees has"
+            f" {', '.join(map(str, FLAT_FIELD_TERMS))}"
+        )
