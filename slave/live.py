@@ -14,7 +14,7 @@ from slave.app import run, wait_for_start
 from slave.cameras.source import FrameSource
 from slave.light_report import LightReport
 from slave.markers.blind import BlindDetector
-from slave.markers.changing import Changeable, ChangingDetector
+from slave.markers.changing import Changeable, ChangingDetector, marker_changes
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
 from slave.markers.following import detector_for
@@ -66,7 +66,8 @@ def run_live(
     changing = None if colours == "none" else ChangingDetector(make(files.camera, rig))
     detector = BlindDetector(len(rig.markers)) if changing is None else changing
     tally = Tally(rig.markers)
-    tuning = CameraTuning(files, source, changing, make, lambda: tally.counts()["frames"] > 0)
+    changes = None if changing is None else marker_changes(changing, make)
+    tuning = CameraTuning(files, source, changes, lambda: tally.counts()["frames"] > 0)
     previews = Previews(name, clock)
     numbers, show = tally, previews.offer
     if changing is not None and changing.follows:

@@ -1,7 +1,8 @@
-"""Count what the slave's loop does, for `Health`: frames, drops, markers seen, detection time."""
+"""Count what the slave's loop does, for `Health`: frames, drops, what was seen, detection time."""
 
 import threading
 import time
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -16,10 +17,13 @@ class Tally:
     Holds the counts since the start, running means, and what the last rate was reckoned from.
     """
 
-    def __init__(self, names: tuple[str, ...]) -> None:
-        """Count for the markers `names`."""
+    def __init__(
+        self, names: tuple[str, ...], others: Callable[[], Mapping[str, int]] = dict[str, int]
+    ) -> None:
+        """Count for the markers `names`, or whatever else is sought; `others` counts more, told with the own counts."""
+        self._others = others
         self._lock = threading.Lock()
-        self._frames = 0
+        self._frames = self._sought = 0
         self._dropped = 0
         self._empty = 0
         self._seen = np.zeros(len(names), np.int64)
@@ -30,7 +34,7 @@ class Tally:
         self._rate_from = (time.monotonic_ns(), 0)
 
     def frame(self, seq: int, detect_ns: int, uv: Float) -> None:
-        """Count one frame.
+        """Count one frame in which was sought.
 
         Args:
             seq: Camera's frame counter.
@@ -40,20 +44,30 @@ class Tally:
         seen = np.isfinite(uv[:, 0])
         took_us = detect_ns * 1e-3
         with self._lock:
-            if self._last_seq is not None and seq > self._last_seq + 1:
-                self._dropped += seq - self._last_seq - 1
-            self._last_seq = seq
-            self._frames += 1
+            self._count(seq)
+            self._detect_us += (took_us - self._detect_us) * (SMOOTHING if self._sought else 1.0)
+            self._worst_us = max(self._worst_us, took_us)
+            self._sought += 1
             self._empty += not seen.any()
             self._seen += seen
-            self._detect_us += (took_us - self._detect_us) * (SMOOTHING if self._frames > 1 else 1.0)
-            self._worst_us = max(self._worst_us, took_us)
+
+    def part(self, seq: int) -> None:
+        """Count one frame in which nothing is sought before others follow: a part of a strobed triple."""
+        with self._lock:
+            self._count(seq)
+
+    def _count(self, seq: int) -> None:
+        if self._last_seq is not None and seq > self._last_seq + 1:
+            self._dropped += seq - self._last_seq - 1
+        self._last_seq = seq
+        self._frames += 1
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: frames, dropped, empty, seen.<marker>."""
+        """Event -> how often since the start: frames, dropped, empty, seen.<name>, and the others."""
         with self._lock:
             counts = {"frames": self._frames, "dropped": self._dropped, "empty": self._empty}
-            return counts | {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
+            counts |= {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
+        return counts | self._others()
 
     def gauges(self) -> dict[str, float]:
         """rate_hz since the last call, running mean and worst (since the last call) of the detection time [us]."""

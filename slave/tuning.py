@@ -13,15 +13,15 @@ the frames that it reads, and the new colours take over between two frames.
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeAlias
 
 from common.calibration import CameraCalibration, RigCalibration, load, parse, save
 from common.camera_settings import WANTED, CameraSettings, figures
 from common.errors import CalibrationError, PhalanxError
 from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
-from slave.markers.changing import Changeable, ChangingDetector
 
 _LOG = logging.getLogger(__name__)
 NEEDS_RESTART = ("name", "width_px", "height_px", "frame_rate_hz", "focus_m")
@@ -41,6 +41,21 @@ class CameraFiles:
     camera: CameraCalibration
     rig: RigCalibration
 
+    def read_again(self) -> "CameraFiles":
+        """The same files, as they are now.
+
+        Raises:
+            CalibrationError: One is broken or gone.
+        """
+        return replace(
+            self, camera=load(self.camera_path, CameraCalibration), rig=load(self.rig_path, RigCalibration)
+        )
+
+
+# Makes what senses with other files (those in use, those to come), some tenths of a second, and returns what puts it
+# in use; None: nothing that it uses was changed. Raises `CalibrationError` where they need a restart.
+Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
+
 
 class CameraTuning:
     """Answers commands about the camera, and follows its files.
@@ -53,24 +68,20 @@ class CameraTuning:
         self,
         files: CameraFiles,
         source: object,
-        detector: ChangingDetector | None,
-        make: Callable[[CameraCalibration, RigCalibration], Changeable],
+        prepare: Prepare | None,
         running: Callable[[], bool],
     ) -> None:
         """Tune a camera.
 
         Args:
             files: What the slave was started with.
-            source: The camera; a `Tunable`, or nothing can be changed but colours.
-            detector: Finds the markers; None: nobody does.
-            make: Makes a detector for other files, some tenths of a second.
+            source: The camera; a `Tunable`, or nothing can be changed but what senses.
+            prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
         """
-        self._paths = (files.camera_path, files.rig_path)
-        self._camera, self._rig = files.camera, files.rig
-        self._on_disk = files.camera, files.rig
+        self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._detector, self._make, self._running = detector, make, running
+        self._prepare, self._running = prepare, running
         self._turn = threading.Lock()
         self._watched = WatchedFiles()
         self._applied = self._refused = 0
@@ -93,16 +104,17 @@ class CameraTuning:
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
+        paths = self._used.camera_path, self._used.rig_path
         with self._turn:
-            if not self._running() or not self._watched.changed(self._paths):
+            if not self._running() or not self._watched.changed(paths):
                 return
             try:
-                camera, rig = load(self._paths[0], CameraCalibration), load(self._paths[1], RigCalibration)
-                was, self._on_disk = self._on_disk, (camera, rig)
+                was, self._on_disk = self._on_disk, self._used.read_again()
                 # Only what the file has changed: what a command has changed meanwhile stays.
-                if self._apply(self._camera if camera == was[0] else camera, rig):
+                kept = self._on_disk.camera == was.camera
+                if self._apply(replace(self._on_disk, camera=self._used.camera) if kept else self._on_disk):
                     self._applied += 1
-                    _LOG.info("%s, %s: changed, in use now", *self._paths)
+                    _LOG.info("%s, %s: changed, in use now", *paths)
             except PhalanxError as error:
                 self._refused += 1
                 _LOG.warning("changed, but not used: %s", error)
@@ -110,80 +122,67 @@ class CameraTuning:
     def _settings(self, body: str) -> dict[str, float]:
         if body:
             raise CalibrationError("settings: takes no body")
-        wanted = {WANTED + name: value for name, value in figures(self._camera).items()}
+        wanted = {WANTED + name: value for name, value in figures(self._used.camera).items()}
         return self.figures() | wanted
 
     def _set(self, body: str) -> dict[str, float]:
         with self._turn:
-            self._apply(parse(body.encode(), CameraSettings, "set").over(self._camera), self._rig)
+            wanted = parse(body.encode(), CameraSettings, "set")
+            self._apply(replace(self._used, camera=wanted.over(self._used.camera)))
         return self._settings("")
 
     def _load(self, body: str) -> dict[str, float]:
         with self._turn:
-            self._apply(parse(body.encode(), CameraCalibration, "load"), self._rig)
+            self._apply(replace(self._used, camera=parse(body.encode(), CameraCalibration, "load")))
         return self._settings("")
 
     def _save(self, body: str) -> dict[str, float]:
         if body:
             raise CalibrationError("save: takes no body; what is in use is saved")
         with self._turn:
-            save(self._paths[0], self._camera)
-            self._on_disk = self._camera, self._on_disk[1]
-            _LOG.info("%s: saved as in use", self._paths[0])
+            save(self._used.camera_path, self._used.camera)
+            self._on_disk = replace(self._on_disk, camera=self._used.camera)
+            _LOG.info("%s: saved as in use", self._used.camera_path)
         return self._settings("")
 
-    def _apply(self, camera: CameraCalibration, rig: RigCalibration) -> bool:
+    def _apply(self, new: CameraFiles) -> bool:
         """Have these files in use, wholly or not at all; False if they are.
 
         Raises:
             CalibrationError: They need a restart, or lack colours.
             CameraError: The camera did not take its settings.
         """
-        old, old_rig = self._camera, self._rig
-        if (camera, rig.markers, rig.free_markers) == (old, old_rig.markers, old_rig.free_markers):
-            self._rig = rig
+        old = self._used
+        _refuse_restart(old, new)
+        switch = None if self._prepare is None else self._prepare(old, new)
+        if switch is None and new.camera == old.camera:
+            self._used = new
             return False
-        _refuse_restart(old, camera, old_rig, rig)
-        made = None
-        if self._detector is not None and (camera.markers, rig.free_markers) != (
-            old.markers,
-            old_rig.free_markers,
-        ):
-            made = self._make(camera, rig)
-            _refuse_other_kind(self._detector, made)
-        exposed = CameraSettings.of(camera), camera.row_time_us
-        if exposed != (CameraSettings.of(old), old.row_time_us):
+        exposed = CameraSettings.of(new.camera), new.camera.row_time_us
+        if exposed != (CameraSettings.of(old.camera), old.camera.row_time_us):
             if self._source is None:
-                raise CalibrationError(f"camera {camera.name!r}: its driver can change no settings")
-            self._source.tune(camera)
-        if self._detector is not None:
-            if made is not None:
-                self._detector.replace(made)
-            self._detector.expose(camera.exposure_us)
-        self._camera, self._rig = camera, rig
+                raise CalibrationError(f"camera {new.camera.name!r}: its driver can change no settings")
+            self._source.tune(new.camera)
+        if switch is not None:
+            switch()
+        self._used = new
         return True
 
 
-def _refuse_restart(
-    old: CameraCalibration, new: CameraCalibration, old_rig: RigCalibration, new_rig: RigCalibration
-) -> None:
+def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
     for key in NEEDS_RESTART:
-        if getattr(old, key) != getattr(new, key):
+        before, after = getattr(old.camera, key), getattr(new.camera, key)
+        if before != after:
             raise CalibrationError(
-                f"camera {old.name!r}: {key}: {getattr(old, key)} cannot become {getattr(new, key)} while it runs: "
-                "restart the slave"
+                f"camera {old.camera.name!r}: {key}: {before} cannot become {after} while it runs: restart the slave"
             )
-    if old_rig.markers != new_rig.markers:
+    if old.rig.kind != new.rig.kind:
         raise CalibrationError(
-            f"rig {new_rig.name!r}: markers: {', '.join(old_rig.markers)} cannot become "
-            f"{', '.join(new_rig.markers)} while it runs: restart all processes of the rig"
+            f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all "
+            "processes of the rig"
         )
-
-
-def _refuse_other_kind(old: ChangingDetector, made: Changeable) -> None:
-    if type(made) is not old.kind:
-        change = "have" if old.follows else "did not have"
+    if old.rig.markers != new.rig.markers:
         raise CalibrationError(
-            f"markers: reference_bgr_linear: the colours in use {change} it for every marker, and the light is "
-            f"{'followed' if old.follows else 'not followed'}: restart the slave to change that"
+            f"rig {new.rig.name!r}: markers: {', '.join(old.rig.markers)} cannot become "
+            f"{', '.join(new.rig.markers)} while it runs: restart all processes of the rig"
         )

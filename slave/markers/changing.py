@@ -6,16 +6,19 @@ too, and takes over as soon as it may tell markers by their colours.
 """
 
 from collections import deque
+from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
 
 from common.arrays import Float, Image
-from common.errors import CameraError
+from common.calibration import CameraCalibration, RigCalibration
+from common.errors import CalibrationError, CameraError
 from slave.cameras.passing import Passing
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.following import FollowingDetector
+from slave.tuning import CameraFiles, Prepare
 
 LOOKS = 60  # a first light takes some tens of frames to be proven, or is not there to be proven
 TIMEOUT_S = 0.5
@@ -93,6 +96,38 @@ class ChangingDetector:
     def tables(self) -> int:
         """Colour tables made for another light."""
         return self._detector.tables if isinstance(self._detector, FollowingDetector) else 0
+
+
+def marker_changes(
+    detector: ChangingDetector, make: Callable[[CameraCalibration, RigCalibration], Changeable]
+) -> Prepare:
+    """How changed files reach `detector`: what `make` makes of them takes over, where colours or markers changed."""
+
+    def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
+        made = None
+        if (new.camera.markers, new.rig.free_markers) != (old.camera.markers, old.rig.free_markers):
+            made = make(new.camera, new.rig)
+            _refuse_other_kind(detector, made)
+        if made is None and new.camera.exposure_us == old.camera.exposure_us:
+            return None
+
+        def switch() -> None:
+            if made is not None:
+                detector.replace(made)
+            detector.expose(new.camera.exposure_us)
+
+        return switch
+
+    return prepare
+
+
+def _refuse_other_kind(old: ChangingDetector, made: Changeable) -> None:
+    if type(made) is not old.kind:
+        change = "have" if old.follows else "did not have"
+        raise CalibrationError(
+            f"markers: reference_bgr_linear: the colours in use {change} it for every marker, and the light is "
+            f"{'followed' if old.follows else 'not followed'}: restart the slave to change that"
+        )
 
 
 def _hand_over(old: Changeable, new: Changeable) -> None:

@@ -21,7 +21,7 @@ from common.sim.scene import Scene
 from slave.app import run
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
-from slave.markers.changing import ChangingDetector
+from slave.markers.changing import ChangingDetector, marker_changes
 from slave.markers.following import detector_for
 from slave.markers.workers import Inline
 from slave.report import Reporter
@@ -89,10 +89,6 @@ def tree(folder: Path) -> CameraFiles:
     return CameraFiles(*paths, FILE, RIG)
 
 
-def no_detector(_camera: CameraCalibration, _rig: RigCalibration) -> Any:
-    raise AssertionError("nobody detects here")
-
-
 @pytest.fixture
 def knobs() -> Knobs:
     return Knobs()
@@ -105,7 +101,7 @@ def files(tmp_path: Path) -> CameraFiles:
 
 @pytest.fixture
 def tuning(files: CameraFiles, knobs: Knobs) -> CameraTuning:
-    return CameraTuning(files, knobs, None, no_detector, lambda: True)
+    return CameraTuning(files, knobs, None, lambda: True)
 
 
 def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs: Knobs) -> None:
@@ -217,7 +213,7 @@ def test_its_own_save_is_no_change(tuning: CameraTuning, knobs: Knobs, files: Ca
 
 def test_files_are_not_looked_at_before_frames_come(files: CameraFiles, knobs: Knobs) -> None:
     frames: list[int] = []
-    tuning = CameraTuning(files, knobs, None, no_detector, lambda: bool(frames))
+    tuning = CameraTuning(files, knobs, None, lambda: bool(frames))
     save(files.camera_path, changed(exposure_us=7000.0))
     tuning.look()
     assert knobs.tuned == []
@@ -254,9 +250,8 @@ class Slave:
 
         self.detector = ChangingDetector(make(FILE, RIG))
         tally = Tally(RIG.markers)
-        self.tuning = CameraTuning(
-            files, self.source, self.detector, make, lambda: tally.counts()["frames"] > 0
-        )
+        changes = marker_changes(self.detector, make)
+        self.tuning = CameraTuning(files, self.source, changes, lambda: tally.counts()["frames"] > 0)
         self.light = np.zeros(3)
         self.reporter = Reporter(
             "left", self.wire, tally, clock, lambda _: self.bus.join(), stop.set, 0.05, camera=self.tuning
