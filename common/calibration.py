@@ -183,11 +183,13 @@ class RigCalibration(Part, frozen=True):
     imu: ImuCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
-        """`T_rig_camera` (4, 4) [m] of one camera.
+        """`T_rig_camera` (4, 4) [m] of one camera; the frame of a wrist rig is that of its camera.
 
         Raises:
             CalibrationError: The rig's places are not measured yet.
         """
+        if self.kind == "wrist":
+            return np.eye(4)
         if camera not in self.T_rig_camera:
             raise CalibrationError(
                 f"rig {self.name!r}: T_rig_camera: camera {camera!r} has no place yet, which"

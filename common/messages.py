@@ -316,6 +316,7 @@ class Still(Message, frozen=True, eq=False, tag=True):
             raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_STILL_BYTES}")
 
 
+Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera sends, of either kind
 AnyMessage: TypeAlias = (
     MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still
 )

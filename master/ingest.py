@@ -41,6 +41,7 @@ class Ingest:
         start_timeout_s: float = 5.0,
         random: Random = os.urandom,
         imus: tuple[str, ...] = (),
+        wrists: tuple[str, ...] = (),
     ) -> None:
         """Begin to call the slaves.
 
@@ -54,15 +55,17 @@ class Ingest:
             start_timeout_s: How long the first slave waits for the others.
             random: Source of nonces.
             imus: Names of IMUs that may take part.
+            wrists: Those of `cameras` that belong to a wrist device.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
-            ValueError: Key of wrong length, no camera, too many senders, or one name for two.
+            ValueError: Key of wrong length, no camera, too many senders, one name for two, or a wrist's camera that is
+                none of the cameras.
         """
         _check_address(beacon[0])
         self._clock = clock
         timeout_ns = round(start_timeout_s * 1e9)
-        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus)
+        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists)
         self._cameras, self._senders = cameras, (*cameras, *imus)
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
@@ -92,12 +95,12 @@ class Ingest:
 
     @property
     def lost(self) -> int:
-        """Frames of all cameras that were sent and never came."""
+        """Frames, or triples, of all cameras that were sent and never came."""
         return sum(self.counts_of(camera).lost for camera in self._cameras)
 
     @property
     def skipped(self) -> int:
-        """Frames of all cameras that were never sent: the camera or its slave had no time for them."""
+        """Frames, or triples, of all cameras that were never sent: camera or slave had no time for them."""
         return sum(self.counts_of(camera).skipped for camera in self._cameras)
 
     @property

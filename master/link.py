@@ -6,6 +6,7 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
   first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU.
+- A sender says one kind of message: a camera markers, that of a wrist device its triples, an IMU samples.
 - Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
 
@@ -20,7 +21,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
-from common.messages import ImuSample, MarkerDetections, decode
+from common.messages import Detections, ImuSample, MarkerDetections, WristDetections, decode
 from common.session import (
     MAX_CAMERAS,
     NONCE_BYTES,
@@ -37,7 +38,7 @@ from common.session import (
     read,
     seal,
 )
-from master.sequence import CameraCounts, Sequence
+from master.sequence import TRIPLE, CameraCounts, Sequence
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
@@ -51,7 +52,7 @@ START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it i
 START_AGAIN_NS = 50_000_000
 OLD_NONCES = 64
 
-Taken: TypeAlias = MarkerDetections | ImuSample
+Taken: TypeAlias = Detections | ImuSample
 
 
 @dataclass(slots=True)
@@ -75,12 +76,13 @@ class _Session:
 
 @dataclass(slots=True)
 class _Sender:
-    """What is kept of one camera or IMU of the rig."""
+    """What is kept of one camera or IMU of the rig, and the one kind of message that it sends."""
 
+    sends: type[Taken]
+    sequence: Sequence
     live: _Session | None = None
     pending: _Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
-    sequence: Sequence = field(default_factory=Sequence)
     missing_before: int = 0  # datagrams lost in sessions that are over
     steps_before: int = 0  # and steps of the clock
 
@@ -101,16 +103,23 @@ class MasterLink:
         start_timeout_ns: int,
         random: Random,
         imus: tuple[str, ...] = (),
+        wrists: tuple[str, ...] = (),
     ) -> None:
-        """Begin a new life of the master, with a nonce from `random`; `imus` may take part, and nobody waits for them.
+        """Begin a new life of the master, with a nonce from `random`.
+
+        `imus` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a wrist device:
+        they send strobed triples, the others markers.
 
         Raises:
-            ValueError: Key of wrong length, no camera, more than 32 senders, or an IMU with the name of a camera.
+            ValueError: Key of wrong length, no camera, more than 32 senders, an IMU with the name of a camera, or a
+                wrist's camera that is none of the cameras.
         """
         if not cameras or not len({*cameras, *imus}) <= MAX_CAMERAS:
             raise ValueError(f"{len({*cameras, *imus})} cameras and IMUs, expected 1 to {MAX_CAMERAS}")
         if both := set(cameras) & set(imus):
             raise ValueError(f"{min(both)!r} is a camera and an IMU")
+        if strange := set(wrists) - set(cameras):
+            raise ValueError(f"{min(strange)!r} of a wrist device is none of the cameras")
         self._keys = RigKeys(key)
         self._clock = clock
         self._random = random
@@ -119,7 +128,9 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
-        self._senders = {name: _Sender() for name in (*cameras, *imus)}
+        self._senders = {name: _Sender(MarkerDetections, Sequence()) for name in cameras}
+        self._senders |= {name: _Sender(WristDetections, Sequence(TRIPLE)) for name in wrists}
+        self._senders |= {name: _Sender(ImuSample, Sequence()) for name in imus}
         self._awaited, self._imus = tuple(self._senders[name] for name in cameras), frozenset(imus)
         self._sessions: dict[int, _Session] = {}
         self._first_ns: int | None = None
@@ -251,7 +262,7 @@ class MasterLink:
         if opened.reordered:
             sender.sequence.reordered()
         if header.kind is Kind.DATA:
-            return self._take_data(session, sender.sequence, opened)
+            return self._take_data(session, sender, opened)
         message = read(header.kind, opened.body)
         if isinstance(message, EchoAnswer):
             session.clock.push(message.t1_ns, message.t2_ns, message.t3_ns, t_ns)
@@ -271,21 +282,18 @@ class MasterLink:
         if self._first_ns is None and session.name not in self._imus:
             self._first_ns = t_ns
 
-    def _take_data(self, session: _Session, sequence: Sequence, opened: Opened) -> Taken | Refusal | None:
+    def _take_data(self, session: _Session, sender: _Sender, opened: Opened) -> Taken | Refusal | None:
         try:
             message = decode(opened.body)
         except MessageError:
             return Refusal.UNDECODABLE
-        if isinstance(message, MarkerDetections):
-            imu, name = False, message.camera
-        elif isinstance(message, ImuSample):
-            imu, name = True, message.source
-        else:
+        if not isinstance(message, Taken):
             return Refusal.UNDECODABLE
-        if name != session.name or imu != (name in self._imus):
+        name = message.source if isinstance(message, ImuSample) else message.camera
+        if name != session.name or not isinstance(message, sender.sends):
             return Refusal.IMPOSTOR
         session.started = True
-        if not sequence.take(message.session, message.seq):
+        if not sender.sequence.take(message.session, message.seq):
             return None
         clock = session.clock.estimate()
         if clock is None:  # data before the start, of a slave that did not wait for it

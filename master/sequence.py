@@ -4,11 +4,15 @@ A frame is *lost* when it was sent and never came, *skipped* when nothing was se
 alone cannot tell, so `Sequence` counts both as lost and `MasterLink.counts_of` parts them. It is *late* when it
 came after a newer one, and is dropped then, because the newer one was used already. So received + lost + skipped
 + late is the number of frames between the first and the last. A restarted slave is a new sequence.
+
+The camera of a wrist device sends one message for three frames, numbered by its laser frame. There all of this counts
+triples: numbers three apart miss nothing, and one more or less, after a frame that slipped, neither.
 """
 
 from dataclasses import dataclass, replace
 
 REMEMBERED = 1024
+TRIPLE = 3  # frames that become one message of a wrist device
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,9 +39,10 @@ class CameraCounts:
 class Sequence:
     """Push machine over frame numbers. Holds the last one, and the newest skipped ones (<= 1024)."""
 
-    def __init__(self) -> None:
-        """Begin with nothing received."""
+    def __init__(self, step: int = 1) -> None:
+        """Begin with nothing received; `step` is how much the number rises from one message to the next."""
         self.counts = CameraCounts()
+        self._step, self._slip = step, step // 2
         self._session: int | None = None
         self._last = -1
         self._missing: dict[int, None] = {}
@@ -49,12 +54,14 @@ class Sequence:
             self._session = session
             self._missing.clear()
         elif seq <= self._last:
-            found = seq in self._missing
-            self._missing.pop(seq, None)
-            self.counts = replace(counts, late=counts.late + 1, lost=counts.lost - found)
+            near = range(seq - self._slip, seq + self._slip + 1)
+            found = next((number for number in near if number in self._missing), None)
+            if found is not None:
+                del self._missing[found]
+            self.counts = replace(counts, late=counts.late + 1, lost=counts.lost - (found is not None))
             return False
         else:
-            skipped = range(self._last + 1, seq)
+            skipped = range(self._last + self._step, seq - self._slip, self._step)
             counts = replace(counts, lost=counts.lost + len(skipped))
             self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
             while len(self._missing) > REMEMBERED:

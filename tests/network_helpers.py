@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from common.messages import Health, MarkerDetections
+from common.messages import FINGER_COUNT, Health, MarkerDetections, WristDetections
 
 
 def free_endpoint() -> str:
@@ -55,6 +55,16 @@ def detections(camera: str, session: int, seq: int, t_ns: int = 0) -> MarkerDete
     ones, nowhere = np.ones(6), np.full((6, 2), np.nan)
     return MarkerDetections(
         camera, session, seq, t_ns, t_ns + 1000, uv, 50.0 * ones, ones, 0.1 * ones, nowhere
+    )
+
+
+def triple(camera: str, session: int, seq: int, t_ns: int = 0) -> WristDetections:
+    """Return what a wrist device saw in one strobed triple; nobody saw the little finger."""
+    uv = np.arange(2.0 * FINGER_COUNT).reshape(FINGER_COUNT, 2)
+    uv[-1] = np.nan
+    seen = np.where(np.isnan(uv[:, 0]), np.nan, 1.0)
+    return WristDetections(
+        camera, session, seq, t_ns, t_ns + 1000, uv, 0.2 * seen, 9.0 * seen, uv + 30.0, seen, 0.1 * seen
     )
 
 

@@ -30,6 +30,7 @@ from common.messages import (
     Preview,
     Source,
     Still,
+    WristDetections,
     decode,
     encode,
 )
@@ -70,6 +71,25 @@ def detections(draw: st.DrawFn) -> MarkerDetections:
 
 
 @st.composite
+def triples(draw: st.DrawFn) -> WristDetections:
+    laser, tip = draw(floats(FINGER_COUNT, 2)), draw(floats(FINGER_COUNT, 2))
+    return WristDetections(
+        camera=draw(names),
+        session=draw(counts),
+        seq=draw(counts),
+        t_ns=draw(times),
+        ready_t_ns=draw(times),
+        laser_uv=laser,
+        laser_sigma_px=positive(draw, np.asarray(~np.isnan(laser).any(axis=1))),
+        laser_px=draw(floats(FINGER_COUNT)),
+        tip_uv=tip,
+        tip_sigma_px=positive(draw, np.asarray(~np.isnan(tip).any(axis=1))),
+        tip_depth=draw(floats(FINGER_COUNT)),
+        t_sigma_ns=draw(st.floats(0.0, 1e18)),
+    )
+
+
+@st.composite
 def hand_poses(draw: st.DrawFn) -> HandPose:
     m, j = draw(st.integers(0, MAX_MARKERS)), JOINT_COUNT
     return HandPose(
@@ -88,6 +108,7 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         markers_cov_m2=draw(floats(m, 3, 3)),
         inside_volume=draw(arrays(np.bool_, j)),
         latency_ns=draw(times),
+        laser_m=draw(floats(FINGER_COUNT, 3)),
     )
 
 
@@ -144,8 +165,19 @@ def sample_detections(markers: int = 6, rivals: Float | None = None) -> MarkerDe
     return MarkerDetections("left", 1, 2, 3, 4, uv, np.full(markers, 80.0), np.ones(markers), sigma, rival)
 
 
+def sample_triple() -> WristDetections:
+    """The little finger's laser and the thumb's tip are not seen."""
+    laser, tip = np.arange(10.0).reshape(5, 2), np.arange(20.0, 30.0).reshape(5, 2)
+    laser[4], tip[0] = np.nan, np.nan
+    seen = [np.where(np.isnan(uv[:, 0]), np.nan, 1.0) for uv in (laser, tip)]
+    return WristDetections(
+        "wrist", 1, 2, 3, 4, laser, 0.2 * seen[0], 9.0 * seen[0], tip, seen[1], 3.0 * seen[1]
+    )
+
+
 SAMPLES: tuple[Message, ...] = (
     sample_detections(),
+    sample_triple(),
     ImuSample("imu", 1, 2, 3, np.zeros(3), np.ones(3), np.full(3, np.nan), np.array([1.0, 0.0, 0.0, 0.0])),
     sample_pose(),
     Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}),
@@ -171,7 +203,7 @@ def as_map(message: Message) -> dict[str, object]:
     return msgspec.msgpack.decode(encode(message), type=dict[str, object])
 
 
-@given(st.one_of(detections(), imu_samples, hand_poses(), healths, commands, previews))
+@given(st.one_of(detections(), triples(), imu_samples, hand_poses(), healths, commands, previews))
 def test_round_trip_keeps_every_bit(message: Message) -> None:
     wire = encode(message)
     assert_same(decode(wire), message)
@@ -217,6 +249,19 @@ def longest(markers: int) -> MarkerDetections:
     )
 
 
+def test_a_triple_is_far_below_one_ethernet_packet() -> None:
+    longest_triple = msgspec.structs.replace(
+        sample_triple(),
+        camera="x" * 64,
+        session=2**63 - 1,
+        seq=2**63 - 1,
+        t_ns=-(2**63),
+        ready_t_ns=-(2**63),
+    )
+    # 5 * (2 + 1 + 1 + 2 + 1 + 1) * 8 bytes of numbers; names and keys come on top.
+    assert 320 < len(encode(sample_triple())) < len(encode(longest_triple)) < 640
+
+
 def test_the_detections_of_24_markers_are_one_ethernet_packet_while_none_has_a_rival() -> None:
     payload = 1500 - 20 - 8  # MTU less the IPv4 and UDP headers: nothing is split into fragments
     assert len(encode(longest(24))) + OVERHEAD <= payload
@@ -250,59 +295,72 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
 @pytest.mark.parametrize(
     ("sample", "change"),
     [
-        (0, {"camera": ""}),
-        (0, {"camera": "a/b"}),
-        (0, {"camera": "left\n"}),
-        (0, {"camera": "x" * 65}),
-        (0, {"seq": -1}),
-        (0, {"seq": 2**63}),
-        (0, {"seq": 1.0}),
-        (0, {"t_ns": 2**63}),
-        (0, {"t_ns": None}),
-        (0, {"uv": b"\0" * 8 * 11}),
-        (0, {"uv": b"\0" * 95}),
-        (0, {"uv": [0.0] * 12}),
-        (0, {"area": b""}),
-        (0, {"area": b"\0" * 8 * (MAX_MARKERS + 1)}),
-        (0, {"quality": b"\0" * 8}),
-        (0, {"sigma_px": b"\0" * 8}),
-        (0, {"sigma_px": b""}),
-        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, 0.0, 0.1, 0.1]).tobytes()}),
-        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, -0.1, 0.1, 0.1]).tobytes()}),
-        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
-        (0, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
-        (0, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
-        (0, {"rival_uv": b"\0" * 8}),
-        (0, {"rival_uv": np.zeros((5, 2)).tobytes()}),
-        (0, {"rival_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
-        (0, {"rival_uv": np.full((6, 2), -np.inf).tobytes()}),
-        (0, {"surplus": 1}),
-        (0, {"type": "HandPose"}),
-        (0, {"type": "Pickle"}),
-        (0, {"type": 3}),
-        (1, {"position_m": b"\0" * 8}),
-        (1, {"valid": b"\2" + b"\0" * (JOINT_COUNT - 1)}),
-        (1, {"source": b"\5" * JOINT_COUNT}),
-        (1, {"markers_m": b"\0" * 24 * (MAX_MARKERS + 1)}),
-        (1, {"markers_raw_m": b""}),
-        (2, {"counts": {"frames": -1}}),
-        (2, {"counts": {f"c{i}": 1 for i in range(513)}}),
-        (2, {"gauges": {"rate_hz": float("nan")}}),
-        (2, {"gauges": {"rate_hz": float("inf")}}),
-        (2, {"gauges": {"a b": 1.0}}),
-        (3, {"verb": ""}),
-        (4, {"jpeg": b""}),
-        (4, {"jpeg": b"GIF89a"}),
-        (4, {"jpeg": "text"}),
-        (4, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 2)}),
-        (5, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_STILL_BYTES - 2)}),
-        (0, {"t_sigma_ns": -1.0}),
-        (0, {"t_sigma_ns": float("nan")}),
-        (3, {"body": "x" * (MAX_BODY_CHARACTERS + 1)}),
+        (MarkerDetections, {"camera": ""}),
+        (MarkerDetections, {"camera": "a/b"}),
+        (MarkerDetections, {"camera": "left\n"}),
+        (MarkerDetections, {"camera": "x" * 65}),
+        (MarkerDetections, {"seq": -1}),
+        (MarkerDetections, {"seq": 2**63}),
+        (MarkerDetections, {"seq": 1.0}),
+        (MarkerDetections, {"t_ns": 2**63}),
+        (MarkerDetections, {"t_ns": None}),
+        (MarkerDetections, {"uv": b"\0" * 8 * 11}),
+        (MarkerDetections, {"uv": b"\0" * 95}),
+        (MarkerDetections, {"uv": [0.0] * 12}),
+        (MarkerDetections, {"area": b""}),
+        (MarkerDetections, {"area": b"\0" * 8 * (MAX_MARKERS + 1)}),
+        (MarkerDetections, {"quality": b"\0" * 8}),
+        (MarkerDetections, {"sigma_px": b"\0" * 8}),
+        (MarkerDetections, {"sigma_px": b""}),
+        (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, 0.0, 0.1, 0.1]).tobytes()}),
+        (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, -0.1, 0.1, 0.1]).tobytes()}),
+        (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.inf, 0.1, 0.1]).tobytes()}),
+        (MarkerDetections, {"sigma_px": np.array([0.1, np.nan, 0.1, np.nan, 0.1, 0.1]).tobytes()}),  # seen
+        (MarkerDetections, {"sigma_px": np.full(6, 0.1).tobytes()}),  # the second is not seen
+        (MarkerDetections, {"rival_uv": b"\0" * 8}),
+        (MarkerDetections, {"rival_uv": np.zeros((5, 2)).tobytes()}),
+        (MarkerDetections, {"rival_uv": np.zeros((6, 2)).tobytes()}),  # the second is not seen
+        (MarkerDetections, {"rival_uv": np.full((6, 2), -np.inf).tobytes()}),
+        (MarkerDetections, {"surplus": 1}),
+        (MarkerDetections, {"type": "HandPose"}),
+        (MarkerDetections, {"type": "Pickle"}),
+        (MarkerDetections, {"type": 3}),
+        (HandPose, {"position_m": b"\0" * 8}),
+        (HandPose, {"valid": b"\2" + b"\0" * (JOINT_COUNT - 1)}),
+        (HandPose, {"source": b"\5" * JOINT_COUNT}),
+        (HandPose, {"markers_m": b"\0" * 24 * (MAX_MARKERS + 1)}),
+        (HandPose, {"markers_raw_m": b""}),
+        (Health, {"counts": {"frames": -1}}),
+        (Health, {"counts": {f"c{i}": 1 for i in range(513)}}),
+        (Health, {"gauges": {"rate_hz": float("nan")}}),
+        (Health, {"gauges": {"rate_hz": float("inf")}}),
+        (Health, {"gauges": {"a b": 1.0}}),
+        (Command, {"verb": ""}),
+        (Preview, {"jpeg": b""}),
+        (Preview, {"jpeg": b"GIF89a"}),
+        (Preview, {"jpeg": "text"}),
+        (Preview, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 2)}),
+        (Still, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_STILL_BYTES - 2)}),
+        (MarkerDetections, {"t_sigma_ns": -1.0}),
+        (MarkerDetections, {"t_sigma_ns": float("nan")}),
+        (Command, {"body": "x" * (MAX_BODY_CHARACTERS + 1)}),
+        (WristDetections, {"laser_uv": b"\0" * 8 * 9}),
+        (WristDetections, {"laser_uv": np.full((5, 2), np.nan).tobytes()}),  # four sigmas are left
+        (WristDetections, {"laser_uv": np.full((5, 2), np.inf).tobytes()}),
+        (WristDetections, {"laser_sigma_px": np.full(5, 0.1).tobytes()}),  # the little finger is not seen
+        (WristDetections, {"laser_sigma_px": np.array([0.1, 0.1, 0.0, 0.1, np.nan]).tobytes()}),
+        (WristDetections, {"laser_sigma_px": np.array([0.1, 0.1, -0.1, 0.1, np.nan]).tobytes()}),
+        (WristDetections, {"laser_px": b""}),
+        (WristDetections, {"tip_uv": np.zeros((6, 2)).tobytes()}),
+        (WristDetections, {"tip_sigma_px": np.full(5, np.nan).tobytes()}),
+        (WristDetections, {"tip_sigma_px": np.full(5, 0.1).tobytes()}),  # the thumb is not seen
+        (WristDetections, {"tip_depth": b"\0" * 8}),
+        (WristDetections, {"uv": b""}),
+        (HandPose, {"laser_m": b"\0" * 8 * 14}),
     ],
 )
-def test_one_wrong_field_is_refused(sample: int, change: dict[str, object]) -> None:
-    content = as_map(SAMPLES[sample])
+def test_one_wrong_field_is_refused(sample: type[Message], change: dict[str, object]) -> None:
+    content = as_map(next(one for one in SAMPLES if type(one) is sample))
     decode(msgspec.msgpack.encode(content))  # the test is about the change, not about the sample
     with pytest.raises(MessageError):
         decode(msgspec.msgpack.encode(content | change))

@@ -12,7 +12,7 @@ import pytest
 
 from common.clock import SkewedClock
 from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
-from common.messages import Command, ImuSample, MarkerDetections, encode
+from common.messages import Command, Detections, ImuSample, encode
 from common.session import Hello, RigKeys, seal
 from master.link import MasterLink
 from slave.link import SlaveLink
@@ -36,7 +36,7 @@ class Wires:
     master: MasterLink | None = None
     slaves: dict[Address, SlaveLink] = field(default_factory=dict[Address, SlaveLink])
     seen: list[tuple[bytes, Address, Address]] = field(default_factory=list[tuple[bytes, Address, Address]])
-    got: list[MarkerDetections] = field(default_factory=list[MarkerDetections])
+    got: list[Detections] = field(default_factory=list[Detections])
     samples: list[ImuSample] = field(default_factory=list[ImuSample])
     lives: int = 0
 
@@ -48,12 +48,13 @@ class Wires:
         cameras: tuple[str, ...] = ("left", "right"),
         timeout_s: float = 5.0,
         imus: tuple[str, ...] = (),
+        wrists: tuple[str, ...] = (),
     ) -> MasterLink:
         self.lives += 1
         source = seeded(1000 * self.seed + self.lives)
         self.master = MasterLink(
-            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", round(timeout_s * S), source, imus
-        )
+            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", round(timeout_s * S), source, imus, wrists
+        )  # fmt: skip
         return self.master
 
     def new_slave(self, name: str, skewed: SkewedClock | None = None, key: bytes = KEY) -> SlaveLink:
@@ -107,7 +108,7 @@ class Wires:
     def all_started(self) -> bool:
         return all(slave.started for slave in self.slaves.values())
 
-    def send(self, slave: SlaveLink, message: MarkerDetections | ImuSample | Command) -> bytes | None:
+    def send(self, slave: SlaveLink, message: Detections | ImuSample | Command) -> bytes | None:
         sealed = slave.seal(message)
         if sealed is None:
             return None

@@ -1,0 +1,165 @@
+"""The camera of a wrist device on the link: it sends triples and nothing else, and no other camera sends any."""
+
+import random
+from collections.abc import Iterator
+from contextlib import ExitStack
+
+import pytest
+
+from common.clock import SkewedClock, SystemClock
+from common.datagram import Kind, Refusal
+from common.messages import Detections, WristDetections, encode
+from master.ingest import Ingest
+from master.link import MasterLink
+from slave.link import SlaveLink
+from slave.uplink import Uplink
+from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
+from tests.loopback.test_imu_link import sample
+from tests.network_helpers import detections, free_udp_port, seeded, triple, until
+
+
+def started(wires: Wires, clock: SkewedClock | None = None) -> tuple[MasterLink, SlaveLink, SlaveLink]:
+    """A master, a camera of a marker rig and that of a wrist device, both in a session and told to start."""
+    master = wires.new_master(cameras=("left", "wrist"), wrists=("wrist",))
+    left, wrist = wires.new_slave("left"), wires.new_slave("wrist", clock)
+    assert wires.run(3.0, wires.all_started)
+    wires.run(0.1)
+    return master, left, wrist
+
+
+def test_its_triples_come_on_the_masters_clock_with_the_doubt_of_the_conversion() -> None:
+    wires = Wires()
+    clock = SkewedClock(7 * S, 40.0, wires.clock)
+    master, _, wrist = started(wires, clock)
+    wires.run(3.0)
+    t_ns = wires.clock.now_ns()
+    wires.send(wrist, triple("wrist", wrist.process, 1, clock.now_ns()))
+    [got] = wires.got
+    assert isinstance(got, WristDetections)
+    assert got.t_ns == pytest.approx(t_ns, abs=2_000_000)
+    assert got.ready_t_ns - got.t_ns == pytest.approx(1000, abs=2)
+    estimate = master.clock_of("wrist")
+    assert estimate is not None
+    assert got.t_sigma_ns == pytest.approx(estimate.sigma_at(got.t_ns))
+    assert not master.refused
+
+
+@pytest.mark.parametrize(
+    ("wrist_says", "message"),
+    [
+        (True, detections("wrist", 1, 0)),  # markers of a camera that has none
+        (True, triple("left", 1, 0)),
+        (True, sample("wrist", 1, 0)),
+        (False, triple("left", 1, 0)),  # a triple of a camera without strobes
+        (False, triple("wrist", 1, 0)),
+        (False, detections("wrist", 1, 0)),
+    ],
+)
+def test_who_sends_what_another_kind_of_camera_sends_is_an_impostor(
+    wrist_says: bool, message: Detections
+) -> None:
+    wires = Wires()
+    master, left, wrist = started(wires)
+    sender = wrist if wrist_says else left
+    wires.send(sender, message)
+    assert master.refused == {Refusal.IMPOSTOR: 1}
+    assert not wires.got
+    wires.send(left, detections("left", left.process, 0))  # and the true ones are heard as before
+    wires.send(wrist, triple("wrist", wrist.process, 1))
+    assert [message.camera for message in wires.got] == ["left", "wrist"]
+    assert master.counts_of("wrist").received == 1
+
+
+def test_nothing_is_lost_where_nothing_was_though_numbers_rise_by_three() -> None:
+    wires = Wires()
+    master, _, wrist = started(wires)
+    for k in range(50):
+        wires.send(wrist, triple("wrist", wrist.process, 3 * k + 1 + (k % 4 == 2)))
+        wires.step()
+    counts = master.counts_of("wrist")
+    assert (counts.received, counts.lost, counts.skipped, counts.late) == (50, 0, 0, 0)
+
+
+def test_triples_lost_on_the_way_and_never_sent_are_told_apart() -> None:
+    wires = Wires()
+    master, _, wrist = started(wires)
+    for k in range(60):
+        if k in (7, 8, 30):  # a frame was missing, or there was no time
+            continue
+        message = triple("wrist", wrist.process, 3 * k + 1)
+        if k in (20, 41, 42, 43):
+            assert wrist.seal(message) is not None  # sent, and never heard of again
+        else:
+            wires.send(wrist, message)
+    counts = master.counts_of("wrist")
+    assert (counts.received, counts.lost, counts.skipped) == (53, 4, 3)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_any_loss_is_accounted_for_in_triples(seed: int) -> None:
+    wires, chance = Wires(seed=seed), random.Random(seed)
+    master, _, wrist = started(wires)
+    kept: list[int] = []
+    for k in range(200):
+        message = triple("wrist", wrist.process, 3 * k + 1)
+        if chance.random() < 0.2:
+            assert wrist.seal(message) is not None
+        else:
+            wires.send(wrist, message)
+            kept.append(k)
+    counts = master.counts_of("wrist")
+    span = kept[-1] - kept[0] + 1
+    assert counts.received == len(kept)
+    assert counts.skipped == 0
+    assert counts.received + counts.lost == span
+
+
+def test_mutated_triples_are_counted_and_have_no_effect() -> None:
+    wires, chance = Wires(), random.Random(5)
+    master, _, wrist = started(wires)
+    session = wrist._session
+    assert session is not None
+    body = encode(triple("wrist", wrist.process, 1))
+    for _ in range(3000):  # sealed rightly: whoever has the session may send what he likes
+        broken = bytearray(body)
+        for _ in range(chance.randint(1, 3)):
+            at = chance.randrange(len(broken))
+            if chance.random() < 0.5:
+                broken[at] ^= 1 << chance.randrange(8)
+            else:
+                del broken[at : at + chance.randint(1, 8)]
+        wires.carry(session.sealer.seal(Kind.DATA, bytes(broken)), ("10.0.1.9", 5), MASTER, keep=False)
+    assert set(master.refused) == {Refusal.UNDECODABLE, Refusal.IMPOSTOR}
+    assert sum(master.refused.values()) > 2000
+    for message in wires.got:  # what came through is a message, only with another number in it
+        assert isinstance(message, WristDetections)
+        assert message.camera == "wrist"
+
+
+def test_a_wrists_camera_is_one_of_the_cameras() -> None:
+    wires = Wires()
+    with pytest.raises(ValueError, match="'wrist' of a wrist device is none of the cameras"):
+        MasterLink(("left",), KEY, wires.clock, BROADCAST, "", S, seeded(1), (), ("wrist",))
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as stack:
+        yield stack
+
+
+def test_triples_come_over_real_sockets_and_none_is_lost(stack: ExitStack) -> None:
+    port, clock = free_udp_port(), SystemClock()
+    ingest = Ingest(
+        ("wrist",), KEY, clock, ("127.255.255.255", port), ("127.0.0.1", 0), "", wrists=("wrist",)
+    )
+    stack.callback(ingest.close)
+    wrist = Uplink("wrist", KEY, clock, port, "127.0.0.1")
+    stack.callback(wrist.close)
+    assert wrist.wait_for_start(10.0)
+    for k in range(30):
+        wrist.send(triple("wrist", wrist.session, 3 * k + 1, clock.now_ns()))
+        assert until(lambda k=k: ingest.counts_of("wrist").received == k + 1)
+    taken = [ingest.get(1.0) for _ in range(30)]
+    assert [one.seq for one in taken if isinstance(one, WristDetections)] == [3 * k + 1 for k in range(30)]
+    assert ingest.lost == ingest.skipped == 0
