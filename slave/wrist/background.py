@@ -1,0 +1,27 @@
+"""What the device's own light adds to a frame: the frame minus the ambient one of the same triple."""
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+
+
+def lit(frame: Image, ambient: Image) -> Image:
+    """The light of the laser or the LEDs alone: a saturating difference, never below 0 (row D2).
+
+    The black level cancels. Where the ambient frame is saturated nothing can be told of the light that was added, and
+    the difference is 0 there by itself.
+
+    Args:
+        frame: (H, W) laser or LED frame, uint8.
+        ambient: (H, W) ambient frame of the same triple, uint8.
+
+    Returns:
+        (H, W) uint8.
+
+    Raises:
+        ValueError: The two are not of one size.
+    """
+    if frame.shape != ambient.shape:
+        raise ValueError(f"frame of {frame.shape} and ambient frame of {ambient.shape} are not of one size")
+    return np.asarray(cv2.subtract(frame, ambient), np.uint8)
