@@ -13,6 +13,7 @@ _EXAMPLES = {
     "demo": """examples:
   phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
+  phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
@@ -120,7 +121,11 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--calibration", type=Path, default=_calibration(), metavar="DIR", help="default: %(default)s"
     )
-    demo.add_argument("--rig", default="desk", help="default: %(default)s")
+    rig = demo.add_mutually_exclusive_group()
+    rig.add_argument("--rig", default="desk", help="default: %(default)s")
+    rig.add_argument(
+        "--wrist", dest="rig", action="store_const", const="wrist", help="the wrist device: --rig wrist"
+    )
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
     demo.add_argument(
         "--scene",

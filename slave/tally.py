@@ -67,7 +67,7 @@ class Tally:
         with self._lock:
             counts = {"frames": self._frames, "dropped": self._dropped, "empty": self._empty}
             counts |= {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
-        return counts | self._others()
+        return {**counts, **self._others()}
 
     def gauges(self) -> dict[str, float]:
         """rate_hz since the last call, running mean and worst (since the last call) of the detection time [us]."""

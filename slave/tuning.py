@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from common.calibration import CameraCalibration, RigCalibration, load, parse, save
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse, save
 from common.camera_settings import WANTED, CameraSettings, figures
 from common.errors import CalibrationError, PhalanxError
 from common.watching import WatchedFiles
@@ -34,12 +34,21 @@ class CameraFiles:
     Attributes:
         camera_path, rig_path: The camera file and the rig file.
         camera, rig: Their content.
+        hand_path, hand: The same of the hand, of which only the slave of a wrist device needs to know; else None.
     """
 
     camera_path: Path
     rig_path: Path
     camera: CameraCalibration
     rig: RigCalibration
+    hand_path: Path | None = None
+    hand: HandProfile | None = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All of them."""
+        hand = () if self.hand_path is None else (self.hand_path,)
+        return (self.camera_path, self.rig_path, *hand)
 
     def read_again(self) -> "CameraFiles":
         """The same files, as they are now.
@@ -48,7 +57,10 @@ class CameraFiles:
             CalibrationError: One is broken or gone.
         """
         return replace(
-            self, camera=load(self.camera_path, CameraCalibration), rig=load(self.rig_path, RigCalibration)
+            self,
+            camera=load(self.camera_path, CameraCalibration),
+            rig=load(self.rig_path, RigCalibration),
+            hand=None if self.hand_path is None else load(self.hand_path, HandProfile),
         )
 
 
@@ -104,9 +116,8 @@ class CameraTuning:
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
-        paths = self._used.camera_path, self._used.rig_path
         with self._turn:
-            if not self._running() or not self._watched.changed(paths):
+            if not self._running() or not self._watched.changed(self._used.paths):
                 return
             try:
                 was, self._on_disk = self._on_disk, self._used.read_again()
@@ -114,7 +125,7 @@ class CameraTuning:
                 kept = self._on_disk.camera == was.camera
                 if self._apply(replace(self._on_disk, camera=self._used.camera) if kept else self._on_disk):
                     self._applied += 1
-                    _LOG.info("%s, %s: changed, in use now", *paths)
+                    _LOG.info("%s: changed, in use now", ", ".join(map(str, self._used.paths)))
             except PhalanxError as error:
                 self._refused += 1
                 _LOG.warning("changed, but not used: %s", error)
@@ -179,6 +190,11 @@ def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
     if old.rig.kind != new.rig.kind:
         raise CalibrationError(
             f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all "
+            "processes of the rig"
+        )
+    if old.hand_path is not None and old.rig.hand != new.rig.hand:
+        raise CalibrationError(
+            f"rig {new.rig.name!r}: hand: {old.rig.hand} cannot become {new.rig.hand} while it runs: restart all "
             "processes of the rig"
         )
     if old.rig.markers != new.rig.markers:

@@ -11,7 +11,7 @@ from common.calibration import CameraCalibration
 from common.camera_settings import CameraSettings, figures
 from common.clock import Clock
 from common.errors import CameraError, RecordingError
-from common.frame_recording import FrameRow, open_recording
+from common.frame_recording import FrameRow, Manifest, open_recording
 from slave.cameras.source import Frame
 
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
@@ -40,6 +40,7 @@ class ReplayCamera:
             raise CameraError(f"{folder}: frames.csv has no frame of camera {camera!r}")
         calibration = recording.manifest.cameras[camera]
         self._calibration = calibration
+        self._grey = is_grey(recording.manifest, camera)
         self._folder = folder
         self._paced = paced
         self._clock = clock
@@ -91,19 +92,27 @@ class ReplayCamera:
         return {}
 
     def _load(self, row: FrameRow) -> Image:
-        return read_png(self._folder / row.file, (self._calibration.height_px, self._calibration.width_px))
+        size = (self._calibration.height_px, self._calibration.width_px)
+        return read_png(self._folder / row.file, size, grey=self._grey)
 
     def _wait_until(self, t_ns: int) -> None:
         while (left_s := (t_ns - self._clock.now_ns()) * 1e-9) > 0.0:
             time.sleep(min(left_s, STEP_S))
 
 
-def read_png(path: Path, size: tuple[int, int]) -> Image:
-    """Read one frame as (H, W, 3) BGR uint8.
+def is_grey(manifest: Manifest, camera: str) -> bool:
+    """Whether a camera of a recording is that of a wrist device, whose frames are grey."""
+    rigs = (manifest.rig, *manifest.rigs)
+    return any(rig is not None and rig.kind == "wrist" and camera in rig.cameras for rig in rigs)
+
+
+def read_png(path: Path, size: tuple[int, int], *, grey: bool = False) -> Image:
+    """Read one frame as (H, W, 3) BGR uint8, or as (H, W).
 
     Args:
         path: PNG file.
         size: Height and width the camera file says.
+        grey: Whether one channel is wanted.
 
     Raises:
         CameraError: Missing, not an image, or of another size; the text names the file.
@@ -112,7 +121,7 @@ def read_png(path: Path, size: tuple[int, int]) -> Image:
         raw = np.frombuffer(path.read_bytes(), np.uint8)
     except OSError as error:
         raise CameraError(f"{path}: cannot read: {error.strerror}") from error
-    image = cv2.imdecode(raw, cv2.IMREAD_COLOR) if raw.size else None
+    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR) if raw.size else None
     if image is None:
         raise CameraError(f"{path}: not an image, or cut; record again or remove its line from frames.csv")
     if image.shape[:2] != size:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from common.errors import CameraError
+from common.frame_recording import Illumination
 from slave.cameras.replay import ReplayCamera
 
 CAMERA = {
@@ -51,6 +52,25 @@ def test_unpaced_it_gives_every_frame_with_the_times_of_the_recording(tmp_path: 
     assert [f.seq for f in frames] == [0, 2, 4]
     assert [f.t_ns for f in frames] == [f.ready_t_ns for f in frames] == [10**9, 1_004_000_000, 1_008_000_000]
     assert [int(f.image[0, 0, 0]) for f in frames] == [0, 10, 20]
+
+
+def test_frames_of_a_wrist_device_are_grey_as_written(tmp_path: Path) -> None:
+    recording(tmp_path)
+    rig = {"version": 1, "name": "w", "kind": "wrist", "cameras": ["left"], "hand": "h"}
+    manifest = {"version": 1, "kind": "wrist", "cameras": {"left": CAMERA}, "rig": rig}
+    (tmp_path / "recording.json").write_text(json.dumps(manifest))
+    image = np.arange(24 * 32, dtype=np.uint32).reshape(24, 32).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "left/0.png"), image)
+    (tmp_path / "frames.csv").write_text(
+        (tmp_path / "frames.csv").read_text().replace("none,left/0", "laser,left/0")
+    )
+    camera = ReplayCamera(tmp_path, "left", paced=False, clock=StepClock(0))
+    first, second = camera.read(), camera.read()
+    assert first is not None
+    assert second is not None
+    assert first.illumination is Illumination.LASER
+    np.testing.assert_array_equal(first.image, image)
+    np.testing.assert_array_equal(second.image, np.full((24, 32), 10))  # three equal channels are one
 
 
 def test_paced_the_times_are_the_slaves_and_no_frame_comes_before_its_time(tmp_path: Path) -> None:
