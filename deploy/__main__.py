@@ -17,6 +17,7 @@ _EXAMPLES = {
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
+  phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
 """,
 }
 _LABELS = {
@@ -135,7 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     replay = commands.add_parser(
         "replay",
         help="a recording of raw frames, offline",
-        description="Detects the markers in every camera's frames, solves the hand, scores it where there is a truth.",
+        description="Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand, "
+        "scores it where there is a truth.",
         epilog=_EXAMPLES["replay"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

@@ -1,4 +1,4 @@
-"""Replay: `phalanx-slave detect` for every camera of a recording, then `phalanx-master solve`."""
+"""Replay: `phalanx-slave detect` for every camera of a recording's rig, then `phalanx-master solve`."""
 
 import json
 import subprocess
@@ -36,7 +36,7 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    cameras = _cameras(settings.recording)
+    kind, cameras = _rig(settings.recording)
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
         raise ReplayError(f"{settings.hand}: no such hand profile")
     try:
@@ -45,12 +45,13 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
         raise ReplayError(f"--out {settings.out}: cannot make the folder: {error.strerror}") from error
     recording = str(settings.recording)
     calibration = [] if settings.calibration is None else ["--calibration", str(settings.calibration)]
-    for camera in cameras:
-        say(f"detecting markers in camera {camera} ...")
-        target = ["-o", str(settings.out / f"detections_{camera}.npz")]
-        _step("slave", "detect", recording, "--camera", camera, *calibration, *target)
-    say("solving ...")
     hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
+    what, needs = ("markers", []) if kind == "markers" else ("fingers", hand)
+    for camera in cameras:
+        say(f"detecting {what} in camera {camera} ...")
+        target = ["-o", str(settings.out / f"detections_{camera}.npz")]
+        _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
+    say("solving ...")
     results = ["--detections", str(settings.out), "--out", str(settings.out)]
     _step("master", "solve", recording, *calibration, *hand, *results)
     return cast(dict[str, object], json.loads((settings.out / "summary.json").read_text()))
@@ -62,16 +63,22 @@ def _step(module: str, *arguments: str) -> None:
         raise ReplayError(f"phalanx-{module} {arguments[0]} ended with code {done.returncode}")
 
 
-def _cameras(recording: Path) -> list[str]:
+def _rig(recording: Path) -> tuple[str, list[str]]:
+    """Kind and cameras of the recording's rig."""
     path = recording / "recording.json"
     try:
         manifest = json.loads(path.read_text())
         rigs = [rig for rig in (manifest.get("rig"), *(manifest.get("rigs") or ())) if rig is not None]
-        marker_rigs = [rig for rig in rigs if rig["kind"] == "markers"]
-        cameras = list[str](marker_rigs[0]["cameras"]) if marker_rigs else None
+        found = {str(rig["kind"]): list[str](rig["cameras"]) for rig in reversed(rigs)}  # the first of a kind
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ReplayError(f"{path}: not a recording of raw frames ({reason})") from error
-    if cameras is None:
-        raise ReplayError(f"{path}: no rig of kind 'markers'; wrist recordings are not solved yet")
-    return cameras
+    if len(found) > 1:
+        raise ReplayError(
+            f"{path}: rigs of the kinds {' and '.join(sorted(found))}: one recording with both is not solved yet; "
+            "leave one rig out of it"
+        )
+    for kind in ("markers", "wrist"):
+        if kind in found:
+            return kind, found[kind]
+    raise ReplayError(f"{path}: no rig of kind 'markers' or 'wrist'")

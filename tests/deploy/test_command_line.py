@@ -38,10 +38,37 @@ def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.C
     assert "recording.json" in capsys.readouterr().err
 
 
-def test_a_wrist_recording_is_refused_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "recording.json").write_text(json.dumps({"rig": {"kind": "wrist", "cameras": ["wrist"]}}))
+@pytest.mark.parametrize(
+    ("rigs", "says"),
+    [
+        ([{"kind": "wrist", "cameras": ["w"]}, {"kind": "markers", "cameras": ["l"]}], "markers and wrist"),
+        ([{"kind": "glove", "cameras": []}], "no rig of kind 'markers' or 'wrist'"),
+        ([], "no rig of kind"),
+    ],
+)
+def test_a_recording_of_no_or_of_two_kinds_is_refused_by_name(
+    rigs: list[object], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "recording.json").write_text(json.dumps({"rigs": rigs}))
     assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
-    assert "no rig of kind 'markers'" in capsys.readouterr().err
+    assert says in capsys.readouterr().err
+
+
+def test_the_wrist_device_is_a_rig_like_any_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = [
+        "demo",
+        "--headless",
+        "--wrist",
+        "--calibration",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert main(command) == 1
+    assert "rigs/wrist.json" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*command, "--rig", "desk4"])
+    assert "not allowed with" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("content", ["[]", "null", "{", '{"rigs": 5}', '{"rig": {}}', '{"rig": 1}'])
