@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import overload
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.errors import PhalanxError
@@ -14,6 +15,8 @@ from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
 from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = "standard | lights | poses | hand-routine | leap:FILE.npz"
 VIEWS = f"{NAMES} | board"
@@ -30,6 +33,10 @@ def scene_by_name(
     Raises:
         PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
     """
+    if rig.kind != "markers":
+        raise PhalanxError(
+            f"scene {name!r}: shows markers, and rig {rig.name!r} is of kind {rig.kind!r}; that has {WRIST_NAMES}"
+        )
     if name == "standard":
         return Scene.standard(rig, cameras, hand, seed)
     if name == "lights":
@@ -48,21 +55,32 @@ def scene_by_name(
 
 def view_by_name(
     name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
-) -> Scene | BoardScene:
-    """What a simulated camera may look at: a scene with a hand, or `board`, a checkerboard to calibrate cameras with.
+) -> Scene | BoardScene | WristScene:
+    """What a simulated camera may look at: a scene with a hand, that of a wrist rig where the rig is one, or `board`,
+    a checkerboard to calibrate cameras with.
 
     Raises:
-        PhalanxError: As `scene_by_name`.
+        PhalanxError: As `scene_by_name`; the scene is none of this kind of rig.
     """
-    return (
-        BoardScene(rig, cameras, seed) if name == "board" else scene_by_name(name, rig, cameras, hand, seed)
-    )
+    if name == "board":
+        return BoardScene(rig, cameras, seed)
+    if rig.kind == "wrist":
+        return WristScene.by_name(name, rig, cameras, hand, seed)
+    return scene_by_name(name, rig, cameras, hand, seed)
 
 
-def renderer_of(scene: Scene | BoardScene, camera: str) -> Renderer | BoardRenderer:
-    """What draws the scene as one camera sees it.
+@overload
+def renderer_of(scene: WristScene, camera: str) -> WristRenderer: ...
+@overload
+def renderer_of(scene: Scene | BoardScene, camera: str) -> Renderer | BoardRenderer: ...
+def renderer_of(
+    scene: Scene | BoardScene | WristScene, camera: str
+) -> Renderer | BoardRenderer | WristRenderer:
+    """What draws the scene as one camera sees it; that of a wrist scene is told what lights each frame.
 
     Raises:
         CalibrationError: The scene has no such camera, or a marker without paint.
     """
+    if isinstance(scene, WristScene):
+        return WristRenderer(scene, camera)
     return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

@@ -1,0 +1,1 @@
+"""The wrist device simulated: what its camera sees of the hand by ambient light, by its laser and by its LEDs."""

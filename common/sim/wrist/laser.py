@@ -1,0 +1,165 @@
+"""The laser line, exact: where the sheet of light first meets the hand, and which of that the camera sees.
+
+The sheet is a fan of rays from the laser's origin. What each ray meets first is lit, so shadows need no thought; a lit
+point is seen where the ray from the camera meets nothing before it. Consecutive rays that meet the same part of the
+hand are joined by chords, whose lengths are those of the line.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.calibration import RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.hand_model import HandJoints
+from common.sim.wrist.cones import Cones, distances
+from common.sim.wrist.flesh import GROUPS, Flesh
+
+RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
+JOINED_M = 0.004  # longer chords jump from one part to another
+SEEN_WITHIN_M = 2e-4
+LEAST_M = 2e-4  # of visible line, for a centroid
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserCurve:
+    """The lit points of one instant, ray by ray (K,).
+
+    Attributes:
+        ray: Index of the ray (K,).
+        points: (K, 3) [m], camera frame.
+        body: Which body is lit (K,).
+        group, segment: As in `Flesh` (K,).
+        seen: Whether the camera sees it (K,).
+        joined: (K,) whether it and the next one are neighbours on one part of the hand.
+    """
+
+    ray: Int
+    points: Float
+    body: Int
+    group: Int
+    segment: Int
+    seen: Bool
+    joined: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserSheet:
+    """The fan of one device, and the hand it lights.
+
+    Attributes:
+        origin: Where the rays begin (3,) [m], camera frame.
+        normal, offset_m: The plane, normal . X = offset_m.
+        rays: Unit directions (RAYS, 3), from one edge of the fan to the other.
+        flesh: The hand.
+        still_m: How far along each ray the palm begins (RAYS,) [m]; inf: nowhere.
+        still_body: Which body of the palm that is (RAYS,).
+        still: The bodies of the palm.
+    """
+
+    origin: Float
+    normal: Float
+    offset_m: float
+    rays: Float
+    flesh: Flesh
+    still_m: Float
+    still_body: Int
+    still: Cones
+
+    @classmethod
+    def of(cls, rig: RigCalibration, optics: CameraModel, flesh: Flesh, joints: HandJoints) -> "LaserSheet":
+        """Of a rig whose palm stands as in `joints`.
+
+        Raises:
+            CalibrationError: The laser is not known well enough to be simulated.
+        """
+        laser, plane = rig.laser, rig.laser_plane
+        if (
+            laser is None
+            or plane is None
+            or laser.origin is None
+            or laser.forward is None
+            or laser.fan_rad is None
+        ):
+            raise CalibrationError(
+                f"rig {rig.name!r}: laser.origin, forward, fan_rad and laser_plane: a laser is simulated as it is built"
+            )
+        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+        offset = plane.offset_m / float(np.linalg.norm(plane.normal))
+        origin = np.array(laser.origin)
+        origin = origin + (offset - origin @ normal) * normal  # files are rounded
+        forward = np.array(laser.forward) - (np.array(laser.forward) @ normal) * normal
+        forward /= np.linalg.norm(forward)
+        angle = np.linspace(-0.5, 0.5, RAYS)[:, None] * laser.fan_rad
+        rays = np.cos(angle) * forward + np.sin(angle) * np.cross(normal, forward)
+        still = flesh.bodies(joints).of(slice(flesh.still))
+        reach = distances(still, origin, rays)
+        body = reach.argmin(axis=1)
+        return cls(origin, normal, offset, rays, flesh, reach[np.arange(RAYS), body], body, still)
+
+    def cross(self, bodies: Cones) -> LaserCurve:
+        """Where it meets the hand whose flesh is at `bodies`."""
+        flesh, first = self.flesh, self.flesh.still
+        reach = distances(bodies.of(slice(first, None)), self.origin, self.rays)
+        body = reach.argmin(axis=1)
+        near = reach[np.arange(RAYS), body]
+        body = np.where(near < self.still_m, body + first, self.still_body)
+        near = np.minimum(near, self.still_m)
+        ray = np.flatnonzero(np.isfinite(near))
+        points = self.origin + near[ray, None] * self.rays[ray]
+        body = body[ray]
+        group = flesh.group[body]
+        joined = np.zeros(len(ray), dtype=np.bool_)
+        chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        joined[:-1] = (np.diff(ray) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
+        return LaserCurve(ray, points, body, group, flesh.segment[body], self.seen(bodies, points), joined)
+
+    def seen(self, bodies: Cones, points: Float) -> Bool:
+        """Which of points (K, 3) [m] on the skin nothing hides from the camera (K,)."""
+        far = np.linalg.norm(points, axis=1)
+        front = points[:, 2] > 0.0
+        reach = distances(bodies, np.zeros(3), points / far[:, None])
+        return front & (reach.min(axis=1) > far - SEEN_WITHIN_M)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineTruth:
+    """The line by group (7,), as in `WristTruth`."""
+
+    uv: Float
+    plane_m: Float
+    centroid_m: Float
+    seen_m: Float
+    lit_m: Float
+    segment: Int
+
+    @classmethod
+    def of(cls, curve: LaserCurve, optics: CameraModel, sheet: LaserSheet) -> "LineTruth":
+        """Sum up the chords; those with both ends in the image and seen count as visible."""
+        uv = optics.project(curve.points)
+        size = np.array([optics.width_px, optics.height_px])
+        seen = curve.seen & ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)
+        chords = np.flatnonzero(curve.joined)
+        both = seen[chords] & seen[chords + 1]
+        group, count = curve.group[chords], len(GROUPS)
+        length = np.linalg.norm(curve.points[chords + 1] - curve.points[chords], axis=1)
+        lit_m = np.bincount(group, length, count)
+        chords, group, length = chords[both], group[both], length[both]
+        seen_m = np.bincount(group, length, count)
+        enough = seen_m >= LEAST_M
+
+        def mean(value: Float, weight: Float) -> Float:
+            middle = 0.5 * (value[chords] + value[chords + 1])
+            total = np.bincount(group, weight, count)
+            sums = np.stack([np.bincount(group, weight * column, count) for column in middle.T], axis=1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                return np.where(enough[:, None], sums / total[:, None], np.nan)
+
+        centre = mean(uv, np.linalg.norm(uv[chords + 1] - uv[chords], axis=1))
+        ray = optics.ray(centre)
+        by_segment = np.bincount(4 * group + curve.segment[chords], length, 4 * count).reshape(count, 4)
+        segment = np.where(seen_m > 0.0, by_segment.argmax(axis=1), -1)
+        plane = ray * (sheet.offset_m / (ray @ sheet.normal))[:, None]
+        return cls(centre, plane, mean(curve.points, length), seen_m, lit_m, segment)

@@ -1,0 +1,151 @@
+"""How the fingers move before the wrist camera: guided curls, study poses, spreads, and a minute of everything.
+
+A motion of stations goes from posture to posture (C2), holds each for a while and drifts all the time, as a hand in
+the air does. The palm pose of a state is that of the forearm in the room; the palm never moves in the camera's frame,
+since the device is strapped to the wrist.
+"""
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import HandModel
+from common.sim.motion import (
+    FIST,
+    PERIOD_S,
+    POSES,
+    REST,
+    Drift,
+    HandState,
+    angles_of,
+    base_pose,
+    smooth_step,
+)
+
+MOVE_S = 0.8  # at most: the way from one posture to the next
+CURL_S = 10.0  # there and back
+CURL_PIP_DEG = 110.0
+MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # row D8, Kamper's ratios
+THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
+FOREARM_TURN = np.radians(12.0)
+_HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
+_WIDE = ((34, -4, 0), (14, 8, 10), (0, 8, 10), (-12, 8, 10), (-15, 8, 10))
+_CLOSED = ((-6, 4, 6), (-6, 10, 14), (0, 10, 14), (4, 10, 14), (7, 10, 14))
+_ACROSS = ((4, 40, 40), (3, 10, 16), (0, 10, 17), (-4, 11, 18), (-9, 12, 19))
+_HOOK = ((8, 2, 6), (3, 12, 80), (0, 12, 82), (-4, 12, 80), (-9, 12, 76))
+
+Posture = tuple[tuple[float, ...], ...]
+
+
+def _alone(finger: int, share: float) -> Posture:
+    """One finger closed by a share, the others at rest."""
+    rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
+    rest[finger] += share * (fist[finger] - rest[finger])
+    return tuple(map(tuple, rest.tolist()))
+
+
+def _swung(degrees: float) -> Posture:
+    """Half-bent fingers swung sideways together, towards the thumb for positive degrees."""
+    return tuple((row[0] + (degrees if finger else 0.0), *row[1:]) for finger, row in enumerate(_HALF_BENT))
+
+
+_STANDARD: tuple[Posture, ...] = (
+    *(
+        REST,
+        FIST,
+        REST,
+        *(_alone(f, 0.9) for f in (1, 2, 3, 4, 0)),
+        _WIDE,
+        _CLOSED,
+        _WIDE,
+        REST,
+        _ACROSS,
+        REST,
+    ),
+    *(*POSES.values(), REST, _HOOK, REST, *(_alone(f, 0.5) for f in (4, 3, 2, 1)), _swung(9.0), _swung(-9.0)),
+    *(POSES["pinch"], REST, POSES["pinch"], POSES["large_grasp"], POSES["small_grasp"], REST, FIST),
+)
+_SPREAD: tuple[Posture, ...] = (
+    _HALF_BENT,
+    _WIDE,
+    _CLOSED,
+    *(_swung(d) for d in (10.0, -10.0, 5.0, -5.0)),
+    _CLOSED,
+)
+
+
+class Stations:
+    """Postures one after another, closed over 60 s. The state it holds is its script, fixed by the constructor."""
+
+    def __init__(self, model: HandModel, postures: tuple[Posture, ...], seed: int) -> None:
+        """Write the script: every posture is hit nearly, as people do.
+
+        Args:
+            model: Whose limits and coupling hold.
+            postures: (5, 3) each [deg]: abduction, flexion, PIP.
+            seed: Same seed, same motion.
+        """
+        rng = np.random.default_rng([seed, 11])
+        self._model, self._drift = model, Drift(rng)
+        self._postures = np.array(postures, dtype=np.float64)
+        self._postures += rng.normal(0.0, (1.0, 2.5, 4.0), self._postures.shape)
+        self._each_s = PERIOD_S / len(postures)
+        self._move_s = min(MOVE_S, 0.7 * self._each_s)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % PERIOD_S
+        place = min(int(t / self._each_s), len(self._postures) - 1)
+        share = smooth_step((t - place * self._each_s) / self._move_s)
+        before = self._postures[place - 1]  # that of the first is the last
+        posture = before + share * (self._postures[place] - before)
+        wobble, shift, turn = self._drift.at(t)
+        return HandState(_forearm(self._model, t, shift, turn), angles_of(self._model, posture, wobble))
+
+
+class GuidedCurl:
+    """All fingers curl slowly from straight to PIP 110 degrees and back, in the natural ratios of row D8."""
+
+    def __init__(self, model: HandModel) -> None:
+        """Of one hand; its limits do not cut what the ratios say."""
+        self._model = model
+        self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return CURL_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % CURL_S
+        share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / CURL_S)
+        pip = share * np.radians(CURL_PIP_DEG)
+        angles = np.zeros((5, 4))
+        angles[0] = self._open + share * (self._closed - self._open)
+        angles[1:, 1:] = MCP_PER_PIP * pip, pip, DIP_PER_PIP * pip
+        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+
+
+def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCurl | None:
+    """The motion of a scene's name; None: there is no such."""
+    if name == "curl":
+        return GuidedCurl(model)
+    rng = np.random.default_rng([seed, 12])
+    poses = tuple(POSES.values())
+    postures = {
+        "standard": _STANDARD,
+        "spread": _SPREAD * 3,
+        "poses": tuple(poses[k] for _ in range(4) for k in rng.permutation(len(poses))),
+    }
+    return Stations(model, postures[name], seed) if name in postures else None
+
+
+def _forearm(model: HandModel, t_s: float, shift_m: Float, turn_rad: Float) -> Float:
+    """Palm pose in the room (4, 4): the forearm turns slowly while the fingers move."""
+    slow = FOREARM_TURN * np.sin(2.0 * np.pi * t_s / (PERIOD_S / 6) + np.array([0.0, 2.1, 4.2]))
+    return base_pose(model, np.zeros(3), shift_m, slow - FOREARM_TURN * np.sin([0.0, 2.1, 4.2]) + turn_rad)

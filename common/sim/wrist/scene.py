@@ -1,0 +1,158 @@
+"""A wrist scene: hand, motion, light and device, as exact truth for every instant. Nothing in it remembers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, cast, get_args
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.calibration import CameraCalibration, HandProfile, RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError, PhalanxError
+from common.hand_model import HandJoints, HandModel
+from common.sim.motion import HandMotion
+from common.sim.scene import STANDARD_SEED, CameraTiming
+from common.sim.wrist.flesh import Flesh
+from common.sim.wrist.laser import LaserSheet, LineTruth
+from common.sim.wrist.motion import wrist_motion
+
+Ambient = Literal["dark", "indoor", "bright", "sun"]
+AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
+MOTIONS = ("standard", "curl", "poses", "spread")
+WRIST_NAMES = f"{' | '.join(MOTIONS)}, each with @{' | @'.join(AMBIENTS)}"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristTruth:
+    """Everything true of one instant, in the frame of the wrist camera; groups palm, thumb ... little, thenar.
+
+    Attributes:
+        t_s: The instant [s], scene time.
+        angles_rad: (5, 4).
+        joints: All joints, camera frame.
+        laser_uv: (7, 2) centroid [px] of the lit and seen part of the laser line, by its length in the image; NaN
+            where less than 0.2 mm of it is seen.
+        laser_pt: (7, 3) that pixel on the laser plane [m].
+        laser_xyz: (7, 3) centroid of the same part by its length in space [m].
+        laser_len_vis, laser_len_lit: (7,) length that is lit and seen, length that is lit [m].
+        laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
+        tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
+        tip_visible: (5,) whether the camera sees that point.
+    """
+
+    t_s: float
+    angles_rad: Float
+    joints: HandJoints
+    laser_uv: Float
+    laser_pt: Float
+    laser_xyz: Float
+    laser_len_vis: Float
+    laser_len_lit: Float
+    laser_seg: Int
+    tip_xyz: Float
+    tip_uv: Float
+    tip_visible: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristScene:
+    """Hand, motion, light and the device that looks at it. The frame of the rig is that of its camera.
+
+    Attributes:
+        rig: Laser, LEDs, palm pose.
+        cameras: Camera name -> its file.
+        model: The hand.
+        motion: How it moves; its `T_rig_palm` is the forearm's way through the room, which an IMU feels.
+        ambient: The light of the room.
+        seed: Of flesh, skin, room and noise.
+        optics: The camera.
+        flesh: The hand's surface.
+        sheet: The laser.
+        T_camera_palm: (4, 4) [m].
+    """
+
+    rig: RigCalibration
+    cameras: Mapping[str, CameraCalibration]
+    model: HandModel
+    motion: HandMotion
+    ambient: Ambient = "indoor"
+    seed: int = STANDARD_SEED
+    optics: CameraModel = field(init=False)
+    flesh: Flesh = field(init=False)
+    sheet: LaserSheet = field(init=False)
+    T_camera_palm: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        where = f"rig {self.rig.name!r}"
+        if self.rig.kind != "wrist":
+            raise CalibrationError(f"{where}: kind is {self.rig.kind!r}; a wrist scene needs 'wrist'")
+        name = self.rig.cameras[0]
+        if name not in self.cameras:
+            raise CalibrationError(f"{where}: cameras: no camera file for {name!r}")
+        for key in ("laser_plane", "laser", "T_camera_palm", "led"):
+            if not getattr(self.rig, key):
+                raise CalibrationError(f"{where}: {key}: missing; a wrist device is simulated as it is built")
+        optics = CameraModel.of(self.cameras[name], np.eye(4))
+        object.__setattr__(self, "optics", optics)
+        object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))
+        object.__setattr__(self, "flesh", Flesh.of(self.model, self.seed))
+        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, optics, self.flesh, self.joints_at(0.0)))
+
+    @classmethod
+    def by_name(
+        cls,
+        name: str,
+        rig: RigCalibration,
+        cameras: Mapping[str, CameraCalibration],
+        hand: HandProfile,
+        seed: int = STANDARD_SEED,
+    ) -> "WristScene":
+        """The scene called MOTION or MOTION@AMBIENT.
+
+        Raises:
+            PhalanxError: No such motion or light; a rig, camera or hand that does not fit.
+        """
+        moves, _, ambient = name.partition("@")
+        model = HandModel.of(hand)
+        motion = wrist_motion(moves, model, seed)
+        if motion is None or (ambient or "indoor") not in AMBIENTS:
+            raise PhalanxError(f"scene {name!r}: for a wrist rig there are {WRIST_NAMES}")
+        return cls(rig, cameras, model, motion, cast(Ambient, ambient or "indoor"), seed)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the scene repeats."""
+        return self.motion.period_s
+
+    def timing(self, camera: str) -> CameraTiming:
+        """How the camera's frames lie in time: there is one, and its clock is right."""
+        self.rig.cameras.index(camera)
+        return CameraTiming(0, 0.0)
+
+    def joints_at(self, t_s: float) -> HandJoints:
+        """The joints at scene time `t_s` [s], camera frame."""
+        return self.model.forward(self.T_camera_palm, self.motion.at(t_s).angles_rad)
+
+    def truth(self, t_s: float) -> WristTruth:
+        """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
+        angles = self.motion.at(t_s).angles_rad
+        joints = self.model.forward(self.T_camera_palm, angles)
+        bodies = self.flesh.bodies(joints)
+        line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
+        tips, along = self.flesh.tips(bodies)
+        faces = np.einsum("ij,ij->i", along, tips) < 0.0
+        return WristTruth(
+            t_s,
+            angles,
+            joints,
+            line.uv,
+            line.plane_m,
+            line.centroid_m,
+            line.seen_m,
+            line.lit_m,
+            line.segment,
+            tips,
+            self.optics.project(tips),
+            faces & self.sheet.seen(bodies, tips),
+        )
