@@ -13,9 +13,10 @@ from common.sim.board import BoardScene
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
 from common.sim.scenes import view_by_name
+from common.sim.wrist.scene import WristScene
 
 
-def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene:
+def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:
     """The scene `name` before the cameras of a rig, from the files of a calib_json tree.
 
     Raises:
@@ -34,7 +35,7 @@ def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed:
         PhalanxError: As `scene_of`, and `SimulatedImu.of`.
     """
     scene = scene_of(calibration, rig, name, seed) if camera == "synthetic" else None
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, Scene | WristScene):
         raise CameraError(
             f"--imu: only a hand before a synthetic camera has one, not {camera} with scene {name}"
         )

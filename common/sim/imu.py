@@ -17,6 +17,7 @@ from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
 from common.sim.scene import Scene
+from common.sim.wrist.scene import WristScene
 
 _NEW_SHARE = 0.25  # of the standard deviation, new in every sample
 _HALF_STEP_S = 1e-3  # for rates and accelerations
@@ -55,7 +56,7 @@ class SimulatedImu:
         return self._rig_world[:, 2]
 
     @classmethod
-    def of(cls, scene: Scene) -> "SimulatedImu":
+    def of(cls, scene: Scene | WristScene) -> "SimulatedImu":
         """The IMU of a scene's rig.
 
         Raises:

@@ -5,6 +5,9 @@ Frame k is exposed when the camera's own oscillator, which is the slave's (perha
 picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame rate loses
 frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
 
+The camera of a wrist device is lit in turn: frame k by what k modulo 3 says. There a slow process loses whole cycles,
+for of a strobe whose single frames are lost no triple would ever be whole.
+
 The lamp of the simulated room is such that the settings of the camera file at the start expose it well. Exposure and
 gains that are changed later make the picture brighter or darker against that, and the exposure smears more or less.
 """
@@ -13,18 +16,23 @@ import time
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
+import cv2
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from common.camera_settings import figures
 from common.clock import Clock
 from common.errors import CameraError
+from common.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.scene import Scene
 from common.sim.scenes import renderer_of
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
 from slave.cameras.source import Frame
 
+STROBE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)  # of a wrist device, frame by frame
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
 
 
@@ -42,7 +50,7 @@ class SyntheticCamera:
 
     def __init__(
         self,
-        scene: Scene | BoardScene,
+        scene: Scene | BoardScene | WristScene,
         camera_name: str,
         epoch_ns: int,
         clock: Clock,
@@ -72,6 +80,8 @@ class SyntheticCamera:
         self._first_ns = self._own(epoch_ns + start_offset_ns)
         self._rate_hz = camera.frame_rate_hz
         self._rows_ns = camera.height_px * camera.row_time_us * 1e3
+        self._grey = scene.rig.kind == "wrist"
+        self._cycle = len(STROBE) if isinstance(scene, WristScene) else 1
         self._next = 0
         self._started = False
         self._closed = False
@@ -83,12 +93,12 @@ class SyntheticCamera:
             return None
         seq = self._due_next()
         t_ns = self._exposed_ns(seq)
-        image = self._renderer.render((self._true_ns(t_ns) - self._epoch_ns) * 1e-9)
+        image, lit = self._draw(seq, (self._true_ns(t_ns) - self._epoch_ns) * 1e-9)
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
         while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
             self._sleep(min(left_s, STEP_S))
-        return Frame(seq, t_ns, self._clock.now_ns(), image)
+        return Frame(seq, t_ns, self._clock.now_ns(), image, lit)
 
     def close(self) -> None:
         """End the stream."""
@@ -116,19 +126,34 @@ class SyntheticCamera:
         """`camera.skipped`: frames that this process was too slow to draw; they count as dropped, too."""
         return {"camera.skipped": self.skipped}
 
+    def _draw(self, seq: int, t_s: float) -> tuple[Image, Illumination]:
+        """Frame `seq` at scene time `t_s` [s], and what lit it."""
+        if isinstance(self._renderer, WristRenderer):
+            lit = STROBE[seq % len(STROBE)]
+            return self._renderer.render(t_s, lit), lit
+        image = self._renderer.render(t_s)
+        if self._grey:
+            image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
+        return image, Illumination.AMBIENT
+
     @property
     def _readout_ns(self) -> int:
         """From the middle of the exposure of row 0 to the last row's read-out [ns]."""
         return round(self._camera.exposure_us * 500.0 + self._rows_ns)
 
     def _due_next(self) -> int:
-        """Number of the next frame: the one after the last, or the first that is not yet read out."""
+        """Number of the next frame: the one after the last, or the first that is not yet read out.
+
+        A cycle of a strobe that has begun is brought to its end, late or not.
+        """
         late_ns = self._clock.now_ns() - self._readout_ns - self._exposed_ns(self._next)
         period_ns = 1e9 / self._rate_hz
-        if late_ns <= (0.5 * period_ns if self._started else 0.0):
+        begun = self._started and self._next % self._cycle != 0
+        if begun or late_ns <= (0.5 * period_ns if self._started else 0.0):
             self._started = True
             return self._next
         seq = self._next + int(late_ns // period_ns) + 1
+        seq += -seq % self._cycle
         if self._started:
             self.skipped += seq - self._next
         self._started = True
