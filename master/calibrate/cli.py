@@ -11,6 +11,7 @@ from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
 from master.calibrate.time.commands import time_command
+from master.calibrate.wrist.laser_command import laser_plane
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "board": board,
@@ -21,6 +22,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "verify": verify_command,
     "time": time_command,
     "hand": hand_command,
+    "laser-plane": laser_plane,
 }
 
 

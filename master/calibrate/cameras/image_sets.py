@@ -10,7 +10,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import RecordingError
-from common.frame_recording import MANIFEST, open_recording
+from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
 from master.calibrate.cameras.views import ImageSet
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -108,11 +108,21 @@ def _load(file: Path) -> Image:
     return image.astype(np.uint8, copy=False)
 
 
+def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:
+    """The frames that show a board: of strobed ones those with the LEDs on, which are there in the dark too, and no
+    second frame of the same moment; never those with a laser's line across the corners."""
+    lit = {row.illumination for row in rows}
+    for best in (Illumination.LED, Illumination.AMBIENT):
+        if best in lit:
+            return [row for row in rows if row.illumination is best]
+    return [row for row in rows if row.illumination is Illumination.NONE]
+
+
 def _of_recording(folder: Path, cameras: Sequence[str]) -> list[tuple[str, ImageSet]]:
     """Views evenly over a recording: frames of the first camera, with those of the others nearest in time."""
     recording = open_recording(folder)
     names = list(cameras) or list(recording.manifest.cameras)
-    rows = {name: recording.frames_of(name) for name in names}
+    rows = {name: _showing(recording.frames_of(name)) for name in names}
     for name, own in rows.items():
         if not own:
             raise RecordingError(f"{folder}: camera {name!r} has no frame")

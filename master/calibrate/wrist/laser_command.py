@@ -1,0 +1,162 @@
+"""`phalanx-master calibrate laser-plane`: the laser's plane in the wrist camera's frame, from views of a board."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from msgspec.structs import replace
+
+from common.calibration import RigCalibration
+from common.camera_model import CameraModel
+from common.errors import FitError
+from common.frame_recording import Illumination
+from master.calibrate.cameras.boards import Board
+from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.line import line_on_board
+from master.calibrate.wrist.lit_views import LitView, lit_views
+from master.calibrate.wrist.placed import placed_board
+from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
+from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
+from master.summary import write_summary
+
+Source = Annotated[
+    Path,
+    typer.Argument(
+        help="A recording, or a folder of VIEW_ambient.png, VIEW_laser.png and, if there are, VIEW_led.png.",
+        show_default=False,
+    ),
+]
+Picture = Annotated[
+    Path | None, typer.Option(help="Write a picture of the lines and what is left of them to this .png.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class LinesSeen:
+    """Lines of the views that show one, and the reason of every other view."""
+
+    lines: tuple[ViewLine, ...]
+    refused: tuple[str, ...]
+
+
+def laser_plane(
+    source: Source,
+    board: Size,
+    square_mm: SquareMm,
+    marker_mm: MarkerMm = None,
+    dictionary: Dictionary = "4X4_50",
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    out: ResultTree = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+) -> None:
+    """Measure the plane of a wrist device's laser, from ten views of a board that the laser crosses.
+
+    Hold the board still for each view, at 15 to 35 cm, near and far and tilted every way, so that the line runs over
+    it. Views with the line elsewhere are left out, each with the reason. Nothing is written without --out.
+
+    Examples:
+
+      phalanx-master calibrate laser-plane RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
+
+      phalanx-master calibrate laser-plane images --board 9x6 --square-mm 15 --rig wrist --picture plane.png
+    """
+    device = device_of(source, rig, calibration, out)
+    views = lit_views(source, device.camera.name, Illumination.LASER)
+    seen = lines_of(views, board_of(board, square_mm, marker_mm, dictionary), device.optics)
+    try:
+        fit = fit_plane(seen.lines)
+    except FitError as error:
+        reasons = "".join(f"\n  {reason}" for reason in seen.refused)
+        raise FitError(f"{source}: {error}{reasons}") from error
+    say(report_lines(fit, seen, len(views)))
+    if picture is not None:
+        from master.calibrate.wrist.picture import draw_plane  # matplotlib takes a second to import
+
+        draw_plane(picture, fit, seen.lines, device.optics)
+        typer.echo(f"drew {picture}")
+    written = write_device(out, device, rig_with_plane(device, fit), "laser_plane")
+    if json_file is not None:
+        told = report_json(fit, seen) | {"written": None if written is None else str(written)}
+        write_summary(json_file, told)
+
+
+def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> LinesSeen:
+    """The laser's line on the board of every view.
+
+    Raises:
+        RecordingError: An image cannot be read.
+    """
+    focal = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
+    lines: list[ViewLine] = []
+    refused: list[str] = []
+    for view in views:
+        laser, ambient = view.load(Illumination.LASER), view.load(Illumination.AMBIENT)
+        assert laser is not None  # `lit_views` gives whole ones
+        assert ambient is not None
+        try:
+            placed = placed_board(view, board, optics)
+            if laser.shape != ambient.shape:
+                raise FitError("its frames differ in size")
+            line = line_on_board(laser, ambient, placed, board, optics)
+        except FitError as error:
+            refused.append(f"view {view.name}: {error}")
+            continue
+        lines.append(ViewLine.of(view.name, line, placed, focal))
+    return LinesSeen(tuple(lines), tuple(refused))
+
+
+def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
+    """The result for a person."""
+    x, y, z = fit.plane.normal
+    used = int(fit.used.sum())
+    points = sum(len(line.points_m) for line, own in zip(seen.lines, fit.used, strict=True) if own)
+    lines = [
+        f"laser plane from {points} points in {used} of {views} views, {1e3 * fit.rms_m:.3f} mm rms from it",
+        f"  normal {x:+.5f} {y:+.5f} {z:+.5f}  ± {np.degrees(fit.normal_sigma_rad):.3f} deg",
+        f"  offset {1e3 * fit.plane.offset_m:.3f} ± {1e3 * fit.offset_sigma_m:.3f} mm",
+    ]
+    wrong = [
+        f"view {line.name}: {1e3 * off:.2f} mm off the plane of the others"
+        for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
+        if not own
+    ]
+    left_out = [*seen.refused, *wrong]
+    if left_out:
+        lines += [f"left out ({len(left_out)}):", *(f"  {reason}" for reason in left_out)]
+    return lines
+
+
+def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
+    """The same for programs."""
+    return {
+        "normal": list(fit.plane.normal),
+        "offset_mm": 1e3 * fit.plane.offset_m,
+        "normal_sigma_deg": round(float(np.degrees(fit.normal_sigma_rad)), 6),
+        "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 6),
+        "covariance_normal_offset_m": fit.covariance.tolist(),
+        "rms_mm": round(1e3 * fit.rms_m, 6),
+        "views": {
+            line.name: {"rms_mm": round(1e3 * float(off), 6), "used": bool(own), "points": len(line.points_m)}
+            for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
+        },
+        "refused": list(seen.refused),
+    }
+
+
+def rig_with_plane(device: Device, fit: PlaneFit) -> RigCalibration:
+    """The device's rig with the new plane and where it comes from."""
+    residual = {
+        "rms_mm": round(1e3 * fit.rms_m, 4),
+        "normal_sigma_deg": round(float(np.degrees(fit.normal_sigma_rad)), 4),
+        "offset_sigma_mm": round(1e3 * fit.offset_sigma_m, 4),
+    }
+    note = f"{int(fit.used.sum())} of {len(fit.used)} views of a board"
+    how = provenance("calibrate laser-plane", (device.source,), residual, note)
+    rig = device.rig
+    return replace(rig, laser_plane=fit.plane, provenance=rig.provenance | {"laser_plane": how})

@@ -1,0 +1,112 @@
+"""Strobed views of a thing held still: the frames of one moment by what lit them, from a recording or from images."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.errors import RecordingError
+from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+
+MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+_NAMED = re.compile(r"(.*?)[-_ .]?(ambient|laser|led)", re.IGNORECASE)
+_APART = 2  # rows: frames of one strobed triple
+
+
+@dataclass(frozen=True, slots=True)
+class LitView:
+    """The frames of one moment.
+
+    Attributes:
+        name: How the view is called in reports: the number of its first frame, or what its files have in common.
+        frames: What lit it -> how to load the frame (H, W), 8 bits.
+    """
+
+    name: str
+    frames: Mapping[Illumination, Callable[[], Image]]
+
+    def load(self, lit: Illumination) -> Image | None:
+        """One of its frames; None where there is none of this kind.
+
+        Raises:
+            RecordingError: The file cannot be read, or is no image.
+        """
+        return self.frames[lit]() if lit in self.frames else None
+
+
+def lit_views(folder: Path, camera: str, needed: Illumination) -> tuple[LitView, ...]:
+    """Views that have an ambient frame and one lit by `needed`, evenly over the source, at most 60.
+
+    Args:
+        folder: A recording whose frames.csv says what lit each frame, or images named VIEW_ambient.png, VIEW_laser.png,
+            VIEW_led.png.
+        camera: Camera of the recording.
+        needed: Laser or LED.
+
+    Raises:
+        RecordingError: No such folder, or no such frames; the text says what is expected.
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"{folder}: is not a folder")
+    views = _recorded(folder, camera) if (folder / MANIFEST).is_file() else _named(folder)
+    whole = [view for view in views if {Illumination.AMBIENT, needed} <= view.frames.keys()]
+    if not whole:
+        raise RecordingError(
+            f"{folder}: no frame lit by the {needed} with an ambient one beside it: a recording says in frames.csv"
+            f" what lit each frame; images are named VIEW_ambient.png, VIEW_{needed}.png"
+        )
+    chosen = np.unique(np.linspace(0, len(whole) - 1, min(MOST_VIEWS, len(whole))).round().astype(int))
+    return tuple(whole[int(i)] for i in chosen)
+
+
+def _recorded(folder: Path, camera: str) -> list[LitView]:
+    """One view for each ambient frame, with the frames lit otherwise that follow within a triple."""
+    rows = open_recording(folder).frames_of(camera)
+    if not rows:
+        raise RecordingError(f"{folder}: camera {camera!r} has no frame")
+    views: list[LitView] = []
+    for i, row in enumerate(rows):
+        if row.illumination is not Illumination.AMBIENT:
+            continue
+        triple: dict[Illumination, FrameRow] = {row.illumination: row}
+        for near in rows[i + 1 : i + 1 + _APART]:
+            if near.illumination is Illumination.AMBIENT or near.seq - row.seq > _APART:
+                break
+            triple.setdefault(near.illumination, near)
+        views.append(
+            LitView(str(row.seq), {lit: partial(load_grey, folder / one.file) for lit, one in triple.items()})
+        )
+    return views
+
+
+def _named(folder: Path) -> list[LitView]:
+    """Images by their names."""
+    found: dict[str, dict[Illumination, Callable[[], Image]]] = {}
+    for file in sorted(folder.iterdir()):
+        match = _NAMED.fullmatch(file.stem)
+        if match is not None and file.suffix.lower() in _ENDINGS:
+            found.setdefault(match[1], {})[Illumination(match[2].lower())] = partial(load_grey, file)
+    return [LitView(name or "0", frames) for name, frames in found.items()]
+
+
+def load_grey(file: Path) -> Image:
+    """An image (H, W), 8 bits.
+
+    Raises:
+        RecordingError: The file cannot be read, or is no image.
+    """
+    # Through numpy, because imread takes no name outside the locale's letters, and says nothing of the reason.
+    try:
+        raw = file.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
+    image = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if raw else None
+    if image is None:
+        raise RecordingError(f"{file}: is no image")
+    return image.astype(np.uint8, copy=False)

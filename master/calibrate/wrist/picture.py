@@ -1,0 +1,63 @@
+"""Pictures of what was measured of a wrist device: lines on boards, light of the LEDs, curls of the fingers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from common.camera_model import CameraModel
+from common.errors import RecordingError
+from common.replacing import replacing
+from master.calibrate.wrist.plane import PlaneFit, ViewLine
+
+_BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
+
+
+def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
+    """Lines in the image; from above, in the plane; and each view's distance from the plane. PNG.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = _figure((15.0, 4.6))
+    figure.suptitle(
+        f"laser plane: normal ± {np.degrees(fit.normal_sigma_rad):.3f} deg,"
+        f" offset {1e3 * fit.plane.offset_m:.2f} ± {1e3 * fit.offset_sigma_m:.3f} mm, rms {1e3 * fit.rms_m:.3f} mm"
+    )
+    image, above, bars = figure.subplots(1, 3)
+    _frame(image, optics, "lines in the image")
+    normal = np.array(fit.plane.normal)
+    for line, own in zip(lines, fit.used, strict=True):
+        colour = _BLUE if own else _ORANGE
+        uv = optics.project(line.points_m)
+        image.plot(uv[:, 0], uv[:, 1], ".", markersize=2, color=colour)
+        above.plot(1e3 * line.points_m[:, 0], 1e3 * line.points_m[:, 2], ".", markersize=2, color=colour)
+    above.set(title="lines from above [mm]; camera at 0, 0", xlabel="x", ylabel="z", aspect="equal")
+    above.plot([0.0], [0.0], "^", color=_GREY)
+    off = [1e3 * float(np.mean(line.points_m @ normal - fit.plane.offset_m)) for line in lines]
+    bars.bar(range(len(lines)), off, color=[_BLUE if own else _ORANGE for own in fit.used])
+    bars.axhline(0.0, color=_GREY, linewidth=0.8)
+    bars.set(title="view's distance from the plane [mm]; orange: left out")
+    bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
+    _save(figure, path)
+
+
+def _figure(size: tuple[float, float]) -> Figure:
+    figure = Figure(figsize=size, dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _frame(axes: Axes, optics: CameraModel, title: str) -> None:
+    axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
+
+
+def _save(figure: Figure, path: Path) -> None:
+    try:
+        with replacing(path) as file:
+            figure.savefig(file, format="png")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write the picture: {error.strerror}") from error

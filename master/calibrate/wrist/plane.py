@@ -1,0 +1,244 @@
+"""The laser's plane through its lines on boards: weighted least squares over views, wrong ones left out.
+
+Every view gives one straight line in space; how far it lies off a plane is two numbers (two points of it with the
+spread of all its points). Their covariance is that of the board's pose, which all points of a view share, and of the
+line's place in the image; so a thousand points of one view do not count as a thousand. A plane is told by lines that
+are not all the same one (three points that are not collinear); how well, the covariance says, and what it does not
+tell to a tenth of a degree and of a millimetre is refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.errors import FitError
+from common.geometry import cross
+from common.wrist_calibration import LaserPlane
+from master.calibrate.wrist.line import BoardLine
+from master.calibrate.wrist.placed import PlacedBoard
+
+MIN_VIEWS = 3
+NORMAL_LIMIT_RAD = np.radians(0.1)
+OFFSET_LIMIT_M = 1e-4
+_MOST_PAIRS = 300
+_WRONG_CHI2 = 22.0  # of two degrees of freedom: one in 60 000
+_WRONG_M = 1.5e-4  # a view that is less off than this is not wrong, however sure it claims to be
+_MODEL_M = 1e-5  # what lens and paper add to every view that neither covariance knows
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewLine:
+    """One view's line in space.
+
+    Attributes:
+        name: Of the view.
+        points_m: (n, 3) [m], camera frame.
+        ends_m: (2, 3) two points of the line with the mean and the spread of all.
+        placed: The board it lies on.
+        sigma_px: How sure the line's place in the image is.
+        focal_px: Of the camera.
+    """
+
+    name: str
+    points_m: Float
+    ends_m: Float
+    placed: PlacedBoard
+    sigma_px: float
+    focal_px: float
+
+    @classmethod
+    def of(cls, name: str, line: BoardLine, placed: PlacedBoard, focal_px: float) -> "ViewLine":
+        """Reduce a line to two points."""
+        mean = line.points_m.mean(axis=0)
+        _, sizes, axes = np.linalg.svd(line.points_m - mean, full_matrices=False)
+        spread = sizes[0] / np.sqrt(len(line.points_m)) * axes[0]
+        return cls(
+            name, line.points_m, np.stack([mean - spread, mean + spread]), placed, line.sigma_px, focal_px
+        )
+
+    def covariance(self, normal: Float) -> Float:
+        """(2, 2) [m^2] of the distances of both ends from a plane with this normal.
+
+        A board that turns or shifts moves a point along its ray: X' = X (1 + (b . shift + turn . (d x b)) / b . X),
+        with b the board's normal and d = X - centre.
+        """
+        facing = self.placed.T_camera_board[:3, 2]
+        d = self.ends_m - self.placed.centre_m
+        share = (self.ends_m @ normal) / (self.ends_m @ facing)
+        board = np.broadcast_to(facing, d.shape)
+        by_pose = share[:, None] * np.concatenate([cross(d, board), board], axis=1)
+        own = self.sigma_px * self.ends_m[:, 2] / self.focal_px
+        return by_pose @ self.placed.covariance @ by_pose.T + np.diag(own**2 + _MODEL_M**2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneFit:
+    """A measured laser plane.
+
+    Attributes:
+        plane: normal . X = offset, offset positive.
+        covariance: (4, 4) of normal and offset [m]; of the normal only across itself.
+        rms_m: Distance of the used points from the plane.
+        used: (views,) the views it is from.
+        off_m: (views,) rms distance of each view's points.
+    """
+
+    plane: LaserPlane
+    covariance: Float
+    rms_m: float
+    used: Bool
+    off_m: Float
+
+    @property
+    def normal_sigma_rad(self) -> float:
+        """Standard deviation of the normal in the direction in which it is least sure [rad]."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def offset_sigma_m(self) -> float:
+        """Standard deviation of the offset [m]."""
+        return float(np.sqrt(self.covariance[3, 3]))
+
+
+def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
+    """The plane through the lines of at least three views.
+
+    Raises:
+        FitError: Too few views, too few that agree, or lines that tell no plane, or not well enough; the text says what
+            to do.
+    """
+    if len(views) < MIN_VIEWS:
+        raise FitError(
+            f"the line is seen on the board in {len(views)} views, at least {MIN_VIEWS} are needed (better 10), each"
+            " with the board at another distance and tilt"
+        )
+    normal, offset = _consensus(views)
+    used = np.ones(len(views), dtype=np.bool_)
+    cov = np.eye(4)
+    for _ in range(6):
+        normal, offset, cov = _least_squares([v for v, own in zip(views, used, strict=True) if own], normal)
+        chi2 = np.array([_chi2(view, normal, offset) for view in views])
+        off = np.array([_off(view, normal, offset) for view in views])
+        # The covariances may be small by a common factor: a wrong view is one that strays more than most.
+        times = max(1.0, float(np.median(chi2)) / 1.386)
+        good = (chi2 < _WRONG_CHI2 * times) | (off < _WRONG_M)
+        if (good == used).all():
+            break
+        used = good
+        if used.sum() < max(MIN_VIEWS, (len(views) + 1) // 2):
+            raise FitError(
+                f"only {int(used.sum())} of {len(views)} views agree on one plane: is the laser fixed to the camera,"
+                " and the board flat? Views with the line on something else than the board must be taken anew"
+            )
+    cov = cov * max(1.0, _reduced(views, used, normal, offset))
+    off = np.array([_off(view, normal, offset) for view in views])
+    points = np.concatenate([view.points_m for view, own in zip(views, used, strict=True) if own])
+    rms = float(np.sqrt(np.mean((points @ normal - offset) ** 2)))
+    fit = PlaneFit(LaserPlane(normal=_vector(normal), offset_m=round(float(offset), 9)), cov, rms, used, off)
+    _refuse_unsure(fit, points)
+    return fit
+
+
+def _consensus(views: Sequence[ViewLine]) -> tuple[Float, float]:
+    """Normal and offset of the plane through two of the lines with which most of the others agree."""
+    pairs: list[tuple[int, int]] = list(combinations(range(len(views)), 2))
+    if len(pairs) > _MOST_PAIRS:
+        chosen = np.random.default_rng(0).choice(len(pairs), _MOST_PAIRS, replace=False)
+        pairs = [pairs[int(i)] for i in chosen]
+    best, cost = (np.array([0.0, 1.0, 0.0]), 0.0), np.inf
+    for i, j in pairs:
+        normal, offset = _through(np.concatenate([views[i].ends_m, views[j].ends_m]))
+        own = sum(min(_chi2(view, normal, offset), _WRONG_CHI2) for view in views)
+        if own < cost:
+            best, cost = (normal, offset), own
+    return best
+
+
+def _through(points: Float) -> tuple[Float, float]:
+    """Plane of least squares through points (n, 3); offset positive."""
+    mean = points.mean(axis=0)
+    normal = np.linalg.svd(points - mean)[2][2]
+    normal = normal * (1.0 if normal @ mean >= 0 else -1.0)
+    return normal, float(normal @ mean)
+
+
+def _chi2(view: ViewLine, normal: Float, offset: float) -> float:
+    off = view.ends_m @ normal - offset
+    return float(off @ np.linalg.solve(view.covariance(normal), off))
+
+
+def _off(view: ViewLine, normal: Float, offset: float) -> float:
+    return float(np.sqrt(np.mean((view.points_m @ normal - offset) ** 2)))
+
+
+def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float) -> float:
+    """Chi square per degree of freedom."""
+    total = sum(_chi2(view, normal, offset) for view, own in zip(views, used, strict=True) if own)
+    return total / max(2.0 * float(used.sum()) - 3.0, 1.0)
+
+
+def _least_squares(views: Sequence[ViewLine], normal: Float) -> tuple[Float, float, Float]:
+    """Normal, offset and their covariance (4, 4), by Gauss and Newton on the turn of the normal and the offset."""
+    middle = np.concatenate([view.ends_m for view in views]).mean(axis=0)
+    level = float(normal @ middle)
+    tangents, cov3 = np.eye(3)[:, :2], np.eye(3)
+    for _ in range(6):
+        tangents = np.linalg.svd(normal[None])[2][1:].T
+        information, pull = np.zeros((3, 3)), np.zeros(3)
+        for view in views:
+            arm = view.ends_m - middle
+            off = arm @ normal - (level - normal @ middle)
+            # By turn of the normal and shift of the plane; about the middle the two hardly depend on each other.
+            jacobian = np.concatenate([arm @ tangents, -np.ones((2, 1))], axis=1)
+            weight = np.linalg.inv(view.covariance(normal))
+            information += jacobian.T @ weight @ jacobian
+            pull -= jacobian.T @ weight @ off
+        scale = 1.0 / np.sqrt(np.diag(information))
+        values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+        if values[0] < 1e-9:
+            raise FitError(_collinear(0.0))
+        cov3 = (vectors / values) @ vectors.T * np.outer(scale, scale)
+        step = cov3 @ pull
+        shift = level - normal @ middle + step[2]
+        normal = normal + tangents @ step[:2]
+        normal = normal / np.linalg.norm(normal)
+        level = float(normal @ middle) + shift
+    to4 = np.zeros((4, 3))
+    to4[:3, :2] = tangents
+    to4[3] = np.append(middle @ tangents, 1.0)
+    if level < 0.0:
+        return -normal, -level, to4 @ cov3 @ to4.T
+    return normal, level, to4 @ cov3 @ to4.T
+
+
+def _refuse_unsure(fit: PlaneFit, points: Float) -> None:
+    """Refuse what does not tell the plane as well as it is needed.
+
+    Raises:
+        FitError: All points on one line, or too uncertain.
+    """
+    if fit.normal_sigma_rad <= NORMAL_LIMIT_RAD and fit.offset_sigma_m <= OFFSET_LIMIT_M:
+        return
+    wide = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) / np.sqrt(len(points))
+    if wide[1] < max(5.0 * fit.rms_m, 0.1 * wide[0]):
+        raise FitError(_collinear(wide[1]))
+    raise FitError(
+        f"the plane is known to {np.degrees(fit.normal_sigma_rad):.2f} deg and {1e3 * fit.offset_sigma_m:.2f} mm only"
+        f" (limits {np.degrees(NORMAL_LIMIT_RAD):.1f} deg, {1e3 * OFFSET_LIMIT_M:.1f} mm): show the board in more"
+        " views, nearer and farther, so large that it fills a third of the image"
+    )
+
+
+def _collinear(wide_m: float) -> str:
+    return (
+        f"all points of the laser lie on one line (they spread {1e3 * wide_m:.1f} mm across it): no plane is told;"
+        " hold the board at other distances too, and turn it, so that the line falls elsewhere"
+    )
+
+
+def _vector(value: Float) -> tuple[float, float, float]:
+    x, y, z = (round(float(number), 9) for number in value)
+    return x, y, z
