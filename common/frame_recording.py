@@ -70,6 +70,19 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     note: str = ""
     clock: RecordedClock | None = None
 
+    def rig_named(self, name: str | None) -> RigCalibration:
+        """The rig called `name`; None: the marker rig, or the wrist rig where there is no other.
+
+        Raises:
+            RecordingError: There is no such rig.
+        """
+        rigs = [rig for rig in (self.rig, *self.rigs) if rig is not None]
+        wanted = [rig for rig in rigs if name in (None, rig.name)]
+        if not wanted:
+            known = ", ".join(rig.name for rig in rigs) or "none"
+            raise RecordingError(f"{MANIFEST}: no rig {name or ''!r}; it has {known}")
+        return min(wanted, key=lambda rig: rig.kind != "markers")
+
     def marker_rig(self) -> RigCalibration:
         """The marker rig of this recording.
 

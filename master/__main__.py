@@ -18,6 +18,7 @@ from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
 from common.sim.scenes import NAMES, scene_by_name
+from common.sim.wrist.scene import WRIST_NAMES, WristScene
 from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
@@ -49,7 +50,7 @@ _TRY_AGAIN_S = 0.3
 
 @app.callback()
 def phalanx_master() -> None:
-    """Turn the detections of several cameras into one hand of 26 joints.
+    """Turn the detections of several cameras, or of a wrist device, into one hand of 26 joints.
 
     `phalanx-master COMMAND --help` shows its examples.
     """
@@ -78,6 +79,8 @@ def run(
 
       phalanx-master run --rig desk
 
+      phalanx-master run --rig wrist
+
       phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
     """
     setup = load_setup(calibration, rig, hand)
@@ -102,6 +105,13 @@ def solve_command(
         Path | None, typer.Option(help="Folder whose hands/ holds the rig's hand.")
     ] = None,
     hand: Hand = None,
+    rig_name: Annotated[
+        str | None,
+        typer.Option(
+            "--rig",
+            help="Which rig of the recording; default: of markers, or the wrist device where that is all.",
+        ),
+    ] = None,
 ) -> None:
     """Solve recorded detections offline and deterministically: no clock, no network.
 
@@ -110,7 +120,7 @@ def solve_command(
       phalanx-master solve RECORDING --detections DIR --out DIR
     """
     opened = open_recording(recording)
-    rig = opened.manifest.marker_rig()
+    rig = opened.manifest.rig_named(rig_name)
     setup = RigSetup.of(rig, opened.manifest.cameras, load_hand(calibration, rig.hand, hand))
     out.mkdir(parents=True, exist_ok=True)
     solve(opened, setup, detections, out, lambda done, total: _progress("solving", done, total))
@@ -168,7 +178,7 @@ def report(
         int, typer.Option(help="Scene time 0 on this machine's monotonic clock, in ns.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
-    scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}.")] = "standard",
+    scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}; of a wrist rig: {WRIST_NAMES}.")] = "standard",
     seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
     rig: Rig = "desk",
     calibration: Calibration = CALIB_JSON,
@@ -185,7 +195,8 @@ def report(
     from master.report import report_scene
 
     setup = load_setup(calibration, rig)
-    played = scene_by_name(scene, setup.rig, setup.cameras, setup.hand.profile, seed)
+    find = scene_by_name if setup.wrist is None else WristScene.by_name
+    played = find(scene, setup.rig, setup.cameras, setup.hand.profile, seed)
     figures = {} if summary is None else read_summary(summary)
     out.mkdir(parents=True, exist_ok=True)
     full = report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)

@@ -9,7 +9,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.clock import Clock
-from common.messages import Health, ImuSample, MarkerDetections
+from common.messages import Detections, Health, ImuSample
 from master.outputs.sink import Sink
 from master.rates import CameraRates
 from master.stereo.pipeline import SolvedPose
@@ -21,15 +21,15 @@ _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour wo
 class Source(Protocol):
     """Where detections and samples come from: the network, or a test."""
 
-    def get(self, timeout_s: float) -> MarkerDetections | ImuSample | None:
+    def get(self, timeout_s: float) -> Detections | ImuSample | None:
         """The next message, or None when none came in time."""
         ...
 
 
 class Solver(Protocol):
-    """What makes poses of detections; a `MarkerPipeline`, or a `LivePipeline`."""
+    """What makes poses of detections; the `Pipeline` of a rig, or a `LivePipeline`."""
 
-    def push(self, message: MarkerDetections) -> list[SolvedPose]:
+    def push(self, message: Detections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
         ...
 
@@ -75,7 +75,7 @@ def run(
     clock: Clock,
     figures: RunFigures,
     stop: threading.Event,
-    watch: Callable[[MarkerDetections], None] = lambda _message: None,
+    watch: Callable[[Detections], None] = lambda _message: None,
 ) -> None:
     """Solve and publish until `stop` is set; `watch` is shown every camera's message once its poses are out."""
     while not stop.is_set():

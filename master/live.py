@@ -87,11 +87,12 @@ def run_live(
             settings.bus,
             settings.start_timeout_s,
             imus=setup.imus,
+            wrists=setup.wrist_cameras,
         )
         stack.callback(ingest.close)
         sinks: list[Sink] = [BusSink(bus)]
         if settings.poses is not None:
-            sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.rig.markers)))
+            sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.markers)))
         for sink in sinks:
             stack.callback(sink.close)
         watch = TimeWatch(setup)

@@ -6,7 +6,7 @@ in between; the rate of arrival counts the frames that were searched, sent and r
 
 from dataclasses import dataclass
 
-from common.messages import MarkerDetections
+from common.messages import Detections
 
 
 @dataclass(slots=True)
@@ -27,7 +27,7 @@ class CameraRates:
     def __init__(self) -> None:
         self._spans: dict[str, _Span] = {}
 
-    def push(self, message: MarkerDetections) -> None:
+    def push(self, message: Detections) -> None:
         """Take one frame; an older one than the last is not counted, and nothing between two processes of a slave."""
         known = self._spans.get(message.camera)
         if known is None:

@@ -1,6 +1,7 @@
 """After a simulated run: its poses against the scene's exact truth, as figures, a picture and a Rerun file."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -8,23 +9,38 @@ import numpy as np
 from common.arrays import Float, Image
 from common.sim.render import Renderer
 from common.sim.scene import Scene
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
 from master.outputs.files import load_poses
-from master.outputs.picture import draw_summary
+from master.outputs.picture import best_row, draw_summary
+from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.truth import PosesTruth
 from master.rig import RigSetup
 from master.score import Truth, score
 from master.solve import fingers_of
+from master.wrist_report import lit_view, wrist_images, wrist_truth_of
+from master.wrist_score import score_wrist
 
 _IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Judged:
+    """A run beside its truth: scores, the true hand, what the cameras saw, and how to draw a wrist device."""
+
+    scores: dict[str, float]
+    truth: PosesTruth
+    images: Iterable[tuple[str, int, Image]]
+    wrist: WristPicture | None = None
+
+
 def report_scene(
     poses_file: Path,
     setup: RigSetup,
-    scene: Scene,
+    scene: Scene | WristScene,
     epoch_ns: int,
     out: Path,
     summary: dict[str, object],
@@ -35,7 +51,7 @@ def report_scene(
     Args:
         poses_file: poses.npz of the run.
         setup: Rig, cameras, hand.
-        scene: What the synthetic cameras rendered.
+        scene: What the synthetic cameras rendered; of the rig's kind.
         epoch_ns: Scene time 0 on the master's clock.
         out: Existing folder.
         summary: Figures of the run so far; drawn with the scores.
@@ -51,15 +67,43 @@ def report_scene(
     poses = poses.rows(int(np.searchsorted(poses.t_ns, epoch_ns)), len(poses))
     if len(poses) == 0:
         return summary
-    truth = truth_of(poses, scene, epoch_ns, tell)
-    full = summary | score(poses, truth, fingers_of(setup))
-    ghost = PosesTruth.of_webxr(truth.joints_m, truth.markers_m)
+    row = best_row(poses)
+    if isinstance(scene, WristScene):
+        judged = _of_wrist(poses, row, setup, scene, epoch_ns, tell)
+    else:
+        judged = _of_markers(poses, setup, scene, epoch_ns, tell)
+    full = summary | judged.scores
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
-    draw_summary(out / "hand.png", poses, setup.rig, setup.hand, figures, ghost)
-    images = _images(poses, scene, epoch_ns, tell)
-    write_rrd(out / "run.rrd", poses, setup.rig, setup.cameras, setup.hand, truth=ghost, images=images)
+    picture, truth = out / "hand.png", judged.truth
+    draw_summary(picture, poses, setup.rig, setup.hand, figures, truth, row, judged.wrist)
+    write_rrd(out / "run.rrd", poses, setup.rig, setup.cameras, setup.hand, truth=truth, images=judged.images)
     return full
+
+
+def _of_markers(poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress) -> _Judged:
+    truth = truth_of(poses, scene, epoch_ns, tell)
+    return _Judged(
+        score(poses, truth, fingers_of(setup)),
+        PosesTruth.of_webxr(truth.joints_m, truth.markers_m),
+        _images(poses, scene, epoch_ns, tell),
+    )
+
+
+def _of_wrist(
+    poses: Poses, row: int | None, setup: RigSetup, scene: WristScene, epoch_ns: int, tell: Progress
+) -> _Judged:
+    truth = wrist_truth_of(poses, scene, epoch_ns, tell)
+    frame = None
+    if row is not None:
+        renderer = WristRenderer(scene, scene.rig.cameras[0])
+        frame = lit_view(renderer, (int(poses.t_ns[row]) - epoch_ns) * 1e-9)
+    return _Judged(
+        score_wrist(poses, truth),
+        PosesTruth.of_webxr(truth.joints_m, poses.markers_m, truth.laser_m[:, 1:6]),
+        wrist_images(poses, scene, epoch_ns, tell),
+        WristPicture.of(setup, frame),
+    )
 
 
 def truth_of(poses: Poses, scene: Scene, epoch_ns: int, tell: Progress) -> Truth:

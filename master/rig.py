@@ -1,44 +1,79 @@
 """From JSON to pipeline: reads rig, cameras and hand of a calibration folder and joins the parts they name."""
 
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, cast
 
 import numpy as np
 
+from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.hand_model import HandModel
+from common.messages import Detections
 from master.filters import OneEuroParameters, PointFilter
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
-from master.stereo.pipeline import MarkerPipeline, Stage
+from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.stereo.place import CalibrationResidual
+from master.wrist.setup import WristSetup
+
+
+class Pipeline(Protocol):
+    """What makes poses of what the cameras of one rig saw, whichever kind of rig it is: a push machine."""
+
+    counts: Counter[str]
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        ...
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+        """Take what the IMU says of its own orientation (4,)."""
+        ...
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for something."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSetup:
-    """A rig with everything its file refers to, checked.
+    """A rig with everything its file refers to, checked; of markers, or of a wrist device.
 
     Attributes:
         rig: The rig file.
         cameras: Camera files by name, in the rig's order.
         models: The same as camera models, placed in the rig.
         hand: The hand model.
+        wrist: Laser plane and palm of a wrist device; None: a marker rig.
     """
 
     rig: RigCalibration
     cameras: dict[str, CameraCalibration]
     models: dict[str, CameraModel]
     hand: HandModel
+    wrist: WristSetup | None = None
+
+    @property
+    def markers(self) -> tuple[str, ...]:
+        """Names of the rig's markers; a wrist device has none."""
+        return self.rig.markers if self.wrist is None else ()
+
+    @property
+    def wrist_cameras(self) -> tuple[str, ...]:
+        """The cameras that send strobed triples and no markers."""
+        return () if self.wrist is None else self.rig.cameras
 
     @property
     def hand_markers(self) -> tuple[str, ...]:
         """The rig's markers that sit on the hand, in the rig's order."""
-        return tuple(name for name in self.rig.markers if name not in self.rig.free_markers)
+        return tuple(name for name in self.markers if name not in self.rig.free_markers)
 
     @property
     def imus(self) -> tuple[str, ...]:
@@ -50,21 +85,22 @@ class RigSetup:
         """Join the files.
 
         Raises:
-            CalibrationError: A camera of the rig is missing or has no intrinsics, fewer than two cameras, a
-                marker the hand does not mount and that is not free, or a rig that is not of kind "markers".
+            CalibrationError: A camera of the rig is missing or has no intrinsics; of a marker rig: fewer than two
+                cameras, or a marker the hand does not mount and that is not free; of a wrist device: no laser plane
+                or no palm pose.
         """
-        if rig.kind != "markers":
-            raise CalibrationError(f"rig {rig.name!r}: kind is {rig.kind!r}, this command needs 'markers'")
-        if len(rig.cameras) < 2:
+        if rig.kind == "markers" and len(rig.cameras) < 2:
             raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
         missing = [name for name in rig.cameras if name not in cameras]
         if missing:
             raise CalibrationError(f"rig {rig.name!r}: no camera file for {missing[0]!r}")
+        ordered = {name: cameras[name] for name in rig.cameras}
+        models = {name: CameraModel.of(camera, rig.camera_pose(name)) for name, camera in ordered.items()}
+        if rig.kind == "wrist":
+            return cls(rig, ordered, models, hand, WristSetup.of(rig, ordered[rig.cameras[0]], hand))
         for name in rig.markers:
             if name not in rig.free_markers:
                 hand.mount(name)
-        ordered = {name: cameras[name] for name in rig.cameras}
-        models = {name: CameraModel.of(camera, rig.camera_pose(name)) for name, camera in ordered.items()}
         return cls(rig, ordered, models, hand)
 
 
@@ -124,7 +160,7 @@ def hand_filter(setup: RigSetup) -> HandFilter:
 def build_pipeline(
     setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
 ) -> MarkerPipeline:
-    """The pipeline this rig's file describes.
+    """The pipeline this marker rig's file describes.
 
     Args:
         setup: The rig.
@@ -133,8 +169,10 @@ def build_pipeline(
         tracker: Tracks the hand; None: a new one, which takes most of the time.
 
     Raises:
-        CalibrationError: The depth model does not fit the rig.
+        CalibrationError: The depth model does not fit the rig, or it is no marker rig.
     """
+    if setup.wrist is not None:
+        raise CalibrationError(f"rig {setup.rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
     rates = {name: camera.frame_rate_hz for name, camera in setup.cameras.items()}
     return MarkerPipeline(
         setup.models,
@@ -153,3 +191,18 @@ def build_pipeline(
         imu=setup.rig.imu,
         stage=stage,
     )
+
+
+def pipeline_of(
+    setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
+) -> Pipeline:
+    """The pipeline of a rig of either kind; arguments and errors as of `build_pipeline`, a wrist device has no tracker.
+
+    It takes what the cameras of its own kind of rig send, and nothing else is ever pushed: the link refuses a camera
+    that sends what those of the other kind do.
+    """
+    if setup.wrist is None:
+        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
+    from master.wrist.pipeline import WristPipeline
+
+    return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))

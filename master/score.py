@@ -80,7 +80,7 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
     out: dict[str, float] = {}
     for name, found in (("marker_mm", poses.markers_m[rows]), ("marker_raw_mm", poses.markers_raw_m[rows])):
         error = np.linalg.norm(found - truth.markers_m[columns], axis=2)[clear]
-        _put(out, name, 1e3 * error[np.isfinite(error)], np.median)
+        put(out, name, 1e3 * error[np.isfinite(error)], np.median)
     wanted = np.isfinite(truth.markers_m[columns]).all(axis=2) & clear
     out["markers_missed"] = float((wanted & ~np.isfinite(poses.markers_raw_m[rows]).all(axis=2)).sum())
     solved = np.isfinite(poses.position_m[rows]).all(axis=(1, 2))
@@ -90,15 +90,16 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
     pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
     finger_clear = _fingers_clear(clear, fingers)
     joint_clear = np.where(_FINGER_OF_JOINT[1:] < 0, True, finger_clear[:, _FINGER_OF_JOINT[1:]])
-    _put(out, "joint_mm", joint[solved], np.mean)
-    _put(out, "joint_mm_visible", joint[solved][joint_clear[solved]], np.mean)
-    _put(out, "pip_deg", pip[solved], np.mean)
-    _put(out, "pip_deg_visible", pip[solved][finger_clear[:, 1:][solved]], np.mean)
+    put(out, "joint_mm", joint[solved], np.mean)
+    put(out, "joint_mm_visible", joint[solved][joint_clear[solved]], np.mean)
+    put(out, "pip_deg", pip[solved], np.mean)
+    put(out, "pip_deg_visible", pip[solved][finger_clear[:, 1:][solved]], np.mean)
     out["frames_without_pose"] = float((~solved).sum())
     return out
 
 
-def _put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:
+def put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:
+    """Add the score `name`; with nothing to reduce it is left out."""
     if values.size:
         out[name] = round(float(np.asarray(reduce(values))), 4)
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from common.clock_offset import ClockEstimate
-from common.messages import MarkerDetections
+from common.messages import Detections, MarkerDetections
 from master.phases import CameraPhases
 from master.rig import RigSetup
 from master.stereo.timing import ResidualTiming
@@ -52,9 +52,10 @@ class TimeWatch:
         self._found: dict[str, TimeOffset] = {}
         self._suspect = dict.fromkeys(self._others, 0)
 
-    def push(self, message: MarkerDetections) -> None:
-        """Take one camera's detections, on the master's clock by its stamps."""
-        self._now.push(message)
+    def push(self, message: Detections) -> None:
+        """Take one camera's detections, on the master's clock by its stamps; that of a wrist device has no other."""
+        if isinstance(message, MarkerDetections):
+            self._now.push(message)
 
     def follow(self, setup: RigSetup) -> None:
         """Go on with other files of the same cameras: what was measured with the old ones is forgotten."""

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from common.arrays import Float
 from common.errors import CalibrationError, PhalanxError
-from common.messages import MarkerDetections
+from common.messages import Detections
 from common.watching import WatchedFiles
 from master.ik.tracker import HandTracker
-from master.rig import RigSetup, build_pipeline, load_setup
-from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
+from master.rig import Pipeline, RigSetup, load_setup, pipeline_of
+from master.stereo.pipeline import SolvedPose, Stage
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (6 Hz at rest) has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
@@ -70,22 +70,22 @@ class LivePipeline:
         """
         self._stage = stage
         self._setup: RigSetup = setup
-        self._tracker = HandTracker(setup.hand, setup.hand_markers)
-        self._now = build_pipeline(setup, stage, tracker=self._tracker)
+        self._tracker = _new_tracker(setup)
+        self._now = pipeline_of(setup, stage, tracker=self._tracker)
         cameras = len(setup.rig.cameras)
         self._close = _CLOSE_FRAMES * cameras
-        self._recent: deque[tuple[int, MarkerDetections]] = deque(maxlen=_WARM_FRAMES * cameras)
+        self._recent: deque[tuple[int, Detections]] = deque(maxlen=_WARM_FRAMES * cameras)
         self._number = 0
         self._last_ns = -(2**63)
         # And the number of the last message it has seen. One thread fills it, another empties it.
-        self._next: deque[tuple[MarkerPipeline, int]] = deque(maxlen=1)
+        self._next: deque[tuple[Pipeline, int]] = deque(maxlen=1)
 
     @property
     def counts(self) -> Counter[str]:
         """Events since the start, whichever pipeline counted them."""
         return self._now.counts
 
-    def push(self, message: MarkerDetections) -> list[SolvedPose]:
+    def push(self, message: Detections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
         self._number += 1
         self._recent.append((self._number, message))
@@ -105,12 +105,12 @@ class LivePipeline:
             CalibrationError: The depth model does not fit the rig; nothing has changed.
         """
         stage = _WhenOpen(self._stage)
-        if _hand(setup) == _hand(self._setup):
+        if self._tracker is not None and _hand(setup) == _hand(self._setup):
             setup = replace(setup, hand=self._setup.hand)
             tracker = self._tracker.fresh()
         else:
-            tracker = HandTracker(setup.hand, setup.hand_markers)
-        new = build_pipeline(setup, stage, tracker=tracker)
+            tracker = _new_tracker(setup)
+        new = pipeline_of(setup, stage, tracker=tracker)
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
             waiting = [(number, message) for number, message in list(self._recent) if number > shown]
@@ -123,7 +123,7 @@ class LivePipeline:
         self._setup, self._tracker = setup, tracker
         self._next.append((new, shown))
 
-    def _take_over(self, new: MarkerPipeline, shown: int) -> list[SolvedPose]:
+    def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
         """Show the new pipeline what it has not seen yet, and take its poses that are later than the last one."""
         old, self._now = self._now.counts, new
         new.counts.clear()
@@ -189,6 +189,11 @@ class RigTuning:
         self._say("changed files are in use")
 
 
+def _new_tracker(setup: RigSetup) -> HandTracker | None:
+    """The tracker of the hand's markers; a wrist device has none."""
+    return HandTracker(setup.hand, setup.hand_markers) if setup.wrist is None else None
+
+
 def _hand(setup: RigSetup) -> tuple[object, ...]:
     return setup.hand.profile, setup.hand_markers
 
@@ -204,6 +209,11 @@ def _refuse_restart(old: RigSetup, new: RigSetup) -> None:
         CalibrationError: With the key, and what to restart.
     """
     where = f"rig {new.rig.name!r}"
+    if old.rig.kind != new.rig.kind:
+        raise CalibrationError(
+            f"{where}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all processes of the"
+            " rig"
+        )
     for key in ("cameras", "markers"):
         was, now = getattr(old.rig, key), getattr(new.rig, key)
         if was != now:

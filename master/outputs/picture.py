@@ -2,7 +2,8 @@
 
 The rig frame is that of a camera that looks along +z at the back of the hand, y down; the hand is shown
 as that camera sees it, turned a little to the side, so it stands upright. All axes of the hand and of
-the rig have one scale.
+the rig have one scale. The hand of a wrist device, whose camera looks along the palm, is shown from above the palm
+and behind the wrist.
 """
 
 from collections.abc import Mapping
@@ -25,6 +26,7 @@ from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
 from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
+from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
 from master.volume import edges
@@ -35,6 +37,7 @@ _HAND_BOX = (0.19, 0.0, 0.43, 0.87)  # left, bottom, width, height of the figure
 _FILL = 0.90  # share of the box that the hand may take
 _SKIN = np.array([1.0, 0.79, 0.67])
 _YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
+_WRIST_YAW, _WRIST_PITCH = np.deg2rad(30.0), np.deg2rad(58.0)
 _RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
 _LINE = 52  # letters of what was tracked that fit in one line beside the figures
@@ -45,9 +48,11 @@ _FIGURES = (
     ("latency_p99_ms", "ms latency p99", "{:.1f}"),
     ("lost", "lost", "{:.0f}"),
     ("marker_mm", "mm marker error", "{:.1f}"),
+    ("laser_mm", "mm laser error", "{:.2f}"),
     ("joint_mm", "mm joint error", "{:.1f}"),
     ("joint_mm_visible", "mm joints, visible", "{:.1f}"),
     ("pip_deg_visible", "deg PIP, visible", "{:.1f}"),
+    ("pip_rms_deg", "deg PIP, rms", "{:.1f}"),
 )
 
 
@@ -59,6 +64,7 @@ def draw_summary(
     summary: Mapping[str, float],
     truth: PosesTruth | None = None,
     row: int | None = None,
+    wrist: WristPicture | None = None,
 ) -> None:
     """Write the picture as PNG.
 
@@ -70,6 +76,7 @@ def draw_summary(
         summary: Key figures by the names of the summary JSON; others are left out.
         truth: Row by row with `poses`; drawn as a ghost, and as error over time.
         row: The pose to show; None: an open hand with as many tracked joints as there are.
+        wrist: The rig's wrist device; None: a marker rig.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -81,8 +88,11 @@ def draw_summary(
     if row is None:
         figure.text(0.3, 0.45, "no valid pose in this run", color=INK, size=20, ha="center")
     else:
-        _hand(figure, poses, row, model, truth)
-        _rig(figure, poses, row, rig)
+        _hand(figure, poses, row, model, truth, wrist)
+        if wrist is None:
+            _rig(figure, poses, row, rig)
+        else:
+            wrist.draw_camera(figure, poses, row, truth)
         draw_panels(figure, poses, row, model, truth)
     _save(figure, path)
 
@@ -102,7 +112,7 @@ def best_row(poses: Poses) -> int | None:
 def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapping[str, float]) -> None:
     figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
     cameras, hand = (
-        f"rig {rig.name} · {len(rig.cameras)} cameras",
+        f"rig {rig.name} · {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}",
         f"hand {model.profile.name} ({model.profile.side})",
     )
     what = cameras + (" · " if len(cameras + hand) <= _LINE else "\n") + hand
@@ -114,11 +124,22 @@ def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapp
         figure.text(x, 0.905, label, color=INK, alpha=0.75, size=10, ha="center", va="center")
 
 
-def _hand(figure: Figure, poses: Poses, row: int, model: HandModel, truth: PosesTruth | None) -> None:
+def _hand(
+    figure: Figure,
+    poses: Poses,
+    row: int,
+    model: HandModel,
+    truth: PosesTruth | None,
+    wrist: WristPicture | None,
+) -> None:
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
-    view = fit_view(
-        at, axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)
-    )  # the thumb towards the eye
+    if wrist is None:
+        view = fit_view(
+            at, axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)
+        )  # thumb to the eye
+    else:
+        turned = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
+        view = fit_view(np.concatenate([at, np.zeros((1, 3))]), turned)  # with the camera itself
     axes = figure.add_axes(_HAND_BOX)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)
@@ -149,12 +170,13 @@ def _hand(figure: Figure, poses: Poses, row: int, model: HandModel, truth: Poses
     for m in range(poses.marker_count):
         ring = unit(series_rgb(m))
         axes.plot(caps[m, 0], caps[m, 1], "o", mfc="none", mec=ring, mew=2.4, ms=19, zorder=7)
+    laser = [] if wrist is None else wrist.draw_laser(axes, view, poses, row)
     _scale_bar(axes, view)
-    _legend(figure, poses, truth)
+    _legend(figure, poses, truth, laser)
 
 
 def fit_view(at: Float, rotation: Float) -> View:
-    """The view in which the joints (26, 3) [m] fill the hand's box."""
+    """The view in which the points (N, 3) [m] fill the hand's box."""
     width, height = round(_HAND_BOX[2] * WIDTH_PX), round(_HAND_BOX[3] * HEIGHT_PX)
     turned = at @ rotation.T
     low, high = np.nanmin(turned, axis=0), np.nanmax(turned, axis=0)
@@ -184,16 +206,18 @@ def _scale_bar(axes: Axes, view: View) -> None:
     axes.text(x + length / 2, y - 9, "5 cm", color=INK, size=11, ha="center", va="bottom")
 
 
-def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None) -> None:
+def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, laser: list[Line2D]) -> None:
     used = [source for source in Source if (poses.source[poses.valid] == source).any()]
     entries = [
         Line2D([], [], color=unit(SOURCE_RGB[s]), marker="o", mfc=PAPER, mew=2, lw=3, label=SOURCE_MEANING[s])
         for s in used
     ]
     entries.append(Line2D([], [], color=INK, marker="o", ls="", label="filled: tracked now"))
-    entries.append(
-        Line2D([], [], color=INK, marker="o", ms=13, mfc="none", mew=2, ls="", label="marker, filtered")
-    )
+    if poses.marker_count:
+        entries.append(
+            Line2D([], [], color=INK, marker="o", ms=13, mfc="none", mew=2, ls="", label="marker, filtered")
+        )
+    entries += laser
     if truth is not None:
         entries.append(Line2D([], [], color=unit(TRUTH_RGB), ls="--", lw=1.3, label="truth"))
     legend = figure.legend(

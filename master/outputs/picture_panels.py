@@ -72,11 +72,11 @@ def _angles(axes: Axes, poses: Poses, seconds: Float, model: HandModel) -> None:
 
 def _errors(axes: Axes, poses: Poses, seconds: Float, truth: PosesTruth) -> None:
     style(axes, "Mean error to the truth [mm]")
-    joints = mean_known(truth.joint_error_m(poses)) * 1e3
-    markers = mean_known(truth.marker_error_m(poses)) * 1e3
-    axes.plot(seconds, joints, color=unit(series_rgb(1)), lw=1.5, label="joints")
-    axes.plot(seconds, markers, color=unit(series_rgb(0)), lw=1.2, label="markers, unfiltered")
-    known = np.concatenate([joints, markers])
+    errors = {name: mean_known(error) * 1e3 for name, error in truth.errors_m(poses).items()}
+    for (name, error), (colour, width) in zip(errors.items(), ((1, 1.5), (0, 1.2)), strict=True):
+        label = "markers, unfiltered" if name == "markers" else name
+        axes.plot(seconds, error, color=unit(series_rgb(colour)), lw=width, label=label)
+    known = np.concatenate(list(errors.values()))
     known = known[~np.isnan(known)]
     # One gap in tracking must not flatten the rest of the curve.
     top = float(np.percentile(known, 99)) * 1.25 if len(known) else 1.0
@@ -86,8 +86,9 @@ def _errors(axes: Axes, poses: Poses, seconds: Float, truth: PosesTruth) -> None
 
 def _seen(axes: Axes, poses: Poses, seconds: Float) -> None:
     style(axes, "What was seen")
-    markers = (~np.isnan(poses.markers_raw_m).any(axis=-1)).sum(axis=1)
-    axes.plot(seconds, markers, color=unit(series_rgb(0)), lw=1.3, drawstyle="steps-mid", label="markers")
+    name, points = ("markers", poses.markers_raw_m) if poses.marker_count else ("laser points", poses.laser_m)
+    seen = (~np.isnan(points).any(axis=-1)).sum(axis=1)
+    axes.plot(seconds, seen, color=unit(series_rgb(0)), lw=1.3, drawstyle="steps-mid", label=name)
     tracked = poses.tracked.sum(axis=1)
     axes.plot(
         seconds, tracked, color=unit(series_rgb(2)), lw=1.3, drawstyle="steps-mid", label="joints tracked"

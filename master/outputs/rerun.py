@@ -24,7 +24,7 @@ from common.calibration import CameraCalibration, RigCalibration
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
 from common.hand_model import HandModel
-from common.messages import HandPose, Health, MarkerDetections, Message, Preview
+from common.messages import Detections, HandPose, Health, Message, Preview
 from common.streams import MASTER
 from master.outputs.poses import Poses
 from master.outputs.previews import PreviewAsker
@@ -120,7 +120,7 @@ def write_rrd(
     rig: RigCalibration,
     cameras: Mapping[str, CameraCalibration],
     hand: HandModel,
-    detections: Mapping[str, Iterable[MarkerDetections]] | None = None,
+    detections: Mapping[str, Iterable[Detections]] | None = None,
     truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
 ) -> None:

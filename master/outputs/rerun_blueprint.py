@@ -19,7 +19,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
-    ("Joints tracked, markers seen", "plots/seen", (0.0, 30.0), True),
+    ("Joints tracked; markers, or laser points, seen", "plots/seen", (0.0, 30.0), True),
     ("Health", "plots/health", None, True),
 )
 _TABS = 4  # the last so many share one place
@@ -27,6 +27,8 @@ _BACKGROUND = rrb.Background(color=(22, 24, 28))
 # Beside and above the hand, which is 0.3-0.5 m in front of the cameras; they stay in the picture on the left.
 _EYE_M, _TARGET_M = (0.21, -0.12, 0.0), (0.012, 0.018, 0.36)
 _BESIDE_M = 0.45  # cameras farther from the hand than that stand around it: the eye steps back, to 1.5 of the farthest
+# Of a wrist device: from above the palm and behind the camera, beside the forearm, towards the fingers.
+_WRIST_EYE_M, _WRIST_TARGET_M = (0.17, -0.17, -0.10), (0.0, 0.035, 0.12)
 _CAMERAS_A_ROW = 4
 _PLOT_SPAN_S = 10.0
 
@@ -50,7 +52,8 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SPAN_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    eye = rrb.EyeControls3D(position=_eye_of(rig), look_target=_TARGET_M, eye_up=(0.0, -1.0, 0.0))
+    position, target = (_WRIST_EYE_M, _WRIST_TARGET_M) if rig.kind == "wrist" else (_eye_of(rig), _TARGET_M)
+    eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
     scene = rrb.Spatial3DView(
         origin=WORLD,
         name="Hand and rig",
@@ -67,7 +70,13 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
         )
         for name in rig.cameras
     ]
-    rows = [(n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several) for n, p, r, several in _PLOTS]
+    left_out = {"plots/jitter_mm"} if rig.kind == "wrist" else set[str]()
+    left_out |= set() if with_truth else {"plots/error_mm"}
+    rows = [
+        (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
+        for n, p, r, several in _PLOTS
+        if p not in left_out
+    ]
     plots = [
         rrb.TimeSeriesView(
             origin=path,
@@ -77,7 +86,6 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
             plot_legend=rrb.PlotLegend(visible=several, corner=rrb.Corner2D.LeftTop),
         )
         for name, path, fixed, several in rows
-        if with_truth or path != "plots/error_mm"
     ]
     legend_view = rrb.TextDocumentView(origin="about", name="Colours")
     tabs = rrb.Tabs(*plots[-_TABS:], legend_view, active_tab=0)
@@ -113,6 +121,8 @@ def legend() -> str:
         "# Colours\nBones and joints by source; a joint at half brightness is valid but not tracked now.\n\n"
         + "\n".join(lines)
         + "\n- **red joint**: an angle is at its limit\n- **thin grey hand**: the truth, where it is known\n"
+        "- of a wrist device: **red fan**: its laser; **points in it**: where that meets each finger; **yellow, grey "
+        "lines**: sights of the camera to these points, and to the tips that are tracked\n"
         "- **small dim / large bright markers**: before / after the filter\n"
         "- **ellipsoids**: 2 sigma of the finger tips, where that is less than 3 cm\n"
         "- **grey box**: the volume that the rig states; outside it, accuracy was not tested\n"

@@ -1,7 +1,6 @@
 """What the viewer shows: poses, detections, images and health as entities of one Rerun recording.
 
-Poses are logged as columns, a batch at a time, so that a live viewer (2 or 3 poses a batch) and a file
-of a whole run take the same path. Every row stands on the timeline "capture" at its `t_ns`.
+Poses are logged as columns (`rerun_columns`). Every row stands on the timeline "capture" at its `t_ns`.
 The scene holds the times of the last second (rate), the images' state, and which entities have got their
 style.
 
@@ -14,12 +13,12 @@ style.
     world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips, up to 3 cm
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
+    world/laser, ...                     of a wrist device, in place of the markers: see `rerun_wrist`
     world/truth/skeleton, markers        where a truth is known
     plots/...                            latency, rate, jitter, error, PIP angles, counts, health
 """
 
 from collections.abc import Iterable, Mapping
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -31,21 +30,24 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_limits import FLEXION
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
-from common.messages import Health, MarkerDetections, Source
-from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, Rgb, dim, pack, series_rgb
+from common.messages import Detections, Health, MarkerDetections, Source, WristDetections
+from master.outputs.laser_fan import fan_rays
+from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, pack, series_rgb
 from master.outputs.poses import Poses
-from master.outputs.rerun_blueprint import TIMELINE, WORLD, camera_path, legend
+from master.outputs.rerun_blueprint import WORLD, camera_path, legend
+from master.outputs.rerun_columns import PIXEL_CENTRE, Columns, seen
 from master.outputs.rerun_images import CameraImages
+from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
+from master.wrist.setup import WristSetup
 
-_PIXEL_CENTRE = 0.5  # Rerun: (0, 0) is the corner of the first pixel; here: its centre
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)
 _HINGE_OF_ANGLE = np.array(
     [[c[-4], c[-4], c[-3], c[-2]] for c in FINGER_JOINTS]
 )  # joint that angle (5, 4) turns
 _PIP = 2
-_MARKER_PX = 3.0
+_MARKER_PX, _DETECTED_PX = 3.0, 4.0
 _ELLIPSE_LINE_M = 0.0002
 _LARGEST_M = 0.03  # half axis of the largest ellipsoid shown
 _JOINT_SHOWN = 0.45  # of its radius, so that the bones stay visible
@@ -66,10 +68,10 @@ class RerunScene:
         """Log what never changes: frames, frusta, names and colours of plots.
 
         Raises:
-            CalibrationError: A camera of the rig has no intrinsics.
+            CalibrationError: A camera of the rig has no intrinsics, or a wrist device no laser plane or palm pose.
         """
-        self._rec = recording
-        self._rig = rig
+        self._rec, self._rows = recording, Columns(recording)
+        self._markers = () if rig.kind == "wrist" else rig.markers
         self._hand = hand
         self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
         self._recent_ns: Int = np.empty(0, np.int64)
@@ -81,10 +83,15 @@ class RerunScene:
             self._log_volume(rig.volume)
         for name, model in self._models.items():
             self._log_camera(name, model)
-        for i, name in enumerate(rig.markers):
-            self._name_series(f"plots/jitter_mm/{name}", name, series_rgb(i))
+        self._wrist = None
+        if rig.kind == "wrist":
+            name = rig.cameras[0]
+            setup = WristSetup.of(rig, cameras[name], hand)
+            self._wrist = WristLayer(recording, name, self._models[name], setup, fan_rays(rig, setup))
+        for i, name in enumerate(self._markers):
+            self._rows.name(f"plots/jitter_mm/{name}", name, series_rgb(i))
         for i, name in enumerate(FINGERS):
-            self._name_series(f"plots/pip_deg/{name}", name, series_rgb(i))
+            self._rows.name(f"plots/pip_deg/{name}", name, series_rgb(i))
 
     @property
     def last_t_ns(self) -> int | None:
@@ -97,25 +104,27 @@ class RerunScene:
             return
         root = rr.new_entity_path([WORLD, "hand", poses.hand])
         self._log_hand(root, poses)
-        self._log_markers(poses)
+        if self._wrist is not None:
+            self._wrist.log_poses(poses)
+        else:
+            self._log_markers(poses)
         self._log_plots(poses)
         if truth is not None:
             self._log_truth(poses, truth)
 
-    def log_detections(self, detections: Iterable[MarkerDetections]) -> None:
-        """Log the centroids that one camera saw, in its image; frames in the order of time."""
+    def log_detections(self, detections: Iterable[Detections]) -> None:
+        """Log what one camera saw, in its image; frames in the order of time."""
         frames = list(detections)
-        if not frames:
+        if self._wrist is not None and frames:
+            self._wrist.log_detections([frame for frame in frames if isinstance(frame, WristDetections)])
             return
-        uv = np.array([frame.uv for frame in frames]) + _PIXEL_CENTRE
-        seen = _seen(uv)
-        colours = np.broadcast_to(self._marker_colours(uv.shape[1]), seen.shape)
-        self._send(
-            f"{camera_path(frames[0].camera)}/detections",
-            np.array([frame.t_ns for frame in frames], np.int64),
-            rr.Points2D.columns(positions=uv[seen], colors=colours[seen], radii=np.full(seen.sum(), 4.0)),
-            seen.sum(axis=1),
-        )
+        markers = [frame for frame in frames if isinstance(frame, MarkerDetections)]
+        if not markers:
+            return
+        uv = np.array([frame.uv for frame in markers])
+        colours = np.broadcast_to(self._marker_colours(uv.shape[1]), uv.shape[:2])
+        t_ns = np.array([frame.t_ns for frame in markers], np.int64)
+        self._rows.pixels(f"{camera_path(markers[0].camera)}/detections", t_ns, uv, colours, _DETECTED_PX)
 
     def log_image(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
         """Show an image of a camera; see `CameraImages.log`."""
@@ -125,7 +134,7 @@ class RerunScene:
         """Plot every count and gauge of a process at `t_ns` [ns] of the timeline."""
         for name, value in [*health.counts.items(), *health.gauges.items()]:
             path = rr.new_entity_path(["plots", "health", health.source, name])
-            self._scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
+            self._rows.scalars(path, np.array([t_ns], np.int64), np.array([float(value)]))
 
     def _log_volume(self, volume: Volume) -> None:
         low, high = np.array(volume.low_m), np.array(volume.high_m)
@@ -140,7 +149,7 @@ class RerunScene:
     def _log_camera(self, name: str, model: CameraModel) -> None:
         pose, path = model.T_rig_camera, camera_path(name)
         matrix = model.matrix.copy()
-        matrix[:2, 2] += _PIXEL_CENTRE
+        matrix[:2, 2] += PIXEL_CENTRE
         pinhole = rr.Pinhole(
             image_from_camera=matrix,
             resolution=(model.width_px, model.height_px),
@@ -165,7 +174,7 @@ class RerunScene:
         colours = palette[np.where(poses.source < len(palette), poses.source, 0)]
         strips = _strips(at, shown)
         strip_colours = colours[:, _STRIP_SOURCE][shown]
-        self._send(
+        self._rows.send(
             f"{root}/skeleton",
             poses.t_ns,
             rr.LineStrips3D.columns(strips=strips, colors=strip_colours, radii=np.full(len(strips), 0.0018)),
@@ -173,10 +182,10 @@ class RerunScene:
         )
         colours = np.where(poses.tracked, colours, dim(colours))
         radii = (poses.radius_m * _JOINT_SHOWN)[valid]
-        self._points(f"{root}/joints", poses.t_ns, at, valid, colours, radii)
+        self._rows.points(f"{root}/joints", poses.t_ns, at, valid, colours, radii)
         limit = self._at_limit(poses.angles_rad) & valid
         red = np.full(limit.shape, pack([LIMIT_RGB])[0])
-        self._points(f"{root}/at_limit", poses.t_ns, at, limit, red, (poses.radius_m * 0.55)[limit])
+        self._rows.points(f"{root}/at_limit", poses.t_ns, at, limit, red, (poses.radius_m * 0.55)[limit])
         self._log_uncertainty(f"{root}/uncertainty", poses)
 
     def _at_limit(self, angles_rad: Float) -> Bool:
@@ -207,45 +216,35 @@ class RerunScene:
             style = rr.Ellipsoids3D.from_fields(fill_mode="MajorWireframe", line_radii=_ELLIPSE_LINE_M)
             self._rec.log(path, style, static=True)
             self._styled.add(path)
-        self._send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
+        self._rows.send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
 
     def _log_markers(self, poses: Poses) -> None:
         colours = np.broadcast_to(self._marker_colours(poses.marker_count), poses.markers_m.shape[:2])
         for name, at, radius in (("raw", poses.markers_raw_m, 0.0025), ("filtered", poses.markers_m, 0.004)):
-            seen = _seen(at)
             tint = dim(colours) if name == "raw" else colours
-            self._points(f"{WORLD}/markers/{name}", poses.t_ns, at, seen, tint, radius)
+            self._rows.points(f"{WORLD}/markers/{name}", poses.t_ns, at, seen(at), tint, radius)
         raw = poses.markers_raw_m
-        seen = _seen(raw)
         for name, model in self._models.items():
-            rays = [np.stack([model.centre, point]) for point in raw[seen]]
-            columns = rr.LineStrips3D.columns(
-                strips=rays,
-                radii=np.full(len(rays), 0.0003),
-                colors=np.full(len(rays), pack([RAY_RGB], alpha=110)[0]),
-            )
-            self._send(rr.new_entity_path([WORLD, "rays", name]), poses.t_ns, columns, seen.sum(axis=1))
-            uv = model.project(raw) + _PIXEL_CENTRE
-            there = _seen(uv)
-            points = rr.Points2D.columns(
-                positions=uv[there], colors=colours[there], radii=np.full(there.sum(), _MARKER_PX)
-            )
-            self._send(f"{camera_path(name)}/markers", poses.t_ns, points, there.sum(axis=1))
+            path = rr.new_entity_path([WORLD, "rays", name])
+            self._rows.rays(path, poses.t_ns, model.centre, raw, int(pack([RAY_RGB], alpha=110)[0]))
+            uv = model.project(raw)
+            self._rows.pixels(f"{camera_path(name)}/markers", poses.t_ns, uv, colours, _MARKER_PX)
 
     def _log_plots(self, poses: Poses) -> None:
         t = poses.t_ns
         if poses.latency_ns.any():  # all zero: an offline run, which has none
-            self._scalars("plots/latency_ms", t, poses.latency_ns.astype(np.float64) * 1e-6)
-        self._scalars("plots/rate_hz", t, self._rate_hz(t))
+            self._rows.scalars("plots/latency_ms", t, poses.latency_ns.astype(np.float64) * 1e-6)
+        self._rows.scalars("plots/rate_hz", t, self._rate_hz(t))
         step = distance_m(poses.markers_raw_m, poses.markers_m) * 1e3
         for m in range(poses.marker_count):
-            name = self._rig.markers[m] if m < len(self._rig.markers) else f"marker-{m}"
-            self._scalars(rr.new_entity_path(["plots", "jitter_mm", name]), t, step[:, m])
+            name = self._markers[m] if m < len(self._markers) else f"marker-{m}"
+            self._rows.scalars(rr.new_entity_path(["plots", "jitter_mm", name]), t, step[:, m])
         for f, name in enumerate(FINGERS):
-            self._scalars(f"plots/pip_deg/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
-        self._scalars("plots/seen/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64))
-        markers = _seen(poses.markers_raw_m).sum(axis=1)
-        self._scalars("plots/seen/markers", t, markers.astype(np.float64))
+            self._rows.scalars(f"plots/pip_deg/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
+        self._rows.scalars("plots/seen/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64))
+        if self._wrist is None:
+            markers = seen(poses.markers_raw_m).sum(axis=1)
+            self._rows.scalars("plots/seen/markers", t, markers.astype(np.float64))
 
     def _log_truth(self, poses: Poses, truth: PosesTruth) -> None:
         t, at = poses.t_ns, truth.joints_m
@@ -253,12 +252,12 @@ class RerunScene:
         strips = _strips(at, known)
         grey = np.full(len(strips), pack([TRUTH_RGB])[0])
         columns = rr.LineStrips3D.columns(strips=strips, colors=grey, radii=np.full(len(strips), 0.0008))
-        self._send(f"{WORLD}/truth/skeleton", t, columns, known.sum(axis=1))
-        seen = _seen(truth.markers_m)
-        grey = np.full(seen.shape, pack([TRUTH_RGB])[0])
-        self._points(f"{WORLD}/truth/markers", t, truth.markers_m, seen, grey, 0.002)
-        for name, error in (("joints", truth.joint_error_m(poses)), ("markers", truth.marker_error_m(poses))):
-            self._scalars(f"plots/error_mm/{name}", t, mean_known(error) * 1e3)
+        self._rows.send(f"{WORLD}/truth/skeleton", t, columns, known.sum(axis=1))
+        name, points = ("markers", truth.markers_m) if truth.laser_m is None else ("laser", truth.laser_m)
+        grey = np.full(points.shape[:2], pack([TRUTH_RGB])[0])
+        self._rows.points(f"{WORLD}/truth/{name}", t, points, seen(points), grey, 0.002)
+        for name, error in truth.errors_m(poses).items():
+            self._rows.scalars(f"plots/error_mm/{name}", t, mean_known(error) * 1e3)
 
     def _rate_hz(self, t_ns: Int) -> Float:
         """Poses per second (T,) over the second that ends at each row; NaN for the very first."""
@@ -271,37 +270,6 @@ class RerunScene:
 
     def _marker_colours(self, count: int) -> npt.NDArray[np.uint32]:
         return pack([series_rgb(i) for i in range(count)])
-
-    def _points(
-        self,
-        path: str,
-        t_ns: Int,
-        at: Float,
-        shown: Bool,
-        colours: npt.NDArray[np.uint32],
-        radii: Float | float,
-    ) -> None:
-        each = np.broadcast_to(radii, shown.sum())
-        columns = rr.Points3D.columns(positions=at[shown], colors=colours[shown], radii=each)
-        self._send(path, t_ns, columns, shown.sum(axis=1))
-
-    def _scalars(self, path: str, t_ns: Int, values: Float) -> None:
-        # NaN is sent as such: the viewer breaks the line there, and would bridge a missing row.
-        self._send(path, t_ns, rr.Scalars.columns(scalars=values), None)
-
-    def _send(self, path: str, t_ns: Int, columns: rr.ComponentColumnList, lengths: Int | None) -> None:
-        """Send rows at `t_ns`; `lengths` (T,) instances each (0 clears the last row), None: one each."""
-        index = rr.TimeColumn(TIMELINE, duration=cast("list[np.timedelta64]", t_ns.astype("timedelta64[ns]")))
-        parts = columns if lengths is None else columns.partition(lengths)
-        self._rec.send_columns(path, [index], parts)
-
-    def _name_series(self, path: str, name: str, rgb: Rgb) -> None:
-        self._rec.log(path, rr.SeriesLines(names=name, colors=[rgb]), static=True)
-
-
-def _seen(points: Float) -> Bool:
-    """Which of the points (..., D) are not NaN, (...)."""
-    return np.asarray(~np.isnan(points).any(axis=-1), np.bool_)
 
 
 def _strips(at: Float, shown: Bool) -> list[Float]:

@@ -16,20 +16,30 @@ class PosesTruth:
     Attributes:
         joints_m: (T, 26, 3) [m], rig frame.
         markers_m: (T, M, 3) [m], centroids of the painted caps, rig frame.
+        laser_m: (T, 5, 3) [m], where the laser meets each finger, of a wrist device; None: a marker rig.
     """
 
     joints_m: Float
     markers_m: Float
+    laser_m: Float | None = None
 
     @classmethod
-    def of_webxr(cls, joints_m: Float, markers_m: Float) -> "PosesTruth":
+    def of_webxr(cls, joints_m: Float, markers_m: Float, laser_m: Float | None = None) -> "PosesTruth":
         """From the 25 WebXR joints (T, 25, 3) of a rendered recording; the palm is derived."""
         palm = (joints_m[:, MIDDLE_METACARPAL - 1] + joints_m[:, MIDDLE_PROXIMAL - 1]) / 2
-        return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m)
+        return cls(np.concatenate([palm[:, None], joints_m], axis=1), markers_m, laser_m)
 
     def rows(self, start: int, stop: int) -> "PosesTruth":
         """Rows start..stop-1, without copying."""
-        return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop])
+        laser_m = None if self.laser_m is None else self.laser_m[start:stop]
+        return PosesTruth(self.joints_m[start:stop], self.markers_m[start:stop], laser_m)
+
+    def errors_m(self, poses: Poses) -> dict[str, Float]:
+        """What is measured -> its distances (T, K) [m] from the truth; NaN where one of both is not known."""
+        joints = {"joints": self.joint_error_m(poses)}
+        if self.laser_m is None:
+            return joints | {"markers": self.marker_error_m(poses)}
+        return joints | {"laser": distance_m(poses.laser_m, self.laser_m)}
 
     def joint_error_m(self, poses: Poses) -> Float:
         """Distance (T, 25) [m] of every joint but the palm; NaN where the pose is not valid or no truth."""

@@ -4,9 +4,10 @@ import json
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
-from common.calibration import HandProfile, MarkerMount, save
+from common.calibration import HandProfile, MarkerMount, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
@@ -84,8 +85,6 @@ def test_contradictions_are_named() -> None:
         RigSetup.of(rig_file(), {"left": files["left"]}, RIGHT)
     with pytest.raises(CalibrationError, match=r"'bench': cameras: two or more"):
         RigSetup.of(rig_file(("left",)), files, RIGHT)
-    with pytest.raises(CalibrationError, match=r"'bench': kind is 'wrist'"):
-        RigSetup.of(rig_file(kind="wrist"), files, RIGHT)
     with pytest.raises(CalibrationError, match=r"no marker 'ring'"):
         RigSetup.of(rig_file(), files, short_of_markers(RIGHT.profile))
     blind = files | {"right": msgspec.structs.replace(files["right"], intrinsics=None)}
@@ -99,3 +98,29 @@ def test_a_law_of_two_cameras_refuses_three() -> None:
     setup = RigSetup.of(rig, {name: camera_file(name) for name in cameras}, RIGHT)
     with pytest.raises(CalibrationError, match="needs two cameras"):
         build_pipeline(setup, StageTimes())
+
+
+def test_a_wrist_rig_has_no_markers_and_the_frame_of_its_camera(root: Path) -> None:
+    setup = load_setup(root / "calib_json", "wrist")
+    assert setup.wrist is not None
+    assert setup.markers == setup.hand_markers == ()
+    assert setup.wrist_cameras == tuple(setup.models) == ("wrist",)
+    assert (setup.models["wrist"].T_rig_camera == np.eye(4)).all()
+    assert load_setup(root / "calib_json", "desk").wrist_cameras == ()
+
+
+def test_what_needs_markers_refuses_a_wrist_rig(root: Path) -> None:
+    setup = load_setup(root / "calib_json", "wrist")
+    with pytest.raises(CalibrationError, match="'wrist': kind is 'wrist', this needs a rig of 'markers'"):
+        build_pipeline(setup, StageTimes())
+
+
+@pytest.mark.parametrize("key", ["laser_plane", "T_camera_palm"])
+def test_a_wrist_rig_without_a_part_names_it(root: Path, key: str) -> None:
+    tree = root / "calib_json"
+    rig = msgspec.structs.replace(load(tree / "rigs" / "wrist.json", RigCalibration), **{key: None})
+    cameras = load_setup(tree, "wrist").cameras
+    with pytest.raises(CalibrationError, match=f"'wrist': {key} is missing"):
+        RigSetup.of(rig, cameras, RIGHT)
+    with pytest.raises(CalibrationError, match="no camera file for 'wrist'"):
+        RigSetup.of(rig, {}, RIGHT)

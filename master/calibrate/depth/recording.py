@@ -18,7 +18,7 @@ from common.messages import MarkerDetections
 from common.npz import read_npz
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import column, rows_of
-from master.solve import recorded_detections
+from master.recorded import recorded_detections
 
 STILL_S = 0.5  # shortest stretch that counts as standing
 STILL_FRAMES = 5

@@ -14,7 +14,7 @@ from common.frame_recording import FrameRecording, open_recording
 from master.calibrate.time.fit import SIGNIFICANT, CameraTime, measure_times
 from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
 from master.options import CALIB_JSON, JsonFile, RecordingRig, ResultTree
-from master.solve import recorded_detections
+from master.recorded import recorded_detections
 from master.summary import write_summary
 
 Recording = Annotated[Path, typer.Argument(help="Folder of a raw-frame recording: a hand that moves.")]

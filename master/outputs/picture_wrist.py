@@ -1,0 +1,92 @@
+"""What a wrist device adds to the picture of a run: its laser's fan about the hand, and what its camera sees."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from common.arrays import Float, Image
+from common.camera_model import CameraModel
+from common.hand_model import FINGER_JOINTS, FINGERS
+from common.messages import FINGER_COUNT
+from master.outputs.hand_render import View
+from master.outputs.laser_fan import LASER_RGB, fan, fan_rays
+from master.outputs.palette import TRUTH_RGB, series_rgb
+from master.outputs.picture_panels import PAPER, style, unit
+from master.outputs.poses import Poses
+from master.outputs.truth import PosesTruth
+from master.rig import RigSetup
+from master.wrist.setup import WristSetup
+
+_BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
+_BRIGHT = 200.0  # level of the brightest skin as shown: such frames are dark
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristPicture:
+    """How to draw one wrist device.
+
+    Attributes:
+        setup: Laser plane and palm.
+        camera: Its camera.
+        rays: (K, 3) directions of the laser's light.
+        frame: What the camera saw by laser and LEDs at the row that is shown, (H, W) grey, or None.
+    """
+
+    setup: WristSetup
+    camera: CameraModel
+    rays: Float
+    frame: Image | None = None
+
+    @classmethod
+    def of(cls, setup: RigSetup, frame: Image | None = None) -> "WristPicture | None":
+        """Of a wrist rig; None: a marker rig."""
+        if setup.wrist is None:
+            return None
+        camera = setup.models[setup.rig.cameras[0]]
+        return cls(setup.wrist, camera, fan_rays(setup.rig, setup.wrist), frame)
+
+    def draw_laser(self, axes: Axes, view: View, poses: Poses, row: int) -> list[Line2D]:
+        """Fan and points about the hand; return the entries of the legend."""
+        for line in fan(self.setup.laser_m, self.rays):
+            pixels = view.project(line)
+            axes.plot(pixels[:, 0], pixels[:, 1], color=unit(LASER_RGB), lw=0.8, alpha=0.4, zorder=4)
+        points = view.project(poses.laser_m[row])
+        for finger in range(FINGER_COUNT):
+            colour = unit(series_rgb(finger))
+            axes.plot(points[finger, 0], points[finger, 1], "D", mfc=colour, mec=PAPER, ms=9, zorder=8)
+        return [
+            Line2D([], [], color=unit(LASER_RGB), lw=1.5, label="laser"),
+            Line2D([], [], color=unit(series_rgb(0)), marker="D", mec=PAPER, ms=9, ls="", label="laser on a finger"),
+        ]  # fmt: skip
+
+    def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
+        """The camera's view, lower left: its frame, the hand and the laser points as it should see them."""
+        axes = figure.add_axes(_BOX)
+        style(axes, "Camera, with the hand as solved")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.grid(visible=False)
+        axes.set_xlim(-0.5, self.camera.width_px - 0.5)
+        axes.set_ylim(self.camera.height_px - 0.5, -0.5)
+        if self.frame is not None:
+            top = max(float(np.percentile(self.frame, 99.5)), 1.0)
+            bright = np.clip(self.frame * (_BRIGHT / 255.0 / top), 0.0, 1.0)
+            axes.imshow(bright, cmap="gray", vmin=0.0, vmax=1.0, interpolation="bilinear")
+        at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
+        seen = self.camera.project(at)
+        for finger, joints in enumerate(FINGER_JOINTS):
+            for a, b in pairwise(joints):
+                axes.plot(seen[[a, b], 0], seen[[a, b], 1], color=unit(series_rgb(finger)), lw=1.8)
+            axes.annotate(FINGERS[finger], seen[joints[-1]], (0, 5), textcoords="offset points",
+                          color=unit(series_rgb(finger)), size=8, ha="center", annotation_clip=True)  # fmt: skip
+        if truth is not None:
+            true = self.camera.project(truth.joints_m[row])
+            for joints in FINGER_JOINTS:
+                x, y = true[list(joints)].T
+                axes.plot(x, y, color=unit(TRUTH_RGB), lw=0.9, ls="--")
+        points = self.camera.project(poses.laser_m[row])
+        axes.plot(points[:, 0], points[:, 1], "D", mfc=unit(LASER_RGB), mec=PAPER, ms=6, ls="", zorder=8)

@@ -1,0 +1,54 @@
+"""A simulated run of a wrist device against its scene: exact truth at the poses, and what its camera saw."""
+
+from collections.abc import Callable, Iterator
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.frame_recording import Illumination
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
+from common.sim.wrist.scene import WristTruth as WristInstant
+from master.outputs.poses import Poses
+from master.wrist_score import WristTruth
+
+_IMAGES_HZ = 2.0
+Progress = Callable[[str, int, int], None]
+
+
+def wrist_truth_of(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress) -> WristTruth:
+    """The scene at the instants of the poses; `epoch_ns` is scene time 0 on their clock."""
+    now: list[WristInstant] = []
+    for row, t_ns in enumerate(poses.t_ns.tolist()):
+        now.append(scene.truth((t_ns - epoch_ns) * 1e-9))
+        if row % 20 == 0:
+            tell("comparing with the truth", row, len(poses))
+    return WristTruth(
+        t_ns=poses.t_ns,
+        laser_m=np.array([one.laser_pt for one in now]),
+        laser_seen_m=np.array([one.laser_len_vis for one in now]),
+        tip_uv=np.array([one.tip_uv for one in now]),
+        tip_visible=np.array([one.tip_visible for one in now], np.bool_),
+        joints_m=np.array([one.joints.position_m[1:] for one in now]),
+        pip_rad=np.array([one.angles_rad[1:, 2] for one in now]),
+    )
+
+
+def lit_view(renderer: WristRenderer, t_s: float) -> Image:
+    """What laser and LEDs together light at scene time `t_s` [s], (H, W) grey: without the light of the room."""
+    ambient = renderer.render(t_s, Illumination.AMBIENT)
+    laser, led = (renderer.render(t_s, lit) for lit in (Illumination.LASER, Illumination.LED))
+    return np.asarray(cv2.add(cv2.subtract(laser, ambient), cv2.subtract(led, ambient)), np.uint8)
+
+
+def wrist_images(
+    poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress
+) -> Iterator[tuple[str, int, Image]]:
+    """Camera, time [ns] and `lit_view`, twice a second."""
+    first, last = int(poses.t_ns[0]), int(poses.t_ns[-1])
+    camera = scene.rig.cameras[0]
+    renderer = WristRenderer(scene, camera)
+    for t_ns in range(first, last, int(1e9 / _IMAGES_HZ)):
+        tell(f"rendering camera {camera}", t_ns - first, last - first)
+        yield camera, t_ns, lit_view(renderer, (t_ns - epoch_ns) * 1e-9)

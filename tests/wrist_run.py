@@ -1,0 +1,77 @@
+"""A simulated wrist device without errors: what its camera would report, and the poses of an exact master."""
+
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import matrix_to_quaternion
+from common.messages import HandPose, Source, WristDetections
+from common.sim.wrist.scene import WristScene, WristTruth
+from master.outputs.poses import Poses
+from master.rig import RigSetup, load_setup
+
+TRIPLE_NS = 33_333_333
+START_NS = 1_000_000_000
+
+
+def wrist_setup(root: Path, rig: str = "wrist") -> RigSetup:
+    """A shipped wrist rig with its camera and its hand."""
+    return load_setup(root / "calib_json", rig)
+
+
+def wrist_scene(setup: RigSetup, name: str = "standard", seed: int = 7) -> WristScene:
+    """What the simulated camera of that rig looks at."""
+    return WristScene.by_name(name, setup.rig, setup.cameras, setup.hand.profile, seed)
+
+
+def exact_triple(setup: RigSetup, now: WristTruth, k: int, t_ns: int | None = None) -> WristDetections:
+    """Triple number `k` without errors: laser points and tips where the truth has them."""
+    laser = now.laser_uv[1:6]
+    tips = np.where(now.tip_visible[:, None], now.tip_uv, np.nan)
+    at_ns = START_NS + k * TRIPLE_NS if t_ns is None else t_ns
+    return WristDetections(
+        camera=setup.rig.cameras[0],
+        session=1,
+        seq=3 * k + 1,
+        t_ns=at_ns,
+        ready_t_ns=at_ns + 12_000_000,
+        laser_uv=laser,
+        laser_sigma_px=_where_seen(laser, 0.2),
+        laser_px=_where_seen(laser, 20.0),
+        tip_uv=tips,
+        tip_sigma_px=_where_seen(tips, 2.0),
+        tip_depth=_where_seen(tips, 0.1),
+    )
+
+
+def true_poses(setup: RigSetup, truths: list[WristTruth]) -> Poses:
+    """One pose for each instant, as an errorless master would publish it."""
+    none = np.empty((0, 3))
+    return Poses.of(
+        [
+            HandPose(
+                hand=setup.hand.profile.name,
+                t_ns=START_NS + k * TRIPLE_NS,
+                position_m=now.joints.position_m,
+                orientation_wxyz=matrix_to_quaternion(now.joints.rotation),
+                radius_m=setup.hand.radius_m,
+                valid=np.ones(26, np.bool_),
+                tracked=np.ones(26, np.bool_),
+                cov_m2=np.tile(1e-6 * np.eye(3), (26, 1, 1)),
+                source=np.full(26, Source.WRIST, np.uint8),
+                angles_rad=now.angles_rad,
+                markers_m=none,
+                markers_raw_m=none,
+                markers_cov_m2=np.empty((0, 3, 3)),
+                inside_volume=np.ones(26, np.bool_),
+                latency_ns=8_000_000,
+                laser_m=now.laser_pt[1:6],
+            )
+            for k, now in enumerate(truths)
+        ]
+    )
+
+
+def _where_seen(uv: Float, value: float) -> Float:
+    return np.where(np.isnan(uv).any(axis=1), np.nan, value)
