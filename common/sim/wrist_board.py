@@ -2,7 +2,7 @@
 
 For the calibration of a wrist device without hardware. The board is flat, exact and white paper (Lambert); a wall
 stands behind it. Light falls off as it does: LEDs with the square of the distance, with the cosine on the paper and
-with their own lobe, the lens with the cosine to the fourth; the laser is a sheet of Gaussian thickness within its fan.
+with their own lobe, the lens with a power of it; the laser is a sheet of Gaussian thickness within its fan.
 The sensor is linear, its noise that of photons and of reading. Left out: motion, since the board is held still.
 """
 
@@ -34,7 +34,8 @@ LED_AT_M = 0.20  # where white paper before the lens fills LED_LEVEL of the rang
 LED_LEVEL = 0.55
 LASER_LEVEL = 0.65  # on white paper at LED_AT_M; falls with the distance, as a fan spreads
 SHEET_SIGMA_M = 4e-4
-LED_LOBE = 1.2  # LEDs behind a diffuser: power of the cosine
+LED_LOBE = 1.0  # LEDs behind a diffuser: power of the cosine
+LENS_POWER = 2.2  # of the cosine: a wide lens keeps more light at its rim than the natural fourth power
 LENS_SIGMA_PX = 0.55
 BLACK_LEVEL, FULL = 2.0, 255.0
 READ_SIGMA, ELECTRONS = 0.7, 40.0  # levels; electrons per level
@@ -81,9 +82,17 @@ class WristBoardScene:
 
 
 def board_poses(
-    optics: CameraModel, columns: int, rows: int, square_m: float, plane: LaserPlane, count: int, seed: int
+    optics: CameraModel,
+    columns: int,
+    rows: int,
+    square_m: float,
+    plane: LaserPlane | None,
+    count: int,
+    seed: int,
 ) -> Float:
     """Poses (count, 4, 4) as a person shows them: whole in the image, near and far, tilted, crossed by the laser.
+
+    Without a plane they are anywhere in the image.
 
     Raises:
         CalibrationError: The plane passes the camera's view, or the board is too large or small for it.
@@ -101,15 +110,20 @@ def board_poses(
         T[:3, :3] = rotation_vector_to_matrix(rng.uniform(-most, most))
         T[:3, 3] = np.append(rng.uniform(-reach, reach), 1.0) * z
         around = rim @ T[:3, :3].T + T[:3, 3]
-        side = around @ np.array(plane.normal) - plane.offset_m
         uv = optics.project(around)
         inside = (uv > 3.0) & (uv < np.array([optics.width_px, optics.height_px]) - 4.0)
-        if inside.all() and min(side.max(), -side.min()) > square_m:
+        if inside.all() and (plane is None or _crossed(around, plane) > square_m):
             T[:3, 3] -= T[:3, :3] @ np.append(half * square_m, 0.0)
             found.append(T)
         if len(found) == count:
             return np.stack(found)
     raise CalibrationError("a board of this size cannot be shown to this camera so that its laser crosses it")
+
+
+def _crossed(points: Float, plane: LaserPlane) -> float:
+    """How far points (n, 3) reach to both sides of a plane, the lesser of the two [m]."""
+    side = points @ np.array(plane.normal) - plane.offset_m
+    return float(min(side.max(), -side.min()))
 
 
 class WristBoardRenderer:
@@ -132,22 +146,23 @@ class WristBoardRenderer:
             for du in (np.arange(FINE) + 0.5) / FINE - 0.5:
                 rays.append(np.moveaxis(xy + du * along + dv * down, -1, 0).astype(np.float32))
         self._rays = rays
-        self._cos4 = ((1.0 + (xy**2).sum(axis=-1)) ** -2.0).astype(np.float32)
+        self._lens = ((1.0 + (xy**2).sum(axis=-1)) ** (-0.5 * LENS_POWER)).astype(np.float32)
 
     def render(self, pose: int, lit: Illumination) -> Image:
         """Image (H, W) of the board in pose number `pose`."""
         scene = self._scene
         T = scene.poses[pose]
-        light = np.zeros(self._cos4.shape, np.float32)
+        light = np.zeros(self._lens.shape, np.float32)
         for x, y in self._rays:
             light += self._radiance(T, x, y, lit)
-        light *= self._cos4 / np.float32(len(self._rays))
+        light *= self._lens / np.float32(len(self._rays))
         return self._exposed(light, pose, lit)
 
     def _radiance(self, T: Float, x: Float32, y: Float32, lit: Illumination) -> Float32:
         """Light (H, W), 1 = the sensor's range, along rays (x, y, 1)."""
         scene, normal = self._scene, T[:3, 2].astype(np.float32)
-        depth = np.float32(T[:3, 2] @ T[:3, 3]) / (normal[0] * x + normal[1] * y + normal[2])
+        facing = normal[0] * x + normal[1] * y + normal[2]
+        depth = np.float32(T[:3, 2] @ T[:3, 3]) / np.where(np.abs(facing) > 1e-6, facing, np.float32(1e-6))
         a, b = (T[:3, :2].T / scene.square_m).astype(np.float32)
         a0, b0 = (T[:3, :2].T @ T[:3, 3] / scene.square_m).astype(np.float32)
         i = depth * (a[0] * x + a[1] * y + a[2]) - a0

@@ -23,9 +23,10 @@ Grey = npt.NDArray[np.float32]
 
 _TEXEL_PX = 0.6
 _MOST_TEXELS = 900  # per side
-_REACH_PX = 7.0  # of a profile to both sides
+_REACH_PX = 8.0  # of a profile to both sides
 _STEP_PX = 0.25
-_WINDOW_PX = 1.6  # standard deviation of the window: a little wider than the line
+_WINDOW_PX = 1.6  # standard deviation of the window: a little wider than the line ...
+_WINDOW = 1.2  # ... that is, than the half of it that is brighter than its half
 _BORDER_PX = 3.0  # kept from the borders of squares ...
 _BORDER = 0.3  # ... but never more of a square than this
 _NOISE_TIMES = 6.0
@@ -155,9 +156,12 @@ def _profiles(
     whole = np.isfinite(profile).all(axis=1)
     s, profile = s[whole], profile[whole]
     light = profile - np.median(profile[:, np.abs(d) > 0.6 * _REACH_PX], axis=1)[:, None]
+    # Wider than what is brighter than half of it: on the flat top of a saturated line a narrow one would rest anywhere.
+    half = 0.5 * _STEP_PX * (light > 0.5 * light.max(axis=1, initial=0.0)[:, None]).sum(axis=1)
+    window = np.maximum(_WINDOW_PX, _WINDOW * half)[:, None]
     centre = np.zeros(len(s))
     for _ in range(8):
-        weight = light * np.exp(-0.5 * ((d - centre[:, None]) / _WINDOW_PX) ** 2)
+        weight = light * np.exp(-0.5 * ((d - centre[:, None]) / window) ** 2)
         total = weight.sum(axis=1)
         centre = np.where(total > 0, (weight * d).sum(axis=1) / np.where(total > 0, total, 1.0), np.nan)
     height = light[np.arange(len(s)), np.abs(d - np.nan_to_num(centre)[:, None]).argmin(axis=1)]

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from common.camera_model import CameraModel
 from common.errors import RecordingError
 from common.replacing import replacing
+from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, field_at
 from master.calibrate.wrist.plane import PlaneFit, ViewLine
 
 _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
@@ -42,6 +43,44 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
     bars.axhline(0.0, color=_GREY, linewidth=0.8)
     bars.set(title="view's distance from the plane [mm]; orange: left out")
     bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
+    _save(figure, path)
+
+
+def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
+    """The flat field over the image, where white paper was seen, and what is left of it. PNG.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = _figure((15.0, 4.2))
+    figure.suptitle(
+        f"flat field: residual {100 * fit.rms:.2f} %, of views left out of the fit {100 * fit.foretold_rms:.2f} %"
+    )
+    field, left, law = figure.subplots(1, 3)
+    u, v = np.meshgrid(np.arange(0, optics.width_px, 8.0), np.arange(0, optics.height_px, 8.0))
+    xy = optics.undistort(np.stack([u, v], axis=-1)).reshape(-1, 2)
+    values = field_at(fit.field, xy).reshape(u.shape)
+    _frame(field, optics, "flat field, 1 on the axis; dots: samples")
+    drawn = field.contourf(u, v, values, levels=20, cmap="viridis")
+    field.plot(samples.uv[:, 0], samples.uv[:, 1], ".", markersize=1, color="white", alpha=0.5)
+    figure.colorbar(drawn, ax=field)
+    _frame(left, optics, "residual [%]")
+    limit = max(300.0 * fit.rms, 1.0)
+    dots = left.scatter(
+        samples.uv[:, 0],
+        samples.uv[:, 1],
+        c=100 * fit.residual,
+        s=6,
+        cmap="coolwarm",
+        vmin=-limit,
+        vmax=limit,
+    )
+    figure.colorbar(dots, ax=left)
+    law.plot(np.linalg.norm(samples.xy, axis=1), 100 * fit.residual, ".", markersize=2, color=_BLUE)
+    law.axhline(0.0, color=_GREY, linewidth=0.8)
+    law.set(
+        title="residual [%] by distance from the axis", xlabel="tangent of the angle", ylim=(-limit, limit)
+    )
     _save(figure, path)
 
 

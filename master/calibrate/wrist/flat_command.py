@@ -1,0 +1,137 @@
+"""`phalanx-master calibrate flat-field`: how the LEDs and the lens of a wrist device light its image."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import RigCalibration
+from common.camera_model import CameraModel
+from common.errors import FitError
+from common.frame_recording import Illumination
+from master.calibrate.cameras.boards import Board
+from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.device import Device, device_of, say, write_device
+from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
+from master.calibrate.wrist.laser_command import Source
+from master.calibrate.wrist.lit_views import LitView, lit_views
+from master.calibrate.wrist.placed import placed_board
+from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
+from master.summary import write_summary
+
+Picture = Annotated[
+    Path | None, typer.Option(help="Write a picture of the flat field and its residuals to this .png.")
+]
+
+
+@dataclass(frozen=True, slots=True)
+class WhiteSeen:
+    """Samples of the views that have some, and the reason of every other view."""
+
+    samples: WhiteSamples
+    views: int
+    refused: tuple[str, ...]
+
+
+def flat_field(
+    source: Source,
+    board: Size,
+    square_mm: SquareMm,
+    marker_mm: MarkerMm = None,
+    dictionary: Dictionary = "4X4_50",
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    out: ResultTree = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+) -> None:
+    """Measure the flat field of a wrist device's LEDs from twenty views of a board on matt paper.
+
+    Its white squares at known places tell how bright paper looks in every part of the image. Show the board
+    everywhere, in the corners too, its face to the camera, still, in a room that is not too bright. Nothing is written
+    without --out.
+
+    Examples:
+
+      phalanx-master calibrate flat-field RECORDING --board 9x6 --square-mm 15 --rig wrist --out calib_json
+
+      phalanx-master calibrate flat-field images --board 9x6 --square-mm 15 --rig wrist --picture flat.png
+    """
+    device = device_of(source, rig, calibration, out)
+    views = lit_views(source, device.camera.name, Illumination.LED)
+    leds = np.array(device.rig.led) if device.rig.led else np.zeros((1, 3))
+    seen = white_of(views, board_of(board, square_mm, marker_mm, dictionary), device.optics, leds)
+    try:
+        fit = fit_flat_field(seen.samples, device.optics)
+    except FitError as error:
+        raise FitError(f"{source}: {error}" + "".join(f"\n  {reason}" for reason in seen.refused)) from error
+    say(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
+    if picture is not None:
+        from master.calibrate.wrist.picture import draw_flat_field  # matplotlib takes a second to import
+
+        draw_flat_field(picture, fit, seen.samples, device.optics)
+        typer.echo(f"drew {picture}")
+    written = write_device(out, device, rig_with_field(device, fit, seen), "flat_field")
+    if json_file is not None:
+        told: dict[str, object] = {
+            "coefficients": list(fit.field.coefficients),
+            "rms_percent": round(100 * fit.rms, 4),
+            "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
+            "samples": len(seen.samples.light),
+            "views": seen.views,
+            "refused": list(seen.refused),
+            "written": None if written is None else str(written),
+        }
+        write_summary(json_file, told)
+
+
+def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_m: Float) -> WhiteSeen:
+    """The white squares of every view.
+
+    Raises:
+        RecordingError: An image cannot be read.
+    """
+    found: list[tuple[Float, Float, Float]] = []
+    refused: list[str] = []
+    for view in views:
+        led, ambient = view.load(Illumination.LED), view.load(Illumination.AMBIENT)
+        assert led is not None  # `lit_views` gives whole ones
+        assert ambient is not None
+        try:
+            placed = placed_board(view, board, optics)
+            found.append(white_samples(led, ambient, placed, board, optics, led_m))
+        except FitError as error:
+            refused.append(f"view {view.name}: {error}")
+    if not found:
+        found.append((np.empty((0, 2)), np.empty((0, 2)), np.empty(0)))
+    return WhiteSeen(gathered(found), len(views) - len(refused), tuple(refused))
+
+
+def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool) -> list[str]:
+    """The result for a person."""
+    lines = [
+        f"flat field from {len(seen.samples.light)} samples in {seen.views} of {views} views",
+        f"  residual {100 * fit.rms:.2f} % rms; of views left out of the fit {100 * fit.foretold_rms:.2f} %",
+    ]
+    if not known_leds:
+        lines.append("  the rig has no `led`: the LEDs were taken to be at the lens")
+    if seen.refused:
+        lines += [f"left out ({len(seen.refused)}):", *(f"  {reason}" for reason in seen.refused)]
+    return lines
+
+
+def rig_with_field(device: Device, fit: FlatFit, seen: WhiteSeen) -> RigCalibration:
+    """The device's rig with the flat field and where it comes from."""
+    residual = {
+        "rms_percent": round(100 * fit.rms, 4),
+        "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
+    }
+    note = f"{len(seen.samples.light)} samples of white squares in {seen.views} views"
+    how = provenance("calibrate flat-field", (device.source,), residual, note)
+    rig = device.rig
+    return replace(rig, flat_field=fit.field, provenance=rig.provenance | {"flat_field": how})

@@ -1,0 +1,250 @@
+"""The flat field of a wrist device's LEDs and lens, from the white squares of a board whose pose is known.
+
+White paper at X with normal n gets E = sum over LEDs of cos / r^2; what a pixel says beyond that is the flat field F:
+
+    led - ambient = k F(x, y) E
+
+with k the paper and the gain, which nobody needs. The logarithm of k F is fitted: a power of the cosine off the axis,
+as LEDs and lenses have it, times a smooth correction of third degree that is believed to be small; so F stays sane
+where there was no paper. Samples that stray (shine, shadow, dirt) count little. The file holds a polynomial of sixth
+degree in the normalised image point, laid through this over the whole image. In the corners of a wide lens, where F
+is a fifth, a polynomial follows a power of the cosine to ten per cent only; in the middle half to two.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Image, Int
+from common.camera_model import CameraModel
+from common.errors import FitError
+from common.geometry import transform
+from common.wrist_calibration import FLAT_FIELD_TERMS, FlatField
+from master.calibrate.cameras.boards import Board, grid_shape
+from master.calibrate.wrist.placed import PlacedBoard
+
+_SATURATED = 250
+_DARKEST = 8.0  # levels above ambient: below, noise and the byte's steps are several per cent
+_STEEPEST = np.cos(np.radians(60.0))  # paper is no Lambertian beyond
+_WITHIN = np.array([-0.22, 0.0, 0.22])  # of a square from its middle: clear of blurred borders
+_DEGREE = 6
+_CORRECTION_SIGMA = 0.15  # of a coefficient of the correction, where the tangent is 1
+_SAMPLE_SIGMA = 0.02  # of paper; samples of one view do not stray independently, so more than of one alone
+_GRID = (24, 32)
+_FOLDS = 5
+_CELLS = (3, 3)
+_ENOUGH_CELL = 6  # samples
+_WORST_RMS = 0.05
+_HUBER = 2.5
+_PLACES = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WhiteSamples:
+    """Light of white paper, over all views. S samples.
+
+    Attributes:
+        xy: (S, 2) normalised image points.
+        uv: (S, 2) [px].
+        light: (S,) levels above ambient, divided by what inverse square and cosine make of the LEDs [levels m^2].
+        view: (S,) number of the view.
+    """
+
+    xy: Float
+    uv: Float
+    light: Float
+    view: Int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlatFit:
+    """A fitted flat field.
+
+    Attributes:
+        field: 1 on the axis.
+        rms: Relative residual of the samples, robust.
+        foretold_rms: The same of views that were left out of the fit.
+        residual: (S,) relative residual of each sample.
+    """
+
+    field: FlatField
+    rms: float
+    foretold_rms: float
+    residual: Float
+
+
+def white_samples(
+    led: Image, ambient: Image, placed: PlacedBoard, board: Board, optics: CameraModel, led_m: Float
+) -> tuple[Float, Float, Float]:
+    """Samples of the white squares of one view: xy (s, 2), uv (s, 2), light (s,) as in `WhiteSamples`.
+
+    Args:
+        led, ambient: Frames (H, W).
+        placed: Where the board is.
+        board: Its squares.
+        optics: The camera.
+        led_m: (L, 3) where the LEDs are [m].
+
+    Raises:
+        FitError: No white square is bright enough, or all are too bright; the text is the reason.
+    """
+    at, white = _squares(board, placed, optics, led)
+    points = transform(placed.T_camera_board, at[white])
+    uv = optics.project(points)
+    height, width = led.shape
+    inside = ((uv >= 2) & (uv <= np.array([width, height]) - 3.0)).all(axis=1)
+    points, uv = points[inside], uv[inside]
+    level = _at(_smooth(led) - _smooth(ambient), uv)
+    too_bright = _at(cast(Image, cv2.dilate(led, np.ones((3, 3), np.uint8))), uv) >= _SATURATED
+    way = points[:, None] - led_m
+    square = (way**2).sum(axis=2)
+    cosine = (way @ placed.T_camera_board[:3, 2]) / np.sqrt(square)
+    expected = (np.maximum(cosine, 0.0) / square).mean(axis=1)
+    good = ~too_bright & (level >= _DARKEST) & (cosine.min(axis=1) >= _STEEPEST)
+    if not good.any():
+        if len(level) and too_bright.mean() > 0.5:
+            raise FitError("its white squares are saturated: hold the board farther away")
+        raise FitError(
+            "its white squares are too dark or too steep: hold the board nearer, its face to the camera"
+        )
+    return points[good, :2] / points[good, 2:], uv[good], level[good] / expected[good]
+
+
+def _squares(board: Board, placed: PlacedBoard, optics: CameraModel, led: Image) -> tuple[Float, Int]:
+    """Places (n, 3) on the board within its whole squares, and the numbers of those that are white."""
+    rows, columns = grid_shape(board)
+    j, i = np.mgrid[0 : rows - 1, 0 : columns - 1] + 0.5
+    middles = np.stack([i.ravel(), j.ravel()], axis=1)
+    spots = np.stack(np.meshgrid(_WITHIN, _WITHIN), axis=-1).reshape(-1, 2)
+    at = (middles[:, None] + spots).reshape(-1, 2) * board.square_m
+    at = np.concatenate([at, np.zeros((len(at), 1))], axis=1)
+    odd = np.repeat((np.floor(middles).sum(axis=1) % 2).astype(np.int64), len(spots))
+    level = _at(led, optics.project(transform(placed.T_camera_board, at)))
+    light = [float(np.nanmedian(level[odd == k])) for k in (0, 1)]
+    return at, np.flatnonzero(odd == int(np.argmax(light))).astype(np.int64)
+
+
+def _smooth(image: Image) -> Float:
+    """Means of 3 x 3 pixels (H, W)."""
+    return np.asarray(cv2.blur(image.astype(np.float64), (3, 3)), np.float64)
+
+
+def _at(image: Float | Image, uv: Float) -> Float:
+    """Values (n,) of the nearest pixels; NaN outside."""
+    height, width = image.shape
+    u, v = np.rint(uv).T
+    inside = (u >= 0) & (v >= 0) & (u < width) & (v < height)
+    found = np.full(len(uv), np.nan)
+    found[inside] = image[v[inside].astype(int), u[inside].astype(int)]
+    return found
+
+
+def gathered(views: Sequence[tuple[Float, Float, Float]]) -> WhiteSamples:
+    """Samples of all views together."""
+    count = [len(light) for _, _, light in views]
+    xy, uv, light = (np.concatenate([view[k] for view in views]) for k in range(3))
+    return WhiteSamples(xy, uv, light, np.repeat(np.arange(len(views)), count).astype(np.int64))
+
+
+def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
+    """The polynomial that the samples tell.
+
+    Args:
+        samples: Of five views or more.
+        optics: The camera.
+
+    Raises:
+        FitError: A part of the image without white paper (named), too few views, or light that follows no such law.
+    """
+    views = int(samples.view.max(initial=-1)) + 1
+    if views < _FOLDS:
+        raise FitError(f"{views} views with white squares; at least {_FOLDS} are needed (better 20)")
+    _refuse_uncovered(samples, (optics.width_px, optics.height_px))
+    v, u = (np.indices(_GRID) + 0.5) * np.array([optics.height_px, optics.width_px])[:, None, None]
+    pixels = np.stack([u / _GRID[1], v / _GRID[0]], axis=-1).reshape(-1, 2)
+    grid = optics.undistort(pixels - 0.5)
+    foretold = np.full(len(samples.light), np.nan)
+    for fold in range(_FOLDS):
+        out = samples.view % _FOLDS == fold
+        told = _polynomial(_law(samples.xy[~out], samples.light[~out]), grid)
+        foretold[out] = samples.light[out] / (terms_of(samples.xy[out], _DEGREE) @ told) - 1.0
+    coefficients = _polynomial(_law(samples.xy, samples.light), grid)
+    residual = samples.light / (terms_of(samples.xy, _DEGREE) @ coefficients) - 1.0
+    fit = FlatFit(
+        FlatField(coefficients=tuple(round(float(c / coefficients[0]), 7) for c in coefficients)),
+        _spread(residual),
+        _spread(foretold),
+        residual,
+    )
+    if fit.foretold_rms > _WORST_RMS:
+        raise FitError(
+            f"the light of the white squares strays {100 * fit.foretold_rms:.1f} % from any flat field (limit"
+            f" {100 * _WORST_RMS:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
+        )
+    return fit
+
+
+def terms_of(xy: Float, degree: int) -> Float:
+    """Terms (S, T) of the polynomial, in the order of `FlatField.coefficients`."""
+    x, y = xy[:, 0], xy[:, 1]
+    return np.stack([x ** (d - k) * y**k for d in range(degree + 1) for k in range(d + 1)], axis=1)
+
+
+def field_at(field: FlatField, xy: Float) -> Float:
+    """The flat field (S,) at normalised image points (S, 2)."""
+    return terms_of(xy, FLAT_FIELD_TERMS.index(len(field.coefficients))) @ np.array(field.coefficients)
+
+
+def _law(xy: Float, light: Float) -> Float:
+    """Coefficients of the logarithm of k F by least squares; samples that stray are weighed down (Huber)."""
+    terms, wanted = _law_terms(xy), np.log(light)
+    believed = np.diag(np.r_[0.0, 0.0, np.full(terms.shape[1] - 2, (_SAMPLE_SIGMA / _CORRECTION_SIGMA) ** 2)])
+    weight = np.ones(len(light))
+    found = np.zeros(terms.shape[1])
+    for _ in range(8):
+        normal = terms.T @ (weight[:, None] * terms) + believed
+        found = np.asarray(np.linalg.solve(normal, terms.T @ (weight * wanted)), np.float64)
+        off = np.abs(terms @ found - wanted)
+        weight = 1.0 / np.maximum(off / (_HUBER * max(1.4826 * float(np.median(off)), 1e-6)), 1.0)
+    return found
+
+
+def _law_terms(xy: Float) -> Float:
+    """Terms (S, 11): 1, the logarithm of the cosine off the axis, and x ... y^3."""
+    cosine = -0.5 * np.log1p((xy**2).sum(axis=1))
+    return np.concatenate([np.ones((len(xy), 1)), cosine[:, None], terms_of(xy, 3)[:, 1:]], axis=1)
+
+
+def _polynomial(law: Float, grid: Float) -> Float:
+    """Coefficients (T,) of k F as a polynomial, from the law at `grid` (G, 2); dark corners weigh less."""
+    wanted = np.exp(_law_terms(grid) @ law)
+    root = 1.0 / np.sqrt(wanted)
+    terms = terms_of(grid, _DEGREE) * root[:, None]
+    return np.asarray(np.linalg.lstsq(terms, wanted * root, rcond=None)[0], np.float64)
+
+
+def _spread(off: Float) -> float:
+    """Rms of residuals, those beyond five robust standard deviations cut."""
+    limit = 5.0 * 1.4826 * float(np.median(np.abs(off)))
+    return float(np.sqrt(np.mean(np.clip(off, -limit, limit) ** 2)))
+
+
+def _refuse_uncovered(samples: WhiteSamples, size_px: tuple[int, int]) -> None:
+    rows, columns = _CELLS
+    i = np.clip((samples.uv[:, 0] + 0.5) * columns / size_px[0], 0, columns - 1).astype(int)
+    j = np.clip((samples.uv[:, 1] + 0.5) * rows / size_px[1], 0, rows - 1).astype(int)
+    count = np.zeros(_CELLS, dtype=np.int64)
+    np.add.at(count, (j, i), 1)
+    missing = [_PLACES[j][i] for j in range(rows) for i in range(columns) if count[j, i] < _ENOUGH_CELL]
+    if missing:
+        raise FitError(
+            f"no white squares at the {', '.join(missing)} of the image: a flat field is needed there too;"
+            " show the board there"
+        )
