@@ -6,14 +6,15 @@ that of Quilez, "Round cone - intersection".)
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Int
 
-Real = npt.NDArray[np.floating[Any]]  # single precision for pictures, double for truth
+Plane = npt.NDArray[np.float32]
+Real = TypeVar("Real", Float, Plane)  # double for truth, single for pictures
 
 _ALONG = 1e-6  # a ray within the cone's own angle of its axis meets the spheres only
 
@@ -38,52 +39,69 @@ class Cones:
             self.start_m[bodies], self.stop_m[bodies], self.start_radius_m[bodies], self.stop_radius_m[bodies]
         )
 
-    def normals(self, body: Int, points: Real) -> Float:
-        """Outward unit normals (N, 3) at surface points (N, 3) [m] of the bodies `body` (N,)."""
-        foot, start = self.feet(body, points), self.start_m[body]
-        out = points - start - foot[:, None] * (self.stop_m - self.start_m)[body]
+    def normals(self, body: Int, points: Real) -> Real:
+        """Outward unit normals (N, 3) at surface points (N, 3) [m] of the bodies `body` (N,), as exact as these."""
+        kind = points.dtype
+        axis = self.stop_m - self.start_m
+        narrowing = self.start_radius_m - self.stop_radius_m
+        # On the side the normal leans by half the angle of the cone, so its foot is not the nearest point of the axis.
+        scale = 1.0 / np.maximum((axis * axis).sum(axis=1) - narrowing**2, 1e-12)
+        table = np.concatenate([self.start_m, axis, axis * scale[:, None]], axis=1)
+        shift = (self.start_radius_m * narrowing * scale).astype(kind)
+        own = table.astype(kind)[body]
+        out = points - own[:, :3]
+        foot = np.einsum("ij,ij->i", out, own[:, 6:]) - shift[body]
+        out -= np.clip(foot, 0.0, 1.0)[:, None] * own[:, 3:6]
         out /= np.sqrt(np.einsum("ij,ij->i", out, out))[:, None]
         return out
 
-    def feet(self, body: Int, points: Real) -> Float:
-        """Where along the axis (0 ... 1) the normals at surface points (N, 3) [m] of the bodies (N,) begin, (N,)."""
-        axis = self.stop_m - self.start_m
-        narrowing = self.start_radius_m - self.stop_radius_m
-        square = np.einsum("ij,ij->i", axis, axis)
-        # On the side the normal leans by half the angle of the cone.
-        shift, scale = self.start_radius_m * narrowing, 1.0 / np.maximum(square - narrowing**2, 1e-12)
-        along = np.einsum("ij,ij->i", points - self.start_m[body], axis[body])
-        return np.clip((along - shift[body]) * scale[body], 0.0, 1.0)
 
-
-def distances(cones: Cones, origin: Float, directions: Real) -> Real:
-    """How far along rays (N, 3) of unit length from one origin (3,) [m] each body begins, (N, B) [m]; inf: not hit.
-
-    In the precision of `directions`.
-    """
-    kind = directions.dtype
+def terms(cones: Cones, origin: Float, kind: type[np.float32] | type[np.float64]) -> Any:
+    """What `first_hits` needs to know of each body, seen from the origin (3,) [m] of the rays: (12, B) of a kind."""
     axis = cones.stop_m - cones.start_m
-    r1, r2 = cones.start_radius_m, cones.stop_radius_m
-    narrowing = r1 - r2
+    r1, narrowing = cones.start_radius_m, cones.start_radius_m - cones.stop_radius_m
     away, beyond = origin - cones.start_m, origin - cones.stop_m
-    m0, m1 = (axis * axis).sum(1), (axis * away).sum(1)
-    m5, m7 = (away * away).sum(1), (beyond * beyond).sum(1)
+    m0, m1, m5 = ((a * b).sum(axis=1) for a, b in ((axis, axis), (axis, away), (away, away)))
     d2 = m0 - narrowing**2
     k0 = d2 * m5 - m1**2 + 2.0 * m1 * narrowing * r1 - m0 * r1**2
-    lean, shift, c1, c2 = (
-        x.astype(kind) for x in (narrowing * r1 - m1, m1 - r1 * narrowing, m5 - r1**2, m7 - r2**2)
-    )
-    d2, k0 = d2.astype(kind), k0.astype(kind)
-    m2, m3 = directions @ axis.T.astype(kind), directions @ away.T.astype(kind)
+    ends = m5 - r1**2, (beyond * beyond).sum(axis=1) - cones.stop_radius_m**2
+    return np.array((*axis.T, *away.T, d2, k0, narrowing * r1 - m1, m1 - r1 * narrowing, *ends), dtype=kind)
+
+
+def first_hits(known: Any, directions: Real) -> Real:
+    """How far along rays (3, ...) of unit length their body begins, each its own or all of them the same.
+
+    Args:
+        known: `terms` of one body (12,), or of the body of each ray (12, ...).
+        directions: The rays, from the origin of the terms.
+
+    Returns:
+        (...) [m], in the precision of both; inf: not hit.
+    """
+    ax, ay, az, wx, wy, wz, d2, k0, lean, shift, c1, c2 = known
+    dx, dy, dz = directions
+    m2, m3 = dx * ax + dy * ay + dz * az, dx * wx + dy * wy + dz * wz
     with np.errstate(invalid="ignore", divide="ignore"):
         k2 = d2 - m2 * m2
         k1 = d2 * m3 + m2 * lean
         side = (-np.sqrt(k1 * k1 - k0 * k2) - k1) / k2
         foot = shift + side * m2
-        side[~((foot > 0.0) & (foot < d2) & (k2 > _ALONG * d2))] = np.inf
+        side = np.where((foot > 0.0) & (foot < d2) & (k2 > _ALONG * d2), side, np.inf)
         first = -m3 - np.sqrt(m3 * m3 - c1)
         m3 -= m2
-        second = -m3 - np.sqrt(m3 * m3 - c2)
-    best = np.fmin(np.fmin(first, second), side)
-    best[~(best > 0.0)] = np.inf
-    return best
+        best = np.fmin(np.fmin(first, side), -m3 - np.sqrt(m3 * m3 - c2))
+    hit: Any = np.where(best > 0.0, best, np.inf)
+    return hit
+
+
+def distances(cones: Cones, origin: Float, directions: Float) -> Float:
+    """How far along each ray (N, 3) from one origin each body begins (N, B) [m]; inf: not hit."""
+    middle = 0.5 * (cones.start_m + cones.stop_m) - origin
+    half = 0.5 * np.linalg.norm(cones.stop_m - cones.start_m, axis=1)
+    radius = half + np.maximum(cones.start_radius_m, cones.stop_radius_m)
+    along = directions @ middle.T
+    # Only bodies whose spheres about them are met.
+    ray, body = np.nonzero((middle * middle).sum(axis=1) - along * along < radius**2)
+    out = np.full(along.shape, np.inf)
+    out[ray, body] = first_hits(terms(cones, origin, np.float64)[:, body], directions[ray].T)
+    return out

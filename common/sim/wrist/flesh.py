@@ -6,6 +6,7 @@ the palm carries stands still in the camera's frame; what a finger carries moves
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ PALM_GROUP, THENAR_GROUP = 0, 6
 THUMB_SEGMENTS, FINGER_SEGMENTS = (0, 1, 3), (1, 2, 3)  # by phalanx: 3 is the last of every finger
 
 _RADIUS_SPREAD = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
-_PAD_M, _PULP_M = (0.0006, 0.0016), (0.0008, 0.0020)  # how far pads and pulps stand out of the cone
+_PAD_M, _PULP_M = (0.0002, 0.0010), (0.0006, 0.0016)  # how far pads and pulps stand out of the cone
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,25 +50,24 @@ class Flesh:
     def of(cls, model: HandModel, seed: int) -> "Flesh":
         """Draw the flesh of one hand; the same seed, the same flesh."""
         rng = np.random.default_rng([seed, 21])
-        radius = model.radius_m * np.clip(rng.normal(1.0, _RADIUS_SPREAD, 26), 0.88, 1.12)
-        bodies = [*_palm(model, radius, rng)]
-        still = len(bodies)
+        radius = (model.radius_m * np.clip(rng.normal(1.0, _RADIUS_SPREAD, 26), 0.88, 1.12)).tolist()
+        parts = _palm(model, radius, rng)
+        still = len(parts)
         tips: list[int] = []
         for finger in range(5):
-            bodies += _finger(model, radius, finger, rng)
-            tips.append(len(bodies) - 1)
-        bodies += _thenar(model, radius, rng)
-        joint, start, stop, r1, r2, group, segment = zip(*bodies, strict=True)
+            parts += _finger(model, radius, finger, rng)
+            tips.append(len(parts) - 1)
+        parts += _thenar(model, radius, rng)
         return cls(
-            np.array(joint),
-            np.array(start),
-            np.array(stop),
-            np.array(r1),
-            np.array(r2),
-            np.array(group),
-            np.array(segment),
-            np.array(tips),
-            still,
+            joint=np.array([part.joint for part in parts]),
+            start=np.array([part.start for part in parts]),
+            stop=np.array([part.stop for part in parts]),
+            start_radius_m=np.array([part.start_radius_m for part in parts]),
+            stop_radius_m=np.array([part.stop_radius_m for part in parts]),
+            group=np.array([part.group for part in parts]),
+            segment=np.array([part.segment for part in parts]),
+            tip=np.array(tips),
+            still=still,
         )
 
     def bodies(self, joints: HandJoints) -> Cones:
@@ -84,70 +84,76 @@ class Flesh:
         return bodies.stop_m[self.tip] + self.stop_radius_m[self.tip, None] * along, along
 
 
-_Body = tuple[int, Float, Float, float, float, int, int]
+class _Part(NamedTuple):
+    """One body: its joint, its ends (3,) in that frame [m], radii [m], group, segment."""
+
+    joint: int
+    start: Float
+    stop: Float
+    start_radius_m: float
+    stop_radius_m: float
+    group: int
+    segment: int
 
 
-def _finger(model: HandModel, radius: Float, finger: int, rng: np.random.Generator) -> list[_Body]:
+def _finger(model: HandModel, radius: list[float], finger: int, rng: np.random.Generator) -> list[_Part]:
     """Cones along the phalanges with a pad each; the last phalanx's own cone comes last."""
     segments = FINGER_SEGMENTS if finger else THUMB_SEGMENTS
-    out: list[_Body] = []
+    out: list[_Part] = []
     for k in range(3):
-        near, far = CHAINS[finger, k], CHAINS[finger, k + 1]
-        bone, group = model.bone_m[finger, k], finger + 1 if finger or k else THENAR_GROUP
-        at = (group, segments[k])
-        if finger or k:
-            share, size, proud = ((0.25, 0.8), 0.9, _PAD_M) if k < 2 else ((0.3, 0.92), 0.88, _PULP_M)
+        near, far = int(CHAINS[finger, k]), int(CHAINS[finger, k + 1])
+        bone = model.bone_m[finger, k]
+        group = finger + 1 if finger or k else THENAR_GROUP
+        if group != THENAR_GROUP:
+            low, high, size, proud = (0.3, 0.92, 0.88, _PULP_M) if k == 2 else (0.25, 0.8, 0.9, _PAD_M)
+            palmar = np.array([0.0, -rng.uniform(*proud) - (1.0 - size) * radius[near], 0.0])
             r1, r2 = size * radius[near], size * radius[far]
-            palmar = np.array([0.0, -1.0, 0.0]) * (rng.uniform(*proud) + (1.0 - size) * radius[near])
-            out.append((int(near), share[0] * bone + palmar, share[1] * bone + palmar, r1, r2, *at))
-        out.append((int(near), np.zeros(3), bone, radius[near], radius[far], *at))
+            out.append(_Part(near, low * bone + palmar, high * bone + palmar, r1, r2, group, segments[k]))
+        out.append(_Part(near, np.zeros(3), bone, radius[near], radius[far], group, segments[k]))
     return out
 
 
-def _thenar(model: HandModel, radius: Float, rng: np.random.Generator) -> list[_Body]:
+def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> list[_Part]:
     """The ball of the thumb, which moves with its metacarpal."""
     bone, near = model.bone_m[0, 0], int(CHAINS[0, 0])
     ball = rng.uniform(0.95, 1.1) * radius[near]
     # Across the palm: towards the middle finger, in the frame of the thumb's metacarpal.
     inward = model.rest_rotation[near].T @ np.array([-model.side_sign, 0.0, 0.0])
-    at = (THENAR_GROUP, 0)
     side = 0.009 * inward + np.array([0.0, rng.uniform(-0.003, -0.001), 0.0])
-    return [
-        (near, 0.05 * bone + side, 0.62 * bone + 0.6 * side, ball, 0.85 * ball, *at),
-        (near, 0.1 * bone + 1.8 * side, 0.8 * bone + 1.6 * side, 0.85 * ball, 0.55 * ball, *at),
-    ]
+    ends = (
+        (0.05 * bone + side, 0.62 * bone + 0.6 * side, ball, 0.85 * ball),
+        (0.1 * bone + 1.8 * side, 0.8 * bone + 1.6 * side, 0.85 * ball, 0.55 * ball),
+    )
+    return [_Part(near, *end, THENAR_GROUP, 0) for end in ends]
 
 
-def _palm(model: HandModel, radius: Float, rng: np.random.Generator) -> list[_Body]:
-    """Metacarpals, what fills the gaps between them, the heel on the side of the little finger, and the forearm."""
-    place, wrist_turn = model.rest_position_m, model.rest_rotation[WRIST]
+def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> list[_Part]:
+    """Metacarpals and what fills the gaps between them, the mounds before the fingers, the heel, the forearm."""
+    place, wrist_turn, s = model.rest_position_m, model.rest_rotation[WRIST], model.side_sign
     roots = CHAINS[1:, 0]
-    heads = place[roots]
-    bases = place[list(METACARPALS)]
-    out: list[_Body] = []
+    heads, bases = place[roots], place[list(METACARPALS)]
+    head_m, base_m = 1.15 * np.array(radius)[roots], np.array(radius)[list(METACARPALS)]
+    out: list[_Part] = []
 
     def add(start: Float, stop: Float, r1: float, r2: float) -> None:
-        # The wrist's joint frame carries the palm: palm frame -> that frame.
-        out.append((WRIST, wrist_turn.T @ start, wrist_turn.T @ stop, r1, r2, PALM_GROUP, 0))
-
-    thick = radius[list(METACARPALS)]
-    for k in range(4):
-        add(bases[k], heads[k], thick[k], 1.2 * radius[roots[k]])
-    for k in range(3):
-        r = 1.12 * 0.5 * (radius[roots[k]] + radius[roots[k + 1]])
-        add(
-            0.5 * (bases[k] + bases[k + 1]),
-            0.5 * (heads[k] + heads[k + 1]),
-            0.5 * (thick[k] + thick[k + 1]),
-            r,
+        # The frame of the wrist's joint is turned to the palm's, and does not move in it.
+        out.append(
+            _Part(WRIST, wrist_turn.T @ start, wrist_turn.T @ stop, float(r1), float(r2), PALM_GROUP, 0)
         )
-    pads = np.array([0.0, -rng.uniform(0.002, 0.004), -0.004])
+
+    for k in range(4):
+        add(bases[k], heads[k], base_m[k], head_m[k])
+    mound, web = np.array([0.0, -rng.uniform(0.002, 0.004), -0.004]), np.array([0.0, -0.001, 0.009])
     for k in range(3):
-        add(heads[k] + pads, heads[k + 1] + pads, radius[roots[k]], radius[roots[k + 1]])
-    s = model.side_sign
-    palmar = -rng.uniform(0.003, 0.006)
-    heel = np.array([-0.017 * s, -0.010 + palmar, 0.012])
-    add(heel, heads[3] + np.array([0.0, palmar, -0.016]), rng.uniform(0.012, 0.014), 0.0105)
-    add(np.array([-0.008 * s, -0.004, -0.06]), np.array([-0.005 * s, -0.004, 0.004]), 0.021, 0.019)
-    add(np.array([0.010 * s, -0.004, -0.06]), np.array([0.008 * s, -0.004, 0.012]), 0.021, 0.018)
+        j = k + 1
+        add(
+            0.5 * (bases[k] + bases[j]), 0.5 * (heads[k] + heads[j]), 0.5 * (base_m[k] + base_m[j]), head_m[k]
+        )
+        add(heads[k] + mound, heads[j] + mound, 0.87 * head_m[k], 0.87 * head_m[j])
+        add(heads[k] + web, heads[j] + web, 0.75 * head_m[k], 0.75 * head_m[j])
+    thick = -rng.uniform(0.003, 0.006)
+    heel = np.array([-0.017 * s, thick - 0.010, 0.012])
+    add(heel, heads[3] + np.array([0.0, thick, -0.016]), rng.uniform(0.012, 0.014), 0.0105)
+    for side in (-0.008, 0.010):
+        add(np.array([side * s, -0.004, -0.06]), np.array([0.7 * side * s, -0.004, 0.008]), 0.021, 0.0185)
     return out

@@ -145,9 +145,9 @@ class LineTruth:
         both = seen[chords] & seen[chords + 1]
         group, count = curve.group[chords], len(GROUPS)
         length = np.linalg.norm(curve.points[chords + 1] - curve.points[chords], axis=1)
-        lit_m = np.bincount(group, length, count)
+        lit_m = np.bincount(group, length, count).astype(np.float64)
         chords, group, length = chords[both], group[both], length[both]
-        seen_m = np.bincount(group, length, count)
+        seen_m = np.bincount(group, length, count).astype(np.float64)
         enough = seen_m >= LEAST_M
 
         def mean(value: Float, weight: Float) -> Float:

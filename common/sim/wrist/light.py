@@ -1,110 +1,133 @@
-"""The light on the scene: the room and its window behind the hand, ambient light, LEDs, the laser, and the sensor.
+"""The light on the scene: the room and its window behind the hand, LEDs and laser, and the sensor that takes it.
 
-Brightness is in levels of the sensor above black at the camera file's exposure: 253 saturates. The four rooms differ by
-what falls on the hand, by how bright the room behind it is, and by how far the window saturates.
+Brightness is in levels of the sensor above black, at the exposure of the camera's file: 253 saturates. The rooms differ
+by what falls on the hand, by how bright they are behind it, by how far the window saturates, and by sunlight on skin.
 """
 
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
 from common.arrays import Float, Image
-from common.camera_model import CameraModel
+from common.sim.wrist.cones import Plane
 
 BLACK_LEVEL = 2.0
-LED_LEVEL = 78.0  # of skin that faces the LEDs at LED_AT_M on the axis
-LED_AT_M = 0.13
-LASER_LEVEL = 2400.0  # at the middle of the line on skin that faces the laser at LED_AT_M
-SHEET_SIGMA_M = 4.2e-4  # thickness of the sheet of laser light
+LED_LEVEL = 105.0  # of skin that faces the LEDs at SKIN_AT_M on the axis
+LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SKIN_AT_M
+SKIN_AT_M = 0.13
+SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
 GLOW = (
-    (4.0, 0.035),
-    (13.0, 0.012),
-)  # light that leaves the skin beside the line: sigma [px], share of the line's
+    (5.0, 0.13),
+    (14.0, 0.10),
+)  # what comes out of the skin beside the line: sigma [px], share of the line's light
 _READ_VARIANCE, _SHOT_VARIANCE = 0.35, 0.032  # of the noise [levels^2], and per level
 _TILE_MARGIN = 128
+_LEVELS = {  # on the hand, behind it, of the window, of sun on skin
+    "dark": (0.6, 0.4, 0.0, 0.0),
+    "indoor": (24.0, 16.0, 330.0, 0.0),
+    "bright": (68.0, 46.0, 900.0, 0.0),
+    "sun": (95.0, 80.0, 2500.0, 190.0),
+}
 
-Plane = npt.NDArray[np.float32]
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Room:
-    """Levels of one ambient light: on the hand, of the wall behind it, of the window, and of a patch of sun on skin."""
+    """One ambient light.
+
+    Attributes:
+        hand, wall, window, sun: Levels on skin, behind it, of the window, and of sunlight that falls straight on skin.
+        to_sky, to_sun: Unit vectors (3,), camera frame.
+        seed: Of what stands in the room.
+    """
 
     hand: float
     wall: float
     window: float
-    sun: float = 0.0
+    sun: float
+    to_sky: Float
+    to_sun: Float
+    seed: int
+
+    @classmethod
+    def of(cls, name: str, seed: int) -> "Room":
+        """The room called dark, indoor, bright or sun."""
+        rng = np.random.default_rng([seed, 31])
+        sky = np.array([rng.uniform(-0.6, 0.6), -1.0, rng.uniform(-0.6, 0.2)])
+        sun = np.array([rng.uniform(-1.0, 1.0), -0.8, rng.uniform(-0.5, 0.1)])
+        return cls(*_LEVELS[name], sky / np.linalg.norm(sky), sun / np.linalg.norm(sun), seed)
+
+    def on_skin(self, normals: Plane) -> Plane:
+        """Levels (N,) of plain skin with normals (N, 3): light from all sides, more from above, and the sun."""
+        shade: Plane = self.hand * (0.75 + 0.25 * (normals @ self.to_sky.astype(np.float32)))
+        if self.sun > 0.0:
+            shade += self.sun * np.maximum(normals @ self.to_sun.astype(np.float32), 0.0)
+        return shade
+
+    def backdrop(self, size: tuple[int, int], step: float) -> Plane:
+        """What is seen where no hand is (H, W), `size` = (W, H): a wall, things out of focus, a bright window.
+
+        `step` is how many pixels of the camera one of the backdrop is.
+        """
+        rng = np.random.default_rng([self.seed, 33])
+        width, height = size
+        wall = np.full((height, width), self.wall, dtype=np.float32)
+        wall *= (1.0 + np.linspace(-0.25, 0.25, width) * rng.uniform(-1.0, 1.0)).astype(np.float32)
+        for _ in range(7):
+            middle, half = rng.uniform(0.0, 1.0, 2), rng.uniform(0.05, 0.25, 2)
+            _box(wall, middle - half, middle + half, self.wall * rng.uniform(0.4, 1.8))
+        if self.window > 0.0:
+            low = np.array([rng.uniform(0.0, 0.6), rng.uniform(-0.2, 0.05)])
+            high = low + np.array([rng.uniform(0.25, 0.4), rng.uniform(0.4, 0.65)])
+            bar = low[0] + rng.uniform(0.4, 0.6) * (high[0] - low[0])
+            _box(wall, low, high, self.window)
+            _box(wall, np.array([bar, low[1]]), np.array([bar + 0.02, high[1]]), 0.2 * self.window)
+        out = np.asarray(cv2.GaussianBlur(wall, (0, 0), 7.0 / step), dtype=np.float32)
+        # The lens scatters a little of the window everywhere.
+        veil = np.asarray(cv2.GaussianBlur(wall, (0, 0), 120.0 / step), dtype=np.float32)
+        return np.asarray(cv2.addWeighted(out, 1.0, veil, 0.006, 0.0), dtype=np.float32)
 
 
-ROOMS = {
-    "dark": Room(0.6, 0.4, 0.0),
-    "indoor": Room(24.0, 16.0, 330.0),
-    "bright": Room(68.0, 46.0, 900.0),
-    "sun": Room(95.0, 80.0, 2500.0, 150.0),
-}
+def _box(image: Plane, low: Float, high: Float, level: float) -> None:
+    """Fill a box given in shares of the picture."""
+    size = np.array(image.shape[::-1])
+    (x0, y0), (x1, y1) = (np.rint(corner * size).astype(int).tolist() for corner in (low, high))
+    cv2.rectangle(image, (x0, y0), (x1, y1), level, -1)
 
 
-def backdrop(room: Room, optics: CameraModel, seed: int, size: tuple[int, int]) -> Plane:
-    """What is seen where no hand is (H, W), `size` = (W, H): a wall, furniture out of focus, and a bright window."""
-    rng = np.random.default_rng([seed, 31])
-    width, height = size
-    scale = width / optics.width_px
-    wall = np.full((height, width), room.wall, dtype=np.float32)
-    slope = np.linspace(-0.25, 0.25, width) * rng.uniform(-1.0, 1.0)
-    wall *= (1.0 + slope).astype(np.float32)
-    for _ in range(7):
-        x, y = rng.uniform(0.0, width), rng.uniform(0.0, height)
-        half = rng.uniform(0.05, 0.25, 2) * size
-        level = float(room.wall * rng.uniform(0.4, 1.8))
-        cv2.rectangle(wall, _pixel(x - half[0], y - half[1]), _pixel(x + half[0], y + half[1]), level, -1)
-    if room.window > 0.0:
-        left, top = rng.uniform(0.35, 0.7) * width, rng.uniform(-0.2, 0.05) * height
-        right, low = left + rng.uniform(0.25, 0.4) * width, rng.uniform(0.3, 0.55) * height
-        cv2.rectangle(wall, _pixel(left, top), _pixel(right, low), room.window, -1)
-        bar = left + rng.uniform(0.4, 0.6) * (right - left)
-        cv2.rectangle(wall, _pixel(bar, top), _pixel(bar + 0.03 * width, low), 0.2 * room.window, -1)
-    blurred = cv2.GaussianBlur(wall, (0, 0), 4.5 * scale)
-    if room.window > 0.0:  # the lens scatters a little of the window everywhere
-        blurred += 0.006 * cv2.GaussianBlur(wall, (0, 0), 60.0 * scale)
-    return np.asarray(blurred, dtype=np.float32)
+class Leds:
+    """The LEDs beside the lens. Holds where they are."""
 
+    def __init__(self, led_m: Float) -> None:
+        """Of places (L, 3) [m], camera frame."""
+        self._led = led_m.astype(np.float32)
 
-def _pixel(x: float, y: float) -> tuple[int, int]:
-    return round(x), round(y)
-
-
-def led_light(points: Plane, normals: Plane, led_m: Float) -> Plane:
-    """Light (N,) of all LEDs on skin at points (N, 3) [m] with normals (N, 3): inverse square, Lambert's cosine.
-
-    1 is what all of them together give skin that faces them at LED_AT_M.
-    """
-    led = led_m.astype(np.float32)
-    faced = normals @ led.T - np.einsum("ij,ij->i", normals, points)[:, None]
-    square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ led.T) + (led * led).sum(axis=1)
-    np.maximum(faced, 0.0, out=faced)
-    faced /= square * np.sqrt(square)
-    return faced.sum(axis=1) * np.float32(LED_AT_M**2 / len(led))
+    def on_skin(self, points: Plane, normals: Plane) -> Plane:
+        """Levels (N,) of plain skin at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs."""
+        faced = normals @ self._led.T - np.einsum("ij,ij->i", normals, points)[:, None]
+        square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ self._led.T)
+        square += (self._led * self._led).sum(axis=1)
+        np.maximum(faced, 0.0, out=faced)
+        faced /= square * np.sqrt(square)
+        return faced.sum(axis=1) * np.float32(LED_LEVEL * SKIN_AT_M**2 / len(self._led))
 
 
 class Sensor:
-    """Adds noise and black level, and cuts at what a byte holds. Its state is a tile of noise, drawn once."""
+    """Adds noise, and cuts at what a byte holds. Holds a tile of noise, drawn once."""
 
     def __init__(self, height: int, width: int, seed: int) -> None:
+        """Of so many pixels."""
         rng = np.random.default_rng([seed, 32])
         self._tile = rng.standard_normal((height + _TILE_MARGIN, width + _TILE_MARGIN), dtype=np.float32)
         level = np.arange(256, dtype=np.float32)
-        self._sigma = np.sqrt(_READ_VARIANCE + _SHOT_VARIANCE * level).reshape(1, 256)
+        self._sigma = np.sqrt(_READ_VARIANCE + _SHOT_VARIANCE * np.maximum(level - BLACK_LEVEL, 0.0))
 
-    def bytes_of(self, level: Plane, key: int, noise: float = 1.0) -> Image:
-        """Image (H, W) of levels above black (H, W); the same key, the same noise."""
+    def bytes_of(self, level: Plane, key: int) -> Image:
+        """Image (H, W) of levels (H, W), black at BLACK_LEVEL; the same key, the same noise."""
         height, width = level.shape
         mixed = (key * 2654435761 + 0x9E3779B9) & 0xFFFFFFFF  # Knuth's multiplicative hash
         mixed = ((mixed ^ (mixed >> 15)) * 0x2C1B3C6D) & 0xFFFFFFFF
         y, x = (mixed >> 4) % _TILE_MARGIN, (mixed >> 14) % _TILE_MARGIN
-        sigma = cv2.LUT(cv2.convertScaleAbs(level), noise * self._sigma)
-        sigma = cv2.multiply(sigma, self._tile[y : y + height, x : x + width], dst=sigma)
-        cv2.add(sigma, level, dst=sigma)
-        # Saturated light has no noise that a byte could show: both ends are cut.
-        return np.asarray(cv2.add(sigma, BLACK_LEVEL, dtype=cv2.CV_8U), dtype=np.uint8)
+        noise = cv2.LUT(cv2.convertScaleAbs(level), self._sigma)
+        cv2.multiply(noise, self._tile[y : y + height, x : x + width], dst=noise)
+        return np.asarray(cv2.add(noise, level, dtype=cv2.CV_8U), dtype=np.uint8)  # rounded, and cut

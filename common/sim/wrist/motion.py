@@ -135,14 +135,15 @@ def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCur
     """The motion of a scene's name; None: there is no such."""
     if name == "curl":
         return GuidedCurl(model)
-    rng = np.random.default_rng([seed, 12])
-    poses = tuple(POSES.values())
-    postures = {
-        "standard": _STANDARD,
-        "spread": _SPREAD * 3,
-        "poses": tuple(poses[k] for _ in range(4) for k in rng.permutation(len(poses))),
-    }
-    return Stations(model, postures[name], seed) if name in postures else None
+    if name == "standard":
+        return Stations(model, _STANDARD, seed)
+    if name == "spread":
+        return Stations(model, 3 * _SPREAD, seed)
+    if name == "poses":
+        rng = np.random.default_rng([seed, 12])
+        names = [name for _ in range(4) for name in rng.permutation(list(POSES)).tolist()]
+        return Stations(model, tuple(POSES[str(name)] for name in names), seed)
+    return None
 
 
 def _forearm(model: HandModel, t_s: float, shift_m: Float, turn_rad: Float) -> Float:

@@ -1,4 +1,4 @@
-"""Scene -> frames of the wrist camera: by ambient light, by the laser, by the LEDs.
+"""Scene -> frames of the wrist camera: by the light of the room alone, with the laser, with the LEDs.
 
 Skin is shaded on a coarser grid (rays against the flesh, then Lambert), and enlarged; the laser line is drawn from its
 exact curve, each piece as wide and as bright as the sheet of light is there, to parts of a pixel.
@@ -13,12 +13,13 @@ from common.arrays import Float, Image
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
 from common.sim.wrist import light
-from common.sim.wrist.light import Plane
+from common.sim.wrist.cones import Plane
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.skin import Skin, SkinView
 from common.sim.wrist.stripe import draw_stripe
 
 REAL_TIME_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
+SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 
 class WristRenderer:
@@ -38,19 +39,25 @@ class WristRenderer:
         if camera not in scene.rig.cameras:
             raise CalibrationError(f"rig {scene.rig.name!r}: cameras: no camera {camera!r}")
         self._scene = scene
-        optics = scene.optics
         self._skin = Skin(scene, step)
-        self._room = light.ROOMS[scene.ambient]
-        self._backdrop = light.backdrop(self._room, optics, scene.seed, self._skin.size)
+        self._room = light.Room.of(scene.ambient, scene.seed)
+        self._leds = light.Leds(np.array(scene.rig.led, dtype=np.float64))
+        optics = scene.optics
         self._sensor = light.Sensor(optics.height_px, optics.width_px, scene.seed)
-        self._led = np.array(scene.rig.led, dtype=np.float64)
         self._gain = 1.0
+        behind = self._room.backdrop(self._skin.size, optics.width_px / self._skin.size[0])
+        self._still = {
+            lit: self._shaded(behind, self._skin.palm, lit)
+            for lit in (Illumination.AMBIENT, Illumination.LED)
+        }
+        self._hand = np.zeros(self._skin.size[::-1], dtype=np.float32)
+        self._hand.reshape(-1)[self._skin.palm.pixel] = 1.0
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "WristRenderer":
         """The same scene before a camera with other settings; shares all that was prepared.
 
         Args:
-            exposure_us: Exposure [us].
+            exposure_us: Exposure [us]; so short that nothing smears.
             gains_bgr: Brightness (3,) against that of the camera file; the middle one counts, as the camera is grey.
         """
         other = copy(self)
@@ -60,24 +67,31 @@ class WristRenderer:
     def render(self, t_s: float, lit: Illumination) -> Image:
         """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
         bodies = self._scene.flesh.bodies(self._scene.joints_at(t_s))
-        view = self._skin.look(bodies)
-        level = self._ambient(view)
-        if lit is Illumination.LED:
-            shade = light.led_light(view.points, view.normals, self._led)
-            shade *= np.float32(light.LED_LEVEL) * view.albedo * self._skin.flat(view.pixel)
-            level.reshape(-1)[view.pixel] += shade
+        fingers = self._skin.look(bodies)
+        leds = lit is Illumination.LED
+        coarse = self._shaded(self._still[Illumination.LED if leds else Illumination.AMBIENT], fingers, lit)
         optics = self._scene.optics
-        full = cv2.resize(level, (optics.width_px, optics.height_px), interpolation=cv2.INTER_LINEAR)
+        level = _sharp(coarse, (optics.width_px, optics.height_px))
         if lit is Illumination.LASER:
-            draw_stripe(full, self._scene, bodies, self._skin, view)
+            hand = self._hand.copy()
+            hand.reshape(-1)[fingers.pixel] = 1.0
+            draw_stripe(level, self._scene, bodies, hand)
         if self._gain != 1.0:
-            full *= self._gain
-        return self._sensor.bytes_of(full, round(t_s * 1e6))
+            level *= np.float32(self._gain)
+        level += np.float32(light.BLACK_LEVEL)
+        return self._sensor.bytes_of(level, round(t_s * 1e6))
 
-    def _ambient(self, view: SkinView) -> Plane:
-        """Levels on the coarse grid by the light of the room."""
-        level = self._backdrop.copy()
-        if self._room.hand > 0.0:
-            sky = 0.62 - 0.3 * view.normals[:, 1] + 0.1 * view.normals[:, 0]
-            level.reshape(-1)[view.pixel] = self._room.hand * view.albedo * sky
+    def _shaded(self, behind: Plane, skin: SkinView, lit: Illumination) -> Plane:
+        """Levels on the coarse grid: `behind` with skin before it."""
+        shade = self._room.on_skin(skin.normals)
+        if lit is Illumination.LED:
+            shade += self._leds.on_skin(skin.points, skin.normals) * self._skin.flat[skin.pixel]
+        level = behind.copy()
+        level.reshape(-1)[skin.pixel] = shade * skin.albedo
         return level
+
+
+def _sharp(coarse: Plane, size: tuple[int, int]) -> Plane:
+    """Levels on the full grid; edges of skin before a window are as soft as the lens makes them, not as the grid."""
+    cut = cv2.GaussianBlur(np.minimum(coarse, SATURATED), (3, 3), 0.6)
+    return np.asarray(cv2.resize(cut, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)

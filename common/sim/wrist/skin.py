@@ -1,7 +1,7 @@
 """What skin the camera sees where: rays of a grid against the flesh, and what the skin there looks like.
 
-The palm stands still in the picture: its depth, normals and lines are found once. Each part of a finger is looked for
-only inside the box of its own image.
+The palm stands still in the picture: it is looked at once, and its gaps between bones are filled up. Each part of a
+finger is looked for only inside the box of its own image.
 """
 
 from dataclasses import dataclass
@@ -10,17 +10,21 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
-from common.sim.wrist.cones import Cones, distances
-from common.sim.wrist.light import Plane
+from common.sim.wrist.cones import Cones, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 
-CREASE_M = 0.0007
-MARGIN_PX = 4.0
+CREASE_M, CREASE_DEPTH = 0.0008, 0.08
+PALM_SMOOTH_PX = 9.0  # about 2 mm at the palm's distance
+TEXELS_PER_M = 2000.0
+_MARGIN = 1.5  # of the boxes, on the grid
+_NEAREST_M = 0.01  # a body that comes nearer may be anywhere in the picture
+_AROUND = (0, 0, 0, 1, 1, 2, 2, 2), (0, 1, 2, 0, 2, 0, 1, 2)  # corners and middles of a box
+_ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SkinView:
-    """The seen skin of one instant (N,).
+    """Seen skin (N,).
 
     Attributes:
         pixel: Flat index in the grid.
@@ -36,103 +40,135 @@ class SkinView:
 
 
 class Skin:
-    """The grid and the palm of one scene. What it holds was prepared by the constructor."""
+    """The grid and the palm of one scene. What it holds was prepared by the constructor.
+
+    Attributes:
+        size: Of the grid, (W, H).
+        flat: (H * W,) how the lens and the LEDs' lobes darken the corners.
+        palm: The seen palm, where no finger is before it.
+    """
 
     def __init__(self, scene: WristScene, step: int) -> None:
         optics = scene.optics
         self._scene, self._step = scene, step
         self.size = (-(-optics.width_px // step), -(-optics.height_px // step))
-        u, v = np.meshgrid(*(np.arange(n) * step + 0.5 * (step - 1) for n in self.size))
-        rays = optics.ray(np.stack([u, v], axis=-1))
-        self._rays = rays.astype(np.float32)
-        self._flat = _flat_field(scene, rays).astype(np.float32).ravel()
-        joints = scene.joints_at(0.0)
-        flesh = scene.flesh
-        self._still_depth = np.full(self.size[::-1], np.inf, dtype=np.float32)
-        self._still_body = np.zeros(self.size[::-1], dtype=np.int64)
-        self._cast(flesh.bodies(joints), range(flesh.still), self._still_depth, self._still_body)
-        rng = np.random.default_rng([scene.seed, 41])
-        self._texture = _texture(rng)
-
-    def flat(self, pixel: Int) -> Plane:
-        """How the lens darkens its corners, at flat indices (N,) of the grid."""
-        return self._flat[pixel]
+        columns, lines = (np.arange(n, dtype=np.float64) * step + 0.5 * (step - 1) for n in self.size)
+        rays = optics.ray(np.stack(np.meshgrid(columns, lines), axis=-1)).reshape(-1, 3)
+        self.flat = _flat_field(scene, rays).astype(np.float32)
+        self._rays = np.ascontiguousarray(rays.T, dtype=np.float32)
+        self._texture = _texture(np.random.default_rng([scene.seed, 41]))
+        bodies = scene.flesh.bodies(scene.joints_at(0.0))
+        self._palm_depth = np.full(len(rays), np.inf, dtype=np.float32)
+        hit = self._cast(bodies, range(scene.flesh.still), self._palm_depth)
+        self.palm = self._smooth(self._view(bodies, np.flatnonzero(hit >= 0), hit, self._palm_depth))
 
     def look(self, bodies: Cones) -> SkinView:
-        """The seen skin of a hand whose flesh is at `bodies`."""
-        depth, body = self._still_depth.copy(), self._still_body.copy()
-        self._cast(bodies, range(self._scene.flesh.still, len(bodies.start_m)), depth, body)
-        pixel = np.flatnonzero(np.isfinite(depth))
-        points = self._rays.reshape(-1, 3)[pixel] * depth.reshape(-1)[pixel, None]
-        index = body.reshape(-1)[pixel]
-        normals = bodies.normals(index, points).astype(np.float32)
-        return SkinView(pixel, points, normals, self._albedo(bodies, index, points))
+        """The seen skin of the fingers and the thumb, of a hand whose flesh is at `bodies`."""
+        depth = self._palm_depth.copy()
+        hit = self._cast(bodies, range(self._scene.flesh.still, len(bodies.start_m)), depth)
+        return self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)
 
-    def _cast(self, bodies: Cones, which: range, depth: Plane, body: Int) -> None:
-        """Bring nearer (H, W) `depth` [m] along the rays, and whose it is, by bodies in their boxes."""
+    def _view(self, bodies: Cones, pixel: Int, hit: Int, depth: Plane) -> SkinView:
+        points = np.ascontiguousarray((self._rays[:, pixel] * depth[pixel]).T)
+        body = hit[pixel]
+        normals = bodies.normals(body, points)
+        return SkinView(pixel, points, normals, self._albedo(bodies, body, points, normals))
+
+    def _cast(self, bodies: Cones, which: range, depth: Plane) -> Int:
+        """Bring nearer `depth` (H * W,) [m] along the rays; say by which body (H * W,), -1: by none of them."""
         low, high = self._boxes(bodies)
+        known = terms(bodies, _ORIGIN, np.float32)
+        shape = self.size[::-1]
+        hit = np.full(shape, -1, dtype=np.int64)
+        near, rays = depth.reshape(shape), self._rays.reshape(3, *shape)
         for b in which:
             (x0, y0), (x1, y1) = low[b], high[b]
-            if x1 <= x0 or y1 <= y0:
-                continue
-            rays = self._rays[y0:y1, x0:x1].reshape(-1, 3)
-            found = distances(bodies.of(slice(b, b + 1)), np.zeros(3), rays).reshape(y1 - y0, x1 - x0)
-            here = depth[y0:y1, x0:x1]
-            nearer = found < here
-            np.copyto(here, found, where=nearer)
-            body[y0:y1, x0:x1][nearer] = b
+            box = slice(y0, y1), slice(x0, x1)
+            found = first_hits(known[:, b], rays[:, *box])
+            nearer = found < near[box]
+            np.copyto(near[box], found, where=nearer)
+            np.copyto(hit[box], b, where=nearer)
+        return hit.ravel()
 
     def _boxes(self, bodies: Cones) -> tuple[Int, Int]:
         """Corners (B, 2) of the boxes on the grid that hold the images of the bodies."""
-        optics = self._scene.optics
         centre = np.stack([bodies.start_m, bodies.stop_m], axis=1)
-        radius = np.stack([bodies.start_radius_m, bodies.stop_radius_m], axis=1)
-        gap = np.maximum(centre[..., 2] - radius, 0.005)
-        spread = optics.matrix[0, 0] * radius / gap * 1.15 + MARGIN_PX
-        near = np.maximum(centre[..., 2:], 0.01)
-        uv = np.clip(optics.distort(np.clip(centre[..., :2] / near, -1.5, 1.5)), -2000.0, 3000.0)
-        behind = (centre[..., 2] - radius < 0.01).any(axis=1)
-        low = np.where(behind[:, None], 0.0, (uv - spread[..., None]).min(axis=1)) / self._step
-        high = np.where(behind[:, None], 1e4, (uv + spread[..., None]).max(axis=1)) / self._step + 1.0
-        size = np.array(self.size)
-        return np.clip(low, 0, size).astype(np.int64), np.clip(high, 0, size).astype(np.int64)
-
-    def _albedo(self, bodies: Cones, body: Int, points: Plane) -> Plane:
-        """Skin is never even: blotches that stay on their body, and dark lines across it at the joints."""
-        axis = (bodies.stop_m - bodies.start_m).astype(np.float32)
-        length = np.sqrt((axis * axis).sum(axis=1))
-        along = np.einsum(
-            "ij,ij->i", points - bodies.start_m.astype(np.float32)[body], (axis / length[:, None])[body]
+        square = np.stack([bodies.start_radius_m, bodies.stop_radius_m], axis=1) ** 2
+        x, z = centre[..., :2], np.maximum(centre[..., 2:], 0.0)
+        gap = z[..., 0] ** 2 - square
+        whole = np.min(gap, axis=1) < _NEAREST_M**2
+        # Where planes through the lens touch a sphere, by column and by row.
+        gap = np.maximum(gap, _NEAREST_M**2)[..., None]
+        half = np.sqrt(square[..., None] * np.maximum(x * x + gap, 0.0))
+        low, high = ((x * z + sign * half) / gap for sign in (-1.0, 1.0))
+        # Beyond the picture the polynomial of the lens means nothing.
+        sides = np.clip(
+            np.stack([low.min(axis=1), 0.5 * (low + high).mean(axis=1), high.max(axis=1)]), -1.2, 1.2
         )
-        side = points[:, 0] * np.float32(2000.0)
-        n = self._texture.shape[0] - 1
-        texture = self._texture[
-            (along * 2000.0).astype(np.int64) & n, (side.astype(np.int64) + 37 * body) & n
-        ]
-        texture *= 1.0 - 0.22 * np.exp(-((along / CREASE_M) ** 2))
-        return texture
+        around = (
+            np.stack([sides[i, :, 0] for i in _AROUND[0]]),
+            np.stack([sides[i, :, 1] for i in _AROUND[1]]),
+        )
+        uv = self._scene.optics.distort(np.stack(around, axis=-1)) / self._step
+        first, last = uv.min(axis=0) - _MARGIN, uv.max(axis=0) + _MARGIN + 1.0
+        first[whole], last[whole] = 0.0, np.inf
+        size = np.array(self.size)
+        return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
+
+    def _albedo(self, bodies: Cones, body: Int, points: Plane, normals: Plane) -> Plane:
+        """Skin is never even: blotches that stay on their body, and dark lines across it where a joint is."""
+        axis = bodies.stop_m - bodies.start_m
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        aside = np.eye(3)[0] - axis[:, :1] * axis  # across the body, whichever way it is bent
+        table = np.concatenate([bodies.start_m, axis, aside * bodies.start_radius_m[:, None]], axis=1)
+        own = table.astype(np.float32)[body]
+        along = np.einsum("ij,ij->i", points - own[:, :3], own[:, 3:6])
+        across = np.einsum("ij,ij->i", normals, own[:, 6:])
+        row, column = ((x * np.float32(TEXELS_PER_M)).astype(np.int32) for x in (along, across))
+        last = self._texture.shape[0] - 1
+        texture = self._texture[row & last, (column + 37 * body) & last]
+        return texture * (1.0 - CREASE_DEPTH * np.exp(-((along / np.float32(CREASE_M)) ** 2)))
+
+    def _smooth(self, palm: SkinView) -> SkinView:
+        """Fill the gaps between the bones as flesh does: normals of the smoothed surface."""
+        width, height = self.size
+        sigma = PALM_SMOOTH_PX / self._step
+        seen = np.zeros(width * height, dtype=np.float32)
+        seen[palm.pixel] = 1.0
+        weight = _blurred(seen, self.size, sigma)
+        cloud = np.zeros((width * height, 3), dtype=np.float32)
+        for k in range(3):
+            plane = np.zeros(width * height, dtype=np.float32)
+            plane[palm.pixel] = palm.normals[:, k]
+            cloud[:, k] = _blurred(plane, self.size, sigma) / np.maximum(weight, 1e-3)
+        normals = cloud[palm.pixel]
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        return SkinView(palm.pixel, palm.points, normals, palm.albedo)
+
+
+def _blurred(values: Plane, size: tuple[int, int], sigma: float) -> Plane:
+    image = cv2.GaussianBlur(values.reshape(size[1], size[0]), (0, 0), sigma)
+    return np.asarray(image, dtype=np.float32).ravel()
 
 
 def _flat_field(scene: WristScene, rays: Float) -> Float:
-    """What the rig's file says of the brightness across the image, at rays (..., 3); 1 where it says nothing."""
+    """What the rig's file says of the brightness across the image, at rays (N, 3); 1 where it says nothing."""
     if scene.rig.flat_field is None:
-        return np.ones(rays.shape[:-1])
-    x, y = rays[..., 0] / rays[..., 2], rays[..., 1] / rays[..., 2]
-    total, degree, used = np.zeros(x.shape), 0, 0
-    while used < len(scene.rig.flat_field.coefficients):
-        for k in range(degree + 1):
-            total += scene.rig.flat_field.coefficients[used + k] * x ** (degree - k) * y**k
-        degree, used = degree + 1, used + degree + 1
-    return np.maximum(total, 0.02)
+        return np.ones(len(rays))
+    coefficients = iter(scene.rig.flat_field.coefficients)
+    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    powers = (
+        (degree - k, k) for degree in range(len(scene.rig.flat_field.coefficients)) for k in range(degree + 1)
+    )
+    total = sum(c * x**i * y**j for c, (i, j) in zip(coefficients, powers, strict=False))
+    return np.maximum(np.asarray(total), 0.02)
 
 
 def _texture(rng: np.random.Generator) -> Plane:
     """Brightness of skin (256, 256) about 1, half a millimetre a texel, closed at its edges."""
     out = np.ones((256, 256), dtype=np.float32)
     for sigma, depth in ((1.0, 0.03), (5.0, 0.03), (20.0, 0.04)):
-        noise = cv2.GaussianBlur(
-            np.tile(rng.standard_normal((256, 256), dtype=np.float32), (2, 2)), (0, 0), sigma
-        )
-        part = noise[128:384, 128:384]
+        noise = np.tile(rng.standard_normal((256, 256), dtype=np.float32), (2, 2))
+        part = np.asarray(cv2.GaussianBlur(noise, (0, 0), sigma), dtype=np.float32)[128:384, 128:384]
         out += depth * part / float(part.std())
     return np.clip(out, 0.7, 1.3)

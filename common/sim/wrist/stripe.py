@@ -9,71 +9,72 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.sim.wrist.cones import Cones
-from common.sim.wrist.light import GLOW, LASER_LEVEL, LED_AT_M, SHEET_SIGMA_M, Plane
+from common.sim.wrist.cones import Cones, Plane
+from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SKIN_AT_M
 from common.sim.wrist.scene import WristScene
-from common.sim.wrist.skin import Skin, SkinView
 
-LAYERS = np.linspace(-2.6, 2.6, 15)  # across the sheet, in its sigmas
+LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
 LENS_SIGMA_PX = 0.9
 LEAST_COSINE = 0.12  # skin that the laser grazes flatter is lit as if it were this steep
+_NUDGE_M = 1e-4
+_EDGE_PX = 40
 
 
-def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, skin: Skin, view: SkinView) -> None:
-    """Add the line to levels (H, W) in place."""
+def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> None:
+    """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), 1 on skin, a coarser grid."""
     sheet, optics = scene.sheet, scene.optics
     curve = sheet.cross(bodies)
     chords = np.flatnonzero(curve.joined)
     chords = chords[curve.seen[chords] & curve.seen[chords + 1]]
-    if not len(chords):
-        return
-    points = curve.points
-    uv = optics.project(points)
+    points = curve.points[chords]
     ray = sheet.rays[curve.ray[chords]]
-    normals = bodies.normals(curve.body[chords], points[chords])
+    normals = bodies.normals(curve.body[chords], points)
     facing = np.maximum(-np.einsum("ij,ij->i", normals, ray), LEAST_COSINE)
-    slope = (normals @ sheet.normal) / facing
-    rise = sheet.normal + slope[:, None] * ray
-    step = 1e-4
-    way = (optics.project(points[chords] + step * rise) - uv[chords]) / step  # px per metre of the sheet
-    reach = np.linalg.norm(points[chords] - sheet.origin, axis=1)
+    rise = sheet.normal + ((normals @ sheet.normal) / facing)[:, None] * ray
+    uv = optics.project(points)
+    way = (optics.project(points + _NUDGE_M * rise) - uv) / _NUDGE_M  # px per metre across the sheet
+    piece = optics.project(curve.points[chords + 1]) - uv
     heights = LAYERS * SHEET_SIGMA_M
-    piece = uv[chords + 1] - uv[chords]
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
-    value = LASER_LEVEL * facing * (LED_AT_M / reach) * area
-    place = (0.5 * (uv[chords] + uv[chords + 1]))[:, None] + heights[:, None] * way[:, None]
-    amount = value[:, None] * np.exp(-0.5 * LAYERS**2)
-    _spread(level, place.reshape(-1, 2), amount.ravel(), skin, view)
+    reach = np.linalg.norm(points - sheet.origin, axis=1)
+    amount = (LASER_LEVEL * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(-0.5 * LAYERS**2)
+    place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]
+    _spread(level, place.reshape(-1, 2), amount.ravel(), hand)
 
 
-def _spread(level: Plane, place: Float, amount: Float, skin: Skin, view: SkinView) -> None:
-    """Add light at places (N, 2) [px], each shared by four pixels, blurred as a lens and skin do."""
+def _spread(level: Plane, place: Float, amount: Float, hand: Plane) -> None:
+    """Add light at places (N, 2) [px], each shared by four pixels, blurred as the lens and skin do."""
     height, width = level.shape
-    edge = 40
     inside = ((place > 1.0) & (place < np.array([width - 2.0, height - 2.0]))).all(axis=1)
     place, amount = place[inside], amount[inside]
     if not len(place):
         return
-    low = np.maximum(place.min(axis=0).astype(int) - edge, 0)
-    high = np.minimum(place.max(axis=0).astype(int) + edge, [width, height])
-    w, h = high - low
-    at = place - low
+    (x0, y0), (x1, y1) = (
+        np.maximum(place.min(axis=0).astype(int) - _EDGE_PX, 0).tolist(),
+        np.minimum(place.max(axis=0).astype(int) + _EDGE_PX, [width, height]).tolist(),
+    )
+    w, h = x1 - x0, y1 - y0
+    at = place - np.array([x0, y0])
     corner = at.astype(np.int64)
     fx, fy = (at - corner).T
     index = corner[:, 1] * w + corner[:, 0]
-    light = np.zeros(w * h)
-    for shift, share in ((0, (1 - fx) * (1 - fy)), (1, fx * (1 - fy)), (w, (1 - fx) * fy), (w + 1, fx * fy)):
-        light += np.bincount(index + shift, amount * share, w * h)
-    line = light.reshape(h, w).astype(np.float32)
-    hand = np.zeros(skin.size[::-1], dtype=np.float32)
-    hand.reshape(-1)[view.pixel] = view.albedo
-    hand = cv2.resize(hand, (width, height), interpolation=cv2.INTER_LINEAR)[
-        low[1] : high[1], low[0] : high[0]
-    ]
-    small = cv2.resize(
-        np.minimum(line, 2.0 * LASER_LEVEL), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
-    )
-    glow = sum(share * cv2.GaussianBlur(small, (0, 0), 0.5 * sigma) for sigma, share in GLOW)
-    glow = cv2.resize(np.asarray(glow), (int(w), int(h)), interpolation=cv2.INTER_LINEAR)
-    line = cv2.GaussianBlur(line, (0, 0), LENS_SIGMA_PX)
-    level[low[1] : high[1], low[0] : high[0]] += line + glow * hand
+    four = np.concatenate([index, index + 1, index + w, index + w + 1])
+    share = np.concatenate([(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]) * np.tile(amount, 4)
+    line = np.bincount(four, share, w * h).reshape(h, w).astype(np.float32)
+    glow = _glow(line, hand, (x0, y0, x1, y1), width)
+    light = cv2.GaussianBlur(line, (0, 0), LENS_SIGMA_PX)
+    light += cv2.resize(glow, (w, h), interpolation=cv2.INTER_LINEAR)
+    level[y0:y1, x0:x1] += light
+
+
+def _glow(line: Plane, hand: Plane, box: tuple[int, int, int, int], width: int) -> Plane:
+    """What the skin about a line gives back, at a quarter of its size; none where no skin is."""
+    h, w = line.shape
+    size = -(-w // 4), -(-h // 4)
+    coarse = cv2.resize(line, size, interpolation=cv2.INTER_AREA)
+    glow = np.zeros(size[::-1], dtype=np.float32)
+    for sigma, part in GLOW:
+        glow += part * np.asarray(cv2.GaussianBlur(coarse, (0, 0), 0.25 * sigma))
+    x0, y0, x1, y1 = (round(side * hand.shape[1] / width) for side in box)
+    glow *= cv2.resize(hand[y0:y1, x0:x1], size, interpolation=cv2.INTER_AREA)
+    return glow
