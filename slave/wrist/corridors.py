@@ -1,0 +1,189 @@
+"""Where in the image the seams between the fingers of one hand can run: made once, from what its fingers can do.
+
+The three seams among index ... little have rows of the image as stations, the thumb's has circles about the thumb's
+root (CMC). A corridor is a middle and a half width at each station, in pixels along the row or in radians along the
+circle, from a sweep of the hand model through the ranges of its joints.
+"""
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Float, Int
+from common.hand_limits import ABDUCTION
+from slave.wrist.view import WristView
+
+Float32 = npt.NDArray[np.float32]
+
+SHRINK = 2  # the LED image is read at a quarter of its resolution
+STATION_PX = 10.0
+LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
+MARGIN = 12  # samples beyond either edge of a corridor: about a finger's breadth
+_PER_BONE = 6
+_NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
+_PIP, _DIP = 2, 3
+_DIP_PER_PIP = 0.84  # of natural flexion (D8)
+_RARE = 0.02  # share of the postures of a sweep left out at either end
+_NEAREST_M = 0.03  # what is nearer than this is not seen as a finger
+_OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
+_LEAST_OF_SPACING = 0.25
+_MOST_OF_SPACING = 0.7  # half width of a corridor, in spacings of fingers: beyond lies another seam
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corridors:
+    """The corridors of the four seams, in the order of `LATERAL`; S stations.
+
+    Attributes:
+        row: First row of the stations of the three finger seams [px].
+        radius: Radius of the first station of the thumb's seam [px].
+        root: (2,) the thumb's root in the image [px]; angles about it are `angle_of`.
+        up: (2,) image direction of angle 0, from the root to the middle finger's knuckle.
+        thumb_side: +1.0 where the thumb is to the right in the image, -1.0 to the left.
+        middle: (4, S) middle of each corridor: u [px], or angle [rad].
+        half: (4, S) half width.
+        thumb_crosses: How many of the circles the thumb crosses however it is held.
+        map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the shrunken image, float32; the corridors side
+            by side, each with its margins.
+    """
+
+    row: float
+    radius: float
+    root: Float
+    up: Float
+    thumb_side: float
+    middle: Float
+    half: Float
+    thumb_crosses: int
+    map_x: Float32
+    map_y: Float32
+
+    def polar(self, uv: Float) -> tuple[Float, Float]:
+        """Radius [px] and angle [rad], positive towards the thumb's side, of pixels (N, 2) about the thumb's root."""
+        x, y = uv[:, 0] - self.root[0], uv[:, 1] - self.root[1]
+        along = x * self.up[0] + y * self.up[1]
+        across = self.thumb_side * (y * self.up[0] - x * self.up[1])
+        return np.hypot(x, y), np.arctan2(across, along)
+
+    def lateral(self, seam: int) -> Float:
+        """Lateral positions (S, LATERAL[seam] + 2 MARGIN) of the samples across one corridor and its margins."""
+        share = np.arange(-MARGIN, LATERAL[seam] + MARGIN, dtype=np.float64) / (LATERAL[seam] - 1) * 2.0 - 1.0
+        return self.middle[seam, :, None] + self.half[seam, :, None] * share
+
+    def across(self, seams: slice, path: Int) -> Float:
+        """Lateral positions (M, S) of samples (M, S) of some of the corridors."""
+        count = np.array(LATERAL[seams])[:, None] - 1
+        return self.middle[seams] + self.half[seams] * (2.0 * (path - MARGIN) / count - 1.0)
+
+    def pixels(self, seam: int, lateral: Float) -> Float:
+        """Pixels (S, ..., 2) of lateral positions (S, ...) of one seam."""
+        station = np.arange(len(lateral), dtype=np.float64).reshape(-1, *[1] * (lateral.ndim - 1))
+        if seam < 3:
+            rows = np.broadcast_to(self.row + STATION_PX * station, lateral.shape)
+            return np.stack([lateral, rows], axis=-1)
+        r = self.radius + STATION_PX * station
+        along, across = r * np.cos(lateral), self.thumb_side * r * np.sin(lateral)
+        x, y = self.up
+        return self.root + np.stack([along * x - across * y, along * y + across * x], axis=-1)
+
+
+@lru_cache(maxsize=8)
+def corridors_of(view: WristView) -> Corridors:
+    """The corridors of one wrist rig and hand."""
+    knuckles = _in_image(view, view.model.rest_position_m[[7, 12, 22]])[0]
+    thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
+    root = _in_image(view, view.model.rest_position_m[2])[0]
+    up = (knuckles[1] - root) / np.linalg.norm(knuckles[1] - root)
+    stations = int(view.optics.height_px // STATION_PX)
+    row = (view.optics.height_px - 1 - STATION_PX * (stations - 1)) / 2.0
+    empty = np.empty((4, stations))
+    still = Corridors(row, STATION_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP)
+    *reach, crossed = _thumb_reach(view, still, stations)
+    three = _between_fingers(view, row + STATION_PX * np.arange(stations, dtype=np.float64))
+    middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
+    placed = replace(still, middle=middle, half=half, thumb_crosses=crossed)
+    grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
+    grid = np.concatenate(grids, axis=1) / SHRINK
+    return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
+
+
+def _in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
+    """Pixels (..., 2) and depths (...) [m] of points (..., 3) in the palm frame; what is too near is held off."""
+    camera = palm_m @ view.T_camera_palm[:3, :3].T + view.T_camera_palm[:3, 3]
+    depth = camera[..., 2]
+    held = np.concatenate([camera[..., :2], np.maximum(depth, _NEAREST_M)[..., None]], axis=-1)
+    return view.optics.project(held), depth
+
+
+def _along_bones(view: WristView, angles: Float) -> Float:
+    """Points (P, 5, 3 * _PER_BONE, 3) [m] along the fingers' bones of postures (P, 5, 4), palm frame."""
+    joints = view.model.chains(angles).position_m
+    share = np.linspace(0.0, 1.0, _PER_BONE)[:, None]
+    bones = joints[:, :, :-1, None] * (1.0 - share) + joints[:, :, 1:, None] * share
+    return bones.reshape(*bones.shape[:2], -1, 3)
+
+
+def _postures(*ranges: Float) -> Float:
+    """All combinations (P, 5, 4) of the given values of the four angles [rad], the same for every finger."""
+    grid = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 1, 4)
+    return np.broadcast_to(grid, (len(grid), 5, 4)).copy()
+
+
+def _spread(low: float, high: float, count: int) -> Float:
+    """Values (count,) from low to high."""
+    return np.linspace(low, high, count, dtype=np.float64)
+
+
+def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
+    """Middle and half width (3, S) [px] of the corridors among index ... little at the given rows."""
+    limits = view.model.limits_rad
+    angles = _postures(
+        np.zeros(1), _spread(0.0, limits[1, 1, 1], 8), _spread(0.0, limits[1, 2, 1], 8), np.zeros(1)
+    )
+    angles[..., _DIP] = _DIP_PER_PIP * angles[..., _PIP]
+    points = _along_bones(view, angles)
+    focal = view.optics.matrix[0, 0]
+    out = np.empty((2, 3, len(rows)))
+    for seam in range(3):
+        a, b = points[:, seam + 1], points[:, seam + 2]
+        mid = (a + b) / 2.0
+        uv, depth = _in_image(view, mid)
+        scale = focal / np.maximum(depth, _NEAREST_M)
+        spacing = scale * np.linalg.norm(a[:, :1] - b[:, :1], axis=-1)
+        lean = np.abs(limits[seam + 1 : seam + 3, ABDUCTION]).max() * _OF_SPREAD
+        free = scale * np.linalg.norm((mid - mid[:, :1])[..., ::2], axis=-1) * np.sin(lean)
+        free = np.minimum(np.maximum(free, _LEAST_OF_SPACING * spacing), _MOST_OF_SPACING * spacing)
+        seen = (depth > _NEAREST_M) & np.isfinite(uv).all(axis=-1)
+        out[:, seam] = _strip(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
+    return out[0], out[1]
+
+
+def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:
+    """Middle and half width (S,) of the intervals low ... high (N,) that lie near each station."""
+    near = np.abs(at[None] - stations[:, None]) <= STATION_PX
+    known = near.any(axis=1)
+    lows = np.array([np.quantile(low[row], 0.1) for row in near[known]])
+    highs = np.array([np.quantile(high[row], 1.0 - 0.1) for row in near[known]])
+    ends = [np.interp(stations, stations[known], end) for end in (lows, highs)]
+    lows, highs = (np.convolve(np.pad(end, 2, mode="edge"), np.full(5, 0.2), mode="valid") for end in ends)
+    return (lows + highs) / 2.0, (highs - lows) / 2.0
+
+
+def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[float, float, int]:
+    """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
+    many stations the thumb crosses however it is held.
+    """
+    low, high = view.model.limits_rad[0].T
+    steps = [_spread(low[k], high[k], n) for k, n in enumerate((7, 7, 3, 3))]
+    points = _along_bones(view, _postures(*steps))[:, 0, _PER_BONE:]  # beyond the metacarpal
+    uv, depth = _in_image(view, points)
+    radius, angle = still.polar(uv.reshape(-1, 2))
+    scale = view.optics.matrix[0, 0] / np.maximum(depth, _NEAREST_M).ravel()
+    breadth = np.arcsin(np.minimum(scale * view.model.radius_m[4] / np.maximum(radius, 1.0), 0.9))
+    seen = (depth > _NEAREST_M).ravel()
+    low, high = np.quantile((angle - breadth)[seen], (_RARE, 1.0 - _RARE))
+    tips = radius.reshape(len(points), -1)[:, -1]
+    crossed = int(np.quantile(tips[depth[:, -1] > _NEAREST_M], _RARE) / STATION_PX)
+    return (low + high) / 2.0, (high - low) / 2.0, min(crossed, stations)
