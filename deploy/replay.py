@@ -19,7 +19,7 @@ class ReplaySettings:
 
     Attributes:
         recording: Folder of raw frames.
-        out: Folder for detections, poses and summary.
+        out: Folder for detections, poses and summary; those of a wrist rig beside a marker rig go to out/wrist.
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
     """
@@ -31,30 +31,51 @@ class ReplaySettings:
 
 
 def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
-    """Detect, solve, and return the summary.
+    """Detect and solve every rig, and return the summary of the first.
 
     Raises:
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
-    kind, cameras = _rig(settings.recording)
+    rigs = _rigs(settings.recording)
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
         raise ReplayError(f"{settings.hand}: no such hand profile")
+    summaries = [_replay_rig(settings, rig, settings.out, say) for rig in rigs[:1]]
+    for rig in rigs[1:]:
+        out = settings.out / rig.kind
+        summaries.append(_replay_rig(settings, rig, out, say))
+        say(f"results of rig {rig.name} are in {out}")
+    return summaries[0]
+
+
+@dataclass(frozen=True, slots=True)
+class _Rig:
+    """A rig of the recording, as far as it matters here."""
+
+    name: str
+    kind: str
+    cameras: list[str]
+
+
+def _replay_rig(
+    settings: ReplaySettings, rig: _Rig, out: Path, say: Callable[[str], None]
+) -> dict[str, object]:
+    """Detect and solve one rig into `out`."""
     try:
-        settings.out.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ReplayError(f"--out {settings.out}: cannot make the folder: {error.strerror}") from error
+        raise ReplayError(f"--out {out}: cannot make the folder: {error.strerror}") from error
     recording = str(settings.recording)
     calibration = [] if settings.calibration is None else ["--calibration", str(settings.calibration)]
     hand = [] if settings.hand is None else ["--hand", str(settings.hand)]
-    what, needs = ("markers", []) if kind == "markers" else ("fingers", hand)
-    for camera in cameras:
+    what, needs = ("markers", []) if rig.kind == "markers" else ("fingers", hand)
+    for camera in rig.cameras:
         say(f"detecting {what} in camera {camera} ...")
-        target = ["-o", str(settings.out / f"detections_{camera}.npz")]
+        target = ["-o", str(out / f"detections_{camera}.npz")]
         _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
     say("solving ...")
-    results = ["--detections", str(settings.out), "--out", str(settings.out)]
+    results = ["--rig", rig.name, "--detections", str(out), "--out", str(out)]
     _step("master", "solve", recording, *calibration, *hand, *results)
-    return cast(dict[str, object], json.loads((settings.out / "summary.json").read_text()))
+    return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
 
 
 def _step(module: str, *arguments: str) -> None:
@@ -63,22 +84,18 @@ def _step(module: str, *arguments: str) -> None:
         raise ReplayError(f"phalanx-{module} {arguments[0]} ended with code {done.returncode}")
 
 
-def _rig(recording: Path) -> tuple[str, list[str]]:
-    """Kind and cameras of the recording's rig."""
+def _rigs(recording: Path) -> list[_Rig]:
+    """The recording's rigs, the first of each kind; that of markers before that of a wrist device."""
     path = recording / "recording.json"
     try:
         manifest = json.loads(path.read_text())
         rigs = [rig for rig in (manifest.get("rig"), *(manifest.get("rigs") or ())) if rig is not None]
-        found = {str(rig["kind"]): list[str](rig["cameras"]) for rig in reversed(rigs)}  # the first of a kind
+        found = {
+            rig["kind"]: _Rig(rig["name"], rig["kind"], list[str](rig["cameras"])) for rig in reversed(rigs)
+        }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ReplayError(f"{path}: not a recording of raw frames ({reason})") from error
-    if len(found) > 1:
-        raise ReplayError(
-            f"{path}: rigs of the kinds {' and '.join(sorted(found))}: one recording with both is not solved yet; "
-            "leave one rig out of it"
-        )
-    for kind in ("markers", "wrist"):
-        if kind in found:
-            return kind, found[kind]
+    if wanted := [found[kind] for kind in ("markers", "wrist") if kind in found]:
+        return wanted
     raise ReplayError(f"{path}: no rig of kind 'markers' or 'wrist'")

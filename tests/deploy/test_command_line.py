@@ -7,7 +7,7 @@ import pytest
 
 from common.sim.scene import APART_PPM, LATE_NS
 from common.sim.scenes import NAMES
-from deploy import demo
+from deploy import demo, replay
 from deploy.__main__ import main
 
 
@@ -41,17 +41,45 @@ def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("rigs", "says"),
     [
-        ([{"kind": "wrist", "cameras": ["w"]}, {"kind": "markers", "cameras": ["l"]}], "markers and wrist"),
-        ([{"kind": "glove", "cameras": []}], "no rig of kind 'markers' or 'wrist'"),
+        ([{"name": "g", "kind": "glove", "cameras": []}], "no rig of kind 'markers' or 'wrist'"),
         ([], "no rig of kind"),
     ],
 )
-def test_a_recording_of_no_or_of_two_kinds_is_refused_by_name(
+def test_a_recording_of_no_known_kind_is_refused_by_name(
     rigs: list[object], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "recording.json").write_text(json.dumps({"rigs": rigs}))
     assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out")]) == 1
     assert says in capsys.readouterr().err
+
+
+def test_of_both_kinds_each_rig_is_replayed_with_results_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[tuple[str, ...]] = []
+
+    def step(module: str, *arguments: str) -> None:
+        steps.append((module, *arguments))
+        if arguments[0] == "solve":
+            (Path(arguments[-1]) / "summary.json").write_text(json.dumps({"poses": len(steps)}))
+
+    monkeypatch.setattr(replay, "_step", step)
+    wrist = {"name": "w", "kind": "wrist", "cameras": ["palm"]}
+    markers = {"name": "d", "kind": "markers", "cameras": ["left", "right"]}
+    (tmp_path / "recording.json").write_text(json.dumps({"rigs": [wrist, markers]}))
+    (tmp_path / "hand.json").write_text("{}")
+    out = tmp_path / "out"
+    settings = replay.ReplaySettings(tmp_path, out, None, tmp_path / "hand.json")
+    assert replay.run_replay(settings, lambda _line: None) == {"poses": 3}
+    assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == [
+        "left",
+        "right",
+        "palm",
+    ]
+    assert ["--hand" in step for step in steps] == [False, False, True, True, True]  # markers know no hand
+    assert [step[step.index("--rig") + 1] for step in steps if "solve" in step] == ["d", "w"]
+    assert steps[3][-1] == str(out / "wrist/detections_palm.npz")
+    assert steps[4][-1] == str(out / "wrist")
 
 
 def test_the_wrist_device_is_a_rig_like_any_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,7 +112,7 @@ def test_a_manifest_of_another_form_is_named(
 def test_an_out_that_is_a_file_is_said(
     command: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    rig = {"kind": "markers", "cameras": ["left", "right"]}
+    rig = {"name": "desk", "kind": "markers", "cameras": ["left", "right"]}
     (tmp_path / "recording.json").write_text(json.dumps({"rig": None, "rigs": [rig]}))
     (tmp_path / "taken").write_text("")
     place = [str(tmp_path) if word == "RECORDING" else word for word in command]
@@ -93,7 +121,7 @@ def test_an_out_that_is_a_file_is_said(
 
 
 def test_a_missing_hand_is_said_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rig = {"kind": "markers", "cameras": ["left", "right"]}
+    rig = {"name": "desk", "kind": "markers", "cameras": ["left", "right"]}
     (tmp_path / "recording.json").write_text(json.dumps({"rig": rig}))
     hand = tmp_path / "nobody.json"
     assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--hand", str(hand)]) == 1
