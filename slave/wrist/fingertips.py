@@ -1,0 +1,207 @@
+"""Fingertips in the LED image: templates of bent fingers against what is seen along each finger (D15).
+
+For each finger its profile of nearness (`spines`) is compared with those of all its bends (`tip_templates`); likeness,
+brightness beside the palm's and a shift of a few rows (a bone that is longer than its profile says) make a
+probability for each. From it comes where the end of the finger lies between the edges that are seen, the contour
+above and the step below, whose places are then measured at full resolution; and how likely that end is seen at all.
+A finger that points away ends behind its own horizon, one that is folded shows its back: no tip is reported.
+
+The thumb shows its side to the wrist, its end is beyond the horizon; it is not sought.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Image
+from slave.wrist.fingers import Fingers
+from slave.wrist.led_depth import DARK, SHRINK, Float32, led_optics, nearness, shrink
+from slave.wrist.spines import GAIN_SIGMA, LIKENESS, fans_of, spine
+from slave.wrist.tip_templates import FOUR, PALM_ROWS, FingerTemplates, templates_of
+from slave.wrist.view import WristView
+
+SHIFTS = np.arange(-3, 4)
+SHIFT_SIGMA_PX = 8.0
+MODEL_PX = 2.0  # a pad is no half sphere
+LEAST_SEEN = 0.5  # probability that the end of the finger is seen
+MOST_SIGMA_PX = 5.0
+LEAST_LIKENESS = 0.985  # a finger behind another or behind the thumb looks like none of the templates
+EDGE_SHARE = 0.2  # of the brightness within: where a contour is drawn, the skin there being seen almost edge on
+LEAST_FACING = 0.4  # from here on the end of a finger is seen whole, and the step below it too
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fingertips:
+    """Of one LED image; NaN where no end of a finger is seen for sure.
+
+    Attributes:
+        uv: (5, 2) [px] where the ends of thumb, index ... little are in the (distorted) image.
+        sigma_px: (5,) standard deviation.
+        depth: (5,) relative depth along the optical axis, in units of one constant for all five.
+    """
+
+    uv: Float
+    sigma_px: Float
+    depth: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bend:
+    """What is believed of one finger's bend: means over all templates and shifts, standard deviations.
+
+    Attributes:
+        below_top, below_top_sigma: How far its end is below the finger's highest row [px].
+        above_bottom, above_bottom_sigma: How far it is above the lowest row of the fingertip.
+        top_v, bottom_v: Where these rows are expected [px].
+        radius_px, depth_m, facing: Of the fingertip.
+        seen: Probability that its end is seen.
+        likeness: Of the best template, 1 at most.
+    """
+
+    below_top: float
+    below_top_sigma: float
+    above_bottom: float
+    above_bottom_sigma: float
+    top_v: float
+    bottom_v: float
+    radius_px: float
+    depth_m: float
+    facing: float
+    seen: float
+    likeness: float
+
+
+def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
+    """Find them in the difference of LED and ambient frame (H, W)."""
+    near = nearness(shrink(led), led_optics(view))
+    uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
+    bank = templates_of(view)
+    gain = palm_gain(near, bank)
+    if gain is None:
+        return Fingertips(uv, sigma, depth)
+    for finger, templates, fan in zip(FOUR, bank, fans_of(view), strict=True):
+        line = spine(near, fan, gain)
+        bend = bend_of(profile(near, line), templates, gain)
+        if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS:
+            continue
+        tip, spread = place(led, line, bend)
+        if spread <= MOST_SIGMA_PX:
+            uv[finger], sigma[finger], depth[finger] = tip, spread, bend.depth_m
+    return Fingertips(uv, sigma, depth)
+
+
+def palm_gain(near: Float32, bank: tuple[FingerTemplates, ...]) -> float | None:
+    """Logarithm of nearness [grey levels^0.5] by nearness [1/m] of the palm below the knuckles; None: it is dark."""
+    gains: list[float] = []
+    for templates in bank:
+        u, v = (int(x) // SHRINK for x in templates.root_uv)
+        patch = near[v + PALM_ROWS[0] : v + PALM_ROWS[1], max(u, 0) : u + 1]
+        if patch.size and float(patch.mean()) ** 2 > DARK:
+            gains.append(float(np.log(patch.mean() / templates.palm)))
+    return float(np.median(gains)) if gains else None
+
+
+def profile(near: Float32, line: Float) -> Float32:
+    """Nearness (rows,) along a spine, the mean of three pixels."""
+    columns = np.clip(np.rint(line).astype(np.int64), 1, near.shape[1] - 2)
+    rows = np.arange(len(line))
+    return (near[rows, columns - 1] + near[rows, columns] + near[rows, columns + 1]) / np.float32(3.0)
+
+
+def bend_of(seen: Float32, templates: FingerTemplates, gain: float) -> Bend | None:
+    """Weigh all bends of a finger by its profile (rows,); None: there is no finger in it."""
+    if np.count_nonzero(seen > np.sqrt(DARK)) < 4:
+        return None
+    shifted = np.zeros((len(seen), len(SHIFTS)), dtype=np.float32)
+    for k, s in enumerate(SHIFTS):
+        shifted[max(-s, 0) : len(seen) - max(s, 0), k] = seen[max(s, 0) : len(seen) + min(s, 0)]
+    size = np.sqrt((shifted * shifted).sum(axis=0)) + np.float32(1e-6)
+    product = templates.unit @ shifted
+    likeness = product / size
+    away = np.log(np.maximum(product, 1e-6) / templates.length[:, None]) - gain
+    score = (likeness - 1.0) / LIKENESS - 0.5 * (away / GAIN_SIGMA) ** 2
+    score -= 0.5 * (SHIFTS * SHRINK / SHIFT_SIGMA_PX) ** 2
+    weight = np.exp(score - score.max())
+    weight /= weight.sum()
+    of_bend = weight.sum(axis=1)
+    shift = SHRINK * float(weight.sum(axis=0) @ SHIFTS)
+
+    def mean(values: Float) -> float:
+        return float(of_bend @ values)
+
+    def spread(values: Float) -> float:
+        return float(np.sqrt(max(of_bend @ (values * values) - mean(values) ** 2, 0.0)))
+
+    below, above = templates.apex_v - templates.top_v, templates.bottom_v - templates.apex_v
+    return Bend(
+        mean(below),
+        spread(below),
+        mean(above),
+        spread(above),
+        mean(templates.top_v) + shift,
+        mean(templates.bottom_v) + shift,
+        mean(templates.radius_px),
+        mean(templates.depth_m),
+        mean(templates.facing),
+        mean(templates.seen.astype(np.float64)),
+        float(likeness.ravel()[score.argmax()]),
+    )
+
+
+def place(led: Image, line: Float, bend: Bend) -> tuple[Float, float]:
+    """Where the end of a finger is (2,) [px], and its standard deviation."""
+    along, column = full_profile(led, line)
+    found: list[tuple[float, float]] = []
+    radius = bend.radius_px
+    top = top_edge(along, bend.top_v, radius)
+    if top is not None:
+        found.append((top + bend.below_top, bend.below_top_sigma))
+    if bend.facing > LEAST_FACING or bend.above_bottom < bend.below_top:
+        bottom = bottom_edge(along, bend.bottom_v, radius)
+        if bottom is not None:
+            found.append((bottom - bend.above_bottom, bend.above_bottom_sigma))
+    if not found:
+        return np.full(2, np.nan), np.inf
+    weights = [1.0 / (MODEL_PX**2 + sigma**2) for _, sigma in found]
+    v = sum(w * x for w, (x, _) in zip(weights, found, strict=True)) / sum(weights)
+    folded = bend.above_bottom < bend.below_top
+    centre = v - bend.above_bottom if folded else v + radius
+    rows = np.arange(*sorted((centre, centre + (-2.0 if folded else 2.0) * radius)), 2.0)
+    rows = np.clip(rows, 0, len(column) - 1).astype(np.int64)
+    slope = np.clip(np.polyfit(rows, column[rows], 1)[0], -0.6, 0.6) if np.ptp(rows) > 4 else 0.0
+    u = column[rows].mean() + slope * (v - rows.mean())
+    return np.array([u, v]), float(np.sqrt(1.0 / sum(weights)))
+
+
+def full_profile(led: Image, line: Float) -> tuple[Float, Float]:
+    """Grey levels along a spine in the rows of the full image, the mean of five pixels; and its columns [px]."""
+    rows = np.arange(len(line) * SHRINK)
+    offset = 0.5 * (SHRINK - 1)
+    column = np.interp(rows, np.arange(len(line)) * SHRINK + offset, line * SHRINK + offset)
+    middle = np.clip(np.rint(column).astype(np.int64), 2, led.shape[1] - 3)
+    across = led[rows[:, None], middle[:, None] + np.arange(-2, 3)]
+    return across.mean(axis=1), column
+
+
+def top_edge(along: Float, near_v: float, radius: float) -> float | None:
+    """Row of the contour above a fingertip, where it is expected at `near_v`."""
+    low, high = (int(np.clip(near_v + x, 1, len(along) - 2)) for x in (-24.0, 24.0))
+    inside = along[min(int(near_v + 0.5 * radius), high) : max(int(near_v + 1.5 * radius), low) + 1]
+    level = max(DARK, EDGE_SHARE * float(np.median(inside))) if inside.size else DARK
+    lit = np.flatnonzero(along[low:high] > level)
+    if not lit.size:
+        return None
+    k = low + int(lit[0])
+    rise = along[k] - along[k - 1]
+    return k - (along[k] - level) / rise if rise > 0.0 else float(k)
+
+
+def bottom_edge(along: Float, near_v: float, radius: float) -> float | None:
+    """Row where the light steps down below a fingertip that is before the palm, expected at `near_v`."""
+    low, high = (int(np.clip(near_v + x, 5, len(along) - 6)) for x in (-radius, radius))
+    if high - low < 4:
+        return None
+    sums = np.concatenate([[0.0], np.cumsum(along)])
+    rows = np.arange(low, high)
+    step = (sums[rows] - sums[rows - 4]) - (sums[rows + 5] - sums[rows + 1])
+    return float(rows[step.argmax()]) + 3.0

@@ -1,0 +1,106 @@
+"""How far away what the LEDs light is, as far as its brightness tells: relative depth (D13, I15).
+
+Light from beside the lens falls with the square of the distance and comes back once: the root of the intensity is
+*nearness*, not distance. With alpha the angle of the ray off the optical axis,
+
+    depth = c cos(alpha) / sqrt(I / F),        F the flat field, what the LEDs make of a white surface
+
+along the optical axis; c is the surface's whiteness, the LEDs' power and the camera's gain in one, and is not known. So
+depth is *relative*: monotone, and right up to one factor where the surface is of one kind and faces the camera. Where
+it is inclined by theta it looks farther away by 1 / sqrt(cos theta).
+
+A pixel as dark as the noise of the difference has no depth (NaN); a saturated one is at most as far as it looks.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from common.arrays import Bool, Float, Image
+from common.wrist_calibration import FlatField
+from slave.wrist.view import WristView
+
+Float32: TypeAlias = npt.NDArray[np.float32]
+
+SHRINK = 4  # the LED image is read at a quarter of its resolution
+DARK = 4.0  # grey levels: what the noise of a difference of two frames leaves
+SATURATED = 250.0  # grey levels of a difference of two frames whose white is 255
+_LEAST_FLAT = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RelativeDepth:
+    """Of a shrunken LED image (h, w).
+
+    Attributes:
+        depth: (h, w) float32 along the optical axis, in units of an unknown constant; NaN: too dark to tell.
+        bound: (h, w) whether the pixel is saturated: it may be nearer than `depth`.
+    """
+
+    depth: Float32
+    bound: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LedOptics:
+    """What each pixel of the shrunken image is multiplied with.
+
+    Attributes:
+        cosine: (h, w) float32 of the angle off the optical axis.
+        level: (h, w) float32 1 / sqrt(F).
+        ray: (h, w, 3) float32 ray of depth 1 along the optical axis.
+    """
+
+    cosine: Float32
+    level: Float32
+    ray: Float32
+
+
+def shrink(led: Image) -> Float32:
+    """Grey levels (h, w) of the difference of LED and ambient frame at a quarter of its resolution."""
+    size = (led.shape[1] // SHRINK, led.shape[0] // SHRINK)
+    return cv2.resize(led, size, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+
+def nearness(grey: Float32, optics: LedOptics) -> Float32:
+    """sqrt(I / F) (h, w) of grey levels; 0 where it is dark."""
+    return np.sqrt(np.maximum(grey, np.float32(0.0))) * optics.level
+
+
+def relative_depth(grey: Float32, optics: LedOptics) -> RelativeDepth:
+    """Depth of grey levels (h, w)."""
+    lit = grey > DARK
+    near = nearness(np.where(lit, grey, np.float32(np.nan)), optics)
+    return RelativeDepth(optics.cosine / near, grey >= SATURATED)
+
+
+def image_rows(view: WristView) -> Float:
+    """Rows of the image [px] at the centres of the shrunken image's rows."""
+    return (np.arange(view.optics.height_px // SHRINK) + 0.5) * SHRINK - 0.5
+
+
+@lru_cache(maxsize=8)
+def led_optics(view: WristView) -> LedOptics:
+    """The maps of one wrist rig; made once."""
+    v = image_rows(view)
+    u = (np.arange(view.optics.width_px // SHRINK) + 0.5) * SHRINK - 0.5
+    xy = view.optics.undistort(np.stack(np.meshgrid(u, v), axis=-1))
+    ray = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
+    flat = np.ones(xy.shape[:2]) if view.flat_field is None else flat_of(view.flat_field, xy)
+    return LedOptics(
+        (1.0 / np.linalg.norm(ray, axis=-1)).astype(np.float32),
+        (1.0 / np.sqrt(flat)).astype(np.float32),
+        ray.astype(np.float32),
+    )
+
+
+def flat_of(field: FlatField, xy: Float) -> Float:
+    """The flat field (...) at normalised image points (..., 2), never less than a fiftieth of that on the axis."""
+    x, y = xy[..., 0], xy[..., 1]
+    powers = [x ** (n - k) * y**k for n in range(7) for k in range(n + 1)]
+    flat = sum(c * p for c, p in zip(field.coefficients, powers, strict=False))
+    return np.maximum(flat, _LEAST_FLAT)

@@ -1,0 +1,157 @@
+"""What a finger looks like from the wrist, bent in every way: templates to find its tip with (D15).
+
+The palm stands still before the camera, so of a finger whose bones are known two angles matter: the flexion of its
+knuckle and of its PIP, which the DIP follows (D8). For each pair the finger is drawn as capsules along its bones, lit
+from the lens: a surface at distance t, its normal inclined by theta to the ray, gives back light in proportion to
+cos(theta) / t^2 (I15). Of a drawing the root of that is kept along the *spine*, the line in the image from the knuckle
+to the fingertip, one number per row of the shrunken image; 0 where the ray meets nothing. Such a profile of nearness
+begins at the contour, steps down where a folded finger ends before the palm, and has its bright bump where a fingertip
+faces the camera. How far the profile lies above the palm's own nearness tells an open hand from a fist.
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.hand_model import CHAINS, FINGER_JOINTS
+from slave.wrist.led_depth import SHRINK, Float32, image_rows
+from slave.wrist.view import WristView
+
+FOUR = (1, 2, 3, 4)  # index ... little
+DIP_PER_PIP = 0.84  # Kamper's ratio (D8)
+STEP_RAD = np.radians(6.0)
+MCP_RAD = np.radians((-12.0, 100.0))
+PIP_RAD = np.radians((0.0, 120.0))  # the range of D8
+# How far a finger reaches beyond its tip joint, in radii of its end: the half sphere about the joint, and a pad of the
+# same thickness before it, as where the tip joint of a tracked hand lies within the last bone.
+OVERHANG = (1.0, 1.6)
+SOFT = 0.15  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
+# A fingertip's end is seen while it is on this side of the finger's own horizon, give or take 2 to 3 mm of a pad that
+# is thicker than the nail's side: pointing away it is seen a little longer, pointing down into the fist not at all.
+HORIZON_UP, HORIZON_DOWN = -0.25, 0.0
+PALM_ROWS = (2, 14)  # rows below the knuckle, where no finger but a folded one is seen
+FINGER_ENDS = 10  # rows above the knuckle: the web between the fingers, about half of the first bone
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingerTemplates:
+    """All bends of one finger.
+
+    Attributes:
+        rows: A profile is that of image rows 0 ... rows - 1 of the shrunken image.
+        unit: (T, rows) profiles of unit length.
+        length: (T,) what they were divided by [1/m].
+        palm: Nearness of the palm below the knuckle, on average [1/m].
+        root_uv: (2,) the knuckle [px].
+        apex_v: (T,) row of the end of the finger [px].
+        top_v, bottom_v: (T,) highest row of the finger, lowest row of its end [px].
+        radius_px: (T,) radius of its end in the image.
+        depth_m: (T,) of its end, along the optical axis.
+        facing: (T,) cosine between the last bone and the way to the camera: 1 the fingertip points at the camera.
+        seen: (T,) whether the end of the finger is on the side towards the camera.
+        bend_rad: (T, 2) knuckle and PIP.
+    """
+
+    rows: int
+    unit: Float32
+    length: Float32
+    palm: float
+    root_uv: Float
+    apex_v: Float
+    top_v: Float
+    bottom_v: Float
+    radius_px: Float
+    depth_m: Float
+    facing: Float
+    seen: Bool
+    bend_rad: Float
+
+
+@lru_cache(maxsize=8)
+def templates_of(view: WristView) -> tuple[FingerTemplates, ...]:
+    """The templates of index ... little of one wrist rig and hand; made once."""
+    return tuple(_templates(view, finger) for finger in FOUR)
+
+
+def _templates(view: WristView, finger: int) -> FingerTemplates:
+    mcp, pip = (np.arange(low, high + 1e-9, STEP_RAD) for low, high in (MCP_RAD, PIP_RAD))
+    grid = np.stack(np.meshgrid(mcp, pip, OVERHANG, indexing="ij"), axis=-1).reshape(-1, 3)
+    angles = np.zeros((len(grid), 5, 4))
+    angles[:, finger, 1:3] = grid[:, :2]
+    angles[:, finger, 3] = DIP_PER_PIP * grid[:, 1]
+    joints = view.model.forward(view.T_camera_palm, angles)
+    chain = joints.position_m[:, CHAINS[finger]]
+    radius = view.model.radius_m[list(FINGER_JOINTS[finger])]
+    along = -joints.rotation[:, CHAINS[finger, 3], :, 2]
+    apex = chain[:, 3] + along * grid[:, 2:] * radius[-1]
+    end = apex - along * radius[-1]
+    metacarpal = joints.position_m[:, FINGER_JOINTS[finger][0]]
+    points = np.stack([metacarpal, chain[:, 0], chain[:, 1], chain[:, 2], end], axis=1)
+    root_uv, apex_uv = view.optics.project(chain[0, 0]), view.optics.project(apex)
+    uv = view.optics.project(points)
+    size = radius * view.optics.matrix[1, 1] / points[..., 2]
+    near = _profiles(view, points, radius, root_uv, uv[:, -1])
+    rows = int(root_uv[1] / SHRINK) - FINGER_ENDS
+    length = np.linalg.norm(near[:, :rows], axis=1)
+    kept = length > 0.0
+    palm = slice(*(int(root_uv[1] / SHRINK) + row for row in PALM_ROWS))
+    toward = -apex / np.linalg.norm(apex, axis=-1, keepdims=True)
+    facing = (along * toward).sum(axis=-1)
+    down = apex_uv[:, 1] > uv[:, -1, 1]
+    return FingerTemplates(
+        rows=rows,
+        unit=(near[kept, :rows] / length[kept, None]).astype(np.float32),
+        length=length[kept].astype(np.float32),
+        palm=float(near[:, palm].mean()),
+        root_uv=root_uv,
+        apex_v=apex_uv[kept, 1],
+        top_v=(uv[..., 1] - size)[kept, 1:].min(axis=1),
+        bottom_v=(uv[..., 1] + size)[kept, -1],
+        radius_px=size[kept, -1],
+        depth_m=apex[kept, 2],
+        facing=facing[kept],
+        seen=np.where(down, facing > HORIZON_DOWN, facing > HORIZON_UP)[kept],
+        bend_rad=grid[kept, :2],
+    )
+
+
+def _profiles(view: WristView, points: Float, radius: Float, root_uv: Float, end_uv: Float) -> Float:
+    """Nearness (T, rows) [1/m] along the spines of fingers of joints (T, 5, 3) [m] and radii (5,) [m]."""
+    v = image_rows(view)
+    rise = np.minimum(end_uv[:, 1:] - root_uv[1], -np.ptp(root_uv) / 8.0 - 1.0)
+    share = np.clip((v - root_uv[1]) / rise, -0.5, 1.5)
+    u = root_uv[0] + share * (end_uv[:, :1] - root_uv[0])
+    ray = view.optics.ray(np.stack([u, np.broadcast_to(v, u.shape)], axis=-1))
+    near, shade = np.zeros(u.shape), np.zeros(u.shape)
+    for k in range(points.shape[1] - 1):
+        thick = 0.5 * (radius[k] + radius[k + 1])
+        distance, cosine = _capsule(ray, points[:, None, k], points[:, None, k + 1], thick)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            nearer = 1.0 / distance > near
+        near = np.where(nearer, 1.0 / np.where(nearer, distance, 1.0), near)
+        shade = np.where(nearer, cosine, shade)
+    return near * np.sqrt((np.clip(shade, 0.0, 1.0) + SOFT) / (1.0 + SOFT))
+
+
+def _capsule(ray: Float, a: Float, b: Float, radius: float) -> tuple[Float, Float]:
+    """Where unit rays (..., 3) from the origin meet capsules from a to b: distance (...), NaN where they miss.
+
+    The second is the cosine of incidence there.
+    """
+    axis = b - a
+    aa, ad, ao = (axis * axis).sum(-1), (axis * ray).sum(-1), -(axis * a).sum(-1)
+    do, oo = -(ray * a).sum(-1), (a * a).sum(-1)
+    k2, k1, k0 = aa - ad * ad, aa * do - ao * ad, aa * oo - ao * ao - radius * radius * aa
+    with np.errstate(invalid="ignore", divide="ignore"):
+        distance = (-k1 - np.sqrt(k1 * k1 - k0 * k2)) / k2
+        foot = ao + distance * ad
+        for end, beyond in ((a, ~(foot > 0.0)), (b, foot >= aa)):
+            near = (ray * end).sum(-1)
+            cap = near - np.sqrt(near * near - (end * end).sum(-1) + radius * radius)
+            distance = np.where(beyond, cap, distance)
+    point = distance[..., None] * ray
+    foot = np.clip((axis * (point - a)).sum(-1) / np.maximum(aa, 1e-12), 0.0, 1.0)
+    normal = (point - a - foot[..., None] * axis) / radius
+    return distance, -(normal * ray).sum(-1)
