@@ -31,7 +31,7 @@ def recorded_detections(folder: Path, camera: str, count: int) -> Iterator[Marke
         rival = data["rival_uv"].astype(np.float64) if "rival_uv" in data else np.full_like(uv, np.nan)
     except (TypeError, ValueError) as error:
         raise RecordingError(f"{path}: {error}: {fix}") from error
-    _check_times(path, t_ns, seq)
+    _check_times(path, t_ns, seq, fix)
     if uv.shape != (len(t_ns), count, 2) or area.shape != uv.shape[:2] or quality.shape != uv.shape[:2]:
         raise RecordingError(f"{path}: uv has shape {uv.shape}, the rig needs ({len(t_ns)}, {count}, 2)")
     if sigma.shape != uv.shape[:2] or rival.shape != uv.shape:
@@ -81,7 +81,7 @@ def recorded_triples(folder: Path, camera: str) -> Iterator[WristDetections]:
         each = {name: array.astype(np.float64) for name, array in rest.items()}
     except (TypeError, ValueError, IndexError) as error:
         raise RecordingError(f"{path}: {error}: {fix}") from error
-    _check_times(path, t_ns, seq)
+    _check_times(path, t_ns, seq, fix)
     for name, array, shape in (
         ("laser_uv", laser, (len(t_ns), FINGER_COUNT, 2)),
         ("tip_uv", tip, (len(t_ns), FINGER_COUNT, 2)),
@@ -110,10 +110,10 @@ def _file_of(folder: Path, camera: str) -> tuple[Path, str]:
     return folder / f"detections_{camera}.npz", f"run `phalanx-slave detect` for camera {camera!r} first"
 
 
-def _check_times(path: Path, t_ns: Int, seq: Int) -> None:
+def _check_times(path: Path, t_ns: Int, seq: Int, fix: str) -> None:
     if t_ns.ndim != 1 or seq.shape != t_ns.shape:
         raise RecordingError(
-            f"{path}: t_ns and seq have shapes {t_ns.shape} and {seq.shape}, expected one (T,)"
+            f"{path}: t_ns and seq have shapes {t_ns.shape} and {seq.shape}, expected one (T,): {fix}"
         )
 
 

@@ -1,0 +1,87 @@
+"""The report of a simulated run of a wrist device: scores against its scene, a picture, a file for the viewer."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.frame_recording import Illumination
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import WristScene
+from master.outputs.files import save_poses
+from master.report import report_scene
+from master.rig import RigSetup
+from master.wrist_report import lit_view
+from tests.master.test_outputs_rerun import rows_of
+from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
+
+N = 40
+
+
+@pytest.fixture(scope="module")
+def setup(root: Path) -> RigSetup:
+    return wrist_setup(root)
+
+
+@pytest.fixture(scope="module")
+def scene(setup: RigSetup) -> WristScene:
+    return wrist_scene(setup, "curl")
+
+
+@pytest.mark.parametrize("late_ms", [0, 30])
+def test_a_run_is_scored_at_the_times_of_its_poses(
+    setup: RigSetup, scene: WristScene, tmp_path: Path, late_ms: int
+) -> None:
+    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(N)])
+    save_poses(tmp_path / "poses.npz", poses)
+    epoch_ns = START_NS - 1_500_000_000 - late_ms * 1_000_000
+    told: list[str] = []
+    full = report_scene(
+        tmp_path / "poses.npz",
+        setup,
+        scene,
+        epoch_ns,
+        tmp_path,
+        {"poses_per_s": 30.0},
+        lambda what, _done, _total: told.append(what),
+    )
+    assert full["poses_per_s"] == 30.0
+    assert full["triples_missed"] == 0.0
+    numbers = {name: value for name, value in full.items() if isinstance(value, float)}
+    if late_ms:  # the truth is that of the same poses, a moment later: the scores see the motion between
+        assert numbers["pip_rms_deg"] > 0.3
+        assert numbers["laser_mm"] > 0.05
+    else:
+        assert numbers["laser_right"] == 1.0
+        for name in ("laser_mm", "laser_missed", "pip_rms_deg", "pip_untracked", "pip_deg", "joint_mm"):
+            assert numbers[name] == pytest.approx(0.0, abs=1e-3), name
+    rows = rows_of(tmp_path / "run.rrd")
+    assert rows["/world/laser/points"] == rows["/world/truth/laser"] == N
+    assert rows["/world/cameras/wrist/image"] == 3  # 1.3 s, twice a second
+    assert (tmp_path / "hand.png").stat().st_size > 50_000
+    assert {"comparing with the truth", "drawing the hand", "rendering camera wrist"} <= set(told)
+
+
+def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristScene, tmp_path: Path) -> None:
+    poses = true_poses(setup, [scene.truth(0.0)])
+    save_poses(tmp_path / "poses.npz", poses)
+    after_ns = START_NS + 1
+    full = report_scene(
+        tmp_path / "poses.npz",
+        setup,
+        scene,
+        after_ns,
+        tmp_path,
+        {"poses": 0},
+        lambda _what, _done, _total: None,
+    )
+    assert full == {"poses": 0}
+
+
+def test_what_laser_and_leds_light_is_without_the_room(scene: WristScene) -> None:
+    renderer = WristRenderer(scene, "wrist")
+    shown = lit_view(renderer, 1.0).astype(np.float64)
+    ambient = renderer.render(1.0, Illumination.AMBIENT)
+    assert ambient[:100].mean() > 5.0  # the room behind the fingers
+    assert shown[:100].mean() < 0.5 * ambient[:100].mean()
+    assert shown.max() > 100.0
