@@ -11,6 +11,7 @@ from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
 from master.calibrate.time.commands import time_command
+from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
 from master.calibrate.wrist.laser_command import laser_plane
 
@@ -25,6 +26,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "hand": hand_command,
     "laser-plane": laser_plane,
     "flat-field": flat_field,
+    "curl": curl,
 }
 
 

@@ -11,9 +11,11 @@ from matplotlib.figure import Figure
 from common.camera_model import CameraModel
 from common.errors import RecordingError
 from common.replacing import replacing
+from master.calibrate.wrist.curl import FingerCurl
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, field_at
 from master.calibrate.wrist.plane import PlaneFit, ViewLine
 
+_FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
 _BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
@@ -81,6 +83,33 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     law.set(
         title="residual [%] by distance from the axis", xlabel="tangent of the angle", ylim=(-limit, limit)
     )
+    _save(figure, path)
+
+
+def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
+    """Laser points of the fingers from above, and their lines from straight (o) to bent (x). PNG.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    figure = _figure((8.0, 6.5))
+    axes = figure.subplots()
+    for found, colour in zip(curls, _FINGER_COLOURS, strict=True):
+        axes.plot(
+            1e3 * found.points_m[:, 0], 1e3 * found.points_m[:, 2], ".", markersize=3, color=colour, alpha=0.5
+        )
+        if found.line is None:
+            continue
+        origin, way = np.array(found.line.origin_m), np.array(found.line.direction)
+        ends = 1e3 * np.stack([origin + t * way for t in found.line.range_m])
+        axes.plot(
+            ends[:, 0], ends[:, 2], color=colour,
+            label=f"{found.finger}: {1e3 * found.line.range_m[1]:.0f} mm, rms {1e3 * found.line.residual_m:.2f} mm",
+        )  # fmt: skip
+        axes.plot(ends[:1, 0], ends[:1, 2], "o", color=colour)
+        axes.plot(ends[1:, 0], ends[1:, 2], "x", color=colour)
+    axes.set(title="laser points from above [mm]: o straight, x bent", xlabel="x", ylabel="z", aspect="equal")
+    axes.legend(fontsize=8)
     _save(figure, path)
 
 

@@ -1,0 +1,95 @@
+"""The line of each finger's laser point from a guided curl: strays are left out, then the principal axis is taken."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.errors import FitError
+from common.hand_model import FINGERS
+from common.wrist_calibration import FingerLine
+from master.wrist.finger_lines import principal_line
+
+MIN_POINTS = 20  # two thirds of a second of triples
+MIN_MOTION_M = (
+    0.015  # of 60 to 100 mm: below it was no curl, and a short line's direction is that of the noise
+)
+_STRAY_M = 3e-3  # from the line: it is a little bent, and the finger goes aside by a millimetre
+_ALONE_M = 3e-3  # beyond all but one per cent of the points along the line
+_PAIRS = 300
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingerCurl:
+    """One finger's curl.
+
+    Attributes:
+        finger: Its name.
+        points_m: (N, 3) the points that count [m], camera frame.
+        seen: Points seen in all.
+        line: Its line; None: not told.
+        reason: Why not.
+    """
+
+    finger: str
+    points_m: Float
+    seen: int
+    line: FingerLine | None
+    reason: str = ""
+
+
+def fit_curls(laser_m: Float) -> tuple[FingerCurl, ...]:
+    """The lines of the five fingers.
+
+    Args:
+        laser_m: (T, 5, 3) laser points [m], camera frame; NaN: not seen.
+
+    Raises:
+        FitError: No finger tells a line; the text says for each finger why.
+    """
+    curls = tuple(_curl(name, laser_m[:, f]) for f, name in enumerate(FINGERS))
+    if all(curl.line is None for curl in curls):
+        reasons = "; ".join(f"{curl.finger}: {curl.reason}" for curl in curls)
+        raise FitError(f"no finger curled before the laser: {reasons}")
+    return curls
+
+
+def _curl(finger: str, laser_m: Float) -> FingerCurl:
+    seen = laser_m[np.isfinite(laser_m).all(axis=1)]
+    if len(seen) < MIN_POINTS:
+        return FingerCurl(
+            finger, seen, len(seen), None, f"{len(seen)} points, at least {MIN_POINTS} are needed"
+        )
+    points = seen[_together(seen)]
+    axis = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][0]
+    moved = float(np.ptp(points @ axis))
+    if len(points) < MIN_POINTS or moved < MIN_MOTION_M:
+        return FingerCurl(
+            finger,
+            points,
+            len(seen),
+            None,
+            f"moved by {1e3 * moved:.1f} mm, at least {1e3 * MIN_MOTION_M:.0f} are needed: bend it to a fist",
+        )
+    try:
+        return FingerCurl(finger, points, len(seen), principal_line(points))
+    except FitError as error:
+        return FingerCurl(finger, points, len(seen), None, str(error))
+
+
+def _together(points: Float) -> Bool:
+    """Which points (N,) lie along the line that most of them share; the points of another finger do not."""
+    rng = np.random.default_rng(0)
+    a, b = points[rng.integers(0, len(points), (2, _PAIRS))]
+    way = b - a
+    length = np.linalg.norm(way, axis=1)
+    # Neighbours tell no direction.
+    far = length > np.quantile(length, 0.5)
+    a, way = a[far], way[far] / length[far, None]
+    arm = points[:, None] - a
+    off = np.linalg.norm(arm - np.vecdot(arm, way)[..., None] * way, axis=2)
+    near = off < _STRAY_M
+    best = int(np.argmax(near.sum(axis=0) - 0.1 * np.minimum(off, _STRAY_M).sum(axis=0) / _STRAY_M))
+    along = (points - a[best]) @ way[best]
+    low, high = np.quantile(along[near[:, best]], [0.01, 0.99])
+    return near[:, best] & (along > low - _ALONE_M) & (along < high + _ALONE_M)
