@@ -1,9 +1,9 @@
 """The principal axis along which the laser point of one finger moves while it bends (Digits, UIST 2012).
 
 The laser draws its points on a plane, and a finger that bends moves its point along a nearly straight line in it,
-towards the device; the thumb's runs diagonally. A guided curl measures this line and how far the points go: the range of
-the line anchors the simulated table of this hand at both of its ends, so that skin thicker than the profile says, or a
-wrist device that sits a little differently, does not become an angle.
+towards the device; the thumb's runs diagonally. A guided curl measures this line and how far the points go. Both anchor
+the simulated table of this hand, so that skin thicker than the profile says, or a wrist device that sits a little
+differently, does not become an angle.
 """
 
 import numpy as np

@@ -1,0 +1,114 @@
+"""From how far fingers are closed to their angles, and how sure each is.
+
+The laser gives two numbers of a finger and its pose has four. The other two come from habit: joints that bend together
+(`master.wrist.forward`). How far hands stray from that is `master.ik.priors`: a natural MCP by 14 degrees, a DIP by 15,
+each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone, hence the MCP; a
+PIP is that divided by 0.54 and its doubt is large, which the covariance says:
+
+    information = G' R^-1 G + H        G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
+
+R is the noise of the sensing, the thickness of skin that is not known, and the part of the line that is not seen.
+The centroid of a line that is shorter than the table expects is off across by up to half of what is missing, and along by
+a third of that, as skin curves away.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.hand_limits import ABDUCTION, FLEXION
+from master.ik.priors import Priors
+from master.wrist.forward import DIP, PIP, ForwardTable
+from master.wrist.invert import Closed
+from master.wrist.setup import WristSetup
+from master.wrist.skin import SPREAD, Skin
+
+_ANYWHERE_RAD = np.radians(35.0)  # closings of hands at work, about their mean
+_ABDUCTION_RAD = np.radians(20.0)
+_WHOLE = 0.75  # a line seen to this share of its length is not missing a part
+_HARDLY = 0.5  # less of it than this is no measurement of the finger
+_CURVES = 1 / 3
+_PLANE_M2 = (2e-4) ** 2  # what calibration leaves
+_OFF_RAD = np.radians(
+    5.0
+)  # beyond its limits of abduction by more than this, a point is not this finger bent naturally
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingerAngles:
+    """The angles of five fingers at one instant. NaN: not seen.
+
+    Attributes:
+        angles_rad: (5, 4) within the limits.
+        cov_rad2: (5, 4, 4).
+        told: (5,) the laser point tells how far the finger is closed.
+        past: (5,) it tells only that it is closed at least to the end of the branch; the angles are the middle of what
+            is left.
+        off: (5,) it fits no natural finger: most of its line is hidden, or it lies aside of all abductions.
+    """
+
+    angles_rad: Float
+    cov_rad2: Float
+    told: Bool
+    past: Bool
+    off: Bool
+
+
+class AngleBelief:
+    """What laser points say of angles, for one device and hand. What it holds was prepared by the constructor."""
+
+    def __init__(self, setup: WristSetup, table: ForwardTable, priors: Priors | None = None) -> None:
+        priors = priors or Priors()
+        self._model, self._curve = setup.model, table.curve
+        skin_m = SPREAD * Skin.of(setup.model).palmar_m.mean(axis=1)
+        self._skin_m2 = skin_m**2
+        self._focal_px = setup.optics.matrix[0, 0]
+        self._most = np.minimum(table.curve.range_rad[:, 1], setup.model.limits_rad[:, PIP, 1])
+        self._aside = table.abduction_rad[:, [0, -1]].T
+        self._habits = np.zeros((5, 4, 4))
+        for f in range(5):
+            mcp, dip = (priors.thumb, priors.thumb) if f == 0 else (priors.natural_flexion, priors.free_dip)
+            rows = np.zeros((3, 4))
+            rows[0, [FLEXION, PIP]] = np.array([1.0, -table.curve.slope[f, FLEXION]]) / mcp
+            rows[1, [DIP, PIP]] = np.array([1.0, -table.curve.slope[f, DIP]]) / dip
+            rows[2, ABDUCTION] = 1.0 / _ABDUCTION_RAD
+            self._habits[f] = rows.T @ rows
+
+    def __call__(self, closed: Closed, cov_m2: Float, distance_m: Float, laser_px: Float) -> FingerAngles:
+        """Angles of fingers.
+
+        Args:
+            closed: What the table says.
+            cov_m2: (5, 2, 2) of the laser points on the plane [m^2].
+            distance_m: (5,) of the points along the optical axis.
+            laser_px: (5,) length of the lines that were seen; NaN: not known.
+        """
+        seen = np.isfinite(closed.closing_rad)
+        shown = np.nan_to_num(laser_px / np.maximum(closed.length_px, 1.0), nan=1.0)
+        low, high = self._aside
+        aside = (closed.abduction_rad < low) | (closed.abduction_rad > high)
+        off = seen & ~closed.past & (aside | (shown < _HARDLY))
+        left = self._most - closed.closing_rad
+        closing = closed.closing_rad + np.where(closed.past, 0.5 * np.maximum(left, 0.0), 0.0)
+        angles = self._model.clamp(self._curve.angles(closing, closed.abduction_rad))
+        noise = self._noise(closed, cov_m2, distance_m, shown)
+        information = np.swapaxes(closed.by_angles, -1, -2) @ np.linalg.inv(noise) @ closed.by_angles
+        information += self._habits
+        spread = np.full(5, _ANYWHERE_RAD)
+        spread[closed.past] = np.maximum(left[closed.past], 0.1) / np.sqrt(12.0)
+        information[:, PIP, PIP] += 1.0 / spread**2
+        cov = np.asarray(np.linalg.inv(information), np.float64)
+        cov[~seen] = np.nan
+        return FingerAngles(angles, cov, seen & ~closed.past & ~off, closed.past, off)
+
+    def _noise(self, closed: Closed, cov_m2: Float, distance_m: Float, shown: Float) -> Float:
+        """How sure the points are, (5, 2, 2) [m^2], finite."""
+        seen = np.isfinite(closed.closing_rad)
+        noise = np.where(seen[:, None, None], cov_m2, 0.0)
+        missing = np.clip(_WHOLE - shown, 0.0, None) * closed.length_px / self._focal_px * distance_m
+        hidden = np.where(seen, 0.5 * missing, 0.0) ** 2 / 3.0
+        noise[:, 0, 0] += 0.25 * self._skin_m2 + _PLANE_M2 + hidden
+        noise[:, 1, 1] += self._skin_m2 + _PLANE_M2 + _CURVES**2 * hidden
+        noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
+        return noise

@@ -1,0 +1,246 @@
+"""Where the laser meets a finger that bends naturally: a table of one hand, simulated (Digits, UIST 2012).
+
+A natural finger bends all its joints together: MCP = 0.54 PIP, DIP = 0.84 PIP, PIP 0 ... 120 degrees (Kamper's ratios),
+where the hand file does not say otherwise. The joints of a thumb go through the same share of their ranges. So a finger
+has two unknowns, how far it is *closed* (its PIP; a thumb's MCP) and its abduction, and its laser point has two
+coordinates on the plane. The table holds that point over both unknowns; `master.wrist.invert` turns it round.
+
+For each pose of the grid the bones go where forward kinematics puts them, the skin around them (`master.wrist.skin`)
+is cut by a fan of rays from the laser, what of the line the camera sees is kept, and its centroid in the
+image is put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are
+left out.
+
+**The branch.** A bending finger moves its point towards the device, by 15 mm for 5 degrees when straight and by 1 mm
+when bent by 80. At about 95 the last phalanx folds into the light: the line jumps to it and then hardly moves. The
+table is turned round up to that jump only.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.geometry import transform
+from common.hand_limits import ABDUCTION, FLEXION
+from common.hand_model import HandModel
+from common.hand_presets import preset_couplings
+from master.wrist.laser_plane import PlaneAxes
+from master.wrist.setup import WristSetup
+from master.wrist.skin import Skin, first_hits
+
+PIP, DIP = 2, 3
+CLOSED_RAD = np.radians(120.0)
+_CLOSINGS, _ABDUCTIONS = 61, 9
+_NUDGED_ROWS = 4
+_ASIDE_RAD = np.radians(20.0)  # abduction of preset D
+_BEYOND_RAD = np.radians(5.0)  # the grid goes beyond the limits of abduction, for noise and skin
+_RAYS = 128
+_SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
+_STRETCH = 0.25  # share of the fan that the rays of one line may leave out: more is a jump from part to part
+_JUMP = 0.3  # spheres by which the line's mean place on the finger may rise while it bends
+_WHOLE = 0.7  # share of the line as it was a few rows before; less is partly hidden by the last phalanx
+_FADE = 0.97  # by which a line may shorten from row to row
+_NUDGE_RAD = np.radians(3.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NaturalCurve:
+    """Angles by closing: base + closing * slope.
+
+    Attributes:
+        base_rad, slope: (5, 4); the slope of the PIP (thumb MCP) is 1.
+        range_rad: (5, 2) of the closing.
+    """
+
+    base_rad: Float
+    slope: Float
+    range_rad: Float
+
+    @classmethod
+    def of(cls, model: HandModel) -> "NaturalCurve":
+        """That of a hand: its own couplings where its file states them, else those of Digits."""
+        stated = model.profile.couplings is not None
+        digits = preset_couplings("D")
+        mcp, dip = (model.mcp_per_pip, model.dip_per_pip) if stated else (None, None)
+        base, slope, reach = np.zeros((5, 4)), np.zeros((5, 4)), np.empty((5, 2))
+        slope[1:, FLEXION] = digits.mcp_per_pip if mcp is None else mcp
+        slope[1:, DIP] = digits.dip_per_pip if dip is None else dip
+        slope[:, PIP] = 1.0
+        reach[1:] = 0.0, CLOSED_RAD
+        low, high = model.limits_rad[0, 1:].T
+        span = np.maximum(high - low, 1e-3)
+        slope[0, 1:] = span / span[1]
+        base[0, 1:] = low - low[1] * slope[0, 1:]
+        reach[0] = low[1], low[1] + span[1]
+        return cls(base, slope, reach)
+
+    def angles(self, closing_rad: Float, abduction_rad: Float) -> Float:
+        """Angles (..., 5, 4) [rad] of closings and abductions (..., 5) [rad]."""
+        closing, abduction = np.broadcast_arrays(closing_rad, abduction_rad)
+        angles = self.base_rad + closing[..., None] * self.slope
+        angles[..., ABDUCTION] = abduction
+        return angles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForwardTable:
+    """Laser points over closing (C) and abduction (A) of the five fingers.
+
+    Attributes:
+        curve: What is natural.
+        closing_rad: (5, C), even steps.
+        abduction_rad: (5, A), even steps.
+        point_m: (5, C, A, 2) coordinates on the plane (across, along) [m], continued where the laser misses the finger.
+        by_mcp, by_dip: (5, C, A, 2) how the point moves with the MCP or the DIP alone [m/rad].
+        length_px: (5, C, A) of the lit and seen line in the undistorted image; 0: the laser misses.
+        last: (5, A) rows at which the branch ends.
+    """
+
+    curve: NaturalCurve
+    closing_rad: Float
+    abduction_rad: Float
+    point_m: Float
+    by_mcp: Float
+    by_dip: Float
+    length_px: Float
+    last: Int
+
+    @classmethod
+    def of(cls, setup: WristSetup) -> "ForwardTable":
+        """Simulate it; takes one or two seconds."""
+        model = setup.model
+        curve = NaturalCurve.of(model)
+        closing = _evenly(curve.range_rad, _CLOSINGS)
+        # A limit of 0, as preset K has for the middle finger, keeps no real finger from moving aside.
+        most = np.maximum(np.abs(model.limits_rad[:, ABDUCTION]), _ASIDE_RAD) + _BEYOND_RAD
+        abduction = _evenly(np.array([-1.0, 1.0]) * most, _ABDUCTIONS)
+        angles = curve.angles(closing.T[:, None], abduction.T[None])  # (C, A, 5, 4)
+        cut = LaserCut(setup)
+        point, length, place = cut(angles)
+        return cls(
+            curve,
+            closing,
+            abduction,
+            _continued(point),
+            _nudged(cut, angles, FLEXION),
+            _nudged(cut, angles, DIP),
+            length,
+            _branch(length, place),
+        )
+
+
+def _evenly(ends: Float, count: int) -> Float:
+    """Even steps (5, count) between ends (5, 2)."""
+    return ends[:, :1] + np.linspace(0.0, 1.0, count) * (ends[:, 1:] - ends[:, :1])
+
+
+def _nudged(cut: "LaserCut", angles_rad: Float, joint: int) -> Float:
+    """How the point moves with one joint [m/rad], (5, C, A, 2): found on some rows, between them interpolated."""
+    rows = np.arange(0, _CLOSINGS, _NUDGED_ROWS)
+    ends: list[Float] = []
+    for sign in (-1.0, 1.0):
+        nudged = angles_rad[rows]
+        nudged[..., joint] += sign * _NUDGE_RAD
+        ends.append(cut(nudged)[0])
+    some = _continued((ends[1] - ends[0]) / (2.0 * _NUDGE_RAD))
+    at = np.arange(_CLOSINGS) / _NUDGED_ROWS
+    before = np.minimum(at.astype(np.int64), len(rows) - 2)
+    share = (at - before)[:, None, None]
+    return (1.0 - share) * some[:, before] + share * some[:, before + 1]
+
+
+class LaserCut:
+    """Cuts the fingers of one hand with the laser of one device. What it holds was prepared by the constructor."""
+
+    def __init__(self, setup: WristSetup) -> None:
+        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
+
+    def __call__(self, angles_rad: Float) -> tuple[Float, Float, Float]:
+        """Laser points (5, C, A, 2) [m] of angles (C, A, 5, 4), and where on the finger they lie.
+
+        Returns:
+            The points, NaN where the laser misses; the length of their lines (5, C, A) [px]; the mean number of the
+            cone that they lie on (5, C, A).
+        """
+        spheres = self._skin.spheres(self._setup.model.chains(angles_rad))
+        spheres = np.moveaxis(transform(self._setup.T_camera_palm, spheres), 2, 0)  # (5, C, A, K, 3)
+        found = [self._finger(f, spheres[f]) for f in range(5)]
+        point, length, place = (np.stack(part) for part in zip(*found, strict=True))
+        return point, length, place
+
+    def _finger(self, f: int, spheres: Float) -> tuple[Float, Float, Float]:
+        """The same of one finger, whose spheres are at (C, A, K, 3)."""
+        radius, laser = self._skin.radius_m[f], self._setup.laser_m
+        rays, on_line = self._fan(spheres, radius)
+        hits = first_hits(laser, rays, spheres, radius)
+        far = hits.min(axis=-1)
+        lit = np.isfinite(far)
+        points = laser + np.where(lit, far, 1.0)[..., None] * rays
+        distance = np.linalg.norm(points, axis=-1)
+        seen_at = first_hits(np.zeros(3), points / distance[..., None], spheres, radius).min(axis=-1)
+        body = hits.argmin(axis=-1)
+        # What the metacarpal of the thumb carries is its ball, and no finger.
+        own = lit & (seen_at > distance - _SEEN_M) & ((body > 2) | (f > 0))
+        image = points[..., :2] / points[..., 2:]
+        step, gap = np.diff(image, axis=-2), np.linalg.norm(np.diff(points, axis=-2), axis=-1)
+        whole = own[..., 1:] & own[..., :-1] & (gap < _STRETCH * on_line[..., None])
+        weight = np.where(whole, np.linalg.norm(step, axis=-1), 0.0)
+        total = weight.sum(axis=-1)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = weight / total[..., None]
+        centre = np.einsum("...r,...rk->...k", share, image[..., 1:, :] - 0.5 * step)
+        ray = np.concatenate([centre, np.ones((*centre.shape[:-1], 1))], axis=-1)
+        point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[..., None]
+        place = (share * body[..., 1:]).sum(axis=-1)
+        return self._axes.flat(point), total * self._setup.optics.matrix[0, 0], place
+
+    def _fan(self, spheres: Float, radius: Float) -> tuple[Float, Float]:
+        """Rays (C, A, R, 3) in the laser plane that take in the whole finger, and how wide it is (C, A) [m]."""
+        flat = self._axes.flat(spheres)
+        distance = np.linalg.norm(flat, axis=-1)
+        turn = np.arctan2(flat[..., 0], flat[..., 1])
+        room = np.arcsin(np.minimum(radius / distance, 1.0))
+        low, high = (turn - room).min(axis=-1), (turn + room).max(axis=-1)
+        turn = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, _RAYS)
+        across, along = self._axes.axes
+        return np.sin(turn)[..., None] * across + np.cos(turn)[
+            ..., None
+        ] * along, 2.0 * radius.max() + 0.0 * low
+
+
+def _continued(values: Float) -> Float:
+    """Values (5, C, A, N) with straight lines along C in place of NaN; 0 where a column holds no two numbers."""
+    out = values.copy()
+    rows = np.arange(values.shape[1], dtype=np.float64)
+    for f, a, n in np.ndindex(values.shape[0], *values.shape[2:]):
+        column = values[f, :, a, n]
+        known = np.flatnonzero(np.isfinite(column))
+        if len(known) == len(column):
+            continue
+        if len(known) < 2:
+            out[f, :, a, n] = 0.0
+            continue
+        filled = np.interp(rows, rows[known], column[known])
+        for end, inner in ((known[0], known[1]), (known[-1], known[-2])):
+            slope = (column[end] - column[inner]) / (end - inner)
+            outside = (rows - end) * np.sign(end - inner) > 0.0
+            filled[outside] = column[end] + slope * (rows[outside] - end)
+        out[f, :, a, n] = filled
+    return out
+
+
+def _branch(length_px: Float, place: Float) -> Int:
+    """Last rows (5, A) to which the lit line is whole and wanders towards the palm while the finger closes.
+
+    A thumb's has no such end: it never reaches its own tip.
+    """
+    last = np.full((5, length_px.shape[2]), length_px.shape[1] - 1)
+    for f, a in np.ndindex(last.shape):
+        lowest, longest = np.inf, 0.0
+        for row in np.flatnonzero(length_px[f, :, a] > 0.0) if f else ():
+            length = length_px[f, row, a]
+            if place[f, row, a] > lowest + _JUMP or length < _WHOLE * longest:
+                last[f, a] = row - 1
+                break
+            lowest, longest = min(lowest, place[f, row, a]), max(_FADE * longest, length)
+    return last

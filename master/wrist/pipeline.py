@@ -1,0 +1,131 @@
+"""The wrist device's straight line: detections -> laser points on their plane -> natural angles -> pose.
+
+`WristPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages and get
+the same poses.
+
+What it says of a finger:
+
+- **seen**: its laser point tells how far it is closed; joints tracked.
+- **past the branch**: bent so far that the point no longer moves with it: not tracked, the angles are the middle of
+  what is left, with its whole width as doubt.
+- **off**: the point fits no natural finger: angles as found, not tracked.
+- **held**: not seen for less than half a second, where frames follow each other: the last angles, their doubt growing
+  as that of a hidden finger of the marker rig.
+- **none**: not valid, NaN. Nothing is made up for it.
+"""
+
+from collections import Counter
+from contextlib import nullcontext
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float
+from common.hand_model import FINGERS
+from common.messages import Source, WristDetections
+from master.filters import OneEuroParameters, PointFilter
+from master.ik.hidden import strayed_rad2
+from master.stereo.pipeline import SolvedPose, Stage
+from master.wrist.belief import AngleBelief, FingerAngles
+from master.wrist.forward import ForwardTable
+from master.wrist.invert import Inverse
+from master.wrist.laser_plane import LaserPoints, PlaneAxes, laser_points
+from master.wrist.pose import PoseMaker
+from master.wrist.setup import WristSetup
+
+_FORGET_S = 0.5
+_NEVER_NS = -(2**62)
+
+
+class WristPipeline:
+    """Push machine. Holds the filter of the laser points, and of each finger the last angles and when it was seen."""
+
+    def __init__(
+        self, setup: WristSetup, *, continuous: bool = True, stage: Stage = lambda name: nullcontext()
+    ) -> None:
+        """Simulate the table, which takes about a second.
+
+        Args:
+            setup: Device and hand.
+            continuous: False: every message is an unrelated pose; no filter, no memory.
+            stage: Opens a timer by stage name.
+        """
+        self.counts: Counter[str] = Counter()
+        self._setup, self._stage, self._continuous = setup, stage, continuous
+        self._axes = PlaneAxes.of(setup)
+        table = ForwardTable.of(setup)
+        self._inverse, self._believe = Inverse(table), AngleBelief(setup, table)
+        self._pose = PoseMaker(setup)
+        self._smooth = _point_filter(setup, self._axes) if continuous else None
+        self._last_ns = _NEVER_NS
+        self._angles, self._cov = np.full((5, 4), np.nan), np.full((5, 4, 4), np.nan)
+        self._seen_ns = np.full(5, _NEVER_NS)
+
+    def push(self, message: WristDetections) -> list[SolvedPose]:
+        """Take what one triple showed; return its pose. A message not later than the last is counted and dropped."""
+        if message.t_ns <= self._last_ns:
+            self.counts["late"] += 1
+            return []
+        self._last_ns = message.t_ns
+        with self._stage("laser"):
+            points = laser_points(self._setup, message.laser_uv, message.laser_sigma_px)
+            self._count("no_plane", np.isfinite(message.laser_uv[:, 0]) & np.isnan(points.point_m[:, 0]))
+        with self._stage("hand"):
+            found = self._angles_of(message, points)
+            angles, cov, source = self._remembered(message.t_ns, found)
+            pose = self._pose(message.t_ns, angles, cov, source, found.told, points.point_m)
+        self._count("past", found.past)
+        self._count("off", found.off)
+        self._count("held", source == Source.HELD)
+        self._count("unseen", source == Source.NONE)
+        self.counts["poses"] += 1
+        return [SolvedPose(pose, message.ready_t_ns)]
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: nothing waits."""
+        return []
+
+    def _angles_of(self, message: WristDetections, points: LaserPoints) -> FingerAngles:
+        """What the laser says of the fingers."""
+        point = points.point_m
+        if self._smooth is not None:
+            point = self._smooth.push(message.t_ns, point, points.cov_m2)
+        closed = self._inverse(self._axes.flat(point))
+        return self._believe(closed, self._axes.flat_cov(points.cov_m2), point[:, 2], message.laser_px)
+
+    def _remembered(self, t_ns: int, found: FingerAngles) -> tuple[Float, Float, Code]:
+        """Angles (5, 4), covariances (5, 4, 4) and sources (5,), with those of fingers that were seen a moment ago."""
+        seen = np.isfinite(found.angles_rad[:, 0])
+        source: Code = np.where(seen, np.uint8(Source.WRIST), np.uint8(Source.NONE))
+        if not self._continuous or seen.all():
+            self._remember(t_ns, found, seen)
+            return found.angles_rad, found.cov_rad2, source
+        gone_s = 1e-9 * (t_ns - self._seen_ns)
+        held = ~seen & (gone_s <= _FORGET_S)
+        source[held] = Source.HELD
+        angles, cov = found.angles_rad.copy(), found.cov_rad2.copy()
+        angles[held] = self._angles[held]
+        cov[held] = self._cov[held] + strayed_rad2(gone_s[held])[:, None, None] * np.eye(4)
+        self._remember(t_ns, found, seen)
+        return angles, cov, source
+
+    def _remember(self, t_ns: int, found: FingerAngles, seen: Bool) -> None:
+        self._angles[seen], self._cov[seen], self._seen_ns[seen] = (
+            found.angles_rad[seen],
+            found.cov_rad2[seen],
+            t_ns,
+        )
+
+    def _count(self, event: str, fingers: Bool) -> None:
+        """Count an event of each of the fingers (5,) by name."""
+        for f in np.flatnonzero(fingers):
+            self.counts[f"{event}.{FINGERS[f]}"] += 1
+
+
+def _point_filter(setup: WristSetup, axes: PlaneAxes) -> PointFilter:
+    """The rig's 1 € filter, across, out of and along the plane."""
+    settings = setup.filter
+    return PointFilter(
+        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
+        settings.jitter_m,
+        np.stack([axes.axes[0], setup.normal, axes.axes[1]]),
+    )
