@@ -21,6 +21,7 @@ from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.stereo.place import CalibrationResidual
+from master.wrist.pipeline import WristPipeline
 from master.wrist.setup import WristSetup
 
 
@@ -203,6 +204,4 @@ def pipeline_of(
     """
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
-    from master.wrist.pipeline import WristPipeline
-
     return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))

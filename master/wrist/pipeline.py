@@ -80,6 +80,10 @@ class WristPipeline:
         self.counts["poses"] += 1
         return [SolvedPose(pose, message.ready_t_ns)]
 
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+        """Count what the IMU says of its own orientation (4,): the palm does not move against the camera."""
+        self.counts["orientation.unused"] += 1
+
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: nothing waits."""
         return []
