@@ -5,11 +5,11 @@ The laser gives two numbers of a finger and its pose has four. The other two com
 each joint of the thumb by 20. What the laser says of a bent finger is the slope of its proximal bone, hence the MCP; a
 PIP is that divided by 0.54 and its doubt is large, which the covariance says:
 
-    information = G' R^-1 G + H        G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
+    information = G' R^-1 G + H      G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
 
-R is the noise of the sensing, the thickness of skin that is not known, and the part of the line that is not seen.
-The centroid of a line that is shorter than the table expects is off across by up to half of what is missing, and along by
-a third of that, as skin curves away.
+R is the noise of the sensing, skin whose thickness is not known, and the part of the line that is not seen. The
+centroid of a line shorter than the table expects is off across by up to half of what is missing, and by a third of
+that along, as skin curves away.
 """
 
 from dataclasses import dataclass
@@ -93,8 +93,9 @@ class AngleBelief:
         closing = closed.closing_rad + np.where(closed.past, 0.5 * np.maximum(left, 0.0), 0.0)
         angles = self._model.clamp(self._curve.angles(closing, closed.abduction_rad))
         noise = self._noise(closed, cov_m2, distance_m, shown)
-        information = np.swapaxes(closed.by_angles, -1, -2) @ np.linalg.inv(noise) @ closed.by_angles
-        information += self._habits
+        information = (
+            np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self._habits
+        )
         spread = np.full(5, _ANYWHERE_RAD)
         spread[closed.past] = np.maximum(left[closed.past], 0.1) / np.sqrt(12.0)
         information[:, PIP, PIP] += 1.0 / spread**2
@@ -112,3 +113,11 @@ class AngleBelief:
         noise[:, 1, 1] += self._skin_m2 + _PLANE_M2 + _CURVES**2 * hidden
         noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
         return noise
+
+
+def _inverse(a: Float) -> Float:
+    """Inverses of symmetric matrices (5, 2, 2)."""
+    out = np.empty(a.shape)
+    out[:, 0, 0], out[:, 1, 1] = a[:, 1, 1], a[:, 0, 0]
+    out[:, 0, 1] = out[:, 1, 0] = -a[:, 0, 1]
+    return out / (a[:, 0, 0] * a[:, 1, 1] - a[:, 0, 1] ** 2)[:, None, None]

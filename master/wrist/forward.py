@@ -76,9 +76,8 @@ class NaturalCurve:
 
     def angles(self, closing_rad: Float, abduction_rad: Float) -> Float:
         """Angles (..., 5, 4) [rad] of closings and abductions (..., 5) [rad]."""
-        closing, abduction = np.broadcast_arrays(closing_rad, abduction_rad)
-        angles = self.base_rad + closing[..., None] * self.slope
-        angles[..., ABDUCTION] = abduction
+        angles = self.base_rad + closing_rad[..., None] * self.slope
+        angles[..., ABDUCTION] = abduction_rad
         return angles
 
 
@@ -114,7 +113,7 @@ class ForwardTable:
         # A limit of 0, as preset K has for the middle finger, keeps no real finger from moving aside.
         most = np.maximum(np.abs(model.limits_rad[:, ABDUCTION]), _ASIDE_RAD) + _BEYOND_RAD
         abduction = _evenly(np.array([-1.0, 1.0]) * most, _ABDUCTIONS)
-        angles = curve.angles(closing.T[:, None], abduction.T[None])  # (C, A, 5, 4)
+        angles = curve.angles(*np.broadcast_arrays(closing.T[:, None], abduction.T[None]))  # (C, A, 5, 4)
         cut = LaserCut(setup)
         point, length, place = cut(angles)
         return cls(
