@@ -2,7 +2,8 @@
 
 The sheet is a fan of rays from the laser's origin. What each ray meets first is lit, so shadows need no thought; a lit
 point is seen where the ray from the camera meets nothing before it. Consecutive rays that meet the same part of the
-hand are joined by chords, whose lengths are those of the line.
+hand are joined by chords, whose lengths are those of the line. Where a part ends the laser grazes it, and a little of
+angle is much of line: there the rays are cast more densely.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from common.sim.wrist.cones import Cones, distances
 from common.sim.wrist.flesh import GROUPS, Flesh
 
 RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
+FINER = 24  # parts of a gap between rays at the end of a part
 JOINED_M = 0.004  # longer chords jump from one part to another
 SEEN_WITHIN_M = 2e-4
 LEAST_M = 2e-4  # of visible line, for a centroid
@@ -28,7 +30,7 @@ class LaserCurve:
     """The lit points of one instant, ray by ray (K,).
 
     Attributes:
-        ray: Index of the ray (K,).
+        rays: Unit directions (K, 3) from the laser's origin, along the fan.
         points: (K, 3) [m], camera frame.
         body: Which body is lit (K,).
         group, segment: As in `Flesh` (K,).
@@ -36,7 +38,7 @@ class LaserCurve:
         joined: (K,) whether it and the next one are neighbours on one part of the hand.
     """
 
-    ray: Int
+    rays: Float
     points: Float
     body: Int
     group: Int
@@ -52,21 +54,22 @@ class LaserSheet:
     Attributes:
         origin: Where the rays begin (3,) [m], camera frame.
         normal, offset_m: The plane, normal . X = offset_m.
-        rays: Unit directions (RAYS, 3), from one edge of the fan to the other.
+        forward, across: Unit vectors (3,) of the plane: the middle of the fan, and towards its second edge.
+        angle_rad: (RAYS,) of the rays to the middle, from one edge of the fan to the other.
         flesh: The hand.
         still_m: How far along each ray the palm begins (RAYS,) [m]; inf: nowhere.
         still_body: Which body of the palm that is (RAYS,).
-        still: The bodies of the palm.
     """
 
     origin: Float
     normal: Float
     offset_m: float
-    rays: Float
+    forward: Float
+    across: Float
+    angle_rad: Float
     flesh: Flesh
     still_m: Float
     still_body: Int
-    still: Cones
 
     @classmethod
     def of(cls, rig: RigCalibration, optics: CameraModel, flesh: Flesh, joints: HandJoints) -> "LaserSheet":
@@ -92,29 +95,36 @@ class LaserSheet:
         origin = origin + (offset - origin @ normal) * normal  # files are rounded
         forward = np.array(laser.forward) - (np.array(laser.forward) @ normal) * normal
         forward /= np.linalg.norm(forward)
-        angle = np.linspace(-0.5, 0.5, RAYS)[:, None] * laser.fan_rad
-        rays = np.cos(angle) * forward + np.sin(angle) * np.cross(normal, forward)
+        across = np.cross(normal, forward)
+        angle = np.linspace(-0.5, 0.5, RAYS) * laser.fan_rad
         still = flesh.bodies(joints).of(slice(flesh.still))
-        reach = distances(still, origin, rays)
-        body = reach.argmin(axis=1)
-        return cls(origin, normal, offset, rays, flesh, reach[np.arange(RAYS), body], body, still)
+        near, body = _nearest(distances(still, origin, _fan(forward, across, angle)))
+        return cls(origin, normal, offset, forward, across, angle, flesh, near, body)
 
     def cross(self, bodies: Cones) -> LaserCurve:
         """Where it meets the hand whose flesh is at `bodies`."""
         flesh, first = self.flesh, self.flesh.still
-        reach = distances(bodies.of(slice(first, None)), self.origin, self.rays)
-        body = reach.argmin(axis=1)
-        near = reach[np.arange(RAYS), body]
+        rays = _fan(self.forward, self.across, self.angle_rad)
+        near, body = _nearest(distances(bodies.of(slice(first, None)), self.origin, rays))
         body = np.where(near < self.still_m, body + first, self.still_body)
         near = np.minimum(near, self.still_m)
-        ray = np.flatnonzero(np.isfinite(near))
-        points = self.origin + near[ray, None] * self.rays[ray]
-        body = body[ray]
+        met = np.where(np.isfinite(near), flesh.group[body], -1)
+        with np.errstate(invalid="ignore"):
+            ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > JOINED_M))
+        part = np.arange(1, FINER) / FINER * (self.angle_rad[1] - self.angle_rad[0])
+        between = (self.angle_rad[ends][:, None] + part).ravel()
+        more = _fan(self.forward, self.across, between)
+        more_near, more_body = _nearest(distances(bodies, self.origin, more))
+        order = np.argsort(np.concatenate([self.angle_rad, between]))
+        near, body = np.concatenate([near, more_near])[order], np.concatenate([body, more_body])[order]
+        lit = np.flatnonzero(np.isfinite(near))
+        rays, body = np.concatenate([rays, more])[order][lit], body[lit]
+        points = self.origin + near[lit, None] * rays
         group = flesh.group[body]
-        joined = np.zeros(len(ray), dtype=np.bool_)
+        joined = np.zeros(len(lit), dtype=np.bool_)
         chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
-        joined[:-1] = (np.diff(ray) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
-        return LaserCurve(ray, points, body, group, flesh.segment[body], self.seen(bodies, points), joined)
+        joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
+        return LaserCurve(rays, points, body, group, flesh.segment[body], self.seen(bodies, points), joined)
 
     def seen(self, bodies: Cones, points: Float) -> Bool:
         """Which of points (K, 3) [m] on the skin nothing hides from the camera (K,)."""
@@ -122,6 +132,17 @@ class LaserSheet:
         front = points[:, 2] > 0.0
         reach = distances(bodies, np.zeros(3), points / far[:, None])
         return front & (reach.min(axis=1) > far - SEEN_WITHIN_M)
+
+
+def _fan(forward: Float, across: Float, angle_rad: Float) -> Float:
+    """Unit directions (N, 3) of rays at angles (N,) to the middle of a fan."""
+    return np.cos(angle_rad)[:, None] * forward + np.sin(angle_rad)[:, None] * across
+
+
+def _nearest(reach: Float) -> tuple[Float, Int]:
+    """Of distances (N, B): the least (N,), and whose it is (N,)."""
+    body = reach.argmin(axis=1)
+    return reach[np.arange(len(reach)), body], body
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,6 +19,7 @@ from common.sim.wrist.skin import Skin, SkinView
 from common.sim.wrist.stripe import draw_stripe
 
 REAL_TIME_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
+_KINDS = tuple(Illumination)  # frames of one instant differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
 
@@ -79,7 +80,7 @@ class WristRenderer:
         if self._gain != 1.0:
             level *= np.float32(self._gain)
         level += np.float32(light.BLACK_LEVEL)
-        return self._sensor.bytes_of(level, round(t_s * 1e6))
+        return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _KINDS.index(lit))
 
     def _shaded(self, behind: Plane, skin: SkinView, lit: Illumination) -> Plane:
         """Levels on the coarse grid: `behind` with skin before it."""

@@ -27,7 +27,7 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> 
     chords = np.flatnonzero(curve.joined)
     chords = chords[curve.seen[chords] & curve.seen[chords + 1]]
     points = curve.points[chords]
-    ray = sheet.rays[curve.ray[chords]]
+    ray = curve.rays[chords]
     normals = bodies.normals(curve.body[chords], points)
     facing = np.maximum(-np.einsum("ij,ij->i", normals, ray), LEAST_COSINE)
     rise = sheet.normal + ((normals @ sheet.normal) / facing)[:, None] * ray
