@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from common.arrays import Float, Int
 from common.hand_limits import ABDUCTION
+from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, in_image, thumb_postures
 from slave.wrist.view import WristView
 
 Float32 = npt.NDArray[np.float32]
@@ -21,12 +22,8 @@ SHRINK = 2  # the LED image is read at a quarter of its resolution
 STATION_PX = 10.0
 LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
 MARGIN = 12  # samples beyond either edge of a corridor: about a finger's breadth
-_PER_BONE = 6
 _NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
-_PIP, _DIP = 2, 3
-_DIP_PER_PIP = 0.84  # of natural flexion (D8)
 _RARE = 0.02  # share of the postures of a sweep left out at either end
-_NEAREST_M = 0.03  # what is nearer than this is not seen as a finger
 _OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
 _LEAST_OF_SPACING = 0.25
 _MOST_OF_SPACING = 0.7  # half width of a corridor, in spacings of fingers: beyond lies another seam
@@ -92,9 +89,9 @@ class Corridors:
 @lru_cache(maxsize=8)
 def corridors_of(view: WristView) -> Corridors:
     """The corridors of one wrist rig and hand."""
-    knuckles = _in_image(view, view.model.rest_position_m[[7, 12, 22]])[0]
+    knuckles = in_image(view, view.model.rest_position_m[[7, 12, 22]])[0]
     thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
-    root = _in_image(view, view.model.rest_position_m[2])[0]
+    root = in_image(view, view.model.rest_position_m[2])[0]
     up = (knuckles[1] - root) / np.linalg.norm(knuckles[1] - root)
     stations = int(view.optics.height_px // STATION_PX)
     row = (view.optics.height_px - 1 - STATION_PX * (stations - 1)) / 2.0
@@ -109,53 +106,22 @@ def corridors_of(view: WristView) -> Corridors:
     return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
 
 
-def _in_image(view: WristView, palm_m: Float) -> tuple[Float, Float]:
-    """Pixels (..., 2) and depths (...) [m] of points (..., 3) in the palm frame; what is too near is held off."""
-    camera = palm_m @ view.T_camera_palm[:3, :3].T + view.T_camera_palm[:3, 3]
-    depth = camera[..., 2]
-    held = np.concatenate([camera[..., :2], np.maximum(depth, _NEAREST_M)[..., None]], axis=-1)
-    return view.optics.project(held), depth
-
-
-def _along_bones(view: WristView, angles: Float) -> Float:
-    """Points (P, 5, 3 * _PER_BONE, 3) [m] along the fingers' bones of postures (P, 5, 4), palm frame."""
-    joints = view.model.chains(angles).position_m
-    share = np.linspace(0.0, 1.0, _PER_BONE)[:, None]
-    bones = joints[:, :, :-1, None] * (1.0 - share) + joints[:, :, 1:, None] * share
-    return bones.reshape(*bones.shape[:2], -1, 3)
-
-
-def _postures(*ranges: Float) -> Float:
-    """All combinations (P, 5, 4) of the given values of the four angles [rad], the same for every finger."""
-    grid = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, 1, 4)
-    return np.broadcast_to(grid, (len(grid), 5, 4)).copy()
-
-
-def _spread(low: float, high: float, count: int) -> Float:
-    """Values (count,) from low to high."""
-    return np.linspace(low, high, count, dtype=np.float64)
-
-
 def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
     """Middle and half width (3, S) [px] of the corridors among index ... little at the given rows."""
     limits = view.model.limits_rad
-    angles = _postures(
-        np.zeros(1), _spread(0.0, limits[1, 1, 1], 8), _spread(0.0, limits[1, 2, 1], 8), np.zeros(1)
-    )
-    angles[..., _DIP] = _DIP_PER_PIP * angles[..., _PIP]
-    points = _along_bones(view, angles)
+    points = along_bones(view, finger_postures(view, 1, 8, 8))
     focal = view.optics.matrix[0, 0]
     out = np.empty((2, 3, len(rows)))
     for seam in range(3):
         a, b = points[:, seam + 1], points[:, seam + 2]
         mid = (a + b) / 2.0
-        uv, depth = _in_image(view, mid)
-        scale = focal / np.maximum(depth, _NEAREST_M)
+        uv, depth = in_image(view, mid)
+        scale = focal / np.maximum(depth, NEAREST_M)
         spacing = scale * np.linalg.norm(a[:, :1] - b[:, :1], axis=-1)
         lean = np.abs(limits[seam + 1 : seam + 3, ABDUCTION]).max() * _OF_SPREAD
         free = scale * np.linalg.norm((mid - mid[:, :1])[..., ::2], axis=-1) * np.sin(lean)
         free = np.minimum(np.maximum(free, _LEAST_OF_SPACING * spacing), _MOST_OF_SPACING * spacing)
-        seen = (depth > _NEAREST_M) & np.isfinite(uv).all(axis=-1)
+        seen = (depth > NEAREST_M) & np.isfinite(uv).all(axis=-1)
         out[:, seam] = _strip(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
     return out[0], out[1]
 
@@ -165,7 +131,7 @@ def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, 
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
     lows = np.array([np.quantile(low[row], 0.1) for row in near[known]])
-    highs = np.array([np.quantile(high[row], 1.0 - 0.1) for row in near[known]])
+    highs = np.array([np.quantile(high[row], 0.9) for row in near[known]])
     ends = [np.interp(stations, stations[known], end) for end in (lows, highs)]
     lows, highs = (np.convolve(np.pad(end, 2, mode="edge"), np.full(5, 0.2), mode="valid") for end in ends)
     return (lows + highs) / 2.0, (highs - lows) / 2.0
@@ -175,15 +141,13 @@ def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[floa
     """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
     many stations the thumb crosses however it is held.
     """
-    low, high = view.model.limits_rad[0].T
-    steps = [_spread(low[k], high[k], n) for k, n in enumerate((7, 7, 3, 3))]
-    points = _along_bones(view, _postures(*steps))[:, 0, _PER_BONE:]  # beyond the metacarpal
-    uv, depth = _in_image(view, points)
+    points = along_bones(view, thumb_postures(view, 7, 7, 3, 3))[:, 0, PER_BONE:]  # beyond the metacarpal
+    uv, depth = in_image(view, points)
     radius, angle = still.polar(uv.reshape(-1, 2))
-    scale = view.optics.matrix[0, 0] / np.maximum(depth, _NEAREST_M).ravel()
+    scale = view.optics.matrix[0, 0] / np.maximum(depth, NEAREST_M).ravel()
     breadth = np.arcsin(np.minimum(scale * view.model.radius_m[4] / np.maximum(radius, 1.0), 0.9))
-    seen = (depth > _NEAREST_M).ravel()
+    seen = (depth > NEAREST_M).ravel()
     low, high = np.quantile((angle - breadth)[seen], (_RARE, 1.0 - _RARE))
     tips = radius.reshape(len(points), -1)[:, -1]
-    crossed = int(np.quantile(tips[depth[:, -1] > _NEAREST_M], _RARE) / STATION_PX)
+    crossed = int(np.quantile(tips[depth[:, -1] > NEAREST_M], _RARE) / STATION_PX)
     return (low + high) / 2.0, (high - low) / 2.0, min(crossed, stations)

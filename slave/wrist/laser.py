@@ -1,0 +1,215 @@
+"""Where the laser meets each finger: the line in the laser image, cut by the seams, its centroid by length (D5).
+
+The line runs from side to side, so each column of the image holds it as short bright runs, one per surface. A run's
+row is its centre of mass above a high share of its own peak: a line that saturates has a flat top and a glow beneath
+it on either side, and only the flanks of the top tell where it is. Runs of adjacent columns are links of one line
+where they overlap; a jump is the border of another surface. A finger's centroid weighs its links by their length in
+the image, not by columns: at the sides of a finger the line falls steeply, and a column there is many pixels of line.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Bool, Float, Image, Int
+from slave.wrist.fingers import NONE, Fingers
+from slave.wrist.reach import reach_of
+from slave.wrist.view import WristView
+
+_FLOOR = 16.0  # grey levels: less is noise even in the dark
+_NOISE = 6.0  # standard deviations above the mean of what no laser reaches
+_ENOUGH_ROWS = 40  # above the laser's reach, to know the noise from
+_OF_BRIGHTEST = 0.1  # of the brightest of the image: less is glow
+_OF_NEIGHBOURHOOD = 0.5  # of the brightest within `_NEIGHBOURHOOD` rows: less is glow beside the line
+_NEIGHBOURHOOD = np.ones((1, 33), dtype=np.uint8)
+_DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
+_NEAR_PX = 24
+_NEAR = np.ones((5, 3), dtype=np.uint8)
+_SECOND = 0.65  # of the brightest run of the same column
+_GLOW = 0.4  # of the brightest near by
+_OF_PEAK = 0.75
+_JUMP_PX = 6.0
+_THICKEST_PX = 64
+_FEWEST = 3
+_CREASE_PX = 20  # columns on either side of a seam in which the crease may be
+_LEAST_M = 2e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaserLines:
+    """One laser segment per finger, thumb ... little; NaN where none was seen.
+
+    Attributes:
+        uv: (5, 2) centroids by length [px].
+        sigma_px: (5,) standard deviation per axis.
+        length_px: (5,) length; 0 where none was seen.
+    """
+
+    uv: Float
+    sigma_px: Float
+    length_px: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runs:
+    """Bright runs of columns, by column and then by row; N of them.
+
+    Attributes:
+        column: (N,).
+        row: (N,) sub-pixel.
+        start, end: (N,) first row, and the one after the last.
+        peak: (N,) grey levels.
+        following: (N,) index of the run of the next column that continues this one, or the run itself.
+    """
+
+    column: Int
+    row: Float
+    start: Int
+    end: Int
+    peak: Float
+    following: Int
+
+
+def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
+    """Find the segments in the difference of laser and ambient frame."""
+    reach = reach_of(view)
+    runs = line_runs(laser, reach.first_row)
+    points = np.stack([runs.column.astype(np.float64), runs.row], axis=-1)
+    finger = fingers.finger_of(points)
+    if len(points):
+        finger = _at_creases(np.where(_lines(runs), finger, NONE), runs)
+        finger = np.where(reach.holds(finger, points), finger, NONE)
+    share = np.ones(len(points))
+    thumb = finger == 0
+    share[thumb] = reach.of_thumb(points[thumb])
+    return _centroids(points, runs.following, finger, share, view)
+
+
+def _centroids(points: Float, following: Int, finger: Int, share: Float, view: WristView) -> LaserLines:
+    """Centroids by length of the runs' links, each with its share of the finger."""
+    here = np.arange(len(points))
+    linked = (following != here) & (finger[following] == finger)
+    a, b = here[linked], following[linked]
+    open_before = np.ones(len(points), dtype=np.bool_)
+    open_before[b] = False
+    ends = np.concatenate([here[~linked], here[open_before]])  # the outer halves of the columns at the ends
+    middle = np.concatenate([(points[a] + points[b]) / 2.0, points[ends]])
+    sure = np.concatenate([(share[a] + share[b]) / 2.0, share[ends]])
+    whole = np.concatenate([np.hypot(1.0, points[b, 1] - points[a, 1]), np.full(len(ends), 0.5)])
+    owner = np.concatenate([finger[a], finger[ends]]) + 1
+    length = np.bincount(owner, whole * sure, 6)[1:].astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        uv = np.stack(
+            [np.bincount(owner, whole * sure * middle[:, k], 6)[1:] / length for k in (0, 1)], axis=-1
+        )
+    depth = view.on_plane(uv)[:, 2]
+    seen = length * depth / view.optics.matrix[0, 0] >= _LEAST_M
+    doubt = np.bincount(owner, whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0]), 6)[
+        1:
+    ] / np.maximum(length, 1.0)
+    sigma = np.hypot(0.3, doubt)
+    return LaserLines(
+        np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
+    )
+
+
+def _at_creases(finger: Int, runs: Runs) -> Int:
+    """Fingers (N,) of runs, with each change of finger along a line moved to the crease near by.
+
+    A line bends away at the sides of every finger, so that between two that touch its farthest, in the image its
+    uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
+    """
+    out = finger.copy()
+    following = runs.following
+    before = np.full(len(finger), -1)
+    before[following[::-1]] = np.arange(len(finger))[::-1]
+    changes = np.flatnonzero((finger != finger[following]) & (finger >= 0) & (finger[following] >= 0))
+    for i in changes.tolist():
+        back, k = [i], i
+        while len(back) < _CREASE_PX and 0 <= before[k] != k and out[before[k]] == out[i]:
+            k = int(before[k])
+            back.append(k)
+        ahead, k = [int(following[i])], int(following[i])
+        while len(ahead) < _CREASE_PX and following[k] != k and finger[following[k]] == finger[ahead[0]]:
+            k = int(following[k])
+            ahead.append(k)
+        line = back[::-1] + ahead
+        top = int(runs.row[line].argmin())
+        out[line[:top]] = out[i]
+        out[line[top:]] = finger[ahead[0]]
+    return out
+
+
+def line_runs(laser: Image, first_row: int) -> Runs:
+    """The runs of the rows from `first_row` on."""
+    band = laser[first_row:]
+    mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= _ENOUGH_ROWS else laser)
+    noise = float(mean[0, 0]) + _NOISE * float(deviation[0, 0])
+    threshold = max(_FLOOR, noise, _OF_BRIGHTEST * float(band.max()))
+    lit = band >= threshold
+    columns = np.flatnonzero(lit.any(axis=0))
+    rows = np.flatnonzero(lit.any(axis=1))
+    if not len(columns):
+        none = np.empty(0, dtype=np.int64)
+        return Runs(none, np.empty(0), none, none, np.empty(0), none)
+    left, top = int(columns[0]), int(rows[0])
+    part = cv2.transpose(band[top : rows[-1] + 1, left : columns[-1] + 1])
+    part = cv2.copyMakeBorder(part, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    around = cv2.dilate(part, _NEIGHBOURHOOD)
+    on = (part >= threshold) & (part >= _OF_NEIGHBOURHOOD * around.astype(np.float32))
+    edges = np.flatnonzero(np.diff(on.ravel()))
+    start, end = edges[::2] + 1, edges[1::2] + 1
+    size = end - start
+    good = size <= _THICKEST_PX
+    start, end, size = start[good], end[good], size[good]
+    if not len(start):
+        none = np.empty(0, dtype=np.int64)
+        return Runs(none, np.empty(0), none, none, np.empty(0), none)
+    flat = part.ravel()
+    first = np.cumsum(size) - size
+    of_run = np.repeat(np.arange(len(size)), size)
+    inside = np.arange(len(of_run)) - first[of_run]
+    level = flat[start[of_run] + inside].astype(np.float64)
+    peak = np.maximum.reduceat(level, first)
+    above = np.maximum(level - _OF_PEAK * peak[of_run], 0.0)
+    centre = np.add.reduceat(above * inside, first) / np.add.reduceat(above, first)
+    width = part.shape[1]
+    column = start // width
+    begin = start - column * width - 1 + top + first_row
+    runs = Runs(column + left, begin + centre, begin, begin + size, peak, column)
+    return Runs(runs.column, runs.row, runs.start, runs.end, peak, _following(runs))
+
+
+def _lines(runs: Runs) -> Bool:
+    """Which runs belong to a line: long enough, and not much darker than what is near, as a glow is."""
+    line = runs.following
+    for _ in range(_DOUBLINGS):
+        line = line[line]
+    brightest = np.zeros(len(line))
+    np.maximum.at(brightest, line, runs.peak)
+    row, column = runs.start // _NEAR_PX, runs.column // _NEAR_PX
+    around = np.zeros((int(row.max()) + 1, int(column.max()) + 1), dtype=np.float32)
+    np.maximum.at(around, (row, column), runs.peak.astype(np.float32))
+    around = cv2.dilate(around, _NEAR)[row, column]
+    beside = np.zeros(len(line))
+    np.maximum.at(beside, line, around)
+    column = np.zeros(int(runs.column[-1]) + 1)
+    np.maximum.at(column, runs.column, runs.peak)
+    bright = (brightest >= _GLOW * beside)[line] & (runs.peak >= _SECOND * column[runs.column])
+    return bright & (np.bincount(line, minlength=len(line)) >= _FEWEST)[line]
+
+
+def _following(runs: Runs) -> Int:
+    key = runs.column * 1024.0 + runs.row
+    here = np.arange(len(key))
+    after = np.searchsorted(key, key + 1024.0)
+    best = here.copy()
+    gap = np.full(len(key), np.inf)
+    for shift in (-1, 0):
+        k = np.clip(after + shift, 0, len(key) - 1)
+        ok = (runs.column[k] == runs.column + 1) & (runs.start[k] <= runs.end) & (runs.end[k] >= runs.start)
+        distance = np.where(ok, np.abs(runs.row[k] - runs.row), np.inf)
+        nearer = distance < np.minimum(gap, _JUMP_PX)
+        best, gap = np.where(nearer, k, best), np.where(nearer, distance, gap)
+    return best
