@@ -26,6 +26,7 @@ from master.filters import OneEuroParameters, PointFilter
 from master.ik.hidden import strayed_rad2
 from master.stereo.pipeline import SolvedPose, Stage
 from master.wrist.belief import AngleBelief, FingerAngles
+from master.wrist.cubic import CubicLaw
 from master.wrist.forward import ForwardTable
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import LaserPoints, PlaneAxes, laser_points
@@ -54,6 +55,7 @@ class WristPipeline:
         self._axes = PlaneAxes.of(setup)
         table = ForwardTable.of(setup)
         self._inverse, self._believe = Inverse(table), AngleBelief(setup, table)
+        self._cubic = CubicLaw(setup, table) if setup.cubic else None
         self._pose = PoseMaker(setup)
         self._smooth = _point_filter(setup, self._axes) if continuous else None
         self._last_ns = _NEVER_NS
@@ -93,7 +95,10 @@ class WristPipeline:
         point = points.point_m
         if self._smooth is not None:
             point = self._smooth.push(message.t_ns, point, points.cov_m2)
-        closed = self._inverse(self._axes.flat(point))
+        flat = self._axes.flat(point)
+        closed = self._inverse(flat)
+        if self._cubic is not None:
+            closed = self._cubic(flat, closed)
         return self._believe(closed, self._axes.flat_cov(points.cov_m2), point[:, 2], message.laser_px)
 
     def _remembered(self, t_ns: int, found: FingerAngles) -> tuple[Float, Float, Code]:
