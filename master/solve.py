@@ -24,7 +24,7 @@ from master.sequence import TRIPLE
 from master.sequence import Sequence as FrameSequence
 from master.stages import StageTimes
 from master.summary import write_summary
-from master.wrist_score import load_wrist_truth, score_tips, score_wrist
+from master.wrist_score import load_wrist_truth, score_tips, score_wrist, triples_missed
 
 _LOG = logging.getLogger(__name__)
 
@@ -93,7 +93,9 @@ def _summarise(
         if exact is None:
             return summary
         triples = [message for message in messages if isinstance(message, WristDetections)]
-        return summary | score_wrist(Poses.of(poses), exact) | score_tips(triples, exact)
+        stacked = Poses.of(poses)
+        summary["triples_missed"] = triples_missed(stacked, exact)
+        return summary | score_wrist(stacked, exact) | score_tips(triples, exact)
     found = np.isfinite([pose.markers_raw_m for pose in poses]).all(axis=2).sum(axis=0)
     truth = load_truth(recording.folder, found == found.max())
     return summary if truth is None else summary | score(Poses.of(poses), truth, fingers_of(setup))

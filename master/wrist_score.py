@@ -112,7 +112,6 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     """Errors of the solved poses; a score with nothing to average is left out.
 
     Returns:
-        triples_missed: Triples without a pose.
         laser_mm, laser_mm_<finger>: Median distance of the laser points found from those of the truth, where at
             least 2 mm of line is seen on the finger.
         laser_right: Share of these (found or not) whose point is found, and nearer to this finger's true point than
@@ -123,8 +122,7 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
         frames_without_pose: Poses of which nothing is valid.
     """
     row = _rows_at(truth.t_ns, poses.t_ns)
-    out = {"triples_missed": float((row < 0).sum())}
-    out |= _score_laser(_at(poses.laser_m, row), truth)
+    out = _score_laser(_at(poses.laser_m, row), truth)
     there = row >= 0
     found = row[there]
     error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there])
@@ -140,6 +138,11 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
     put(out, "joint_mm", 1e3 * distance[valid & np.isfinite(distance)], np.mean)
     out["frames_without_pose"] = float((~valid.any(axis=1)).sum())
     return out
+
+
+def triples_missed(poses: Poses, truth: WristTruth) -> int:
+    """Triples of a recording without a pose."""
+    return int((_rows_at(truth.t_ns, poses.t_ns) < 0).sum())
 
 
 def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""Into a calibration tree: which rig file gets a result, where it comes from, and the file written whole or not."""
+"""Out of a calibration tree, and into it: which rig file gets a result, where it comes from, the file whole or not."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -22,6 +22,19 @@ def provenance(tool: str, data: tuple[str, ...], residual: dict[str, float], not
         note: What else a reader should know.
     """
     return Provenance(date=date_now(), tool=tool, data=data, residual=residual, note=note)
+
+
+def load_marker_rig(calibration: Path, name: str) -> RigCalibration:
+    """rigs/<name>.json of a tree, for what is measured by markers.
+
+    Raises:
+        CalibrationError: The file is missing or broken, or the rig is of another kind.
+    """
+    path = _path(calibration, "rigs", name)
+    rig = load(path, RigCalibration)
+    if rig.kind != "markers":
+        raise CalibrationError(f"{path}: kind is {rig.kind!r}, this needs a rig of 'markers'")
+    return rig
 
 
 def rig_in_tree(out: Path | None, file_name: str, rig: RigCalibration) -> RigCalibration:

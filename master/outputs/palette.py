@@ -18,7 +18,7 @@ SOURCE_MEANING: dict[Source, str] = {
     Source.NONE: "no pose",
     Source.MEASURED: "measured by a marker",
     Source.SOLVED: "solved from markers",
-    Source.HELD: "held (marker lost)",
+    Source.HELD: "held (lost from sight)",
     Source.WRIST: "from the wrist device",
 }
 TRUTH_RGB: Rgb = (170, 170, 178)

@@ -11,6 +11,7 @@ from common.calibration import HandProfile, MarkerMount, RigCalibration, load, s
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
+from master.calibrate.tree_files import load_marker_rig
 from master.rig import RigSetup, build_pipeline, load_hand, load_setup
 from master.stages import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, rig_file
@@ -113,6 +114,11 @@ def test_what_needs_markers_refuses_a_wrist_rig(root: Path) -> None:
     setup = load_setup(root / "calib_json", "wrist")
     with pytest.raises(CalibrationError, match="'wrist': kind is 'wrist', this needs a rig of 'markers'"):
         build_pipeline(setup, StageTimes())
+    with pytest.raises(
+        CalibrationError, match=r"wrist\.json: kind is 'wrist', this needs a rig of 'markers'"
+    ):
+        load_marker_rig(root / "calib_json", "wrist")
+    assert load_marker_rig(root / "calib_json", "desk").kind == "markers"
 
 
 @pytest.mark.parametrize("key", ["laser_plane", "T_camera_palm"])

@@ -11,7 +11,7 @@ from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.messages import WristDetections
 from master.outputs.poses import Poses
-from master.wrist_score import GROUPS, WristTruth, load_wrist_truth, score_tips, score_wrist
+from master.wrist_score import GROUPS, WristTruth, load_wrist_truth, score_tips, score_wrist, triples_missed
 from tests.hand_helpers import camera_file
 
 PERIOD_NS = 33_333_333
@@ -73,7 +73,8 @@ def test_an_errorless_device_has_no_errors() -> None:
     got = score_wrist(poses(exact), exact) | score_tips(messages(exact, exact.tip_uv), exact)
     assert got["laser_mm"] == got["laser_mm_thumb"] == got["laser_mm_little"] == 0.0
     assert got["laser_right"] == 1.0
-    assert got["laser_missed"] == got["triples_missed"] == got["pip_untracked"] == 0.0
+    assert got["laser_missed"] == got["pip_untracked"] == 0.0
+    assert triples_missed(poses(exact), exact) == 0
     assert got["pip_rms_deg"] == got["pip_deg"] == got["joint_mm"] == 0.0
     assert (got["tip_px"], got["tip_within_6px"], got["tip_false"]) == (0.0, 1.0, 0.0)
 
@@ -110,7 +111,7 @@ def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> N
     exact = truth()
     found = poses(exact)
     got = score_wrist(found.rows(1, N), exact)
-    assert got["triples_missed"] == 1.0
+    assert triples_missed(found.rows(1, N), exact) == 1
     assert got["laser_missed"] == 5.0
     assert got["laser_right"] == 0.75
     tips = score_tips(messages(exact, exact.tip_uv)[1:], exact)
@@ -121,9 +122,10 @@ def test_a_triple_of_which_nothing_was_made_is_missed_with_all_its_points() -> N
 def test_poses_of_the_frames_beside_are_not_taken_for_those_of_the_triple() -> None:
     exact = truth()
     late = replace(poses(exact), t_ns=exact.t_ns + 11_111_111)
-    assert score_wrist(late, exact)["triples_missed"] == N
+    assert triples_missed(late, exact) == N
+    assert "laser_mm" not in score_wrist(late, exact)
     near = replace(poses(exact), t_ns=exact.t_ns + 4_000_000)  # the centre row of a rolling shutter
-    assert score_wrist(near, exact)["triples_missed"] == 0.0
+    assert triples_missed(near, exact) == 0
 
 
 def test_the_pip_is_scored_up_to_85_degrees_where_it_is_tracked() -> None:

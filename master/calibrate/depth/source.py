@@ -16,6 +16,7 @@ from common.frame_recording import FrameRecording, open_recording
 from master.calibrate.depth.recording import Pairs, by_file, by_list, by_truth, read_pairs
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import parse_distances, read_table
+from master.calibrate.tree_files import load_marker_rig
 from master.stereo.blob_bias import card_outline, centre_of_blob, round_outline
 
 _LEFT_RIGHT = ("left", "right")
@@ -120,7 +121,7 @@ def load_pair(
     """
     if fov_deg is not None and not 0.0 < fov_deg < 180.0:
         raise CalibrationError(f"--fov-deg {fov_deg:g}: expected an angle between 0 and 180 degrees")
-    rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
+    rig = load_marker_rig(calibration, rig_name)
     paths = {name: calibration / "cameras" / f"{name}.json" for name in rig.cameras}
     there = recorded is None or all(path.exists() for path in paths.values())
     files = {name: load(path, CameraCalibration) for name, path in paths.items()} if there else {}

@@ -8,7 +8,7 @@ import typer
 from msgspec.structs import replace
 
 from common.back_markers import with_three_back_markers
-from common.calibration import HandProfile, RigCalibration, load
+from common.calibration import HandProfile, load
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile, mirrored_profile, scaled_profile
@@ -17,7 +17,7 @@ from master.calibrate.hand.live import observe_live
 from master.calibrate.hand.measure import hand_length_of, measure_hand
 from master.calibrate.hand.observed import read_observed
 from master.calibrate.hand.save import measured_profile, quick_profile, report_json, report_lines
-from master.calibrate.tree_files import write_hand
+from master.calibrate.tree_files import load_marker_rig, write_hand
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JsonFile
 from master.summary import write_summary
 
@@ -96,7 +96,7 @@ def hand_command(
         profile = quick_profile(scaled, name, 1e-3 * length_mm)
         typer.echo(f"{side} hand scaled to {length_mm:g} mm; no bone is measured")
     else:
-        names = load(calibration / "rigs" / f"{rig}.json", RigCalibration).markers
+        names = load_marker_rig(calibration, rig).markers
         model = HandModel.of(template)
         observed = observe_live(bus, names, model) if poses is None else read_observed(poses, names, model)
         ratio = None if dip_per_pip is None else (dip_per_pip, _RATIO_SD)

@@ -12,7 +12,7 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.frame_recording import FrameRecording, open_recording
 from master.calibrate.time.fit import SIGNIFICANT, CameraTime, measure_times
-from master.calibrate.tree_files import provenance, rig_in_tree, write_rig
+from master.calibrate.tree_files import load_marker_rig, provenance, rig_in_tree, write_rig
 from master.options import CALIB_JSON, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_detections
 from master.summary import write_summary
@@ -70,7 +70,7 @@ def _geometry(
     if rig is None:
         own = recording.manifest.marker_rig()
         return own, {name: recording.manifest.cameras[name] for name in own.cameras}
-    named = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
+    named = load_marker_rig(calibration, rig)
     for name in named.cameras:
         if name not in recording.manifest.cameras:
             raise CalibrationError(f"{recording.folder}: no camera {name!r}, which rig {rig!r} has")
