@@ -6,13 +6,14 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 
-from common.calibration import CameraCalibration, RigCalibration, load
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, PhalanxError
 from slave.arguments import CAMERAS, parser
@@ -49,6 +50,12 @@ def _run(options: argparse.Namespace) -> int:
         signal.signal(number, lambda _number, _frame: stop.set())
     rig, camera = _calibration(options)
     files = CameraFiles(*_paths(options), camera, rig)
+    if rig.kind == "wrist":
+        if options.engine != "numpy":
+            raise CameraError(f"--engine {options.engine}: finds markers; rig {rig.name!r} is a wrist device")
+        if options.colours != "none":  # then nothing is detected, and fingers need not be known
+            hand_path = options.calibration / "hands" / f"{rig.hand}.json"
+            files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
@@ -88,6 +95,11 @@ def _source(
     stop: threading.Event | None = None,
 ) -> FrameSource:
     """Open the camera; with `stop`, a real one that is lost later is opened again until that is set."""
+    if rig.kind == "wrist" and str(options.camera).partition(":")[0] in real.DRIVERS:
+        raise CameraError(
+            f"--camera {options.camera}: gives colour frames; the camera of a wrist device gives grey ones, lit in "
+            "turn by its laser and its LEDs, and no driver of such a camera is here yet: synthetic, or replay:FOLDER"
+        )
     if (found := real.open_real(options.camera, options, camera, clock, stop)) is not None:
         return found
     kind, _, folder = str(options.camera).partition(":")
@@ -190,14 +202,34 @@ def _join(options: argparse.Namespace) -> int:
 
 
 def _detect(options: argparse.Namespace) -> int:
+    from common.frame_recording import MANIFEST, Manifest
+    from slave.cameras.replay import is_grey
     from slave.offline import detect_recording, save_detections
 
     def progress(done: int, total: int) -> None:
         if done % PROGRESS_EVERY == 0 or done == total:
             print(f"{options.camera}: {done} of {total} frames", file=sys.stderr)
 
+    if is_grey(load(options.recording / MANIFEST, Manifest), options.camera):
+        return _detect_wrist(options, progress)
+    if options.hand is not None:
+        raise CalibrationError(
+            f"--hand: camera {options.camera!r} sees markers; only a wrist camera knows a hand"
+        )
     found = detect_recording(options.recording, options.camera, options.calibration, progress)
     save_detections(options.output, found)
+    return 0
+
+
+def _detect_wrist(options: argparse.Namespace, progress: Callable[[int, int], None]) -> int:
+    from slave.offline import save_detections
+    from slave.wrist.offline import detect_wrist_recording
+
+    done = detect_wrist_recording(
+        options.recording, options.camera, options.calibration, options.hand, progress
+    )
+    print(f"{options.camera}: {done.summary()}", file=sys.stderr)
+    save_detections(options.output, done.detections)
     return 0
 
 

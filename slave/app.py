@@ -1,15 +1,21 @@
-"""The slave's loop: frame in, one sealed datagram out; where camera, detector and uplink meet."""
+"""The slave's loop: frame in, one sealed datagram out; where camera, detector and uplink meet.
+
+A camera that looks for markers sends of every frame, the camera of a wrist device of every strobed triple.
+"""
 
 import threading
 import time
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
+
 from common.arrays import Image
 from common.messages import MarkerDetections, Message
 from slave.cameras.source import Frame, FrameSource
 from slave.markers.detector import Detections
 from slave.tally import Tally
+from slave.wrist.detector import WristFound
 
 
 class Detector(Protocol):
@@ -17,6 +23,14 @@ class Detector(Protocol):
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Markers of one frame; times [ns] rise."""
+        ...
+
+
+class StrobedDetector(Protocol):
+    """What finds the fingers before a wrist device; a `WristDetector`."""
+
+    def push(self, frame: Frame) -> WristFound | None:
+        """What was found, where the frame completes a strobed triple."""
         ...
 
 
@@ -42,6 +56,7 @@ class Barrier(Protocol):
 
 
 POLL_S = 0.2
+DARK_AFTER = 9  # frames without a triple, 0.1 s at 90 Hz: then every frame is shown, lit or not
 
 
 def wait_for_start(barrier: Barrier, stop: threading.Event) -> bool:
@@ -88,3 +103,36 @@ def run(
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)
         show(frame)
+
+
+def run_wrist(
+    source: FrameSource,
+    detector: StrobedDetector,
+    sender: Sender,
+    camera: str,
+    tally: Tally,
+    stop: threading.Event,
+    show: Callable[[Frame], None] = lambda _frame: None,
+) -> None:
+    """Detect and send until the source ends or `stop` is set. A triple without any finger is sent as well.
+
+    `show` is offered the frame under the LEDs of every triple, and every frame while there are no triples.
+
+    Raises:
+        CameraError: The camera is gone.
+    """
+    took_ns, parts = 0, 0
+    while not stop.is_set() and (frame := source.read()) is not None:
+        began_ns = time.perf_counter_ns()
+        found = detector.push(frame)
+        took_ns += time.perf_counter_ns() - began_ns
+        if found is None:
+            tally.part(frame.seq)
+            parts += 1
+            if parts > DARK_AFTER:
+                show(frame)
+            continue
+        sender.send(found.message(camera, sender.session))
+        tally.frame(frame.seq, took_ns, np.vstack([found.laser.uv, found.tips.uv]))
+        took_ns, parts = 0, 0
+        show(found.triple.led)

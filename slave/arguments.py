@@ -7,7 +7,8 @@ from pathlib import Path
 from slave.cameras import real
 
 ABOUT = (
-    "The slave stands beside a camera: it finds the painted markers and sends their centroids.\n"
+    "The slave stands beside a camera: it finds the painted markers, or the fingers before a wrist device, and sends\n"
+    "where they are.\n"
     "Images leave it only as small previews, on request, while somebody looks."
 )
 # Command -> what it is for, in the list of commands; and its examples.
@@ -19,6 +20,8 @@ HELP = {
         waits for the master's start, then sends one sealed datagram per frame
   phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
         without hardware: renders the standard scene in real time
+  phalanx-slave run --name wrist --rig wrist --camera synthetic --bind 127.0.0.1 --key-file rig.key
+        the camera of a wrist device, docs/wrist.md
   phalanx-slave run --name left --rig desk --camera picamera2 --colours none --key-file rig.key
         before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
@@ -44,6 +47,8 @@ HELP = {
         """\
   phalanx-slave detect recordings/wave --camera left --calibration calib_json -o detections_left.npz
         offline: every frame of one camera, the same bytes on every run
+  phalanx-slave detect recordings/curl --camera wrist --calibration calib_json -o detections_wrist.npz
+        of a wrist device: laser points and fingertips of every strobed triple; the hand is DIR/hands/RIG'S HAND.json
 """,
     ),
     "colours": (
@@ -98,14 +103,14 @@ def _run(run: argparse.ArgumentParser) -> None:
         "--colours",
         choices=("follow", "fixed", "none"),
         default="follow",
-        help="whether the colours follow changes of the light (default: %(default)s; docs/light.md); none: detect "
-        "nothing, while the lens or the place of a camera without colours is calibrated",
+        help="whether the colours of markers follow changes of the light (default: %(default)s; docs/light.md); none: "
+        "detect nothing, while the lens or the place of a camera is calibrated",
     )
     run.add_argument(
         "--engine",
         choices=("numpy", "numba"),
         default="numpy",
-        help="what detects: numba is several times faster, needs the extra `fast` (default: %(default)s)",
+        help="what detects markers: numba is several times faster, needs the extra `fast` (default: %(default)s)",
     )
 
 
@@ -144,8 +149,12 @@ def _detect(detect: argparse.ArgumentParser) -> None:
     )
     detect.add_argument("--camera", required=True, metavar="NAME")
     detect.add_argument(
-        "--calibration", type=Path, metavar="DIR", help="its cameras/NAME.json gives the colours"
+        "--calibration",
+        type=Path,
+        metavar="DIR",
+        help="its cameras/NAME.json gives the colours; for a wrist device its hands/ the hand",
     )
+    detect.add_argument("--hand", type=Path, metavar="FILE", help="hand profile, for a wrist device")
     detect.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
     )

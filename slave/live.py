@@ -5,13 +5,15 @@ import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Literal
 
 from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
+from common.hand_model import FINGERS
 from common.zenoh_bus import ZenohBus
-from slave.app import run, wait_for_start
-from slave.cameras.source import FrameSource
+from slave.app import run, run_wrist, wait_for_start
+from slave.cameras.source import Frame, FrameSource
 from slave.light_report import LightReport
 from slave.markers.blind import BlindDetector
 from slave.markers.changing import Changeable, ChangingDetector, marker_changes
@@ -19,10 +21,13 @@ from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
 from slave.markers.following import detector_for
 from slave.preview import Previews
-from slave.report import Reporter
+from slave.report import Numbers, Reporter
 from slave.tally import Tally
-from slave.tuning import CameraFiles, CameraTuning
+from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
+from slave.wrist.blind import BlindWrist
+from slave.wrist.changing import view_of, wrist_changes
+from slave.wrist.detector import WristDetector
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -51,34 +56,26 @@ def run_live(
         source: The open camera.
         uplink: Where detections go.
         clock: The slave's clock.
-        colours: Whether they follow the light, stay fixed, or nothing is detected.
-        engine: What scans and measures.
+        colours: Whether those of markers follow the light, stay fixed, or nothing is detected at all.
+        engine: What scans and measures for markers.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
 
     Raises:
-        CalibrationError: A marker has no colour.
+        CalibrationError: A marker has no colour, or something of a wrist device is not calibrated.
         CameraError: The camera is gone.
     """
-    rig = files.rig
-    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
-    make = _maker(colours, engine, workers)
-    changing = None if colours == "none" else ChangingDetector(make(files.camera, rig))
-    detector = BlindDetector(len(rig.markers)) if changing is None else changing
-    tally = Tally(rig.markers)
-    changes = None if changing is None else marker_changes(changing, make)
-    tuning = CameraTuning(files, source, changes, lambda: tally.counts()["frames"] > 0)
     previews = Previews(name, clock)
-    numbers, show = tally, previews.offer
-    if changing is not None and changing.follows:
-        numbers = LightReport(name, changing, tally, rig.markers, previews.offer)
-        show = numbers.offer
-    elif colours == "follow":
-        _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
+    workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
+    if files.rig.kind == "wrist":
+        line = _wrist_line(name, files, source, uplink, colours, stop, previews.offer)
+    else:
+        line = _marker_line(name, files, source, uplink, colours, engine, stop, previews.offer, workers)
+    tuning = CameraTuning(files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0)
     reporter = Reporter(
         name,
         uplink,
-        numbers,
+        line.numbers,
         clock,
         lambda endpoint: ZenohBus(None, endpoint),
         stop.set,
@@ -90,14 +87,82 @@ def run_live(
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
         if wait_for_start(uplink, stop):
-            run(source, detector, uplink, name, tally, stop, show)
+            line.run()
     finally:
         reporter.close()
         previews.close()
         uplink.close()
         source.close()
         workers.shutdown(cancel_futures=True)
-    say(f"{tally.counts()['frames']} frames, sent {uplink.counts['sent']}")
+    say(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """What a slave does with its frames.
+
+    Attributes:
+        run: The loop; returns at the end.
+        numbers: What it counts.
+        prepare: How changed files reach it; None: it uses none of them.
+    """
+
+    run: Callable[[], None]
+    numbers: Numbers
+    prepare: Prepare | None
+
+
+def _marker_line(
+    name: str,
+    files: CameraFiles,
+    source: FrameSource,
+    uplink: Uplink,
+    colours: Colours,
+    engine: Engine,
+    stop: threading.Event,
+    show: Callable[[Frame], None],
+    workers: ThreadPoolExecutor,
+) -> _Line:
+    rig = files.rig
+    tally = Tally(rig.markers)
+    if colours == "none":
+        blind = BlindDetector(len(rig.markers))
+        return _Line(lambda: run(source, blind, uplink, name, tally, stop, show), tally, None)
+    make = _maker(colours, engine, workers)
+    detector = ChangingDetector(make(files.camera, rig))
+    numbers, seen = tally, show
+    if detector.follows:
+        numbers = LightReport(name, detector, tally, rig.markers, show)
+        seen = numbers.offer
+    elif colours == "follow":
+        _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
+    return _Line(
+        lambda: run(source, detector, uplink, name, tally, stop, seen),
+        numbers,
+        marker_changes(detector, make),
+    )
+
+
+def _wrist_line(
+    name: str,
+    files: CameraFiles,
+    source: FrameSource,
+    uplink: Uplink,
+    colours: Colours,
+    stop: threading.Event,
+    show: Callable[[Frame], None],
+) -> _Line:
+    if colours == "none":
+        tally = Tally(())
+        return _Line(lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, show), tally, None)
+    detector = WristDetector(view_of(files), files.camera.frame_rate_hz)
+    names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
+    tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
+    return _Line(
+        lambda: run_wrist(source, detector, uplink, name, tally, stop, show),
+        tally,
+        wrist_changes(detector),
+    )
 
 
 def _maker(

@@ -19,6 +19,7 @@ from slave.markers.autocolour_surroundings import spread
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.following import detector_for
 from slave.markers.workers import Inline
+from slave.wrist.offline import RecordedWristDetections
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,7 +194,7 @@ def make_folder(folder: Path) -> None:
         raise RecordingError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
-def save_detections(path: Path, found: RecordedDetections) -> None:
+def save_detections(path: Path, found: RecordedDetections | RecordedWristDetections) -> None:
     """Write detections_<camera>.npz; equal content gives equal bytes.
 
     Raises:

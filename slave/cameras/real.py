@@ -15,6 +15,7 @@ from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
 
 CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
+DRIVERS = ("picamera2", "v4l2")
 # Option -> its driver and the value that means "not given".
 OPTIONS: dict[str, tuple[str, object]] = {
     "sync": ("picamera2", "off"),

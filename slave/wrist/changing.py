@@ -1,0 +1,36 @@
+"""What a wrist device knows of itself and its hand, from the files of a slave, also when they change while it runs."""
+
+from collections.abc import Callable
+
+from common.errors import CalibrationError
+from slave.tuning import CameraFiles, Prepare
+from slave.wrist.detector import WristDetector
+from slave.wrist.view import WristView
+
+
+def view_of(files: CameraFiles) -> WristView:
+    """The view that camera, rig and hand make together.
+
+    Raises:
+        CalibrationError: Something is not calibrated; the text names files and key.
+    """
+    if files.hand is None:
+        raise CalibrationError(
+            f"{files.rig_path}: hand: the profile {files.rig.hand!r} of a wrist rig is not loaded"
+        )
+    try:
+        return WristView.of(files.rig, files.camera, files.hand)
+    except CalibrationError as error:
+        raise CalibrationError(f"{', '.join(map(str, files.paths))}: {error}") from error
+
+
+def wrist_changes(detector: WristDetector) -> Prepare:
+    """How changed files reach `detector`: with the next triple."""
+
+    def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
+        if (old.camera.intrinsics, old.rig, old.hand) == (new.camera.intrinsics, new.rig, new.hand):
+            return None
+        view = view_of(new)
+        return lambda: detector.replace(view)
+
+    return prepare

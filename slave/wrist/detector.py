@@ -1,0 +1,101 @@
+"""The whole line of a wrist camera, from frames to what its laser and its LEDs show of five fingers.
+
+frame -> strobe -> triple -- LED less ambient ---> seams between the fingers, fingertips
+                         \\-- laser less ambient -> where the laser meets each finger
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.messages import WristDetections
+from slave.cameras.source import Frame
+from slave.wrist.background import lit
+from slave.wrist.fingers import separate
+from slave.wrist.fingertips import Fingertips, fingertips
+from slave.wrist.laser import LaserLines, laser_lines
+from slave.wrist.strobe import Strobe, Triple
+from slave.wrist.view import WristView
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristFound:
+    """What was found in one strobed triple.
+
+    Attributes:
+        triple: The frames.
+        laser: Where the laser meets each finger.
+        tips: Fingertips.
+    """
+
+    triple: Triple
+    laser: LaserLines
+    tips: Fingertips
+
+    def message(self, camera: str, session: int) -> WristDetections:
+        """What the camera called `camera` of process `session` sends of it."""
+        triple = self.triple
+        return WristDetections(
+            camera,
+            session,
+            triple.laser.seq,
+            triple.laser.t_ns,
+            max(frame.ready_t_ns for frame in (triple.ambient, triple.laser, triple.led)),
+            self.laser.uv,
+            self.laser.sigma_px,
+            self.laser.length_px,
+            self.tips.uv,
+            self.tips.sigma_px,
+            self.tips.depth,
+            triple.laser.t_sigma_ns,
+        )
+
+
+class WristDetector:
+    """Holds the strobe, which knows the frames since the last triple, and the view that the next triple is seen with.
+
+    Of a pose nothing is kept: two triples have nothing to do with each other.
+    """
+
+    def __init__(self, view: WristView, frame_rate_hz: float) -> None:
+        """Begin with no frame; it takes a second or two to prepare the view.
+
+        Args:
+            view: What the device knows of itself and of the hand.
+            frame_rate_hz: Of the camera file: single frames per second, three per triple.
+        """
+        self._strobe = Strobe(frame_rate_hz)
+        self._view = prepared(view)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Those of the strobe: event -> how often. From any thread."""
+        return dict(self._strobe.counts)
+
+    def push(self, frame: Frame) -> WristFound | None:
+        """Take the next frame of the camera; what was found, where it completes a triple."""
+        triple = self._strobe.push(frame)
+        return None if triple is None else find(triple, self._view)
+
+    def replace(self, view: WristView) -> None:
+        """See with another view from the next triple on. Not from the loop's thread: it takes a second or two."""
+        self._view = prepared(view)
+
+
+def prepared(view: WristView) -> WristView:
+    """The same view, once all that hangs on it alone (corridors, templates) has been made and is kept.
+
+    A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
+    """
+    dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
+    find(Triple(dark, dark, dark), view)
+    return view
+
+
+def find(triple: Triple, view: WristView) -> WristFound:
+    """What one triple shows of the five fingers."""
+    ambient = triple.ambient.image
+    led = lit(triple.led.image, ambient)
+    fingers = separate(led, view)
+    laser = laser_lines(lit(triple.laser.image, ambient), fingers, view)
+    return WristFound(triple, laser, fingertips(led, fingers, view))

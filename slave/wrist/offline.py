@@ -1,0 +1,175 @@
+"""Detect a whole recording of a wrist camera offline: deterministic, without clock or network, a row per triple.
+
+What the recording says of the illumination of a frame is not used: the strobe tells it from the frames. Where the two
+disagree it is counted, because one of them is wrong then.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.calibration import HandProfile, RigCalibration, load
+from common.errors import CalibrationError, RecordingError
+from common.frame_recording import FrameRecording, Illumination, open_recording
+from slave.cameras.replay import read_png
+from slave.cameras.source import Frame
+from slave.wrist.detector import WristDetector, WristFound
+from slave.wrist.strobe import Triple
+from slave.wrist.view import WristView
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedWristDetections:
+    """Content of detections_<camera>.npz of a wrist camera: T triples, fingers thumb ... little, NaN = not seen.
+
+    Attributes:
+        t_ns: (T,) middle of the exposure of row 0 of the laser frame [ns].
+        seq: (T,) frame counter of the laser frame.
+        laser_uv: (T, 5, 2) where the laser meets each finger [px], distorted image.
+        laser_sigma_px: (T, 5) their standard deviation per axis [px].
+        laser_px: (T, 5) length of the part of the line that was seen [px].
+        tip_uv: (T, 5, 2) fingertips [px].
+        tip_sigma_px: (T, 5) their standard deviation per axis [px].
+        tip_depth: (T, 5) distance of the fingertips by the fall-off of the LED light, relative.
+    """
+
+    t_ns: Int
+    seq: Int
+    laser_uv: Float
+    laser_sigma_px: Float
+    laser_px: Float
+    tip_uv: Float
+    tip_sigma_px: Float
+    tip_depth: Float
+
+    @classmethod
+    def of(cls, found: list[WristFound]) -> "RecordedWristDetections":
+        """Row by row."""
+        laser = [one.triple.laser for one in found]
+        return cls(
+            np.array([frame.t_ns for frame in laser], np.int64),
+            np.array([frame.seq for frame in laser], np.int64),
+            _stacked([one.laser.uv for one in found], 2),
+            _stacked([one.laser.sigma_px for one in found]),
+            _stacked([one.laser.length_px for one in found]),
+            _stacked([one.tips.uv for one in found], 2),
+            _stacked([one.tips.sigma_px for one in found]),
+            _stacked([one.tips.depth for one in found]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristRecordingFound:
+    """A recording of a wrist camera, detected.
+
+    Attributes:
+        detections: A row per triple.
+        frames: Frames read.
+        counts: What the strobe counted: event -> how often.
+        mislabelled: Frames of recognised triples that frames.csv says were lit otherwise.
+    """
+
+    detections: RecordedWristDetections
+    frames: int
+    counts: Mapping[str, int]
+    mislabelled: int
+
+    def summary(self) -> str:
+        """One line for a person."""
+        parts = [f"{self.frames} frames", f"{len(self.detections.t_ns)} triples"]
+        parts += [f"{event} {count}" for event, count in self.counts.items() if count]
+        if self.mislabelled:
+            parts.append(
+                f"{self.mislabelled} frames lit otherwise than frames.csv says (its illumination is not used)"
+            )
+        return ", ".join(parts)
+
+
+def view_of(
+    recording: FrameRecording, rig: RigCalibration, calibration: Path | None, hand_file: Path | None
+) -> WristView:
+    """What the wrist device of a recording knows of itself and of its hand.
+
+    Args:
+        recording: Gives rig and camera.
+        rig: Its wrist rig.
+        calibration: calib_json tree with hands/<hand of the rig>.json, or None.
+        hand_file: Another hand profile, or None.
+
+    Raises:
+        CalibrationError: There is no hand profile, or something is not calibrated; the text names files and key.
+    """
+    if hand_file is None:
+        if calibration is None:
+            raise CalibrationError(
+                f"{recording.folder}/recording.json: its fingers are those of hand {rig.hand!r}: give --hand FILE, or "
+                f"--calibration DIR with DIR/hands/{rig.hand}.json"
+            )
+        hand_file = calibration / "hands" / f"{rig.hand}.json"
+        if not hand_file.exists():
+            raise CalibrationError(f"{hand_file}: no such hand profile: give --hand FILE")
+    hand = load(hand_file, HandProfile)
+    try:
+        return WristView.of(rig, recording.manifest.cameras[rig.cameras[0]], hand)
+    except CalibrationError as error:
+        raise CalibrationError(f"{recording.folder}/recording.json with {hand_file}: {error}") from error
+
+
+def detect_wrist_recording(
+    folder: Path,
+    camera: str,
+    calibration: Path | None = None,
+    hand_file: Path | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> WristRecordingFound:
+    """Detect laser points and fingertips in every triple of one camera.
+
+    Args:
+        folder: Recording.
+        camera: The camera of its wrist rig.
+        calibration: calib_json tree with the hand profile.
+        hand_file: Hand profile in its place.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        RecordingError: The recording is broken or has no such wrist camera or no frame of it.
+        CalibrationError: No hand profile, or something is not calibrated.
+        CameraError: A frame cannot be read.
+    """
+    recording = open_recording(folder)
+    rig = recording.manifest.wrist_rig()
+    rows = recording.frames_of(camera)
+    if camera not in rig.cameras:
+        raise RecordingError(f"{folder}: camera {camera!r} is not that of wrist rig {rig.name!r}")
+    if not rows:
+        raise RecordingError(f"{folder}/frames.csv: no frame of camera {camera!r}")
+    own = recording.manifest.cameras[camera]
+    detector = WristDetector(view_of(recording, rig, calibration, hand_file), own.frame_rate_hz)
+    found: list[WristFound] = []
+    mislabelled = 0
+    for i, row in enumerate(rows):
+        image = read_png(folder / row.file, (own.height_px, own.width_px), grey=True)
+        seen = detector.push(Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination))
+        if seen is not None:
+            found.append(seen)
+            mislabelled += _mislabelled(seen.triple)
+        progress(i + 1, len(rows))
+    return WristRecordingFound(RecordedWristDetections.of(found), len(rows), detector.counts, mislabelled)
+
+
+def _mislabelled(triple: Triple) -> int:
+    """How many of the three frames have a label that is not what the strobe took them for; NONE is no label."""
+    taken = (
+        (triple.ambient, Illumination.AMBIENT),
+        (triple.laser, Illumination.LASER),
+        (triple.led, Illumination.LED),
+    )
+    return sum(frame.illumination not in (lit, Illumination.NONE) for frame, lit in taken)
+
+
+def _stacked(rows: list[Float], *last: int) -> Float:
+    """Rows (5, ...) on one another, (T, 5, ...); T may be 0."""
+    return np.array(rows, np.float64).reshape(len(rows), 5, *last)

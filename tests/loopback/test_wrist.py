@@ -1,0 +1,148 @@
+"""A wrist device in real processes: its slave over sealed UDP and zenoh, and the whole demo."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from shutil import copytree
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from common.bus import Bus, Subscription
+from common.calibration import RigCalibration, load, save
+from common.clock import SystemClock
+from common.keys import new_key
+from common.messages import Command, Health, Preview, WristDetections
+from common.zenoh_bus import ZenohBus
+from master.ingest import Ingest
+from tests.network_helpers import free_endpoint, free_udp_port, until
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+class Device:
+    """The slave of a simulated wrist device as a process, and a master's ends of its link and bus."""
+
+    def __init__(self, files: Path, ingest: Ingest, bus: Bus, log: Path) -> None:
+        self.files, self.ingest, self.bus, self.log = files, ingest, bus, log
+
+    def triples(self, count: int) -> list[WristDetections]:
+        """The next so many."""
+        found: list[WristDetections] = []
+        assert until(lambda: len(found) >= count or self._take(found), 60.0), self.log.read_text()
+        return found
+
+    def _take(self, found: list[WristDetections]) -> bool:
+        message = self.ingest.get(0.1)
+        if message is not None:
+            assert isinstance(message, WristDetections)
+            found.append(message)
+        return False
+
+    def ask(self, verb: str, body: str = "") -> Health:
+        return self.bus.ask(Command("wrist", verb, body), 10.0)
+
+    def pictures(self) -> Subscription:
+        return self.bus.subscribe("preview")
+
+
+@contextmanager
+def device(folder: Path) -> Generator[Device, None, None]:
+    files = folder / "calib"
+    copytree(ROOT / "calib_json", files)
+    key, port, endpoint = new_key(), free_udp_port(), free_endpoint()
+    command = [sys.executable, "-m", "slave", "run", "--name", "wrist", "--rig", "wrist", "--scene", "curl"]
+    command += ["--calibration", str(files), "--camera", "synthetic", "--bind", "127.0.0.1"]
+    clock, log = SystemClock(), folder / "slave.log"
+    bus = ZenohBus(endpoint, None)
+    beacon = ("127.255.255.255", port)
+    ingest = Ingest(
+        ("wrist",), bytes.fromhex(key), clock, beacon, ("127.0.0.1", 0), endpoint, wrists=("wrist",)
+    )
+    with log.open("w") as out:
+        process = subprocess.Popen(
+            [*command, "--beacon-port", str(port)],
+            cwd=ROOT,
+            env=os.environ | {"PHALANX_RIG_KEY": key},
+            stdout=out,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        yield Device(files, ingest, bus, log)
+    finally:
+        process.terminate()
+        code = process.wait(20)
+        ingest.close()
+        bus.close()
+    assert code == 0, log.read_text()
+    assert "Traceback" not in log.read_text()
+
+
+def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path) -> None:
+    with device(tmp_path) as wrist:
+        sent = wrist.triples(5)
+        assert all(message.seq % 3 == 1 for message in sent)
+        assert (np.diff([message.seq for message in sent]) > 0).all()
+        assert (
+            np.isfinite([message.laser_uv for message in sent]).all(axis=2).mean() > 0.5
+        )  # at any time of a curl
+        assert all(message.t_ns < message.ready_t_ns for message in sent)
+
+        assert until(lambda: "wrist" in wrist.bus.alive(), 20.0)
+        counts = wrist.ask("report").counts
+        assert counts["frames"] >= 3 * counts["strobe.triples"] >= 15
+        assert sum(count for name, count in counts.items() if name.startswith("seen.laser.")) >= 12
+        assert {f"seen.tip.{finger}" for finger in ("thumb", "little")} <= counts.keys()
+
+        pictures = wrist.pictures()
+        wrist.ask("preview")
+        picture = pictures.get(10.0)
+        assert isinstance(picture, Preview)
+        shown = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
+        assert shown is not None
+        assert shown.shape == (240, 320)
+        assert shown[60:180, 80:240].mean() > 30.0  # by the LEDs
+
+        assert wrist.ask("set", '{"exposure_us": 1500}').gauges["exposure_us"] == 1500.0
+        path = wrist.files / "rigs/wrist.json"
+        rig = load(path, RigCalibration)
+        assert rig.T_camera_palm is not None
+        palm = np.array(rig.T_camera_palm)
+        palm[0, 3] += 0.002
+        moved = tuple(tuple(row) for row in palm.tolist())
+        save(path, msgspec.structs.replace(rig, T_camera_palm=moved))
+        assert until(lambda: wrist.ask("report").counts["reload.applied"] == 1)
+        save(path, msgspec.structs.replace(rig, laser_plane=None))
+        assert until(lambda: wrist.ask("report").counts["reload.refused"] == 1)
+        assert "laser_plane" in wrist.log.read_text()
+        while wrist.ingest.get(0.0) is not None:
+            pass
+        wrist.triples(2)  # it goes on
+
+
+def test_the_demo_of_the_device_scores_against_its_truth_and_leaves_its_results(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "deploy", "demo", "--wrist", "--headless", "--seconds", "4"]
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=180, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    # How many poses there are is up to the machine; how good they are is not.
+    assert summary["poses"] > 10
+    assert summary["laser_mm"] < 1.0
+    assert summary["laser_right"] > 0.9
+    assert summary["joint_mm"] < 8.0
+    assert summary["camera_hz"] == pytest.approx({"wrist": 90.0}, rel=2e-3)
+    assert "laser point error, median" in done.stdout
+    for name in ("hand.png", "run.rrd", "poses.npz", "wrist.log", "master.log"):
+        assert (tmp_path / name).stat().st_size > 0, name
+    pids = re.findall(r"\(pid (\d+)\)", done.stdout)
+    assert len(pids) == 2
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
