@@ -105,9 +105,8 @@ def _finger(model: HandModel, radius: list[float], finger: int, rng: np.random.G
         bone = model.bone_m[finger, k]
         group = finger + 1 if finger or k else THENAR_GROUP
         if group != THENAR_GROUP:
-            low, high, size, proud = (0.3, 0.92, 0.88, _PULP_M) if k == 2 else (0.25, 0.8, 0.9, _PAD_M)
-            palmar = np.array([0.0, -rng.uniform(*proud) - (1.0 - size) * radius[near], 0.0])
-            r1, r2 = size * radius[near], size * radius[far]
+            low, high, proud = (0.3, 0.92, _PULP_M) if k == 2 else (0.25, 0.8, _PAD_M)
+            palmar, r1, r2 = np.array([0.0, -rng.uniform(*proud), 0.0]), radius[near], radius[far]
             out.append(_Part(near, low * bone + palmar, high * bone + palmar, r1, r2, group, segments[k]))
         out.append(_Part(near, np.zeros(3), bone, radius[near], radius[far], group, segments[k]))
     return out
@@ -119,10 +118,14 @@ def _thenar(model: HandModel, radius: list[float], rng: np.random.Generator) -> 
     ball = rng.uniform(0.95, 1.1) * radius[near]
     # Across the palm: towards the middle finger, in the frame of the thumb's metacarpal.
     inward = model.rest_rotation[near].T @ np.array([-model.side_sign, 0.0, 0.0])
-    side = 0.009 * inward + np.array([0.0, rng.uniform(-0.003, -0.001), 0.0])
+    side, deep = (
+        0.009 * inward + np.array([0.0, rng.uniform(-0.003, -0.001), 0.0]),
+        np.array([0.0, 0.004, 0.0]),
+    )
     ends = (
         (0.05 * bone + side, 0.62 * bone + 0.6 * side, ball, 0.85 * ball),
-        (0.1 * bone + 1.8 * side, 0.8 * bone + 1.6 * side, 0.85 * ball, 0.55 * ball),
+        (0.1 * bone + 1.8 * side, 0.75 * bone + 1.5 * side, 0.9 * ball, 0.65 * ball),
+        (0.2 * bone + 2.6 * side + deep, 0.7 * bone + 2.3 * side + deep, 0.8 * ball, 0.6 * ball),
     )
     return [_Part(near, *end, THENAR_GROUP, 0) for end in ends]
 

@@ -52,7 +52,7 @@ class WristRenderer:
             for lit in (Illumination.AMBIENT, Illumination.LED)
         }
         self._hand = np.zeros(self._skin.size[::-1], dtype=np.float32)
-        self._hand.reshape(-1)[self._skin.palm.pixel] = 1.0
+        self._hand.reshape(-1)[self._skin.palm.pixel] = self._skin.palm.albedo**2
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "WristRenderer":
         """The same scene before a camera with other settings; shares all that was prepared.
@@ -75,7 +75,7 @@ class WristRenderer:
         level = _sharp(coarse, (optics.width_px, optics.height_px))
         if lit is Illumination.LASER:
             hand = self._hand.copy()
-            hand.reshape(-1)[fingers.pixel] = 1.0
+            hand.reshape(-1)[fingers.pixel] = fingers.albedo**2  # through the skin, and out again
             draw_stripe(level, self._scene, bodies, hand)
         if self._gain != 1.0:
             level *= np.float32(self._gain)

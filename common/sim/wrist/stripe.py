@@ -21,7 +21,8 @@ _EDGE_PX = 40
 
 
 def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> None:
-    """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), 1 on skin, a coarser grid."""
+    """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), a coarser grid: what skin
+    gives back, about 1, and 0 where none is."""
     sheet, optics = scene.sheet, scene.optics
     curve = sheet.cross(bodies)
     chords = np.flatnonzero(curve.joined)
