@@ -21,7 +21,7 @@ from slave.wrist.view import WristView
 NONE = -1  # no finger
 _DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
 _SHOWN = 24  # grey levels that the brightest of a lit hand exceeds
-_ASIDE = 0.05  # energy at the edge of a corridor
+_ASIDE = 3.0  # energy at the edge of a corridor
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
 _VALLEY = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
 _ACROSS = 0.3  # energy where the thumb would lie across all fingers

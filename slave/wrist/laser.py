@@ -27,6 +27,8 @@ _DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
 _NEAR_PX = 24
 _NEAR = np.ones((5, 3), dtype=np.uint8)
 _SECOND = 0.65  # of the brightest run of the same column
+_SHORT = 8  # columns
+_GLOW_OF_SHORT = 0.7
 _GLOW = 0.4  # of the brightest near by
 _OF_PEAK = 0.75
 _JUMP_PX = 6.0
@@ -98,16 +100,17 @@ def _centroids(points: Float, following: Int, finger: Int, share: Float, view: W
     sure = np.concatenate([(share[a] + share[b]) / 2.0, share[ends]])
     whole = np.concatenate([np.hypot(1.0, points[b, 1] - points[a, 1]), np.full(len(ends), 0.5)])
     owner = np.concatenate([finger[a], finger[ends]]) + 1
+    line = np.bincount(owner, whole, 6)[1:]
     length = np.bincount(owner, whole * sure, 6)[1:].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         uv = np.stack(
             [np.bincount(owner, whole * sure * middle[:, k], 6)[1:] / length for k in (0, 1)], axis=-1
         )
     depth = view.on_plane(uv)[:, 2]
-    seen = length * depth / view.optics.matrix[0, 0] >= _LEAST_M
+    seen = line * depth / view.optics.matrix[0, 0] >= _LEAST_M
     doubt = np.bincount(owner, whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0]), 6)[
         1:
-    ] / np.maximum(length, 1.0)
+    ] / np.maximum(length, 1e-9)
     sigma = np.hypot(0.3, doubt)
     return LaserLines(
         np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
@@ -196,8 +199,10 @@ def _lines(runs: Runs) -> Bool:
     np.maximum.at(beside, line, around)
     column = np.zeros(int(runs.column[-1]) + 1)
     np.maximum.at(column, runs.column, runs.peak)
-    bright = (brightest >= _GLOW * beside)[line] & (runs.peak >= _SECOND * column[runs.column])
-    return bright & (np.bincount(line, minlength=len(line)) >= _FEWEST)[line]
+    columns = np.bincount(line, minlength=len(line))
+    share = np.where(columns < _SHORT, _GLOW_OF_SHORT, _GLOW)
+    bright = (brightest >= share * beside)[line] & (runs.peak >= _SECOND * column[runs.column])
+    return bright & (columns >= _FEWEST)[line]
 
 
 def _following(runs: Runs) -> Int:

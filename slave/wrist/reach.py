@@ -17,7 +17,8 @@ Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
 _BORDER_M = 1.5e-3  # how well the border between thumb and thenar is known
-_FLESH = 2.0  # of the radius at the thumb's MCP: how far the skin of the ball of the thumb lies from its bone
+_WEB = 1.1  # of the thumb's metacarpal: where the fold of its web ends, a little beyond the MCP
+_LEAST_SHARE = 0.005  # a line that lies on the ball of the thumb alone is the best that is known of the thumb
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,9 +105,9 @@ def _share_of_thumb(view: WristView) -> Float32:
     """
     model, T = view.model, view.T_camera_palm
     root, knuckle = model.rest_position_m[CHAINS[0, :2]]
-    border = np.hypot(np.linalg.norm(knuckle - root), _FLESH * model.radius_m[CHAINS[0, 1]])
+    border = np.hypot(_WEB * np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]])
     u, v = np.meshgrid(np.arange(view.optics.width_px), np.arange(view.optics.height_px))
     points = view.on_plane(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
     away = np.linalg.norm(points - (T[:3, :3] @ root + T[:3, 3]), axis=1)
-    share = np.clip(0.5 + (np.nan_to_num(away) - border) / (2.0 * _BORDER_M), 0.0, 1.0)
+    share = np.clip(0.5 + (np.nan_to_num(away) - border) / (2.0 * _BORDER_M), _LEAST_SHARE, 1.0)
     return share.reshape(u.shape).astype(np.float32)
