@@ -71,7 +71,9 @@ class WristTruth:
 
 
 def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | None:
-    """Truth of a rendered wrist recording, one row for each laser frame of `camera`; None where there is none.
+    """Truth of a rendered wrist recording; None where there is none.
+
+    Its rows stand at its own `t_ns` where it has some; else there is one for each laser frame of `camera`.
 
     Raises:
         RecordingError: truth.npz is broken, lacks an array, or has another number of triples than frames.csv.
@@ -80,32 +82,21 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     if not path.exists():
         return None
     data = read_npz(path)
-    rows = [row for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
-    t_ns = np.array([row.t_ns for row in rows], np.int64)
+    rows = [row.t_ns for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
     try:
-        return wrist_truth(t_ns, data)
+        return WristTruth(
+            t_ns=data["t_ns"].astype(np.int64) if "t_ns" in data else np.array(rows, np.int64),
+            laser_m=data["laser_pt"],
+            laser_seen_m=data["laser_len_vis"],
+            tip_uv=data["tip_uv"],
+            tip_visible=np.asarray(data["tip_visible"], np.bool_),
+            joints_m=data["joints"],
+            pip_rad=data["angles"][:, [7, 11, 15, 19]],
+        )
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(
             f"{path}: not the truth of the {len(rows)} triples of camera {camera!r}: {error}"
         ) from error
-
-
-def wrist_truth(t_ns: Int, data: dict[str, Float]) -> WristTruth:
-    """The arrays of a wrist recording's truth.npz (datasets/wrist/README.md) at the times (N,) [ns] of its triples.
-
-    Raises:
-        KeyError: An array is missing.
-        ValueError: Another number of rows than times.
-    """
-    return WristTruth(
-        t_ns=t_ns,
-        laser_m=data["laser_pt"],
-        laser_seen_m=data["laser_len_vis"],
-        tip_uv=data["tip_uv"],
-        tip_visible=np.asarray(data["tip_visible"], np.bool_),
-        joints_m=data["joints"],
-        pip_rad=data["angles"][:, [7, 11, 15, 19]],
-    )
 
 
 def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:

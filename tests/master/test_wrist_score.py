@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
 from common.messages import WristDetections
@@ -191,7 +191,7 @@ def recording(folder: Path, triples: int) -> FrameRecording:
     return FrameRecording(folder, manifest, tuple(reversed(rows)))  # the table is in no order
 
 
-def write_truth(folder: Path, exact: WristTruth, **changes: Float | Bool) -> None:
+def write_truth(folder: Path, exact: WristTruth, **changes: Float | Bool | Int) -> None:
     angles = np.zeros((N, 21))
     angles[:, [7, 11, 15, 19]] = exact.pip_rad
     arrays = {
@@ -212,6 +212,13 @@ def test_a_truth_belongs_to_the_laser_frames(tmp_path: Path) -> None:
     assert exact is not None
     np.testing.assert_array_equal(exact.t_ns, 1_000_000_000 + (3 * np.arange(N) + 1) * PERIOD_NS // 3)
     np.testing.assert_allclose(exact.pip_rad, truth().pip_rad)
+
+
+def test_a_truth_with_times_of_its_own_needs_no_frame_for_each_row(tmp_path: Path) -> None:
+    write_truth(tmp_path, truth(), t_ns=truth().t_ns)
+    exact = load_wrist_truth(recording(tmp_path, N - 1), "wrist")  # the laser frame of one triple was lost
+    assert exact is not None
+    np.testing.assert_array_equal(exact.t_ns, truth().t_ns)
 
 
 def test_a_truth_that_does_not_fit_is_named(tmp_path: Path) -> None:
