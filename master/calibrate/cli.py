@@ -14,6 +14,7 @@ from master.calibrate.time.commands import time_command
 from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
 from master.calibrate.wrist.laser_command import laser_plane
+from master.calibrate.wrist.palm_command import palm
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "board": board,
@@ -27,6 +28,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "laser-plane": laser_plane,
     "flat-field": flat_field,
     "curl": curl,
+    "palm": palm,
 }
 
 

@@ -9,7 +9,7 @@ towards the fingers. Three lengths say where it is, all measured with a ruler:
 - `aside_m`: from the middle finger's line to the middle of the board, positive towards the thumb;
 - `depth_m`: from the axis of the wrist joint, half of the wrist's thickness below the skin, up to the print.
 
-In palm axes (z to the fingers, y out of the back): board x = +x, board y = -z, board z, which points into the board, = +y.
+In palm axes (z to the fingers, y out of the back): board x = +x, board y = -z, board z (into the board) = +y.
 """
 
 from collections.abc import Sequence
@@ -97,8 +97,8 @@ def palm_from_board(placed: Sequence[PlacedBoard], board: Board, mounting: Mount
     if turn_sigma > _TURN_LIMIT_RAD or shift_sigma > _SHIFT_LIMIT_M:
         raise FitError(
             f"the board's pose is known to {np.degrees(turn_sigma):.1f} deg and {1e3 * shift_sigma:.1f} mm only"
-            f" (limits {np.degrees(_TURN_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board, sharp"
-            " and well lit"
+            f" (limits {np.degrees(_TURN_LIMIT_RAD):.0f} deg, {1e3 * _SHIFT_LIMIT_M:.0f} mm): take a larger board,"
+            " sharp and well lit"
         )
     return PalmFit(
         T_camera_board @ invert(mounting.T_palm_board(board)),
