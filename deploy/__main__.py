@@ -136,7 +136,8 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--scene",
         default="standard",
-        help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz",
+        help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz; of a wrist "
+        "device standard, curl, poses or spread, each with @dark, @indoor, @bright or @sun",
     )
     replay = commands.add_parser(
         "replay",

@@ -203,7 +203,8 @@ def _camera(command: argparse.ArgumentParser) -> None:
         "--scene",
         default="standard",
         metavar="NAME",
-        help="standard | lights | poses | hand-routine | leap:FILE.npz | board",
+        help="standard | lights | poses | hand-routine | leap:FILE.npz | board; before a wrist device "
+        "standard | curl | poses | spread, each with @dark | @indoor | @bright | @sun, or board",
     )
     sim.add_argument("--seed", type=int, default=7)
     sim.add_argument(

@@ -21,11 +21,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest, RecordedClock
 from common.frame_writing import RecordingWriter, encode_png
+from slave.cameras.replay import is_grey
 from slave.cameras.source import Frame, FrameSource
 from slave.progress import Length, Progress, megabytes
 
@@ -80,7 +80,8 @@ class Recorder:
         self._writer = RecordingWriter(folder, manifest)
         self._folder, self._camera, self._length = folder, manifest.cameras[camera], length
         self._name, self._show, self._reserve, self._free = camera, show, reserve_bytes, free_bytes
-        self._capacity = max(queue_bytes // _raw_bytes(self._camera), 2)
+        frame_bytes = self._camera.width_px * self._camera.height_px * (1 if is_grey(manifest, camera) else 3)
+        self._capacity = max(queue_bytes // frame_bytes, 2)
         self._waiting: queue.Queue[_Waiting | None] = queue.Queue(self._capacity)
         self._encoders = ThreadPoolExecutor(min(ENCODERS, os.cpu_count() or 1), f"{camera} png")
         self._taken = self._refused = self._lost = 0  # by the camera's thread
@@ -239,7 +240,3 @@ def clock_of(clock: Clock, simulated: str = "") -> RecordedClock | None:
         before_ns, wall_ns, after_ns = clock.now_ns(), time.time_ns(), clock.now_ns()
         readings.append((after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2))
     return RecordedClock(id=boot + simulated, wall_ahead_ns=min(readings)[1])  # of the shortest look
-
-
-def _raw_bytes(camera: CameraCalibration) -> int:
-    return camera.width_px * camera.height_px * 3

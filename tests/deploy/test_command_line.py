@@ -7,6 +7,7 @@ import pytest
 
 from common.sim.scene import APART_PPM, LATE_NS
 from common.sim.scenes import NAMES
+from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import demo, replay
 from deploy.__main__ import main
 
@@ -31,6 +32,7 @@ def test_help_of_the_demo_lists_every_scene(
         main(["demo", "--help"])
     text = capsys.readouterr().out
     assert [scene for scene in NAMES.split(" | ") if scene not in text] == []
+    assert [scene for scene in (*MOTIONS, *AMBIENTS) if scene not in text] == []
 
 
 def test_a_folder_that_is_no_recording_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
