@@ -5,6 +5,7 @@ import argparse
 import pytest
 
 from common.sim.scenes import VIEWS
+from common.sim.wrist.scene import WRIST_NAMES
 from slave.__main__ import COMMANDS
 from slave.arguments import HELP, parser
 
@@ -31,7 +32,9 @@ def test_help_lists_every_scene(
     monkeypatch.setenv("COLUMNS", "200")  # nothing is broken at its hyphen
     with pytest.raises(SystemExit):
         parser().parse_args([command, "--help"])
-    assert VIEWS in " ".join(capsys.readouterr().out.split())
+    text = " ".join(capsys.readouterr().out.split())
+    assert VIEWS in text
+    assert WRIST_NAMES in text
 
 
 def test_help_of_all_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
