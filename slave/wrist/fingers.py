@@ -23,6 +23,7 @@ _DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
 _SHOWN = 24  # grey levels that the brightest of a lit hand exceeds
 _ASIDE = 3.0  # energy at the edge of a corridor
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
+_ONE_VALLEY = 0.35  # of the distance of two corridors, and of the rows of the hand
 _VALLEY = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
 _ACROSS = 0.3  # energy where the thumb would lie across all fingers
 _TURN = 0.02  # energy of a step aside between stations
@@ -82,13 +83,37 @@ def separate(led: Image, view: WristView) -> Fingers:
     energy = _energy(cast(Image, strips), corridors.thumb_crosses) + _PRIOR
     thumb = _STARTS[3]
     seams = np.empty_like(corridors.middle)
-    seams[:3] = corridors.across(slice(0, 3), _least_paths(energy[:, :thumb], 3))
+    paths = _least_paths(energy[:, :thumb], 3)
+    lit = strips[:, :thumb].max(axis=1) > _DARK
+    for seam in range(2):
+        _part(seam, paths, lit, energy, corridors)
+    seams[:3] = corridors.across(slice(0, 3), paths)
     # Towards the little finger, each seam stays on its own side of the one before it.
     order = corridors.thumb_side
     seams[:3] = order * np.minimum.accumulate(order * seams[:3], axis=0)
     energy[:, thumb:] += _TAKEN * _near(corridors, seams[:3])
     seams[3:] = corridors.across(slice(3, 4), _least_paths(energy[:, thumb:], 1))
     return Fingers(corridors, seams, shown)
+
+
+def _part(seam: int, paths: Int, lit: Bool, energy: Float32, corridors: Corridors) -> None:
+    """Where a seam and the next one lie in one valley, send the one that is farther out of its corridor to another.
+
+    `paths` (3, S) and `energy` are changed.
+    """
+    across = corridors.across(slice(seam, seam + 2), paths[seam : seam + 2])
+    apart = np.abs(np.diff(corridors.middle[seam : seam + 2], axis=0))[0]
+    same = lit & (np.abs(across[1] - across[0]) < _ONE_VALLEY * apart)
+    if same.sum() < _ONE_VALLEY * lit.sum():
+        return
+    off = np.abs(paths[seam : seam + 2] - (_WIDTHS[seam] - 1) / 2.0)[:, lit].sum(axis=1)
+    loser = seam + int(off[1] > off[0])
+    start = _STARTS[loser]
+    of_winner = across[0] if loser == seam + 1 else across[1]
+    at = ((of_winner - corridors.middle[loser]) / corridors.half[loser] + 1.0) * (LATERAL[loser] - 1) / 2.0 + MARGIN
+    strip = energy[:, start : start + _WIDTHS[loser]]
+    strip += _TAKEN * (np.abs(np.arange(_WIDTHS[loser]) - at[:, None]) < _VALLEY)
+    paths[loser] = _least_paths(strip, 1)[0]
 
 
 def _near(corridors: Corridors, seams: Float) -> Bool:

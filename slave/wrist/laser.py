@@ -27,6 +27,7 @@ _DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
 _NEAR_PX = 24
 _NEAR = np.ones((5, 3), dtype=np.uint8)
 _SECOND = 0.65  # of the brightest run of the same column
+_FADED = 0.15  # of the brightest of the line: what is darker is its blur beyond the finger
 _SHORT = 8  # columns
 _GLOW_OF_SHORT = 0.7
 _GLOW = 0.4  # of the brightest near by
@@ -129,18 +130,15 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
     before[following[::-1]] = np.arange(len(finger))[::-1]
     changes = np.flatnonzero((finger != finger[following]) & (finger >= 0) & (finger[following] >= 0))
     for i in changes.tolist():
-        back, k = [i], i
-        while len(back) < _CREASE_PX and 0 <= before[k] != k and out[before[k]] == out[i]:
-            k = int(before[k])
-            back.append(k)
-        ahead, k = [int(following[i])], int(following[i])
-        while len(ahead) < _CREASE_PX and following[k] != k and finger[following[k]] == finger[ahead[0]]:
-            k = int(following[k])
-            ahead.append(k)
+        back = _climb(i, before, runs.row, out == out[i])
+        ahead = _climb(int(following[i]), following, runs.row, finger == finger[following[i]])
         line = back[::-1] + ahead
         top = int(runs.row[line].argmin())
-        out[line[:top]] = out[i]
-        out[line[top:]] = finger[ahead[0]]
+        if len(line) - top < _SHORT:
+            top = len(line)
+        elif top < _SHORT:
+            top = 0
+        out[line[:top]], out[line[top:]] = out[i], finger[ahead[0]]
     return out
 
 
@@ -201,8 +199,17 @@ def _lines(runs: Runs) -> Bool:
     np.maximum.at(column, runs.column, runs.peak)
     columns = np.bincount(line, minlength=len(line))
     share = np.where(columns < _SHORT, _GLOW_OF_SHORT, _GLOW)
-    bright = (brightest >= share * beside)[line] & (runs.peak >= _SECOND * column[runs.column])
+    bright = (brightest >= share * beside)[line] & (runs.peak >= _FADED * brightest[line]) & (runs.peak >= _SECOND * column[runs.column])
     return bright & (columns >= _FEWEST)[line]
+
+
+def _climb(start: int, step: Int, row: Float, same: Bool) -> list[int]:
+    """Runs from one on along a line, of the same finger: some columns, and farther while it rises in the image."""
+    out, k = [start], int(step[start])
+    while k not in (-1, out[-1]) and same[k] and (len(out) < _CREASE_PX or row[k] < row[out[-1]]):
+        out.append(k)
+        k = int(step[k])
+    return out
 
 
 def _following(runs: Runs) -> Int:

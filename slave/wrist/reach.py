@@ -65,8 +65,10 @@ def reach_of(view: WristView) -> Reach:
     pixels = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_NEAREST) for part in cells]).astype(
         np.bool_
     )
+    share = _share_of_thumb(view)
+    pixels[1:] &= share > _LEAST_SHARE  # no finger is where the ball of the thumb is
     rows = np.flatnonzero(pixels.any(axis=(0, 2)))
-    return Reach(pixels, _share_of_thumb(view), int(rows[0]) if len(rows) else size[1] - 1)
+    return Reach(pixels, share, int(rows[0]) if len(rows) else size[1] - 1)
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
