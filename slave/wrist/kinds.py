@@ -1,69 +1,77 @@
-"""What was switched between two frames of a strobed camera, and whether three of them are ambient, laser and LED.
+"""What frames of a strobed camera are, by what they show: LEDs on or off between two; ambient, laser, LED of three.
 
-Everything is judged on a coarse image by signed differences, cell by cell:
+All is judged on a coarse image, cell by cell, by how far one frame is brighter than another *beyond* what noise, and
+ambient light that swings, explain:
 
-    gained     brighter than what ambient light, noise and flicker explain
-    broad      the part of it that a square of 72 px fits into: LEDs light the whole palm, nothing else does
-    thin       bright, and in its column lower than 72 px: the line of the laser
+    broad      a square of 72 px fits into what is brighter: LEDs light a palm, which is wider than that
+    thin       much brighter, and in its column lower than 72 px: the line of the laser
+    flash      thin, and brighter than both other frames: light that was there in one frame alone
 
-Light only adds, so of three frames the ambient one is nowhere brighter than the others; and the laser lights what is
-near, so that its line lies where the LEDs light. A shadow or a window that moves through the picture does one of the
-two at most. Where both frames are saturated neither gains: such cells are not counted.
+LEDs are told by broad light. The laser is told by a flash on what the LEDs light, or at its edge, and nowhere else: a
+window between moving fingers, a shadow, somebody who walks by are thin at times, or near, or there for one frame, and
+hardly ever all at once. Of three frames the ambient one is nowhere brighter, as light only adds.
+Where both frames are saturated neither is brighter: such cells tell nothing and are not counted.
 """
 
 from dataclasses import dataclass
+from enum import Enum
 from math import inf, log2
 
 import cv2
 import numpy as np
 
 from common.arrays import Image
-from common.frame_recording import Illumination
-
-AMBIENT, LASER, LED = Illumination.AMBIENT, Illumination.LASER, Illumination.LED
-ORDER = (AMBIENT, LASER, LED)
 
 _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
 _ROWS = 4  # every how manieth row is looked at
 _NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
-_FLICKER = (
-    3  # right shift: lamps on the mains swing by an eighth between two frames (an incandescent one by 10 %)
-)
-_STRIPE = 20  # levels beyond that: a line that a centroid can be taken of
+_SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
+_EXPLAINED = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
+_LINE = 20  # levels beyond that: a line that a centroid can be taken of
 _SATURATED = 250  # level of a cell
-_SQUARE = cv2.getStructuringElement(cv2.MORPH_RECT, (9, 9))  # narrower than a palm, wider than a finger
-_COLUMN = cv2.getStructuringElement(cv2.MORPH_RECT, (1, 9))
+# Neighbourhoods, (rows, columns) of cells.
+_SQUARE = np.ones((9, 9), np.uint8)  # narrower than a palm, wider than a finger
+_COLUMN = np.ones((9, 1), np.uint8)
+_LINE_HIGH = np.ones((5, 1), np.uint8)  # a line hides so many from the LEDs
+_AROUND = np.ones((5, 5), np.uint8)
+_SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a window moves in one frame
 
 LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
 LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
-LASER_LEAST = 8  # cells: the line of one finger
+LASER_LEAST = 8  # cells of flash: the line on one finger
+LASER_OF_REST = 2.0  # times as many cells as flash elsewhere, or are thin and brighter in the ambient frame
 VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Gain:
-    """Where one coarse frame is brighter than another.
+class Led(Enum):
+    """What became of the LEDs from one frame to another."""
+
+    ON = "on"
+    OFF = "off"
+    SAME = "same"
+    UNSURE = "unsure"
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """How sure it is that three frames are ambient, laser, LED: base-2 logarithms of measures over their thresholds.
 
     Attributes:
-        broad: Share of the valid cells.
-        lit: (60, 80) 255 where brighter at all.
-        thin: (60, 80) 255 on thin bright lines.
-        lines: Number of cells of `thin`.
+        led: The LED frame has broad light that the ambient frame has not.
+        laser: The laser frame has a flash where the LEDs light.
+        alone: There are no such lines in the ambient frame, nor flashes elsewhere, against that flash.
+        steady: Nothing broad came or went with the laser, or went with the LEDs.
     """
 
-    broad: float
-    lit: Image
-    thin: Image
-    lines: int
+    led: float
+    laser: float
+    alone: float
+    steady: float
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Change:
-    """From one frame to another: what was gained and what was lost; `valid`: share of cells that are not saturated."""
-
-    gained: Gain
-    lost: Gain
-    valid: float
+    @property
+    def margin(self) -> float:
+        """The weakest of the four [octaves]; not positive: not sure."""
+        return min(self.led, self.laser, self.alone, self.steady)
 
 
 def coarse(image: Image) -> Image:
@@ -72,91 +80,67 @@ def coarse(image: Image) -> Image:
     return np.asarray(cells if cells.ndim == 2 else cells.max(axis=2), np.uint8)
 
 
-def change(before: Image, after: Image) -> Change:
-    """Compare two coarse frames (60, 80)."""
-    darker = np.minimum(before, after)
-    valid = int(np.count_nonzero(darker < _SATURATED))
-    explained = np.asarray(np.right_shift(darker, _FLICKER) + np.uint8(_NOISE), np.uint8)
-    return Change(
-        _gain(before, after, explained, valid), _gain(after, before, explained, valid), valid / darker.size
-    )
+def led_change(before: Image, after: Image) -> Led:
+    """What became of the LEDs between two coarse frames (60, 80)."""
+    valid = _valid(before, after)
+    if valid < VALID_LEAST * before.size:
+        return Led.UNSURE
+    on, off = _broad(_over(after, before)) / valid, _broad(_over(before, after)) / valid
+    if max(on, off) <= LED_NEVER:
+        return Led.SAME
+    if on >= LED_LEAST and off <= LED_NEVER:
+        return Led.ON
+    if off >= LED_LEAST and on <= LED_NEVER:
+        return Led.OFF
+    return Led.UNSURE
 
 
-def _gain(before: Image, after: Image, explained: Image, valid: int) -> Gain:
-    gained = np.asarray(cv2.subtract(cv2.subtract(after, before), explained), np.uint8)
-    lit = _above(gained, 0)
-    broad = cv2.countNonZero(cv2.morphologyEx(lit, cv2.MORPH_OPEN, _SQUARE))
-    bright = _above(gained, _STRIPE)
-    thin = np.asarray(cv2.subtract(bright, cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)), np.uint8)
-    return Gain(broad / max(valid, 1), lit, thin, cv2.countNonZero(thin))
-
-
-def _above(cells: Image, level: int) -> Image:
-    return np.asarray(cv2.threshold(cells, level, 255, cv2.THRESH_BINARY)[1], np.uint8)
-
-
-def kinds(of: Change) -> tuple[Illumination | None, Illumination | None]:
-    """What two successive frames are by what was switched between them; None where it does not tell.
-
-    `NONE` for both: nothing was switched, whatever they are.
-    """
-    on, off = of.gained.broad, of.lost.broad
-    doubtful = any(LED_NEVER < share < LED_LEAST for share in (on, off))
-    if of.valid < VALID_LEAST or doubtful or min(on, off) >= LED_LEAST:
-        return None, None
-    brighter, darker = of.gained.lines >= LASER_LEAST, of.lost.lines >= LASER_LEAST
-    if on >= LED_LEAST:
-        return LASER if darker else None, LED
-    if off >= LED_LEAST:
-        return LED, LASER if brighter else AMBIENT
-    if brighter and darker:
-        return None, None
-    if brighter:
-        return AMBIENT, LASER
-    if darker:
-        return LASER, AMBIENT
-    return Illumination.NONE, Illumination.NONE
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """How sure it is that three frames are ambient, laser, LED: base-2 logarithms of each share over its threshold.
-
-    Attributes:
-        led: Broad light in the LED frame.
-        laser: Thin light of the laser frame where the LEDs light.
-        ambient: The ambient frame is the darkest: what it has in excess, against the laser's light.
-        other: Nothing broad came or went with the laser.
-    """
-
-    led: float
-    laser: float
-    ambient: float
-    other: float
-
-    @property
-    def margin(self) -> float:
-        """The weakest of the four [octaves]; not positive: not sure."""
-        return min(self.led, self.laser, self.ambient, self.other)
-
-
-def evidence(ambient_laser: Change, ambient_led: Change) -> Evidence:
-    """Of three frames, from the changes from the one that should be ambient to the two others."""
-    if min(ambient_laser.valid, ambient_led.valid) < VALID_LEAST:
+def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
+    """Of three coarse frames (60, 80), each as what it should be."""
+    valid = _valid(ambient, led)
+    if valid < VALID_LEAST * ambient.size:
         return Evidence(-inf, -inf, -inf, -inf)
-    near = ambient_led.gained.lit
-    laser = cv2.countNonZero(cv2.bitwise_and(ambient_laser.gained.thin, near))
-    excess = [
-        cv2.countNonZero(cv2.bitwise_and(thin, near))
-        for thin in (ambient_laser.lost.thin, ambient_led.lost.thin)
-    ]
-    other = max(ambient_laser.gained.broad, ambient_laser.lost.broad, ambient_led.lost.broad)
+    led_gain, laser_gain = _over(led, ambient), _over(laser, ambient)
+    led_loss, laser_loss = _over(ambient, led), _over(ambient, laser)
+    skin = cv2.morphologyEx(_lit(np.minimum(led_gain, _over(led, laser))), cv2.MORPH_OPEN, _SMALL)
+    near = cv2.dilate(skin, _LINE_HIGH)
+    inside = cv2.erode(cv2.morphologyEx(_lit(led_gain), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
+    flash = _thin(np.minimum(laser_gain, _over(laser, led)))
+    on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
+    elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
+    excess = [cv2.countNonZero(cv2.bitwise_and(_thin(loss), inside)) for loss in (led_loss, laser_loss)]
+    came_or_went = max(_broad(laser_gain), _broad(laser_loss), _broad(led_loss)) / valid
     return Evidence(
-        _octaves(ambient_led.gained.broad, LED_LEAST),
-        _octaves(laser, LASER_LEAST),
-        _octaves(laser, 2.0 * max(excess)),
-        -_octaves(other, LED_NEVER),
+        _octaves(_broad(led_gain) / valid, LED_LEAST),
+        _octaves(on_hand, LASER_LEAST),
+        _octaves(on_hand, LASER_OF_REST * max(elsewhere, *excess)),
+        -_octaves(came_or_went, LED_NEVER),
     )
+
+
+def _valid(first: Image, second: Image) -> int:
+    """Number of cells in which one of the frames may be brighter than the other."""
+    return int(np.count_nonzero(np.minimum(first, second) < _SATURATED))
+
+
+def _over(bright: Image, dark: Image) -> Image:
+    """How far one frame is brighter than another beyond what noise and a swing of ambient light explain [levels]."""
+    explained = cv2.LUT(np.minimum(bright, dark), _EXPLAINED)
+    return np.asarray(cv2.subtract(cv2.subtract(bright, dark), explained), np.uint8)
+
+
+def _lit(over: Image) -> cv2.typing.MatLike:
+    return cv2.threshold(over, 0, 255, cv2.THRESH_BINARY)[1]
+
+
+def _broad(over: Image) -> int:
+    return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
+
+
+def _thin(over: Image) -> cv2.typing.MatLike:
+    bright = cv2.threshold(over, _LINE, 255, cv2.THRESH_BINARY)[1]
+    high = cv2.morphologyEx(bright, cv2.MORPH_OPEN, _COLUMN)
+    return cv2.subtract(bright, high)
 
 
 def _octaves(value: float, threshold: float) -> float:
