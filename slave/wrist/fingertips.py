@@ -16,8 +16,8 @@ import numpy as np
 from common.arrays import Float, Image
 from slave.wrist.fingers import Fingers
 from slave.wrist.led_depth import DARK, SHRINK, Float32, led_optics, nearness, shrink
-from slave.wrist.spines import GAIN_SIGMA, LIKENESS, fans_of, spine
-from slave.wrist.tip_templates import FOUR, PALM_ROWS, FingerTemplates, templates_of
+from slave.wrist.spines import borders, spines
+from slave.wrist.tip_templates import FOUR, GAIN_SIGMA, LIKENESS, PALM_ROWS, FingerTemplates, templates_of
 from slave.wrist.view import WristView
 
 SHIFTS = np.arange(-3, 4)
@@ -27,7 +27,8 @@ LEAST_SEEN = 0.5  # probability that the end of the finger is seen
 MOST_SIGMA_PX = 5.0
 LEAST_LIKENESS = 0.985  # a finger behind another or behind the thumb looks like none of the templates
 EDGE_SHARE = 0.2  # of the brightness within: where a contour is drawn, the skin there being seen almost edge on
-LEAST_FACING = 0.4  # from here on the end of a finger is seen whole, and the step below it too
+MOST_LEAN = 0.6  # of a fingertip in the image, columns per row
+LEAST_FACING = 0.7  # from here on the end of a finger is seen whole, and the step below it too
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,13 +80,15 @@ def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
     gain = palm_gain(near, bank)
     if gain is None:
         return Fingertips(uv, sigma, depth)
-    for finger, templates, fan in zip(FOUR, bank, fans_of(view), strict=True):
-        line = spine(near, fan, gain)
-        bend = bend_of(profile(near, line), templates, gain)
+    sides = borders(fingers, bank, len(near))
+    lines = spines(near, sides)
+    for finger, templates, border, whole in zip(FOUR, bank, sides, lines, strict=True):
+        line = whole[: templates.rows]
+        bend = bend_of(profile(near, line, border), templates, gain)
         if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS:
             continue
         tip, spread = place(led, line, bend)
-        if spread <= MOST_SIGMA_PX:
+        if spread <= MOST_SIGMA_PX and fingers.finger_of(tip[None])[0] == finger:
             uv[finger], sigma[finger], depth[finger] = tip, spread, bend.depth_m
     return Fingertips(uv, sigma, depth)
 
@@ -101,11 +104,13 @@ def palm_gain(near: Float32, bank: tuple[FingerTemplates, ...]) -> float | None:
     return float(np.median(gains)) if gains else None
 
 
-def profile(near: Float32, line: Float) -> Float32:
-    """Nearness (rows,) along a spine, the mean of three pixels."""
+def profile(near: Float32, line: Float, border: Float) -> Float32:
+    """Nearness (rows,) along a spine, the mean of three pixels; 0 where it leaves the finger's region."""
     columns = np.clip(np.rint(line).astype(np.int64), 1, near.shape[1] - 2)
     rows = np.arange(len(line))
-    return (near[rows, columns - 1] + near[rows, columns] + near[rows, columns + 1]) / np.float32(3.0)
+    seen = (near[rows, columns - 1] + near[rows, columns] + near[rows, columns + 1]) / np.float32(3.0)
+    low, high = border[:, : len(line)]
+    return np.where((line >= low - 0.5) & (line <= high + 0.5), seen, np.float32(0.0))
 
 
 def bend_of(seen: Float32, templates: FingerTemplates, gain: float) -> Bend | None:
@@ -164,12 +169,11 @@ def place(led: Image, line: Float, bend: Bend) -> tuple[Float, float]:
         return np.full(2, np.nan), np.inf
     weights = [1.0 / (MODEL_PX**2 + sigma**2) for _, sigma in found]
     v = sum(w * x for w, (x, _) in zip(weights, found, strict=True)) / sum(weights)
-    folded = bend.above_bottom < bend.below_top
-    centre = v - bend.above_bottom if folded else v + radius
-    rows = np.arange(*sorted((centre, centre + (-2.0 if folded else 2.0) * radius)), 2.0)
-    rows = np.clip(rows, 0, len(column) - 1).astype(np.int64)
-    slope = np.clip(np.polyfit(rows, column[rows], 1)[0], -0.6, 0.6) if np.ptp(rows) > 4 else 0.0
-    u = column[rows].mean() + slope * (v - rows.mean())
+    away = -radius if bend.above_bottom < bend.below_top else radius
+    rows = np.linspace(v + 0.3 * away, v + 2.0 * away, 9).clip(0, len(column) - 1)
+    columns = column[rows.astype(np.int64)]
+    slope = np.clip((columns[6:].mean() - columns[:3].mean()) / (1.275 * away), -MOST_LEAN, MOST_LEAN)
+    u = columns.mean() + slope * (v - rows.mean())
     return np.array([u, v]), float(np.sqrt(1.0 / sum(weights)))
 
 
@@ -189,7 +193,7 @@ def top_edge(along: Float, near_v: float, radius: float) -> float | None:
     inside = along[min(int(near_v + 0.5 * radius), high) : max(int(near_v + 1.5 * radius), low) + 1]
     level = max(DARK, EDGE_SHARE * float(np.median(inside))) if inside.size else DARK
     lit = np.flatnonzero(along[low:high] > level)
-    if not lit.size:
+    if not lit.size or lit[0] == 0:
         return None
     k = low + int(lit[0])
     rise = along[k] - along[k - 1]

@@ -1,89 +1,91 @@
-"""Where in the image each finger runs: its spine, the middle of the lit finger at every row.
+"""Where in the image each finger runs: its spine, the middle of what is lit between its seams at every row."""
 
-A finger is nearly straight in the image, from a knuckle that is known to wherever it leans. So of a fan of lines
-through the knuckle the one is taken along which the image looks most like a finger (`slave.wrist.tip_templates`, few
-of them), and from it each row is drawn to the middle of what is lit around.
-"""
+from itertools import pairwise
 
-from dataclasses import dataclass
-from functools import lru_cache
-
+import cv2
 import numpy as np
 
-from common.arrays import Float, Int
-from slave.wrist.led_depth import SHRINK, Float32
-from slave.wrist.tip_templates import FingerTemplates, templates_of
-from slave.wrist.view import WristView
+from common.arrays import Float
+from slave.wrist.fingers import Fingers
+from slave.wrist.led_depth import DARK, SHRINK, Float32
+from slave.wrist.tip_templates import FingerTemplates
 
-LEANS_RAD = np.radians(np.arange(-24.0, 24.1, 3.0))  # fingers spread by up to 20 degrees, and look more so from aside
-LEAN_SIGMA_RAD = np.radians(10.0)
-SPREAD_SHARE = 0.3  # of the nearness of the brightest beside it: what is darker is a gap
-REACH = 5  # shrunken pixels aside: half a finger
-ROUNDS = 2
-LIKENESS = 5e-4  # of 1 - cosine between profile and template: what flesh differs from capsules
-GAIN_SIGMA = 0.15  # of the logarithm of what a finger returns beside the palm: skin, creases, stray light
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Fan:
-    """The lines through one knuckle.
-
-    Attributes:
-        u: (L, rows) columns of the shrunken image.
-        pixel: (L, rows) the same as places in the flattened image.
-        coarse: Every how many of the finger's templates are compared, as indices.
-        unit, length: Those templates.
-        prior: (L,) log probability of each lean.
-    """
-
-    u: Float
-    pixel: Int
-    unit: Float32
-    log_length: Float32
-    prior: Float
+EDGE_SHARE = 0.5  # of the nearness of a row's brightest: what is darker is a gap, or skin seen edge on
+MOST_SPREAD = 0.36  # tan of 20 degrees, the limit of spreading
+ROOT_PX = 36.0  # half of a broad finger near its root, and the pose of the palm
+LIT = 2.0 * DARK  # grey levels of a finger's middle, as of a hand stretched out far
+JUMP = 5.0  # columns from row to row: that is another finger
+SMOOTH = 5  # rows
+MOST_LEAN = 0.5  # columns per row
+MOST = 12.0  # grey levels^0.5 that count: what is nearer than a finger is the thumb
+_ASIDE = np.arange(-11, 12)  # a finger that faces the camera, and its bow
 
 
-@lru_cache(maxsize=8)
-def fans_of(view: WristView) -> tuple[Fan, ...]:
-    """The fans of index ... little of one wrist rig and hand; made once."""
-    width = view.optics.width_px // SHRINK
-    return tuple(_fan(templates, width) for templates in templates_of(view))
+def borders(fingers: Fingers, bank: tuple[FingerTemplates, ...], rows: int) -> Float:
+    """Columns (4, 2, rows) of the shrunken image between which index ... little are, by the seams and what they can spread."""
+    v = (np.arange(rows) + 0.5) * SHRINK - 0.5
+    seams = [_column(line, v) for line in fingers.polylines()]
+    thumb_right = fingers.corridors.thumb_side > 0.0
+    beyond = np.full(rows, -1e4 if thumb_right else 1e4)
+    sides = [(b, a) if thumb_right else (a, b) for a, b in pairwise([seams[3], *seams[:3], beyond])]
+    roots = np.array([templates.root_uv for templates in bank])
+    lean = MOST_SPREAD * np.maximum(roots[:, 1:] - v, 0.0) + ROOT_PX
+    low, high = np.array(sides).transpose(1, 0, 2)
+    low, high = np.maximum(low, roots[:, :1] - lean), np.minimum(high, roots[:, :1] + lean)
+    return (np.stack([low, high], axis=1) - 0.5 * (SHRINK - 1)) / SHRINK
 
 
-def _fan(templates: FingerTemplates, width: int) -> Fan:
-    v = np.arange(templates.rows)
-    root = (templates.root_uv - 0.5 * (SHRINK - 1)) / SHRINK
-    u = np.clip(root[0] + np.tan(LEANS_RAD)[:, None] * (root[1] - v), 0.0, width - 1.0)
-    few = np.flatnonzero((np.arange(len(templates.unit)) % 6) == 1)
-    return Fan(
-        u=u,
-        pixel=v * width + np.rint(u).astype(np.int64),
-        unit=templates.unit[few],
-        log_length=np.log(templates.length[few]),
-        prior=-0.5 * (LEANS_RAD / LEAN_SIGMA_RAD) ** 2,
-    )
+def _column(line: Float, v: Float) -> Float:
+    """Where a seam (S, 2) [px] crosses rows [px]; one that turns back is taken where it first came."""
+    up = line[np.argsort(-line[:, 1], kind="stable")] if line[0, 1] < line[-1, 1] else line
+    row = np.minimum.accumulate(up[:, 1])
+    return np.interp(v, row[::-1], up[::-1, 0])
 
 
-def spine(near: Float32, fan: Fan, gain: float) -> Float:
-    """Columns (rows,) of one finger's middle in the shrunken image.
+def spines(near: Float32, border: Float) -> Float:
+    """Columns (4, rows) of the fingers' middles in the shrunken image; above a finger's end as at its end.
 
     Args:
-        near: (h, w) nearness.
-        fan: The finger's.
-        gain: Logarithm of nearness [grey levels^0.5] by nearness [1/m].
+        near: (h, w) nearness [grey levels^0.5].
+        border: (4, 2, rows) columns between which the fingers are; the first rows of the image.
     """
-    seen = near.ravel()[fan.pixel]
-    size = np.sqrt((seen * seen).sum(axis=1)) + np.float32(1e-6)
-    like = fan.unit @ seen.T
-    away = np.log(np.maximum(like, 1e-6)) - fan.log_length[:, None] - gain
-    score = (like / size - 1.0) / LIKENESS - 0.5 * (away / GAIN_SIGMA) ** 2
-    line = fan.u[int(np.argmax(score.max(axis=0) + fan.prior))]
-    rows = np.arange(len(line))[:, None]
-    aside = np.arange(-REACH, REACH + 1)
-    for _ in range(ROUNDS):
-        columns = np.clip(np.rint(line).astype(np.int64)[:, None] + aside, 0, near.shape[1] - 1)
-        light = near[rows, columns]
-        light = np.where(light > SPREAD_SHARE * light.max(axis=1, keepdims=True), light * light, 0.0)
-        mass = light.sum(axis=1)
-        line = np.where(mass > 0.0, (light * columns).sum(axis=1) / np.maximum(mass, 1e-6), line)
-    return line
+    rows, width = border.shape[2], near.shape[1]
+    lines = _straight(near[:rows], border)
+    columns = np.rint(lines).astype(np.int64)[..., None] + _ASIDE
+    inside = (columns >= border[:, 0, :, None]) & (columns <= border[:, 1, :, None])
+    light = near[np.arange(rows)[:, None], columns.clip(0, width - 1)] * inside
+    brightest = light.max(axis=2)
+    light[light <= EDGE_SHARE * brightest[..., None]] = 0.0
+    light *= light
+    middle = (light * columns).sum(axis=2) / np.maximum(light.sum(axis=2), np.float32(1e-6))
+    ends = brightest * brightest <= LIT
+    ends[:, :-1] |= np.abs(np.diff(middle, axis=1)) > JUMP
+    out = np.empty(middle.shape)
+    for finger in range(len(middle)):
+        dark = np.flatnonzero(ends[finger])
+        begin = int(dark[-1]) + 1 if dark.size else 0
+        if rows - begin < SMOOTH:
+            out[finger] = lines[finger]
+            continue
+        lit = middle[finger, begin:, None]
+        out[finger, begin:] = cv2.blur(lit, (1, SMOOTH), borderType=cv2.BORDER_REPLICATE)[:, 0]
+        out[finger, :begin] = out[finger, begin]
+    return out
+
+
+def _straight(near: Float32, border: Float) -> Float:
+    """The straight lines (4, rows) that fit best what is lit between the borders."""
+    rows, width = near.shape
+    light = np.minimum(near, np.float32(MOST)) * (near > np.float32(np.sqrt(LIT)))
+    sums = np.zeros((2, rows, width + 1))
+    np.cumsum(light, axis=1, out=sums[0, :, 1:])
+    np.cumsum(light * np.arange(width, dtype=np.float32), axis=1, out=sums[1, :, 1:])
+    low, high = np.ceil(border.clip(0, width)).astype(np.int64).transpose(1, 0, 2)
+    row = np.arange(rows)
+    mass, moment = sums[:, row, np.maximum(high, low)] - sums[:, row, low]
+    middle = moment / np.maximum(mass, 1e-6)
+    total = np.maximum(mass.sum(axis=1, keepdims=True), 1e-6)
+    at, u = (mass @ row)[:, None] / total, (mass * middle).sum(axis=1, keepdims=True) / total
+    about = row - at
+    lean = (mass * about * (middle - u)).sum(axis=1) / np.maximum((mass * about * about).sum(axis=1), 1e-6)
+    return u + lean.clip(-MOST_LEAN, MOST_LEAN)[:, None] * about

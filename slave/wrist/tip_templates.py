@@ -26,12 +26,14 @@ MCP_RAD = np.radians((-12.0, 100.0))
 PIP_RAD = np.radians((0.0, 120.0))  # the range of D8
 # How far a finger reaches beyond its tip joint, in radii of its end: the half sphere about the joint, and a pad of the
 # same thickness before it, as where the tip joint of a tracked hand lies within the last bone.
-OVERHANG = (1.0, 1.6)
-SOFT = 0.15  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
+OVERHANG = (1.0, 1.4, 1.8)
+SOFT = 0.3  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
 # A fingertip's end is seen while it is on this side of the finger's own horizon, give or take 2 to 3 mm of a pad that
 # is thicker than the nail's side: pointing away it is seen a little longer, pointing down into the fist not at all.
 HORIZON_UP, HORIZON_DOWN = -0.25, 0.0
 PALM_ROWS = (2, 14)  # rows below the knuckle, where no finger but a folded one is seen
+LIKENESS = 5e-4  # of 1 - cosine between profile and template: what flesh differs from capsules
+GAIN_SIGMA = 0.15  # of the logarithm of what a finger returns beside the palm: skin, creases, stray light
 FINGER_ENDS = 10  # rows above the knuckle: the web between the fingers, about half of the first bone
 
 
