@@ -116,15 +116,9 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
             " with the board at another distance and tilt"
         )
     normal, offset = _consensus(views)
-    used = np.ones(len(views), dtype=np.bool_)
-    cov = np.eye(4)
+    used, cov = np.zeros(len(views), dtype=np.bool_), np.eye(4)
     for _ in range(6):
-        normal, offset, cov = _least_squares([v for v, own in zip(views, used, strict=True) if own], normal)
-        chi2 = np.array([_chi2(view, normal, offset) for view in views])
-        off = np.array([_off(view, normal, offset) for view in views])
-        # The covariances may be small by a common factor: a wrong view is one that strays more than most.
-        times = max(1.0, float(np.median(chi2)) / 1.386)
-        good = (chi2 < _WRONG_CHI2 * times) | (off < _WRONG_M)
+        good = _agreeing(views, normal, offset)
         if (good == used).all():
             break
         used = good
@@ -133,6 +127,7 @@ def fit_plane(views: Sequence[ViewLine]) -> PlaneFit:
                 f"only {int(used.sum())} of {len(views)} views agree on one plane: is the laser fixed to the camera,"
                 " and the board flat? Views with the line on something else than the board must be taken anew"
             )
+        normal, offset, cov = _least_squares([v for v, own in zip(views, used, strict=True) if own], normal)
     cov = cov * max(1.0, _reduced(views, used, normal, offset))
     off = np.array([_off(view, normal, offset) for view in views])
     points = np.concatenate([view.points_m for view, own in zip(views, used, strict=True) if own])
@@ -172,6 +167,15 @@ def _chi2(view: ViewLine, normal: Float, offset: float) -> float:
 
 def _off(view: ViewLine, normal: Float, offset: float) -> float:
     return float(np.sqrt(np.mean((view.points_m @ normal - offset) ** 2)))
+
+
+def _agreeing(views: Sequence[ViewLine], normal: Float, offset: float) -> Bool:
+    """Which views (V,) agree with a plane."""
+    chi2 = np.array([_chi2(view, normal, offset) for view in views])
+    off = np.array([_off(view, normal, offset) for view in views])
+    # The covariances may be small by a common factor: a wrong view is one that strays more than most.
+    times = max(1.0, float(np.median(chi2)) / 1.386)
+    return (chi2 < _WRONG_CHI2 * times) | (off < _WRONG_M)
 
 
 def _reduced(views: Sequence[ViewLine], used: Bool, normal: Float, offset: float) -> float:

@@ -1,0 +1,165 @@
+"""The laser plane: from rendered views of several devices, and exact lines for everything that must be refused."""
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.errors import FitError
+from common.geometry import rigid, rotation_vector_to_matrix
+from master.calibrate.wrist.laser_command import lines_of
+from master.calibrate.wrist.placed import PlacedBoard
+from master.calibrate.wrist.plane import ViewLine, fit_plane
+from tests.master.calibrate.wrist.devices import (
+    BOARD,
+    FOCAL_PX,
+    OPTICS,
+    angle_deg,
+    plane_of,
+    triples_of,
+    view_of,
+)
+
+NORMAL = np.array([0.0, 0.995, 0.0998749218])
+OFFSET_M = 0.03
+BOARD_SIGMA = np.diag([5e-4, 5e-4, 5e-4, 2e-5, 2e-5, 4e-5]) ** 2
+
+
+def view_line(
+    name: str, turn_deg: tuple[float, float, float], centre: tuple[float, float, float]
+) -> ViewLine:
+    """Exact line of the plane on a board at `centre` [m], turned about the camera's axes."""
+    turn = rotation_vector_to_matrix(np.radians(turn_deg))
+    facing, at = turn[:, 2], np.array(centre)
+    way = np.cross(facing, NORMAL)
+    way /= np.linalg.norm(way)
+    # The point of both planes nearest to the centre.
+    system = np.stack([facing, NORMAL, way])
+    point = np.linalg.solve(system, np.array([facing @ at, OFFSET_M, way @ at]))
+    points = point + np.linspace(-0.05, 0.05, 60)[:, None] * way
+    ends = point + np.array([[-0.03], [0.03]]) * way
+    placed = PlacedBoard(rigid(turn, at), at, BOARD_SIGMA, 0.06)
+    return ViewLine(name, points, ends, placed, 0.02, FOCAL_PX)
+
+
+def shifted(line: ViewLine, by: Float) -> ViewLine:
+    """The same line elsewhere."""
+    return ViewLine(
+        line.name, line.points_m + by, line.ends_m + by, line.placed, line.sigma_px, line.focal_px
+    )
+
+
+GOOD = (
+    view_line("near", (0.0, 0.0, 0.0), (0.0, 0.03, 0.15)),
+    view_line("far", (20.0, 5.0, 0.0), (0.02, 0.0, 0.32)),
+    view_line("left", (-10.0, 35.0, 0.0), (-0.05, 0.02, 0.22)),
+    view_line("right", (0.0, -35.0, 10.0), (0.05, 0.01, 0.22)),
+)
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_rendered_views_give_the_plane_to_a_tenth_of_a_degree_and_millimetre(seed: int) -> None:
+    views = tuple(view_of(str(k), frames) for k, frames in enumerate(triples_of(seed, 6)))
+    fit = fit_plane(lines_of(views, BOARD, OPTICS).lines)
+    true = plane_of(seed)
+    off_deg = angle_deg(np.array(fit.plane.normal), np.array(true.normal))
+    off_mm = 1e3 * abs(fit.plane.offset_m - true.offset_m)
+    assert off_deg < 0.05  # the bar is 0.1
+    assert off_mm < 0.05
+    # Its own doubt covers the error, and is not so wide that it says nothing.
+    assert off_deg < 4.0 * np.degrees(fit.normal_sigma_rad) + 0.002
+    assert off_mm < 4e3 * fit.offset_sigma_m
+    assert fit.normal_sigma_rad < np.radians(0.05)
+
+
+def test_exact_lines_give_the_exact_plane() -> None:
+    fit = fit_plane(GOOD)
+    assert angle_deg(np.array(fit.plane.normal), NORMAL) < 1e-6
+    assert fit.plane.offset_m == pytest.approx(OFFSET_M, abs=1e-8)
+    assert fit.used.all()
+    assert fit.rms_m < 1e-9
+
+
+def test_the_stated_sigma_is_that_of_many_repetitions() -> None:
+    # Boards drawn from their covariance move the points along their rays, as poses that are a little wrong do.
+    rng = np.random.default_rng(5)
+    turns: list[float] = []
+    offsets: list[float] = []
+    stated = fit_plane(GOOD)
+    for _ in range(300):
+        noisy: list[ViewLine] = []
+        for line in GOOD:
+            pull = rng.multivariate_normal(np.zeros(6), BOARD_SIGMA)
+            facing = line.placed.T_camera_board[:3, 2]
+
+            def moved(
+                points: Float, line: ViewLine = line, pull: Float = pull, facing: Float = facing
+            ) -> Float:
+                turned = facing + np.cross(pull[:3], facing)
+                at = line.placed.centre_m + pull[3:]
+                return points * ((turned @ at) / (points @ turned))[:, None]
+
+            noisy.append(
+                ViewLine(line.name, moved(line.points_m), moved(line.ends_m), line.placed, 0.02, FOCAL_PX)
+            )
+        fit = fit_plane(noisy)
+        turns.append(angle_deg(np.array(fit.plane.normal), NORMAL))
+        offsets.append(fit.plane.offset_m - OFFSET_M)
+    # The floors for line and lens are in the stated sigma and not in these draws.
+    assert 0.4 < np.std(offsets) / stated.offset_sigma_m < 1.1
+    assert 0.3 < np.sqrt(np.mean(np.square(turns)) / 2) / np.degrees(stated.normal_sigma_rad) < 1.1
+
+
+@pytest.mark.parametrize("wrong", [(0.0, 0.004, 0.0), (0.0, -0.02, 0.01)])
+def test_a_wrong_view_is_left_out_and_told(wrong: tuple[float, float, float]) -> None:
+    bad = shifted(view_line("wrong", (10.0, 0.0, 5.0), (0.0, 0.02, 0.25)), np.array(wrong))
+    fit = fit_plane((*GOOD, bad))
+    assert fit.used.tolist() == [True, True, True, True, False]
+    assert angle_deg(np.array(fit.plane.normal), NORMAL) < 1e-6
+    assert fit.off_m[-1] > 1e-3
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_views_are_refused(count: int) -> None:
+    with pytest.raises(FitError, match=f"in {count} views, at least 3 are needed"):
+        fit_plane(GOOD[:count])
+
+
+def test_one_place_of_the_board_again_and_again_is_refused() -> None:
+    rng = np.random.default_rng(1)
+    same = [shifted(GOOD[0], rng.normal(0.0, 2e-5, 3)) for _ in range(8)]
+    with pytest.raises(FitError, match=r"on one line .* hold the board at other distances"):
+        fit_plane(same)
+
+
+def test_boards_turned_about_the_line_itself_are_refused() -> None:
+    # Another tilt, but the laser falls on the same line in space: no plane is told.
+    line = view_line("0", (0.0, 0.0, 0.0), (0.0, 0.03, 0.2))
+    others = [ViewLine(str(k), line.points_m, line.ends_m, line.placed, 0.02, FOCAL_PX) for k in range(5)]
+    with pytest.raises(FitError, match="on one line"):
+        fit_plane(others)
+
+
+def test_noise_beyond_the_spread_is_refused() -> None:
+    # Distances that differ by a centimetre, poses sure to a degree and a millimetre only.
+    unsure = np.diag([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3]) ** 2
+    lines = [view_line(str(k), (0.0, 0.0, 0.0), (0.0, 0.03, 0.2 + 0.005 * k)) for k in range(3)]
+    lines = [
+        ViewLine(
+            one.name,
+            one.points_m,
+            one.ends_m,
+            PlacedBoard(one.placed.T_camera_board, one.placed.centre_m, unsure, 0.9),
+            0.02,
+            FOCAL_PX,
+        )
+        for one in lines
+    ]
+    with pytest.raises(FitError, match=r"on one line|is known to"):
+        fit_plane(lines)
+
+
+def test_views_that_contradict_each_other_are_refused() -> None:
+    rng = np.random.default_rng(3)
+    loose = [shifted(line, rng.normal(0.0, 0.01, 3)) for line in (*GOOD, *GOOD)]
+    with pytest.raises(FitError, match=r"views agree on one plane|is known to|on one line"):
+        fit_plane(loose)
