@@ -37,7 +37,7 @@ class WristTruth:
         laser_xyz: (7, 3) centroid of the same part by its length in space [m].
         laser_len_vis, laser_len_lit: (7,) length that is lit and seen, length that is lit [m].
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
-        tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
+        tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin at the end of each last bone.
         tip_visible: (5,) whether the camera sees that point.
     """
 
@@ -140,8 +140,8 @@ class WristScene:
         joints = self.model.forward(self.T_camera_palm, angles)
         bodies = self.flesh.bodies(joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
-        tips, along = self.flesh.tips(bodies)
-        faces = np.einsum("ij,ij->i", along, tips) < 0.0
+        tips, out = self.flesh.tips(bodies, joints)
+        faces = np.einsum("ij,ij->i", out, tips) < 0.0
         return WristTruth(
             t_s,
             angles,
