@@ -1,20 +1,18 @@
 """From the angles of five fingers to the pose of 26 joints in the frame of the wrist camera, with covariances.
 
-The palm does not move against the camera: it is where calibration found it. What moves are the three joints and the tip
-of each finger; their covariance is that of the angles, carried by the arcs on which each angle turns them.
+The palm does not move against the camera: it is where calibration found it. What moves are two joints and the tip of
+each finger; their covariance is that of the angles, carried along the arcs on which these turn them.
 """
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float
-from common.geometry import cross, matrix_to_quaternion
+from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, WRIST
 from common.messages import HandPose, Source
 from master.ik.priors import Priors
 from master.wrist.setup import WristSetup
 
-_TURNED_BY = np.array([0, 0, 1, 2])  # joint of the chain about which abduction, flexion, PIP, DIP turn
-_MOVES = np.array([[j > k for k in _TURNED_BY] for j in (1, 2, 3)])
 _NO_MARKERS = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
 _NO_MARKERS[0].flags.writeable = False
 
@@ -28,6 +26,7 @@ class PoseMaker:
         self._palm = np.array([PALM, WRIST, *METACARPALS])
         self._still_m2 = np.broadcast_to(priors.model_m**2 * np.eye(3), (26, 3, 3))
         self._inside = np.ones(26, np.bool_)
+        self._low, self._high = np.moveaxis(setup.model.limits_rad, -1, 0)
 
     def __call__(
         self, t_ns: int, angles_rad: Float, cov_rad2: Float, source: Code, tracked: Bool, laser_m: Float
@@ -47,7 +46,7 @@ class PoseMaker:
         joints = model.joints(T, chains)
         R = T[:3, :3]
         cov = self._still_m2.copy()
-        cov[CHAINS[:, 1:]] += R @ self._moving_cov(chains.position_m, chains.rotation, cov_rad2) @ R.T
+        cov[CHAINS[:, 1:]] += R @ self._moving_cov(angles_rad, cov_rad2) @ R.T
         known = source != Source.NONE
         valid, seen, origin = np.zeros((3, 26), np.uint8)
         valid[CHAINS], seen[CHAINS], origin[CHAINS] = known[:, None], tracked[:, None], source[:, None]
@@ -73,13 +72,16 @@ class PoseMaker:
             laser_m=laser_m,
         )
 
-    def _moving_cov(self, position_m: Float, rotation: Float, cov_rad2: Float) -> Float:
-        """Covariances (5, 3, 3, 3) [m^2], palm frame, of what moves of the chains (5, 4, ...)."""
-        model = self._model
-        axes = np.empty((5, 4, 3))
-        axes[1:, 0] = 0.0, model.side_sign, 0.0
-        axes[0, 0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
-        axes[:, 1:] = -rotation[:, :3, :, 0]
-        arm = position_m[:, 1:, None] - position_m[:, None, _TURNED_BY]
-        by_angle = np.where(_MOVES[..., None], cross(np.broadcast_to(axes[:, None], arm.shape), arm), 0.0)
-        return np.swapaxes(by_angle, -1, -2) @ cov_rad2[:, None] @ by_angle
+    def _moving_cov(self, angles_rad: Float, cov_rad2: Float) -> Float:
+        """Covariances (5, 3, 3, 3) [m^2], palm frame, of what moves of the fingers; NaN where angles are.
+
+        Unscented (Julier, Uhlmann 1997): a doubt of 20 degrees bends a joint off the tangent of its arc, which the
+        poses at the ends of the doubt's axes show and derivatives do not. Like fingers, they stop at the limits.
+        """
+        known = np.isfinite(angles_rad[:, 0])
+        root = np.linalg.cholesky(np.where(known[:, None, None], cov_rad2, np.eye(4)))
+        ends = np.sqrt(4.0) * np.moveaxis(root, -1, 0)  # (4, 5, 4)
+        poses = np.concatenate([angles_rad[None], angles_rad + ends, angles_rad - ends])
+        position = self._model.chains(np.clip(poses, self._low, self._high)).position_m[:, :, 1:]
+        off = np.moveaxis(position[1:] - position[0], 0, -2)  # (5, 3, 8, 3)
+        return np.swapaxes(off, -1, -2) @ off / len(ends) / 2.0
