@@ -26,8 +26,8 @@ from slave.wrist.strobe import Triple
 from slave.wrist.view import WristView
 
 TREE = Path(__file__).resolve().parents[1] / "calib_json"
-T_S = 1.4  # of a curl: half bent
-SCALE = 0.75
+T_S = 2.0  # of a curl: half bent, the fingertips in view
+SCALE = 0.6
 # Okabe and Ito's colours, blue first: thumb ... little.
 COLOURS = ((0, 159, 230), (233, 180, 86), (115, 158, 0), (167, 121, 204), (0, 94, 213))
 GREY = (160, 160, 160)
@@ -74,7 +74,7 @@ def _shown(image: Image, title: str) -> Image:
     bright = np.clip(image.astype(np.float32) * 1.4, 0.0, 255.0).astype(np.uint8)
     size = (round(image.shape[1] * SCALE), round(image.shape[0] * SCALE))
     out = cv2.cvtColor(cv2.resize(bright, size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR)
-    cv2.putText(out, title, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.6, (255, 255, 255), 1, cv2.LINE_AA)
+    cv2.putText(out, title, (10, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
     return np.asarray(out, np.uint8)
 
 
@@ -83,9 +83,9 @@ def _points(image: Image, uv: Float, *, cross: bool) -> None:
         if np.isfinite(point).all():
             x, y = _pixels(point[None])[0, 0].tolist()
             if cross:
-                cv2.drawMarker(image, (x, y), colour, cv2.MARKER_CROSS, 18, 2, cv2.LINE_AA)
+                cv2.drawMarker(image, (x, y), colour, cv2.MARKER_CROSS, 14, 2, cv2.LINE_AA)
             else:
-                cv2.circle(image, (x, y), 9, colour, 2, cv2.LINE_AA)
+                cv2.circle(image, (x, y), 8, colour, 2, cv2.LINE_AA)
 
 
 def _bones(image: Image, joints: Float) -> None:
