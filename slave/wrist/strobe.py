@@ -91,7 +91,10 @@ class Strobe:
         """
         self._period_ns = 1e9 / frame_rate_hz
         self._seen: list[_Seen] = []
-        self._forget()
+        self._in_order = IN_ORDER
+        self._led_place: int | None = None
+        self._phase: int | None = None
+        self._same = 0
         self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
         self.state = StrobeState.SEARCHING
         self.margin = np.nan
@@ -99,10 +102,10 @@ class Strobe:
     def push(self, frame: Frame) -> Triple | None:
         """The triple that this frame completes, or None. Never looks at `frame.illumination`."""
         cells = coarse(frame.image)
-        if not self._seen:
-            self._seen = [_Seen(frame, cells, None, 0, follows=False, latest=frame)]
+        last = self._seen[-1] if self._seen else None
+        if last is None or abs(self._step(last.latest, frame)[0]) > FORGOTTEN:
+            self._begin(frame, cells)
             return None
-        last = self._seen[-1]
         step, on_beat = self._step(last.latest, frame)
         if _copied(last, frame, cells):
             self.counts["doubled"] += 1
@@ -110,22 +113,21 @@ class Strobe:
             if self._led_place is not None:
                 self._led_place += step  # the strobe did not go on meanwhile
             return None
-        if abs(step) > FORGOTTEN:
-            self.counts["gaps"] += 1
-            self._forget()
         follows = on_beat and step == 1 and frame.seq == last.latest.seq + 1
         became = led_change(last.cells, cells)
-        led = self._led(became, last)
-        seen = _Seen(frame, cells, led, last.place + step, follows, frame)
+        self._same = self._same + 1 if became is Led.SAME and follows else 0
+        seen = _Seen(frame, cells, self._led(became, last), last.place + step, follows, frame)
         self._count(seen, became, in_time=on_beat and step > 0)
         self._seen = [*self._seen[-2:], seen]
-        return self._triple() if led and follows else None
+        return self._triple() if seen.led and follows else None
 
-    def _forget(self) -> None:
-        """How the cycle lies: the next triple is believed unless something is out of order before it."""
+    def _begin(self, frame: Frame, cells: Image) -> None:
+        """Know of no cycle: the next triple is believed unless something is out of order before it."""
+        self.counts["gaps"] += bool(self._seen)
+        self._seen = [_Seen(frame, cells, None, 0, follows=False, latest=frame)]
         self._in_order = IN_ORDER
-        self._led_place: int | None = None
-        self._phase: int | None = None
+        self._led_place = None
+        self._phase = None
         self._same = 0
 
     def _step(self, last: Frame, frame: Frame) -> tuple[int, bool]:
@@ -135,7 +137,6 @@ class Strobe:
 
     def _led(self, became: Led, last: _Seen) -> bool | None:
         """Whether the LEDs are on, by what became of them since the last frame."""
-        self._same = self._same + 1 if became is Led.SAME else 0
         if became is Led.SAME:
             return last.led if self._same < UNLIT_AFTER else None
         return None if became is Led.UNSURE else became is Led.ON
