@@ -27,11 +27,12 @@ _DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
 _NEAR_PX = 24
 _NEAR = np.ones((5, 3), dtype=np.uint8)
 _SECOND = 0.65  # of the brightest run of the same column
-_FADED = 0.15  # of the brightest of the line: what is darker is its blur beyond the finger
+_STEEPEST = 8.0  # px of row per root of a column: how fast a line goes round the side of a finger
+_FADED = 0.5  # of the brightest of the line: its edge, through the blur of the camera
 _SHORT = 8  # columns
 _GLOW_OF_SHORT = 0.7
 _GLOW = 0.4  # of the brightest near by
-_OF_PEAK = 0.75
+_OF_PEAK = 0.85
 _JUMP_PX = 6.0
 _THICKEST_PX = 64
 _FEWEST = 3
@@ -64,6 +65,7 @@ class Runs:
         start, end: (N,) first row, and the one after the last.
         peak: (N,) grey levels.
         following: (N,) index of the run of the next column that continues this one, or the run itself.
+        preceding: (N,) index of a run that this one continues, or the run itself.
     """
 
     column: Int
@@ -72,6 +74,7 @@ class Runs:
     end: Int
     peak: Float
     following: Int
+    preceding: Int
 
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
@@ -86,21 +89,32 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
     share = np.ones(len(points))
     thumb = finger == 0
     share[thumb] = reach.of_thumb(points[thumb])
-    return _centroids(points, runs.following, finger, share, view)
+    return _centroids(points, runs, finger, share, view)
 
 
-def _centroids(points: Float, following: Int, finger: Int, share: Float, view: WristView) -> LaserLines:
-    """Centroids by length of the runs' links, each with its share of the finger."""
+def _centroids(points: Float, runs: Runs, finger: Int, share: Float, view: WristView) -> LaserLines:
+    """Centroids by length of the pieces of line, each with its share of the finger."""
     here = np.arange(len(points))
-    linked = (following != here) & (finger[following] == finger)
-    a, b = here[linked], following[linked]
-    open_before = np.ones(len(points), dtype=np.bool_)
-    open_before[b] = False
-    ends = np.concatenate([here[~linked], here[open_before]])  # the outer halves of the columns at the ends
-    middle = np.concatenate([(points[a] + points[b]) / 2.0, points[ends]])
-    sure = np.concatenate([(share[a] + share[b]) / 2.0, share[ends]])
-    whole = np.concatenate([np.hypot(1.0, points[b, 1] - points[a, 1]), np.full(len(ends), 0.5)])
-    owner = np.concatenate([finger[a], finger[ends]]) + 1
+    kept = (runs.following != here) & (finger[runs.following] == finger)
+    starts, stops, owners = [], [], []
+    for step, back, outwards in (
+        (runs.following, runs.preceding, 0.5),
+        (runs.preceding, runs.following, -0.5),
+    ):
+        last = here[(step == here) | (finger[step] != finger)]
+        end, inner = _ends(points, finger, last, back, outwards)
+        starts.append(points[inner])
+        stops.append(end)
+        owners.append(last)
+        bent = inner != last  # the links beyond `inner` are replaced by the piece to the end
+        first, second = (last[bent], back[last[bent]]) if outwards < 0.0 else (inner[bent], back[last[bent]])
+        kept[first] = kept[second] = False
+    a = here[kept]
+    start = np.concatenate([points[a], *starts])
+    stop = np.concatenate([points[runs.following[a]], *stops])
+    sure = np.concatenate([(share[a] + share[runs.following[a]]) / 2.0, *(share[last] for last in owners)])
+    owner = np.concatenate([finger[a], *(finger[last] for last in owners)]) + 1
+    middle, whole = (start + stop) / 2.0, np.hypot(*(stop - start).T)
     line = np.bincount(owner, whole, 6)[1:]
     length = np.bincount(owner, whole * sure, 6)[1:].astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -109,13 +123,28 @@ def _centroids(points: Float, following: Int, finger: Int, share: Float, view: W
         )
     depth = view.on_plane(uv)[:, 2]
     seen = line * depth / view.optics.matrix[0, 0] >= _LEAST_M
-    doubt = np.bincount(owner, whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0]), 6)[
-        1:
-    ] / np.maximum(length, 1e-9)
+    away = whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0])
+    doubt = np.bincount(owner, away, 6)[1:] / np.maximum(length, 1e-9)
     sigma = np.hypot(0.3, doubt)
     return LaserLines(
         np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
     )
+
+
+def _ends(points: Float, finger: Int, last: Int, back: Int, outwards: float) -> tuple[Float, Int]:
+    """Where lines end (E, 2) beyond their last runs (E,), and from which run (E,) on the line is drawn straight there.
+
+    A line goes round a finger until it is seen no more: near its end it falls away as the root of the distance to the
+    end does, most of it in less than a column, and dark. So it is continued from a few columns within.
+    """
+    inner = back[back[last]]
+    deep = back[back[back[inner]]]
+    smooth = (np.abs(points[last, 0] - points[deep, 0]) == 5.0) & (finger[deep] == finger[last])
+    smooth &= (points[inner, 0] != points[last, 0]) & (finger[inner] == finger[last])
+    bend = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, _STEEPEST)
+    end = points[last] + [outwards, 0.0]
+    end[:, 1] = np.where(smooth, points[inner, 1] - bend * np.sqrt(2.5), end[:, 1])
+    return end, np.where(smooth, inner, last)
 
 
 def _at_creases(finger: Int, runs: Runs) -> Int:
@@ -126,11 +155,9 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
     """
     out = finger.copy()
     following = runs.following
-    before = np.full(len(finger), -1)
-    before[following[::-1]] = np.arange(len(finger))[::-1]
     changes = np.flatnonzero((finger != finger[following]) & (finger >= 0) & (finger[following] >= 0))
     for i in changes.tolist():
-        back = _climb(i, before, runs.row, out == out[i])
+        back = _climb(i, runs.preceding, runs.row, out == out[i])
         ahead = _climb(int(following[i]), following, runs.row, finger == finger[following[i]])
         line = back[::-1] + ahead
         top = int(runs.row[line].argmin())
@@ -153,7 +180,7 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     rows = np.flatnonzero(lit.any(axis=1))
     if not len(columns):
         none = np.empty(0, dtype=np.int64)
-        return Runs(none, np.empty(0), none, none, np.empty(0), none)
+        return Runs(none, np.empty(0), none, none, np.empty(0), none, none)
     left, top = int(columns[0]), int(rows[0])
     part = cv2.transpose(band[top : rows[-1] + 1, left : columns[-1] + 1])
     part = cv2.copyMakeBorder(part, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0)
@@ -166,7 +193,7 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     start, end, size = start[good], end[good], size[good]
     if not len(start):
         none = np.empty(0, dtype=np.int64)
-        return Runs(none, np.empty(0), none, none, np.empty(0), none)
+        return Runs(none, np.empty(0), none, none, np.empty(0), none, none)
     flat = part.ravel()
     first = np.cumsum(size) - size
     of_run = np.repeat(np.arange(len(size)), size)
@@ -178,8 +205,13 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     width = part.shape[1]
     column = start // width
     begin = start - column * width - 1 + top + first_row
-    runs = Runs(column + left, begin + centre, begin, begin + size, peak, column)
-    return Runs(runs.column, runs.row, runs.start, runs.end, peak, _following(runs))
+    runs = Runs(column + left, begin + centre, begin, begin + size, peak, column, column)
+    following = _following(runs)
+    here = np.arange(len(column))
+    preceding = here.copy()
+    on = following != here
+    preceding[following[on]] = here[on]
+    return Runs(runs.column, runs.row, runs.start, runs.end, peak, following, preceding)
 
 
 def _lines(runs: Runs) -> Bool:
@@ -199,14 +231,18 @@ def _lines(runs: Runs) -> Bool:
     np.maximum.at(column, runs.column, runs.peak)
     columns = np.bincount(line, minlength=len(line))
     share = np.where(columns < _SHORT, _GLOW_OF_SHORT, _GLOW)
-    bright = (brightest >= share * beside)[line] & (runs.peak >= _FADED * brightest[line]) & (runs.peak >= _SECOND * column[runs.column])
+    bright = (
+        (brightest >= share * beside)[line]
+        & (runs.peak >= _FADED * brightest[line])
+        & (runs.peak >= _SECOND * column[runs.column])
+    )
     return bright & (columns >= _FEWEST)[line]
 
 
 def _climb(start: int, step: Int, row: Float, same: Bool) -> list[int]:
     """Runs from one on along a line, of the same finger: some columns, and farther while it rises in the image."""
     out, k = [start], int(step[start])
-    while k not in (-1, out[-1]) and same[k] and (len(out) < _CREASE_PX or row[k] < row[out[-1]]):
+    while k != out[-1] and same[k] and (len(out) < _CREASE_PX or row[k] < row[out[-1]]):
         out.append(k)
         k = int(step[k])
     return out
