@@ -1,0 +1,146 @@
+"""The loop of a wrist device's slave: one message per triple, what is counted, which frames are shown."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.hand_model import FINGERS
+from common.messages import Message, WristDetections
+from slave.__main__ import main
+from slave.app import DARK_AFTER, run_wrist
+from slave.cameras.source import Frame
+from slave.tally import Tally
+from slave.wrist.blind import BlindWrist
+from slave.wrist.detector import WristDetector, WristFound
+from slave.wrist.fingertips import Fingertips
+from slave.wrist.laser import LaserLines
+from slave.wrist.strobe import Triple
+from tests.slave.wrist.wrist_frames import CAMERA, ROOT, VIEW, strobed
+
+NAMES = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
+GREY = np.zeros((4, 4), np.uint8)
+
+
+class Source:
+    """A camera with a list of frames."""
+
+    def __init__(self, frames: list[Frame] | tuple[Frame, ...]) -> None:
+        self.frames = list(frames)
+
+    def read(self) -> Frame | None:
+        return self.frames.pop(0) if self.frames else None
+
+    def close(self) -> None:
+        self.frames = []
+
+
+class Wire:
+    """Stands for the uplink."""
+
+    session = 77
+
+    def __init__(self) -> None:
+        self.sent: list[WristDetections] = []
+
+    def send(self, message: Message) -> None:
+        assert isinstance(message, WristDetections)
+        self.sent.append(message)
+
+
+class ByNumber:
+    """Takes frames 3k, 3k + 1, 3k + 2 for a triple, and sees the laser on the index from the second triple on."""
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+
+    def push(self, frame: Frame) -> WristFound | None:
+        self.frames = [*self.frames[-2:], frame]
+        if frame.seq % 3 != 2 or len(self.frames) < 3:
+            return None
+        nothing, uv = np.full(5, np.nan), np.full((5, 2), np.nan)
+        sigma = nothing.copy()
+        if frame.seq > 2:
+            uv[1], sigma[1] = (3.0, 4.0), 0.5
+        nowhere = Fingertips(np.full((5, 2), np.nan), nothing, nothing)
+        return WristFound(Triple(*self.frames), LaserLines(uv, sigma, sigma), nowhere)
+
+
+def frames(numbers: list[int]) -> list[Frame]:
+    return [Frame(seq, 11_000_000 * seq, 11_000_000 * seq + 5, GREY) for seq in numbers]
+
+
+def test_every_triple_is_sent_the_empty_ones_too_and_all_frames_are_counted() -> None:
+    wire, tally, shown = Wire(), Tally(NAMES, lambda: {"strobe.triples": 3}), list[int]()
+    source = Source(frames([0, 1, 2, 3, 4, 5, 9, 10, 11]))
+    run_wrist(
+        source, ByNumber(), wire, "wrist", tally, threading.Event(), lambda frame: shown.append(frame.seq)
+    )
+    assert [(m.camera, m.session, m.seq, m.ready_t_ns) for m in wire.sent] == [
+        ("wrist", 77, 1, 22_000_005),
+        ("wrist", 77, 4, 55_000_005),
+        ("wrist", 77, 10, 121_000_005),
+    ]
+    counts = tally.counts()
+    assert (counts["frames"], counts["dropped"], counts["empty"]) == (9, 3, 1)
+    assert (counts["seen.laser.index"], counts["seen.laser.thumb"], counts["seen.tip.index"]) == (2, 0, 0)
+    assert counts["strobe.triples"] == 3
+    assert shown == [2, 5, 11]  # those under the LEDs
+    assert tally.gauges()["detect_us"] > 0.0
+
+
+def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -> None:
+    wire, tally, shown = Wire(), Tally(()), list[int]()
+    run_wrist(
+        Source(frames(list(range(30)))),
+        BlindWrist(),
+        wire,
+        "wrist",
+        tally,
+        threading.Event(),
+        lambda frame: shown.append(frame.seq),
+    )
+    assert wire.sent == []
+    assert shown == list(range(DARK_AFTER, 30))
+    assert (tally.counts()["frames"], tally.counts()["empty"]) == (30, 0)
+
+
+def test_the_loop_ends_when_told() -> None:
+    wire, stop = Wire(), threading.Event()
+    stop.set()
+    run_wrist(Source(frames([0, 1, 2])), ByNumber(), wire, "wrist", Tally(NAMES), stop)
+    assert wire.sent == []
+
+
+def test_real_frames_go_through_the_loop_into_messages() -> None:
+    wire, tally = Wire(), Tally(NAMES)
+    detector = WristDetector(VIEW, CAMERA.frame_rate_hz)
+    run_wrist(Source(strobed("curl", 6)), detector, wire, "wrist", tally, threading.Event())
+    assert len(wire.sent) == detector.counts["triples"] >= 4
+    counts = tally.counts()
+    assert counts["frames"] == 18
+    assert counts["seen.laser.middle"] == np.isfinite([m.laser_uv[2, 0] for m in wire.sent]).sum() >= 4
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--camera", "v4l2"], "no driver of such a camera is here yet: synthetic, or replay:FOLDER"),
+        (["--camera", "picamera2:1"], "no driver of such a camera is here yet"),
+        (["--camera", "synthetic", "--engine", "numba"], "finds markers; rig 'wrist' is a wrist device"),
+        (["--camera", "synthetic", "--scene", "lights"], "for a wrist rig there are standard"),
+    ],
+)
+def test_what_a_wrist_device_cannot_have_is_said_at_the_start(
+    option: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("PHALANX_RIG_KEY", "00" * 32)
+    monkeypatch.chdir(tmp_path)
+    command = ["run", "--name", "wrist", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]
+    assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
+    assert says in capsys.readouterr().err
