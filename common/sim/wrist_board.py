@@ -228,13 +228,19 @@ class WristBoardRenderer:
         return np.clip(np.rint(level + sigma * rng.standard_normal(level.shape)), 0.0, FULL).astype(np.uint8)
 
 
-def record_wrist_board(folder: Path, scene: WristBoardScene, rig: RigCalibration | None = None) -> int:
+def record_wrist_board(
+    folder: Path,
+    scene: WristBoardScene,
+    rig: RigCalibration | None = None,
+    kinds: tuple[Illumination, ...] = KINDS,
+) -> int:
     """Render every pose as one strobed triple; return the number of poses.
 
     Args:
         folder: New or empty. Gets a recording of raw frames of kind "wrist", and truth.npz with T_camera_board.
         scene: What to render.
         rig: What the manifest says of the device; None: the truth.
+        kinds: Frames of a triple that are kept; the others were lost.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.
@@ -252,6 +258,8 @@ def record_wrist_board(folder: Path, scene: WristBoardScene, rig: RigCalibration
     try:
         for pose in range(len(scene.poses)):
             for k, lit in enumerate(KINDS):
+                if lit not in kinds:
+                    continue
                 t_ns = FIRST_NS + pose * HELD_NS + k * PERIOD_NS
                 writer.add(scene.camera.name, 3 * pose + k, t_ns, lit, encode_png(renderer.render(pose, lit)))
     finally:
