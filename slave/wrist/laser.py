@@ -32,7 +32,8 @@ _FADED = 0.5  # of the brightest of the line: its edge, through the blur of the 
 _SHORT = 8  # columns
 _GLOW_OF_SHORT = 0.7
 _GLOW = 0.4  # of the brightest near by
-_OF_PEAK = 0.85
+_TOP, _FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
+_OF_PEAK, _OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
 _JUMP_PX = 6.0
 _THICKEST_PX = 64
 _FEWEST = 3
@@ -96,7 +97,9 @@ def _centroids(points: Float, runs: Runs, finger: Int, share: Float, view: Wrist
     """Centroids by length of the pieces of line, each with its share of the finger."""
     here = np.arange(len(points))
     kept = (runs.following != here) & (finger[runs.following] == finger)
-    starts, stops, owners = [], [], []
+    starts: list[Float] = []
+    stops: list[Float] = []
+    owners: list[Int] = []
     for step, back, outwards in (
         (runs.following, runs.preceding, 0.5),
         (runs.preceding, runs.following, -0.5),
@@ -200,7 +203,8 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     inside = np.arange(len(of_run)) - first[of_run]
     level = flat[start[of_run] + inside].astype(np.float64)
     peak = np.maximum.reduceat(level, first)
-    above = np.maximum(level - _OF_PEAK * peak[of_run], 0.0)
+    flat = np.add.reduceat(level > _TOP * peak[of_run], first, dtype=np.int64) >= _FLAT_PX
+    above = np.maximum(level - (np.where(flat, _OF_FLAT, _OF_PEAK) * peak)[of_run], 0.0)
     centre = np.add.reduceat(above * inside, first) / np.add.reduceat(above, first)
     width = part.shape[1]
     column = start // width

@@ -1,0 +1,91 @@
+"""Seams between fingers: beside every finger of a rendered hand, never crossing, and there in the dark, too."""
+
+import cv2
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from common.arrays import Image
+from common.frame_recording import Illumination
+from common.hand_profiles import mirrored_profile
+from common.sim.wrist.render import WristRenderer
+from slave.wrist.background import lit
+from slave.wrist.corridors import corridors_of
+from slave.wrist.fingers import NONE, separate
+from slave.wrist.view import WristView
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
+
+BLACK = np.zeros((480, 640), dtype=np.uint8)
+
+
+def led_images(name: str, count: int, seed: int) -> list[tuple[float, Image]]:
+    """Differences of LED and ambient frame at instants spread over a scene."""
+    renderer = WristRenderer(scene(name, seed), "wrist")
+    times = [scene(name, seed).period_s * k / count for k in range(count)]
+    return [
+        (t, lit(renderer.render(t, Illumination.LED), renderer.render(t, Illumination.AMBIENT)))
+        for t in times
+    ]
+
+
+@pytest.mark.parametrize(("name", "seed"), [("curl@indoor", 11), ("spread@dark", 12), ("spread@bright", 13)])
+def test_laser_points_and_tips_lie_on_their_own_fingers(name: str, seed: int) -> None:
+    right = total = 0
+    for t, image in led_images(name, 12, seed):
+        fingers = separate(image, VIEW)
+        assert fingers.shown
+        truth = scene(name, seed).truth(t)
+        long = truth.laser_len_vis[1:6] > 0.01
+        found = fingers.finger_of(truth.laser_uv[1:6])
+        right += int((found == np.arange(5))[long].sum())
+        total += int(long.sum())
+    assert right >= 0.95 * total
+
+
+def test_the_seams_of_fingers_never_cross() -> None:
+    for _, image in led_images("standard@indoor", 12, 3):
+        seams = separate(image, VIEW).seams[:3]
+        assert (np.diff(corridors_of(VIEW).thumb_side * seams, axis=0) <= 0.0).all()
+
+
+@pytest.mark.parametrize("image", [BLACK, np.full_like(BLACK, 255), np.full_like(BLACK, 12)])
+def test_an_image_without_a_hand_has_the_seams_of_geometry(image: Image) -> None:
+    fingers = separate(image, VIEW)
+    corridors = corridors_of(VIEW)
+    assert (np.abs(fingers.seams - corridors.middle) <= corridors.half + 1e-9).all()
+    rest = VIEW.model.forward(VIEW.T_camera_palm, np.zeros((5, 4))).position_m
+    knuckles = VIEW.optics.project(rest[[8, 13, 18, 23]])
+    np.testing.assert_array_equal(fingers.finger_of(knuckles), [1, 2, 3, 4])
+
+
+def test_a_black_image_is_told() -> None:
+    assert not separate(BLACK, VIEW).shown
+
+
+def test_a_left_hand_has_its_thumb_on_the_other_side() -> None:
+    turned = np.diag([-1.0, 1.0, 1.0, 1.0]) @ VIEW.T_camera_palm @ np.diag([-1.0, 1.0, 1.0, 1.0])
+    rig = replace(RIG, T_camera_palm=tuple(tuple(row) for row in turned.tolist()))
+    left = corridors_of(WristView.of(rig, CAMERA, mirrored_profile(HAND)))
+    assert left.thumb_side == -corridors_of(VIEW).thumb_side
+    mirror = 2.0 * VIEW.optics.matrix[0, 2]
+    np.testing.assert_allclose(left.middle[:3], mirror - corridors_of(VIEW).middle[:3], atol=1.0)
+
+
+def test_a_pixel_that_is_not_seen_is_on_no_finger() -> None:
+    fingers = separate(BLACK, VIEW)
+    np.testing.assert_array_equal(fingers.finger_of(np.array([[np.nan, 3.0]])), [NONE])
+    assert len(fingers.finger_of(np.empty((0, 2)))) == 0
+
+
+def test_a_crease_between_touching_fingers_is_the_seam() -> None:
+    """Two bright bars that touch in a darker line, drawn where index and middle hang."""
+    corridors = corridors_of(VIEW)
+    image = np.zeros_like(BLACK)
+    crease = corridors.middle[0] + 0.3 * corridors.half[0]
+    for k, u in enumerate(crease.tolist()):
+        row = int(corridors.row + 10.0 * k)
+        cv2.rectangle(image, (int(u) - 45, row - 5), (int(u) + 45, row + 5), 120, -1)
+        cv2.rectangle(image, (int(u) - 3, row - 5), (int(u) + 3, row + 5), 60, -1)
+    found = separate(image, VIEW).seams[0]
+    inside = slice(12, 36)
+    assert np.abs(found - crease)[inside].max() < 8.0
