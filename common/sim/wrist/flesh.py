@@ -18,7 +18,6 @@ GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THENAR_GROUP = 0, 6
 THUMB_SEGMENTS, FINGER_SEGMENTS = (0, 1, 3), (1, 2, 3)  # by phalanx: 3 is the last of every finger
 
-TIP_LEAN_RAD = np.radians(15.0)
 _RADIUS_SPREAD = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
 _PAD_M, _PULP_M = (0.0002, 0.0010), (0.0006, 0.0016)  # how far pads and pulps stand out of the cone
 
@@ -78,21 +77,11 @@ class Flesh:
         stop = position + np.einsum("bij,bj->bi", rotation, self.stop)
         return Cones(start, stop, self.start_radius_m, self.stop_radius_m)
 
-    def tips(self, bodies: Cones, joints: HandJoints) -> tuple[Float, Float]:
-        """The outermost points of the five fingers (5, 3) [m] and the normals of the skin there (5, 3).
-
-        Outermost towards `TIP_LEAN_RAD` from the last bone to the palm's side: the nail takes the other side.
-        """
+    def tips(self, bodies: Cones) -> Float:
+        """The outermost points of the skin along the last bones of the five fingers (5, 3) [m]."""
         along = bodies.stop_m[self.tip] - bodies.start_m[self.tip]
         along /= np.linalg.norm(along, axis=1, keepdims=True)
-        palmar = -joints.rotation[self.joint[self.tip], :, 1]
-        palmar -= np.einsum("ij,ij->i", palmar, along)[:, None] * along
-        palmar /= np.linalg.norm(palmar, axis=1, keepdims=True)
-        out = np.cos(TIP_LEAN_RAD) * along + np.sin(TIP_LEAN_RAD) * palmar
-        ends = np.stack([self.tip, self.tip - 1])  # the phalanx and its pulp
-        points = bodies.stop_m[ends] + self.stop_radius_m[ends][..., None] * out
-        farther = np.einsum("kij,ij->ki", points, out).argmax(axis=0)
-        return points[farther, np.arange(5)], out
+        return bodies.stop_m[self.tip] + self.stop_radius_m[self.tip, None] * along
 
 
 class _Part(NamedTuple):

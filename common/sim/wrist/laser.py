@@ -126,12 +126,12 @@ class LaserSheet:
         joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
         return LaserCurve(rays, points, body, group, flesh.segment[body], self.seen(bodies, points), joined)
 
-    def seen(self, bodies: Cones, points: Float) -> Bool:
-        """Which of points (K, 3) [m] on the skin nothing hides from the camera (K,)."""
+    def seen(self, bodies: Cones, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
+        """Which of points (K, 3) [m] nothing hides from the camera that is more than `within_m` before them (K,)."""
         far = np.linalg.norm(points, axis=1)
         front = points[:, 2] > 0.0
         reach = distances(bodies, np.zeros(3), points / far[:, None])
-        return front & (reach.min(axis=1) > far - SEEN_WITHIN_M)
+        return front & (reach.min(axis=1) > far - within_m)
 
 
 def _fan(forward: Float, across: Float, angle_rad: Float) -> Float:

@@ -13,7 +13,7 @@ from common.arrays import Float, Image
 from common.sim.wrist.cones import Plane
 
 BLACK_LEVEL = 2.0
-LED_LEVEL = 105.0  # of skin that faces the LEDs at SKIN_AT_M on the axis
+LED_LEVEL = 88.0  # of skin that faces the LEDs at SKIN_AT_M on the axis
 LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SKIN_AT_M
 SKIN_AT_M = 0.13
 SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light

@@ -18,6 +18,7 @@ from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
+TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
 MOTIONS = ("standard", "curl", "poses", "spread")
 WRIST_NAMES = f"{' | '.join(MOTIONS)}, each with @{' | @'.join(AMBIENTS)}"
@@ -37,8 +38,8 @@ class WristTruth:
         laser_xyz: (7, 3) centroid of the same part by its length in space [m].
         laser_len_vis, laser_len_lit: (7,) length that is lit and seen, length that is lit [m].
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
-        tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin at the end of each last bone.
-        tip_visible: (5,) whether the camera sees that point.
+        tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
+        tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
     """
 
     t_s: float
@@ -140,8 +141,7 @@ class WristScene:
         joints = self.model.forward(self.T_camera_palm, angles)
         bodies = self.flesh.bodies(joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
-        tips, out = self.flesh.tips(bodies, joints)
-        faces = np.einsum("ij,ij->i", out, tips) < 0.0
+        tips = self.flesh.tips(bodies)
         return WristTruth(
             t_s,
             angles,
@@ -154,5 +154,5 @@ class WristScene:
             line.segment,
             tips,
             self.optics.project(tips),
-            faces & self.sheet.seen(bodies, tips),
+            self.sheet.seen(bodies, tips, TIP_WITHIN_M),
         )
