@@ -20,6 +20,8 @@ from common.hand_model import CHAINS, HandModel
 from common.messages import HandPose, WristDetections
 from common.sim.wrist.scene import WristScene
 from master.rig import load_setup
+from master.wrist.forward import ForwardTable
+from master.wrist.invert import Inverse
 from master.wrist.pipeline import WristPipeline
 from master.wrist.setup import WristSetup
 from slave.wrist.offline import detect_wrist_recording
@@ -47,10 +49,11 @@ def rows() -> Iterator[Row]:
 
 def _simulated() -> Iterator[Row]:
     setups = [load_setup(_ROOT / "calib_json", rig) for rig in ("wrist", "wrist-left")]
+    tables = [Inverse(ForwardTable.of(rig.wrist)) for rig in setups if rig.wrist is not None]
     error: dict[str, list[Float]] = {"exact": [], "noise": [], "cubic": []}
     missed = said = closed = 0
     for k, seed in enumerate(_SEEDS):
-        rig = setups[k % 2]
+        rig, inverse = setups[k % 2], tables[k % 2]
         assert rig.wrist is not None
         scene = WristScene.by_name("curl", rig.rig, rig.cameras, rig.hand.profile, seed)
         truths = [scene.truth(float(t)) for t in np.linspace(0.0, 0.5 * scene.motion.period_s, _POSES)]
@@ -58,7 +61,7 @@ def _simulated() -> Iterator[Row]:
         pip = np.array([now.angles_rad[1:, 2] for now in truths])
         noise = _NOISE_PX * np.random.default_rng(seed).normal(size=uv.shape)
         for kind, cubic, points in (("exact", False, uv), ("noise", False, uv + noise), ("cubic", True, uv)):
-            found, tracked = _solved(replace(rig.wrist, cubic=cubic), points, _NOISE_PX)
+            found, tracked = _solved(replace(rig.wrist, cubic=cubic), inverse, points, _NOISE_PX)
             error[kind].append((found - pip)[tracked & (pip <= _USUAL_RAD)])
             if kind == "exact":
                 missed += int((~tracked & (pip <= _USUAL_RAD)).sum())
@@ -105,11 +108,16 @@ def _rendered(folder: Path, hand: Path) -> Iterator[Row]:
         [frame.t_ns for frame in recording.frames_of(camera) if frame.illumination is Illumination.LASER],
         seen.t_ns,
     )
-    from_frames = _solved(setup, seen.laser_uv, seen.laser_sigma_px, seen.laser_px)
+    inverse = Inverse(ForwardTable.of(setup))
+    from_frames = _solved(setup, inverse, seen.laser_uv, seen.laser_sigma_px, seen.laser_px)
     for what, (found, tracked), exactly in (
-        ("exact points", _solved(setup, exact, _NOISE_PX), pip),
+        ("exact points", _solved(setup, inverse, exact, _NOISE_PX), pip),
         ("points found in its frames", from_frames, pip[row]),
-        ("exact points, the printed cubic", _solved(replace(setup, cubic=True), exact, _NOISE_PX), pip),
+        (
+            "exact points, the printed cubic",
+            _solved(replace(setup, cubic=True), inverse, exact, _NOISE_PX),
+            pip,
+        ),
     ):
         usual = tracked & (exactly <= _USUAL_RAD) & np.isfinite(found)
         error = (found - exactly)[usual]
@@ -118,10 +126,10 @@ def _rendered(folder: Path, hand: Path) -> Iterator[Row]:
 
 
 def _solved(
-    setup: WristSetup, uv: Float, sigma_px: Float | float, length_px: Float | None = None
+    setup: WristSetup, inverse: Inverse, uv: Float, sigma_px: Float | float, length_px: Float | None = None
 ) -> tuple[Float, Bool]:
     """PIP (T, 4) [rad] of index ... little and whether they are tracked, of unrelated points (T, 5, 2)."""
-    pipeline = WristPipeline(setup, continuous=False)
+    pipeline = WristPipeline(setup, continuous=False, inverse=inverse)
     sigma = np.broadcast_to(sigma_px, uv.shape[:2])
     poses: list[HandPose] = []
     for k, points in enumerate(uv):

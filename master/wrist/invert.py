@@ -45,6 +45,7 @@ class Inverse:
     """The table turned round. What it holds was prepared by the constructor."""
 
     def __init__(self, table: ForwardTable) -> None:
+        self.table = table
         found = [_finger(table, f) for f in range(5)]
         self._low = np.array([low for low, _ in found])
         self._shape = np.array([grid.shape[:2] for _, grid in found])

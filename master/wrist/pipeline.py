@@ -41,20 +41,27 @@ class WristPipeline:
     """Push machine. Holds the filter of the laser points, and of each finger the last angles and when it was seen."""
 
     def __init__(
-        self, setup: WristSetup, *, continuous: bool = True, stage: Stage = lambda name: nullcontext()
+        self,
+        setup: WristSetup,
+        *,
+        continuous: bool = True,
+        stage: Stage = lambda name: nullcontext(),
+        inverse: Inverse | None = None,
     ) -> None:
-        """Simulate the table, which takes about a second.
+        """Join the parts.
 
         Args:
             setup: Device and hand.
             continuous: False: every message is an unrelated pose; no filter, no memory.
             stage: Opens a timer by stage name.
+            inverse: The table of this device and hand; None: a new one, which takes a second or two.
         """
         self.counts: Counter[str] = Counter()
         self._setup, self._stage, self._continuous = setup, stage, continuous
         self._axes = PlaneAxes.of(setup)
-        table = ForwardTable.of(setup)
-        self._inverse, self._believe = Inverse(table), AngleBelief(setup, table)
+        self.inverse = Inverse(ForwardTable.of(setup)) if inverse is None else inverse
+        table = self.inverse.table
+        self._believe = AngleBelief(setup, table)
         self._cubic = CubicLaw(setup, table) if setup.cubic else None
         self._pose = PoseMaker(setup)
         self._smooth = _point_filter(setup, self._axes) if continuous else None
@@ -64,17 +71,18 @@ class WristPipeline:
 
     def push(self, message: WristDetections) -> list[SolvedPose]:
         """Take what one triple showed; return its pose. A message not later than the last is counted and dropped."""
-        if message.t_ns <= self._last_ns:
+        t_ns = message.t_ns + self._setup.late_ns
+        if t_ns <= self._last_ns:
             self.counts["late"] += 1
             return []
-        self._last_ns = message.t_ns
+        self._last_ns = t_ns
         with self._stage("laser"):
             points = laser_points(self._setup, message.laser_uv, message.laser_sigma_px)
             self._count("no_plane", np.isfinite(message.laser_uv[:, 0]) & np.isnan(points.point_m[:, 0]))
         with self._stage("hand"):
-            found = self._angles_of(message, points)
-            angles, cov, source = self._remembered(message.t_ns, found)
-            pose = self._pose(message.t_ns, angles, cov, source, found.told, points.point_m)
+            found = self._angles_of(t_ns, message, points)
+            angles, cov, source = self._remembered(t_ns, found)
+            pose = self._pose(t_ns, angles, cov, source, found.told, points.point_m)
         self._count("past", found.past)
         self._count("off", found.off)
         self._count("held", source == Source.HELD)
@@ -90,13 +98,13 @@ class WristPipeline:
         """At the end of a recording: nothing waits."""
         return []
 
-    def _angles_of(self, message: WristDetections, points: LaserPoints) -> FingerAngles:
+    def _angles_of(self, t_ns: int, message: WristDetections, points: LaserPoints) -> FingerAngles:
         """What the laser says of the fingers."""
         point = points.point_m
         if self._smooth is not None:
-            point = self._smooth.push(message.t_ns, point, points.cov_m2)
+            point = self._smooth.push(t_ns, point, points.cov_m2)
         flat = self._axes.flat(point)
-        closed = self._inverse(flat)
+        closed = self.inverse(flat)
         if self._cubic is not None:
             closed = self._cubic(flat, closed)
         return self._believe(closed, self._axes.flat_cov(points.cov_m2), point[:, 2], message.laser_px)

@@ -11,6 +11,7 @@ from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, WRIST
 from common.messages import HandPose, Source
 from master.ik.priors import Priors
+from master.volume import inside
 from master.wrist.setup import WristSetup
 
 _NO_MARKERS = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
@@ -25,7 +26,6 @@ class PoseMaker:
         self._setup, self._model = setup, setup.model
         self._palm = np.array([PALM, WRIST, *METACARPALS])
         self._still_m2 = np.broadcast_to(priors.model_m**2 * np.eye(3), (26, 3, 3))
-        self._inside = np.ones(26, np.bool_)
         self._low, self._high = np.moveaxis(setup.model.limits_rad, -1, 0)
 
     def __call__(
@@ -68,7 +68,7 @@ class PoseMaker:
             markers_m=_NO_MARKERS[0],
             markers_raw_m=_NO_MARKERS[1],
             markers_cov_m2=_NO_MARKERS[2],
-            inside_volume=self._inside,
+            inside_volume=inside(self._setup.volume, position),
             laser_m=laser_m,
         )
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, FilterCalibration, RigCalibration
+from common.calibration import CameraCalibration, FilterCalibration, RigCalibration, Volume
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert
@@ -27,6 +27,8 @@ class WristSetup:
         lines: Finger -> the measured line its laser point moves along; of none, the simulated one counts.
         cubic: Flexion by the cubic printed in the paper and not by the table of this hand.
         filter: Of the laser points, where frames follow each other.
+        volume: What the rig states, or None.
+        late_ns: How much later frames are taken than their stamps say [ns].
     """
 
     optics: CameraModel
@@ -38,6 +40,8 @@ class WristSetup:
     lines: dict[str, FingerLine]
     cubic: bool
     filter: FilterCalibration
+    volume: Volume | None = None
+    late_ns: int = 0
 
     @classmethod
     def of(cls, rig: RigCalibration, camera: CameraCalibration, model: HandModel) -> "WristSetup":
@@ -80,4 +84,6 @@ class WristSetup:
             lines={name: rig.finger_lines[name] for name in FINGERS if name in rig.finger_lines},
             cubic=rig.forward == "cubic",
             filter=rig.filter,
+            volume=rig.volume,
+            late_ns=round(1e3 * rig.stamp_offset_us.get(camera.name, 0.0)),
         )

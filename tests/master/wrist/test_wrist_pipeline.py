@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, Volume, load
 from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
 from common.messages import HandPose, Source, WristDetections
@@ -141,8 +141,10 @@ def test_angles_stay_within_limits_whatever_is_reported(
     assert (pose.tracked <= pose.valid).all()
 
 
-def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(setup: WristSetup) -> None:
-    pipeline = WristPipeline(setup)
+def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(
+    alone: WristPipeline, setup: WristSetup
+) -> None:
+    pipeline = WristPipeline(setup, inverse=alone.inverse)
     uv = shown(setup, natural(setup, 40.0))
     first = solved(pipeline, uv, TRIPLE_NS)
     uv[1] = np.nan
@@ -169,8 +171,10 @@ def test_unrelated_poses_remember_nothing(alone: WristPipeline, setup: WristSetu
     assert not solved(alone, uv).valid[CHAINS[1]].any()
 
 
-def test_late_and_doubled_messages_are_counted_and_change_nothing(setup: WristSetup) -> None:
-    plain, troubled = WristPipeline(setup), WristPipeline(setup)
+def test_late_and_doubled_messages_are_counted_and_change_nothing(
+    alone: WristPipeline, setup: WristSetup
+) -> None:
+    plain, troubled = (WristPipeline(setup, inverse=alone.inverse) for _ in range(2))
     rng = np.random.default_rng(3)
     sent = [
         message(shown(setup, natural(setup, 30.0 + k)) + 0.2 * rng.normal(size=(5, 2)), (k + 1) * TRIPLE_NS)
@@ -191,13 +195,15 @@ def test_late_and_doubled_messages_are_counted_and_change_nothing(setup: WristSe
     assert troubled.flush() == []
 
 
-def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(setup: WristSetup) -> None:
+def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(
+    alone: WristPipeline, setup: WristSetup
+) -> None:
     uv = shown(setup, natural(setup, 70.0))
     rng = np.random.default_rng(8)
     noise = 0.5 * rng.normal(size=(60, 5, 2))
     spread: list[Float] = []
     for continuous in (True, False):
-        pipeline = WristPipeline(setup, continuous=continuous)
+        pipeline = WristPipeline(setup, continuous=continuous, inverse=alone.inverse)
         angles = [
             solved(pipeline, uv + off, (k + 1) * TRIPLE_NS).angles_rad[1:, 2] for k, off in enumerate(noise)
         ]
@@ -205,9 +211,9 @@ def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(setup: Wr
     assert (spread[0] < 0.8 * spread[1]).all()
 
 
-def test_nineteen_of_twenty_joints_lie_in_their_regions(setup: WristSetup) -> None:
+def test_nineteen_of_twenty_joints_lie_in_their_regions(alone: WristPipeline, setup: WristSetup) -> None:
     """Of hands that stray from habits and whose skin differs as much as is believed: between 90 and 99 of 100."""
-    pipeline, priors = WristPipeline(setup, continuous=False), Priors()
+    pipeline, priors = WristPipeline(setup, continuous=False, inverse=alone.inverse), Priors()
     rng = np.random.default_rng(12)
     inside: list[bool] = []
     for _ in range(150):
@@ -231,8 +237,8 @@ def test_nineteen_of_twenty_joints_lie_in_their_regions(setup: WristSetup) -> No
     assert 0.90 < np.mean(inside) < 0.995
 
 
-def test_the_cubic_is_a_preset(setup: WristSetup) -> None:
-    pipeline = WristPipeline(replace(setup, cubic=True), continuous=False)
+def test_the_cubic_is_a_preset(alone: WristPipeline, setup: WristSetup) -> None:
+    pipeline = WristPipeline(replace(setup, cubic=True), continuous=False, inverse=alone.inverse)
     flexed: list[Float] = []
     for pip in (10.0, 40.0, 70.0):
         pose = solved(pipeline, shown(setup, natural(setup, pip)))
@@ -255,6 +261,21 @@ def test_a_rig_that_lacks_something_names_it(rig: RigSetup, change: dict[str, ob
     broken = msgspec.structs.replace(rig.rig, **change)
     with pytest.raises(CalibrationError, match=says):
         WristSetup.of(broken, rig.cameras["wrist"], rig.hand)
+
+
+def test_what_the_rig_says_of_stamps_and_volume_holds(
+    alone: WristPipeline, rig: RigSetup, setup: WristSetup
+) -> None:
+    stated = msgspec.structs.replace(
+        rig.rig, stamp_offset_us={"wrist": 1500.0}, volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1))
+    )
+    pipeline = WristPipeline(
+        WristSetup.of(stated, rig.cameras["wrist"], rig.hand), continuous=False, inverse=alone.inverse
+    )
+    pose = solved(pipeline, shown(setup, natural(setup, 20.0)), TRIPLE_NS)
+    assert pose.t_ns == TRIPLE_NS + 1_500_000
+    np.testing.assert_array_equal(pose.inside_volume, pose.position_m[:, 2] >= 0.15)
+    assert 0 < pose.inside_volume.sum() < 26
 
 
 def test_an_unknown_laser_is_put_at_the_foot_of_the_camera(rig: RigSetup, setup: WristSetup) -> None:
