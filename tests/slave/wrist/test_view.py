@@ -33,7 +33,7 @@ def test_a_rig_that_does_not_fit_is_refused_with_its_name_and_the_key(
     change: dict[str, object], says: str
 ) -> None:
     with pytest.raises(CalibrationError, match=f"rig 'wrist': .*{says}"):
-        WristView.of(replace(RIG, **change), CAMERA, HAND)  # pyright: ignore[reportArgumentType]
+        WristView.of(replace(RIG, **change), CAMERA, HAND)
 
 
 def test_a_camera_without_intrinsics_is_refused() -> None:
