@@ -3,6 +3,7 @@
 Every strobed triple of the truth counts once, also one of which nothing was made: what is not found is missed there.
 """
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,7 @@ _STRAIGHT_RAD = np.radians(
     85.0
 )  # up to here the laser tells the flexion; from about 95 degrees its point stands still
 _MATCH_NS = 5_000_000  # less than half the time from one frame to the next
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,16 +75,26 @@ class WristTruth:
 def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | None:
     """Truth of a rendered wrist recording; None where there is none.
 
-    Its rows stand at its own `t_ns` where it has some; else there is one for each laser frame of `camera`.
+    Its rows stand at its own `t_ns` where it has some; else there is one for each laser frame of `camera`. Where
+    frames were lost since, nobody can say which: there is none then, with a warning.
 
     Raises:
-        RecordingError: truth.npz is broken, lacks an array, or has another number of triples than frames.csv.
+        RecordingError: truth.npz is broken, or lacks an array.
     """
     path = recording.folder / "truth.npz"
     if not path.exists():
         return None
     data = read_npz(path)
     rows = [row.t_ns for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
+    if "t_ns" not in data and "laser_pt" in data and len(data["laser_pt"]) != len(rows):
+        _LOG.warning(
+            "%s: nothing is scored: it has %d rows and no t_ns, camera %s has %d laser frames",
+            path,
+            len(data["laser_pt"]),
+            camera,
+            len(rows),
+        )
+        return None
     try:
         return WristTruth(
             t_ns=data["t_ns"].astype(np.int64) if "t_ns" in data else np.array(rows, np.int64),
