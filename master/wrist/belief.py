@@ -29,7 +29,7 @@ _ABDUCTION_RAD = np.radians(20.0)
 _WHOLE = 0.75  # a line seen to this share of its length is not missing a part
 _HARDLY = 0.5  # less of it than this is no measurement of the finger
 _CURVES = 1 / 3
-_PLANE_M2 = (2e-4) ** 2  # what calibration leaves
+_PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _OFF_RAD = np.radians(
     5.0
 )  # beyond its limits of abduction by more than this, a point is not this finger bent naturally
@@ -109,8 +109,8 @@ class AngleBelief:
         noise = np.where(seen[:, None, None], cov_m2, 0.0)
         missing = np.clip(_WHOLE - shown, 0.0, None) * closed.length_px / self._focal_px * distance_m
         hidden = np.where(seen, 0.5 * missing, 0.0) ** 2 / 3.0
-        noise[:, 0, 0] += 0.25 * self._skin_m2 + _PLANE_M2 + hidden
-        noise[:, 1, 1] += self._skin_m2 + _PLANE_M2 + _CURVES**2 * hidden
+        noise[:, 0, 0] += 0.25 * self._skin_m2 + _PALM_M2 + hidden
+        noise[:, 1, 1] += self._skin_m2 + _PALM_M2 + _CURVES**2 * hidden
         noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
         return noise
 
