@@ -15,18 +15,27 @@ import numpy as np
 
 from common.arrays import Float, Image
 from slave.wrist.fingers import Fingers
-from slave.wrist.led_depth import DARK, SHRINK, Float32, led_optics, nearness, shrink
+from slave.wrist.led_depth import DARK, SATURATED, SHRINK, Float32, LedOptics, led_optics, nearness, shrink
+from slave.wrist.normals import normals_of
 from slave.wrist.spines import borders, spines
 from slave.wrist.tip_templates import FOUR, GAIN_SIGMA, LIKENESS, PALM_ROWS, FingerTemplates, templates_of
 from slave.wrist.view import WristView
 
 SHIFTS = np.arange(-3, 4)
 SHIFT_SIGMA_PX = 8.0
-MODEL_PX = 2.0  # a pad is no half sphere
+KEEP = 96  # templates that are compared at every shift
+SATURATED_NEAR = float(np.sqrt(SATURATED))
+_SHIFT_PRIOR = (0.5 * (SHIFTS * SHRINK / SHIFT_SIGMA_PX) ** 2).astype(np.float32)
+_GAIN_WEIGHT = np.float32(0.5 / GAIN_SIGMA**2)
+CAP_SHARE = 0.8  # of a fingertip's radius: how much of it is compared with a half sphere
+_NOISE = np.float32(np.sqrt(DARK))
+MODEL_PX = 3.0  # a pad is no half sphere
 LEAST_SEEN = 0.5  # probability that the end of the finger is seen
-MOST_SIGMA_PX = 5.0
+MOST_SIGMA_PX = 6.0
 LEAST_LIKENESS = 0.985  # a finger behind another or behind the thumb looks like none of the templates
-EDGE_SHARE = 0.2  # of the brightness within: where a contour is drawn, the skin there being seen almost edge on
+EDGE_SHARE = (
+    0.2  # of the brightness within: where a contour is drawn, the skin there being seen almost edge on
+)
 MOST_LEAN = 0.6  # of a fingertip in the image, columns per row
 LEAST_FACING = 0.7  # from here on the end of a finger is seen whole, and the step below it too
 
@@ -74,7 +83,8 @@ class Bend:
 
 def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
     """Find them in the difference of LED and ambient frame (H, W)."""
-    near = nearness(shrink(led), led_optics(view))
+    optics = led_optics(view)
+    near = nearness(shrink(led), optics)
     uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
     bank = templates_of(view)
     gain = palm_gain(near, bank)
@@ -87,7 +97,7 @@ def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
         bend = bend_of(profile(near, line, border), templates, gain)
         if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS:
             continue
-        tip, spread = place(led, line, bend)
+        tip, spread = place(led, near, optics, line, bend)
         if spread <= MOST_SIGMA_PX and fingers.finger_of(tip[None])[0] == finger:
             uv[finger], sigma[finger], depth[finger] = tip, spread, bend.depth_m
     return Fingertips(uv, sigma, depth)
@@ -117,43 +127,55 @@ def bend_of(seen: Float32, templates: FingerTemplates, gain: float) -> Bend | No
     """Weigh all bends of a finger by its profile (rows,); None: there is no finger in it."""
     if np.count_nonzero(seen > np.sqrt(DARK)) < 4:
         return None
+    unit, log_length = templates.unit, templates.log_length
+    cap = float(seen.max())
+    if cap > SATURATED_NEAR:
+        unit, log_length = _capped(templates, cap / np.exp(gain))
+    few = np.argpartition(_score(unit, log_length, seen[:, None], gain)[1][:, 0], -KEEP)[-KEEP:]
     shifted = np.zeros((len(seen), len(SHIFTS)), dtype=np.float32)
     for k, s in enumerate(SHIFTS):
         shifted[max(-s, 0) : len(seen) - max(s, 0), k] = seen[max(s, 0) : len(seen) + min(s, 0)]
-    size = np.sqrt((shifted * shifted).sum(axis=0)) + np.float32(1e-6)
-    product = templates.unit @ shifted
-    likeness = product / size
-    away = np.log(np.maximum(product, 1e-6) / templates.length[:, None]) - gain
-    score = (likeness - 1.0) / LIKENESS - 0.5 * (away / GAIN_SIGMA) ** 2
-    score -= 0.5 * (SHIFTS * SHRINK / SHIFT_SIGMA_PX) ** 2
+    likeness, score = _score(unit[few], log_length[few], shifted, gain)
+    score -= _SHIFT_PRIOR
     weight = np.exp(score - score.max())
     weight /= weight.sum()
     of_bend = weight.sum(axis=1)
+    table = templates.table[:, few]
+    mean = table @ of_bend
+    spread = np.sqrt(np.maximum((table * table) @ of_bend - mean * mean, 0.0))
     shift = SHRINK * float(weight.sum(axis=0) @ SHIFTS)
-
-    def mean(values: Float) -> float:
-        return float(of_bend @ values)
-
-    def spread(values: Float) -> float:
-        return float(np.sqrt(max(of_bend @ (values * values) - mean(values) ** 2, 0.0)))
-
-    below, above = templates.apex_v - templates.top_v, templates.bottom_v - templates.apex_v
+    below, above, top, bottom, radius, depth, facing, end_seen = mean.tolist()
     return Bend(
-        mean(below),
-        spread(below),
-        mean(above),
-        spread(above),
-        mean(templates.top_v) + shift,
-        mean(templates.bottom_v) + shift,
-        mean(templates.radius_px),
-        mean(templates.depth_m),
-        mean(templates.facing),
-        mean(templates.seen.astype(np.float64)),
-        float(likeness.ravel()[score.argmax()]),
+        below,
+        float(spread[0]),
+        above,
+        float(spread[1]),
+        top + shift,
+        bottom + shift,
+        radius,
+        depth,
+        facing,
+        end_seen,
+        float(likeness.flat[int(score.argmax())]),
     )
 
 
-def place(led: Image, line: Float, bend: Bend) -> tuple[Float, float]:
+def _score(unit: Float32, log_length: Float32, seen: Float32, gain: float) -> tuple[Float32, Float32]:
+    """Likeness and log probability (T, S) of templates (T, rows) for profiles (rows, S)."""
+    product = np.maximum(unit @ seen, np.float32(1e-6))
+    likeness = product / (np.sqrt(np.einsum("rs,rs->s", seen, seen)) + np.float32(1e-6))
+    away = np.log(product) - (log_length[:, None] + np.float32(gain))
+    return likeness, (likeness - np.float32(1.0)) * np.float32(1.0 / LIKENESS) - away * away * _GAIN_WEIGHT
+
+
+def _capped(templates: FingerTemplates, cap: float) -> tuple[Float32, Float32]:
+    """The templates as a saturated image shows them: nowhere nearer than `cap` [1/m]."""
+    near = np.minimum(templates.unit * np.exp(templates.log_length)[:, None], np.float32(cap))
+    length = np.sqrt(np.einsum("tr,tr->t", near, near))
+    return near / length[:, None], np.log(length)
+
+
+def place(led: Image, near: Float32, optics: LedOptics, line: Float, bend: Bend) -> tuple[Float, float]:
     """Where the end of a finger is (2,) [px], and its standard deviation."""
     along, column = full_profile(led, line)
     found: list[tuple[float, float]] = []
@@ -165,6 +187,13 @@ def place(led: Image, line: Float, bend: Bend) -> tuple[Float, float]:
         bottom = bottom_edge(along, bend.bottom_v, radius)
         if bottom is not None:
             found.append((bottom - bend.above_bottom, bend.above_bottom_sigma))
+    middle: Float | None = None
+    if found and bend.facing > LEAST_FACING:
+        guess = sum(v for v, _ in found) / len(found) + bend.above_bottom - radius
+        at = float(column[int(np.clip(guess, 0, len(column) - 1))])
+        middle = half_sphere(near, optics, (at, guess), radius)
+        if middle is not None:
+            found.append((middle[1] + radius - bend.above_bottom, bend.above_bottom_sigma))
     if not found:
         return np.full(2, np.nan), np.inf
     weights = [1.0 / (MODEL_PX**2 + sigma**2) for _, sigma in found]
@@ -174,7 +203,37 @@ def place(led: Image, line: Float, bend: Bend) -> tuple[Float, float]:
     columns = column[rows.astype(np.int64)]
     slope = np.clip((columns[6:].mean() - columns[:3].mean()) / (1.275 * away), -MOST_LEAN, MOST_LEAN)
     u = columns.mean() + slope * (v - rows.mean())
+    if middle is not None:
+        u = middle[0] + slope * (v - middle[1])
     return np.array([u, v]), float(np.sqrt(1.0 / sum(weights)))
+
+
+def half_sphere(near: Float32, optics: LedOptics, guess: tuple[float, float], radius: float) -> Float | None:
+    """Centre (2,) [px] of the half sphere whose normals are nearest to those of the image, by squared distance.
+
+    At p the half sphere of centre c leans by (p - c) / radius aside from the way to the camera, the image by t; the
+    sum of squares of the difference is least where c is the mean of p - radius t.
+    """
+    reach = int(radius / SHRINK) + 3
+    u, v = (round(x / SHRINK) for x in guess)
+    rows, columns = slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
+    part = near[rows, columns]
+    if part.size == 0:
+        return None
+    ray, cosine = optics.ray[rows, columns], optics.cosine[rows, columns]
+    view = -ray * cosine[..., None]
+    lit = np.where(part > _NOISE, part, np.float32(np.nan)).astype(np.float32)
+    full = normals_of(cosine / lit, ray, cosine)
+    lean = full[..., :2] - (full * view).sum(axis=-1, keepdims=True) * view[..., :2]
+    down, across = np.indices(part.shape, dtype=np.float64)
+    at: Float = np.stack([across + columns.start, down + rows.start], axis=-1) * SHRINK + 0.5 * (SHRINK - 1)
+    centre: Float = np.array(guess)
+    for _ in range(2):
+        inside = (((at - centre) ** 2).sum(axis=-1) < (CAP_SHARE * radius) ** 2) & np.isfinite(lean[..., 0])
+        if np.count_nonzero(inside) < 6:
+            return None
+        centre = (at[inside] - radius * lean[inside]).mean(axis=0)
+    return centre if np.hypot(*(centre - np.array(guess))) < radius else None
 
 
 def full_profile(led: Image, line: Float) -> tuple[Float, Float]:

@@ -80,14 +80,18 @@ def relative_depth(grey: Float32, optics: LedOptics) -> RelativeDepth:
 
 def image_rows(view: WristView) -> Float:
     """Rows of the image [px] at the centres of the shrunken image's rows."""
-    return (np.arange(view.optics.height_px // SHRINK) + 0.5) * SHRINK - 0.5
+    return _centres(view.optics.height_px)
+
+
+def _centres(size_px: int) -> Float:
+    return np.arange(size_px // SHRINK, dtype=np.float64) * SHRINK + 0.5 * (SHRINK - 1)
 
 
 @lru_cache(maxsize=8)
 def led_optics(view: WristView) -> LedOptics:
     """The maps of one wrist rig; made once."""
     v = image_rows(view)
-    u = (np.arange(view.optics.width_px // SHRINK) + 0.5) * SHRINK - 0.5
+    u = _centres(view.optics.width_px)
     xy = view.optics.undistort(np.stack(np.meshgrid(u, v), axis=-1))
     ray = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], axis=-1)
     flat = np.ones(xy.shape[:2]) if view.flat_field is None else flat_of(view.flat_field, xy)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from slave.wrist.fingers import Fingers
 from slave.wrist.led_depth import DARK, SHRINK, Float32
 from slave.wrist.tip_templates import FingerTemplates
@@ -22,8 +22,8 @@ _ASIDE = np.arange(-11, 12)  # a finger that faces the camera, and its bow
 
 
 def borders(fingers: Fingers, bank: tuple[FingerTemplates, ...], rows: int) -> Float:
-    """Columns (4, 2, rows) of the shrunken image between which index ... little are, by the seams and what they can spread."""
-    v = (np.arange(rows) + 0.5) * SHRINK - 0.5
+    """Columns (4, 2, rows) of the shrunken image between which index ... little are: by their seams and their roots."""
+    v: Float = (np.arange(rows, dtype=np.float64) + 0.5) * SHRINK - 0.5
     seams = [_column(line, v) for line in fingers.polylines()]
     thumb_right = fingers.corridors.thumb_side > 0.0
     beyond = np.full(rows, -1e4 if thumb_right else 1e4)
@@ -81,11 +81,15 @@ def _straight(near: Float32, border: Float) -> Float:
     np.cumsum(light, axis=1, out=sums[0, :, 1:])
     np.cumsum(light * np.arange(width, dtype=np.float32), axis=1, out=sums[1, :, 1:])
     low, high = np.ceil(border.clip(0, width)).astype(np.int64).transpose(1, 0, 2)
-    row = np.arange(rows)
-    mass, moment = sums[:, row, np.maximum(high, low)] - sums[:, row, low]
+    index: Int = np.arange(rows, dtype=np.int64)
+    within: Float = sums[:, index, np.maximum(high, low)] - sums[:, index, low]
+    mass, moment = within[0], within[1]
+    row: Float = index.astype(np.float64)
     middle = moment / np.maximum(mass, 1e-6)
     total = np.maximum(mass.sum(axis=1, keepdims=True), 1e-6)
-    at, u = (mass @ row)[:, None] / total, (mass * middle).sum(axis=1, keepdims=True) / total
-    about = row - at
-    lean = (mass * about * (middle - u)).sum(axis=1) / np.maximum((mass * about * about).sum(axis=1), 1e-6)
+    at: Float = (mass @ row)[:, None] / total
+    u: Float = (mass * middle).sum(axis=1, keepdims=True) / total
+    about: Float = row - at
+    lean: Float = (mass * about * (middle - u)).sum(axis=1)
+    lean /= np.maximum((mass * about * about).sum(axis=1), 1e-6)
     return u + lean.clip(-MOST_LEAN, MOST_LEAN)[:, None] * about

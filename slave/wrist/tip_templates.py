@@ -14,23 +14,25 @@ from functools import lru_cache
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Float
 from common.hand_model import CHAINS, FINGER_JOINTS
 from slave.wrist.led_depth import SHRINK, Float32, image_rows
 from slave.wrist.view import WristView
 
 FOUR = (1, 2, 3, 4)  # index ... little
 DIP_PER_PIP = 0.84  # Kamper's ratio (D8)
-STEP_RAD = np.radians(6.0)
+STEP_RAD = float(np.radians(6.0))
 MCP_RAD = np.radians((-12.0, 100.0))
 PIP_RAD = np.radians((0.0, 120.0))  # the range of D8
 # How far a finger reaches beyond its tip joint, in radii of its end: the half sphere about the joint, and a pad of the
 # same thickness before it, as where the tip joint of a tracked hand lies within the last bone.
 OVERHANG = (1.0, 1.4, 1.8)
-SOFT = 0.3  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
+SOFT = (
+    0.3  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
+)
 # A fingertip's end is seen while it is on this side of the finger's own horizon, give or take 2 to 3 mm of a pad that
 # is thicker than the nail's side: pointing away it is seen a little longer, pointing down into the fist not at all.
-HORIZON_UP, HORIZON_DOWN = -0.25, 0.0
+HORIZON_UP, HORIZON_DOWN = -0.25, -0.15
 PALM_ROWS = (2, 14)  # rows below the knuckle, where no finger but a folded one is seen
 LIKENESS = 5e-4  # of 1 - cosine between profile and template: what flesh differs from capsules
 GAIN_SIGMA = 0.15  # of the logarithm of what a finger returns beside the palm: skin, creases, stray light
@@ -44,31 +46,21 @@ class FingerTemplates:
     Attributes:
         rows: A profile is that of image rows 0 ... rows - 1 of the shrunken image.
         unit: (T, rows) profiles of unit length.
-        length: (T,) what they were divided by [1/m].
+        log_length: (T,) logarithm of what they were divided by [1/m].
         palm: Nearness of the palm below the knuckle, on average [1/m].
         root_uv: (2,) the knuckle [px].
-        apex_v: (T,) row of the end of the finger [px].
-        top_v, bottom_v: (T,) highest row of the finger, lowest row of its end [px].
-        radius_px: (T,) radius of its end in the image.
-        depth_m: (T,) of its end, along the optical axis.
-        facing: (T,) cosine between the last bone and the way to the camera: 1 the fingertip points at the camera.
-        seen: (T,) whether the end of the finger is on the side towards the camera.
-        bend_rad: (T, 2) knuckle and PIP.
+        table: (8, T) of the end of the finger: how far it is below the finger's highest row [px] and above the lowest
+            row of the fingertip [px], those two rows [px], the fingertip's radius [px], depth along the optical axis
+            [m], cosine between the last bone and the way to the camera (1: it points at the camera), and whether the
+            end is seen.
     """
 
     rows: int
     unit: Float32
-    length: Float32
+    log_length: Float32
     palm: float
     root_uv: Float
-    apex_v: Float
-    top_v: Float
-    bottom_v: Float
-    radius_px: Float
-    depth_m: Float
-    facing: Float
-    seen: Bool
-    bend_rad: Float
+    table: Float
 
 
 @lru_cache(maxsize=8)
@@ -78,7 +70,7 @@ def templates_of(view: WristView) -> tuple[FingerTemplates, ...]:
 
 
 def _templates(view: WristView, finger: int) -> FingerTemplates:
-    mcp, pip = (np.arange(low, high + 1e-9, STEP_RAD) for low, high in (MCP_RAD, PIP_RAD))
+    mcp, pip = (_steps(float(low), float(high)) for low, high in (MCP_RAD, PIP_RAD))
     grid = np.stack(np.meshgrid(mcp, pip, OVERHANG, indexing="ij"), axis=-1).reshape(-1, 3)
     angles = np.zeros((len(grid), 5, 4))
     angles[:, finger, 1:3] = grid[:, :2]
@@ -100,23 +92,27 @@ def _templates(view: WristView, finger: int) -> FingerTemplates:
     kept = length > 0.0
     palm = slice(*(int(root_uv[1] / SHRINK) + row for row in PALM_ROWS))
     toward = -apex / np.linalg.norm(apex, axis=-1, keepdims=True)
-    facing = (along * toward).sum(axis=-1)
+    facing: Float = (along * toward).sum(axis=-1)
     down = apex_uv[:, 1] > uv[:, -1, 1]
+    horizon: Float = np.where(down, HORIZON_DOWN, HORIZON_UP)
+    seen: Float = (facing > horizon).astype(np.float64)
+    top, bottom = (uv[..., 1] - size)[:, 1:].min(axis=1), (uv[..., 1] + size)[:, -1]
+    apex_v = apex_uv[:, 1]
+    table: Float = np.array(
+        [apex_v - top, bottom - apex_v, top, bottom, size[:, -1], apex[:, 2], facing, seen]
+    )
     return FingerTemplates(
         rows=rows,
         unit=(near[kept, :rows] / length[kept, None]).astype(np.float32),
-        length=length[kept].astype(np.float32),
+        log_length=np.log(length[kept]).astype(np.float32),
         palm=float(near[:, palm].mean()),
         root_uv=root_uv,
-        apex_v=apex_uv[kept, 1],
-        top_v=(uv[..., 1] - size)[kept, 1:].min(axis=1),
-        bottom_v=(uv[..., 1] + size)[kept, -1],
-        radius_px=size[kept, -1],
-        depth_m=apex[kept, 2],
-        facing=facing[kept],
-        seen=np.where(down, facing > HORIZON_DOWN, facing > HORIZON_UP)[kept],
-        bend_rad=grid[kept, :2],
+        table=table[:, kept],
     )
+
+
+def _steps(low: float, high: float) -> Float:
+    return np.arange(low, high + 1e-9, STEP_RAD, dtype=np.float64)
 
 
 def _profiles(view: WristView, points: Float, radius: Float, root_uv: Float, end_uv: Float) -> Float:
@@ -147,13 +143,13 @@ def _capsule(ray: Float, a: Float, b: Float, radius: float) -> tuple[Float, Floa
     do, oo = -(ray * a).sum(-1), (a * a).sum(-1)
     k2, k1, k0 = aa - ad * ad, aa * do - ao * ad, aa * oo - ao * ao - radius * radius * aa
     with np.errstate(invalid="ignore", divide="ignore"):
-        distance = (-k1 - np.sqrt(k1 * k1 - k0 * k2)) / k2
-        foot = ao + distance * ad
+        distance: Float = (-k1 - np.sqrt(k1 * k1 - k0 * k2)) / k2
+        foot: Float = ao + distance * ad
         for end, beyond in ((a, ~(foot > 0.0)), (b, foot >= aa)):
-            near = (ray * end).sum(-1)
-            cap = near - np.sqrt(near * near - (end * end).sum(-1) + radius * radius)
+            near: Float = (ray * end).sum(-1)
+            cap: Float = near - np.sqrt(near * near - (end * end).sum(-1) + radius * radius)
             distance = np.where(beyond, cap, distance)
-    point = distance[..., None] * ray
+    point: Float = distance[..., None] * ray
     foot = np.clip((axis * (point - a)).sum(-1) / np.maximum(aa, 1e-12), 0.0, 1.0)
     normal = (point - a - foot[..., None] * axis) / radius
     return distance, -(normal * ray).sum(-1)
