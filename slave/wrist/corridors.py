@@ -20,6 +20,8 @@ Float32 = npt.NDArray[np.float32]
 
 SHRINK = 2  # the LED image is read at a quarter of its resolution
 STATION_PX = 10.0
+_FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
+_UNUSED_PX = 80.0  # rows left out: the fingers end below the upper edge of the image
 LATERAL = (25, 25, 25, 61)  # samples across: index|middle, middle|ring, ring|little, thumb
 MARGIN = 12  # samples beyond either edge of a corridor: about a finger's breadth
 _NO_MAP: Float32 = np.empty((0, 0), dtype=np.float32)
@@ -93,10 +95,10 @@ def corridors_of(view: WristView) -> Corridors:
     thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
     root = in_image(view, view.model.rest_position_m[2])[0]
     up = (knuckles[1] - root) / np.linalg.norm(knuckles[1] - root)
-    stations = int(view.optics.height_px // STATION_PX)
-    row = (view.optics.height_px - 1 - STATION_PX * (stations - 1)) / 2.0
+    stations = int((view.optics.height_px - _UNUSED_PX) // STATION_PX)
+    row = view.optics.height_px - STATION_PX * stations
     empty = np.empty((4, stations))
-    still = Corridors(row, STATION_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP)
+    still = Corridors(row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP)
     *reach, crossed = _thumb_reach(view, still, stations)
     three = _between_fingers(view, row + STATION_PX * np.arange(stations, dtype=np.float64))
     middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
@@ -149,5 +151,5 @@ def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[floa
     seen = (depth > NEAREST_M).ravel()
     low, high = np.quantile((angle - breadth)[seen], (_RARE, 1.0 - _RARE))
     tips = radius.reshape(len(points), -1)[:, -1]
-    crossed = int(np.quantile(tips[depth[:, -1] > NEAREST_M], _RARE) / STATION_PX)
-    return (low + high) / 2.0, (high - low) / 2.0, min(crossed, stations)
+    crossed = (np.quantile(tips[depth[:, -1] > NEAREST_M], _RARE) - _FIRST_RADIUS_PX) / STATION_PX
+    return (low + high) / 2.0, (high - low) / 2.0, int(np.clip(crossed, 0, stations))

@@ -110,7 +110,9 @@ def _part(seam: int, paths: Int, lit: Bool, energy: Float32, corridors: Corridor
     loser = seam + int(off[1] > off[0])
     start = _STARTS[loser]
     of_winner = across[0] if loser == seam + 1 else across[1]
-    at = ((of_winner - corridors.middle[loser]) / corridors.half[loser] + 1.0) * (LATERAL[loser] - 1) / 2.0 + MARGIN
+    at = ((of_winner - corridors.middle[loser]) / corridors.half[loser] + 1.0) * (
+        LATERAL[loser] - 1
+    ) / 2.0 + MARGIN
     strip = energy[:, start : start + _WIDTHS[loser]]
     strip += _TAKEN * (np.abs(np.arange(_WIDTHS[loser]) - at[:, None]) < _VALLEY)
     paths[loser] = _least_paths(strip, 1)[0]
@@ -118,16 +120,19 @@ def _part(seam: int, paths: Int, lit: Bool, energy: Float32, corridors: Corridor
 
 def _near(corridors: Corridors, seams: Float) -> Bool:
     """Which samples of the thumb's corridor (S, K) lie in the valley of one of three seams (3, S)."""
-    stations = corridors.radius + STATION_PX * np.arange(seams.shape[1], dtype=np.float64)
-    out = np.zeros((seams.shape[1], _WIDTHS[3]), dtype=np.bool_)
-    samples = np.arange(_WIDTHS[3])
-    for seam in range(3):
-        radius, angle = corridors.polar(corridors.pixels(seam, seams[seam]))
-        upward = np.interp(stations, radius[::-1], angle[::-1])
-        at = (upward - corridors.middle[3]) / corridors.half[3] + 1.0
-        at = at * (LATERAL[3] - 1) / 2.0 + MARGIN
-        out |= np.abs(samples - at[:, None]) < _VALLEY
-    return out
+    count = seams.shape[1]
+    stations = corridors.radius + STATION_PX * np.arange(count, dtype=np.float64)
+    rows = np.broadcast_to(corridors.row + STATION_PX * np.arange(count, dtype=np.float64), seams.shape)
+    radius, angle = corridors.polar(np.stack([seams.ravel(), rows.ravel()], axis=-1))
+    upward = np.concatenate(
+        [
+            np.interp(stations, radius[k : k + count][::-1], angle[k : k + count][::-1])
+            for k in (0, count, 2 * count)
+        ]
+    )
+    at = (upward.reshape(3, count, 1) - corridors.middle[3, 0]) / corridors.half[3, 0] + 1.0
+    at = at * (LATERAL[3] - 1) / 2.0 + MARGIN
+    return (np.abs(np.arange(_WIDTHS[3]) - at) < _VALLEY).any(axis=0)
 
 
 def _energy(strips: Image, crossed: int) -> Float32:

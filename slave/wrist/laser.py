@@ -178,18 +178,17 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= _ENOUGH_ROWS else laser)
     noise = float(mean[0, 0]) + _NOISE * float(deviation[0, 0])
     threshold = max(_FLOOR, noise, _OF_BRIGHTEST * float(band.max()))
-    lit = band >= threshold
-    columns = np.flatnonzero(lit.any(axis=0))
-    rows = np.flatnonzero(lit.any(axis=1))
+    columns = np.flatnonzero(band.max(axis=0) >= threshold)
+    rows = np.flatnonzero(band.max(axis=1) >= threshold)
     if not len(columns):
         none = np.empty(0, dtype=np.int64)
         return Runs(none, np.empty(0), none, none, np.empty(0), none, none)
     left, top = int(columns[0]), int(rows[0])
     part = cv2.transpose(band[top : rows[-1] + 1, left : columns[-1] + 1])
     part = cv2.copyMakeBorder(part, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    around = cv2.dilate(part, _NEIGHBOURHOOD)
-    on = (part >= threshold) & (part >= _OF_NEIGHBOURHOOD * around.astype(np.float32))
-    edges = np.flatnonzero(np.diff(on.ravel()))
+    least = cv2.convertScaleAbs(cv2.dilate(part, _NEIGHBOURHOOD), alpha=_OF_NEIGHBOURHOOD)
+    on = (part >= np.maximum(least, np.uint8(min(threshold, 255.0)))).ravel()
+    edges = np.flatnonzero(on[1:] != on[:-1])
     start, end = edges[::2] + 1, edges[1::2] + 1
     size = end - start
     good = size <= _THICKEST_PX
