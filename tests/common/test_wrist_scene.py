@@ -17,7 +17,7 @@ from common.hand_model import HandModel
 from common.sim.imu import SimulatedImu
 from common.sim.scenes import renderer_of, view_by_name
 from common.sim.wrist.cones import Cones, distances, first_hits, terms
-from common.sim.wrist.flesh import PALM_GROUP, THENAR_GROUP, Flesh
+from common.sim.wrist.flesh import PALM_GROUP, THENAR_GROUP, THUMB_GROUP, Flesh
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, MOTIONS, WristScene
@@ -113,6 +113,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
         group=np.array([0, 2]),
         segment=np.array([0, 3]),
         tip=np.zeros(5, dtype=np.int64),
+        thumb=np.zeros(2, dtype=np.int64),
         still=1,
     )
     ball = Cones(
@@ -189,6 +190,21 @@ def test_truth_agrees_with_itself_and_with_the_plane() -> None:
         tip_gap = np.linalg.norm(truth.tip_xyz - truth.joints.position_m[[5, 10, 15, 20, 25]], axis=1)
         assert ((tip_gap > 0.005) & (tip_gap < 0.0105)).all()
     assert groups > 100  # or the loop would say nothing
+
+
+def test_the_joint_of_the_thumb_parts_it_from_its_ball() -> None:
+    shown = scene("poses")
+    both = 0
+    for t_s in np.arange(1.2, 60.0, 2.5).tolist():
+        joints = shown.joints_at(t_s).position_m
+        curve = shown.sheet.cross(shown.flesh.bodies(shown.joints_at(t_s)))
+        ball, beyond = (curve.points[curve.group == group] for group in (THENAR_GROUP, THUMB_GROUP))
+        before, after = (joints[k + 1] - joints[k] for k in (2, 3))
+        halving = before / np.linalg.norm(before) + after / np.linalg.norm(after)
+        assert ((ball - joints[3]) @ halving <= 1e-9).all()
+        assert ((beyond - joints[3]) @ halving > -1e-9).all()
+        both += bool(len(ball)) and bool(len(beyond))
+    assert both > 3  # or nothing was parted
 
 
 def test_a_straight_finger_is_cut_far_out_and_a_bent_one_near_its_root() -> None:

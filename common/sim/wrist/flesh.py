@@ -15,7 +15,7 @@ from common.hand_model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, H
 from common.sim.wrist.cones import Cones
 
 GROUPS = ("palm", *FINGERS, "thenar")
-PALM_GROUP, THENAR_GROUP = 0, 6
+PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6
 THUMB_SEGMENTS, FINGER_SEGMENTS = (0, 1, 3), (1, 2, 3)  # by phalanx: 3 is the last of every finger
 
 _RADIUS_SPREAD = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
@@ -33,6 +33,7 @@ class Flesh:
         group: (B,) index in GROUPS.
         segment: (B,) 0 palm or metacarpal, 1 proximal, 2 intermediate, 3 distal.
         tip: (5,) body that ends each finger.
+        thumb: (2,) bodies of the thumb's metacarpal and of the phalanx after it.
         still: How many bodies, the first ones, belong to the palm.
     """
 
@@ -44,6 +45,7 @@ class Flesh:
     group: Int
     segment: Int
     tip: Int
+    thumb: Int
     still: int
 
     @classmethod
@@ -67,6 +69,7 @@ class Flesh:
             group=np.array([part.group for part in parts]),
             segment=np.array([part.segment for part in parts]),
             tip=np.array(tips),
+            thumb=np.array([still, still + 2]),  # the phalanx's pad lies between them
             still=still,
         )
 
@@ -76,6 +79,19 @@ class Flesh:
         start = position + np.einsum("bij,bj->bi", rotation, self.start)
         stop = position + np.einsum("bij,bj->bi", rotation, self.stop)
         return Cones(start, stop, self.start_radius_m, self.stop_radius_m)
+
+    def parts(self, bodies: Cones, body: Int, points: Float) -> tuple[Int, Int]:
+        """Group and segment (N,) of skin at points (N, 3) [m] of bodies (N,).
+
+        Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts them.
+        """
+        group, segment = self.group[body], self.segment[body]
+        axis = bodies.stop_m[self.thumb] - bodies.start_m[self.thumb]
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        beyond = (points - bodies.start_m[self.thumb[1]]) @ axis.sum(axis=0) > 0.0
+        near = (group == THENAR_GROUP) | ((group == THUMB_GROUP) & (segment == THUMB_SEGMENTS[1]))
+        group = np.where(near, np.where(beyond, THUMB_GROUP, THENAR_GROUP), group)
+        return group, np.where(near, np.where(beyond, THUMB_SEGMENTS[1], THUMB_SEGMENTS[0]), segment)
 
     def tips(self, bodies: Cones) -> Float:
         """The outermost points of the skin along the last bones of the five fingers (5, 3) [m]."""

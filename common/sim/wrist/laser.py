@@ -120,11 +120,11 @@ class LaserSheet:
         lit = np.flatnonzero(np.isfinite(near))
         rays, body = np.concatenate([rays, more])[order][lit], body[lit]
         points = self.origin + near[lit, None] * rays
-        group = flesh.group[body]
+        group, segment = flesh.parts(bodies, body, points)
         joined = np.zeros(len(lit), dtype=np.bool_)
         chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
         joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
-        return LaserCurve(rays, points, body, group, flesh.segment[body], self.seen(bodies, points), joined)
+        return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
 
     def seen(self, bodies: Cones, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
         """Which of points (K, 3) [m] nothing hides from the camera that is more than `within_m` before them (K,)."""
