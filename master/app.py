@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import msgspec
 import numpy as np
@@ -18,18 +18,23 @@ _NAME = 64  # characters of a name in `Health`
 _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour would halt the loop 3 ms every second
 
 
-class Source(Protocol):
+SeenT = TypeVar("SeenT", bound=Detections)
+SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
+SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
+
+
+class Source(Protocol[SeenT_co]):
     """Where detections and samples come from: the network, or a test."""
 
-    def get(self, timeout_s: float) -> Detections | ImuSample | None:
+    def get(self, timeout_s: float) -> SeenT_co | ImuSample | None:
         """The next message, or None when none came in time."""
         ...
 
 
-class Solver(Protocol):
-    """What makes poses of detections; the `Pipeline` of a rig, or a `LivePipeline`."""
+class Solver(Protocol[SeenT_contra]):
+    """What makes poses of detections; the pipeline of a rig, or a `LivePipeline`."""
 
-    def push(self, message: Detections) -> list[SolvedPose]:
+    def push(self, message: SeenT_contra) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
         ...
 
@@ -69,13 +74,13 @@ class RunFigures:
 
 
 def run(
-    source: Source,
-    pipeline: Solver,
+    source: Source[SeenT],
+    pipeline: Solver[SeenT],
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,
     stop: threading.Event,
-    watch: Callable[[Detections], None] = lambda _message: None,
+    watch: Callable[[SeenT], None] = lambda _message: None,
 ) -> None:
     """Solve and publish until `stop` is set; `watch` is shown every camera's message once its poses are out."""
     while not stop.is_set():

@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Float, Int
 from common.clock import Clock
 from common.errors import FitError
-from common.messages import MarkerDetections
+from common.messages import Detections, MarkerDetections
 from master.app import Source
 from master.calibrate.depth.sweep import FARTHEST_M, Sweep
 
@@ -106,7 +106,9 @@ def _drift(uv: Float) -> float:
     return float(np.ptp(means, axis=0).max())
 
 
-def measure(source: Source, meter: Meter, clock: Clock, progress: Callable[[float], None]) -> Reading:
+def measure(
+    source: Source[Detections], meter: Meter, clock: Clock, progress: Callable[[float], None]
+) -> Reading:
     """Read the target that stands before the cameras now.
 
     Raises:
@@ -127,7 +129,7 @@ def measure(source: Source, meter: Meter, clock: Clock, progress: Callable[[floa
 
 
 def run_session(
-    source: Source,
+    source: Source[Detections],
     cameras: tuple[str, str],
     marker: int,
     distances: Sequence[float],
