@@ -1,0 +1,225 @@
+"""What the calibration of a wrist device is worth: laser plane, flat field and palm against the truth they are of.
+
+Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
+board; curls are those of the wrist scene, each seed another hand's skin, detected exactly but for noise.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from msgspec.structs import replace
+
+from bench.row import Row
+from common.arrays import Float
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.camera_model import CameraModel
+from common.errors import FitError
+from common.frame_recording import Illumination
+from common.geometry import (
+    intersect_plane,
+    matrix_to_rotation_vector,
+    rigid,
+    rotation_vector_to_matrix,
+    transform,
+)
+from common.hand_model import HandModel
+from common.sim.wrist.scene import WristScene
+from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer, WristBoardScene, board_poses
+from common.wrist_calibration import LaserPlane
+from master.calibrate.cameras.boards import Checkerboard, board_corners
+from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.wrist.curled import Curled
+from master.calibrate.wrist.flat_command import white_of
+from master.calibrate.wrist.flat_field import field_at, fit_flat_field
+from master.calibrate.wrist.laser_command import LinesSeen, lines_of
+from master.calibrate.wrist.lit_views import LitView
+from master.calibrate.wrist.palm_board import Mounting, palm_from_board
+from master.calibrate.wrist.palm_hand import palm_from_hand
+from master.calibrate.wrist.placed import place_corners
+from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
+from master.wrist.setup import WristSetup
+
+CALIB = Path("calib_json")
+SEEDS = range(100, 120)
+VIEWS = (3, 4, 6, 10)
+FLAT_SEEDS, FLAT_VIEWS = range(200, 204), 24
+CURL_SEEDS = range(300, 305)
+BOARD = Checkerboard(9, 6, 0.015)
+PALM_BOARD, MOUNTING = Checkerboard(7, 4, 0.010), Mounting(0.085, 0.0, 0.022, 1.0)
+LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: what a calibration from a dozen board views leaves
+KNUCKLES = np.array([0.0, 0.0, 0.08])
+
+
+def rows() -> Iterator[Row]:
+    """Errors against the truth: normal [deg], offset [mm], flat field [%], palm [deg, mm]."""
+    camera = load(CALIB / "cameras" / "wrist.json", CameraCalibration)
+    rig = load(CALIB / "rigs" / "wrist.json", RigCalibration)
+    yield from _planes(camera, rig)
+    yield from _fields(camera, rig)
+    yield from _palms(camera, rig)
+
+
+def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
+    exact: dict[int, list[tuple[PlaneFit, LaserPlane]]] = {count: [] for count in VIEWS}
+    wrong_lens: list[tuple[PlaneFit, LaserPlane]] = []
+    refused = dict.fromkeys(VIEWS, 0)
+    for seed in SEEDS:
+        plane = _plane_of(seed)
+        scene, views = _shown(camera, rig, plane, max(VIEWS), seed)
+        seen = lines_of(views, BOARD, scene.optics())
+        for count in VIEWS:
+            try:
+                exact[count].append((fit_plane(_first(seen, count)), plane))
+            except FitError:
+                refused[count] += 1
+        lens = lines_of(views, BOARD, _wrong_lens(camera, seed))
+        wrong_lens.append((fit_plane(lens.lines), plane))
+    for count in VIEWS:
+        note = f"{len(exact[count])} of {len(SEEDS)} seeds; {refused[count]} refused: board missed"
+        yield from _errors(f"laser plane, {count} views", exact[count], note)
+    yield from _errors(
+        f"laser plane, {max(VIEWS)} views, lens as measured", wrong_lens, "lens off by its sigma"
+    )
+
+
+def _errors(name: str, found: list[tuple[PlaneFit, LaserPlane]], note: str) -> Iterator[Row]:
+    turn = [_angle_deg(np.array(fit.plane.normal), np.array(true.normal)) for fit, true in found]
+    shift = [1e3 * abs(fit.plane.offset_m - true.offset_m) for fit, true in found]
+    sigma = [np.degrees(fit.normal_sigma_rad) for fit, _ in found]
+    told = f"largest {max(turn):.4f}, stated sigma {np.median(sigma):.4f}; goal 0.1; {note}"
+    yield Row(f"{name}: normal, median", float(np.median(turn)), "deg", told)
+    sigma_mm = np.median([1e3 * fit.offset_sigma_m for fit, _ in found])
+    told = f"largest {max(shift):.4f}, stated sigma {sigma_mm:.4f}; goal 0.1"
+    yield Row(f"{name}: offset, median", float(np.median(shift)), "mm", told)
+
+
+def _fields(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
+    residual: list[float] = []
+    worst: list[float] = []
+    for seed in FLAT_SEEDS:
+        scene, views = _shown(camera, rig, None, FLAT_VIEWS, seed)
+        seen = white_of(views, BOARD, scene.optics(), np.array(rig.led))
+        try:
+            fit = fit_flat_field(seen.samples, scene.optics())
+        except FitError as error:
+            yield Row(f"flat field, seed {seed}", float("nan"), "%", f"refused: {error}")
+            continue
+        residual.append(100.0 * fit.foretold_rms)
+        xy = seen.samples.xy
+        ratio = field_at(fit.field, xy) * (1.0 + (xy**2).sum(axis=1)) ** (0.5 * (LED_LOBE + LENS_POWER))
+        worst.append(100.0 * float(np.percentile(np.abs(ratio / np.median(ratio) - 1.0), 95)))
+    if residual:
+        note = f"{len(residual)} seeds of {FLAT_VIEWS} views; largest {max(residual):.2f}"
+        yield Row("flat field: residual of views left out", float(np.median(residual)), "%", note)
+        yield Row(
+            "flat field against the truth, p95 where paper was",
+            float(np.median(worst)),
+            "%",
+            f"largest {max(worst):.2f}",
+        )
+
+
+def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
+    optics, true = CameraModel.of(camera, np.eye(4)), np.array(rig.T_camera_palm)
+    uv = optics.project(transform(true @ MOUNTING.T_palm_board(PALM_BOARD), board_corners(PALM_BOARD)))
+    by_board: list[tuple[float, float]] = []
+    for seed in SEEDS:
+        noise = 0.1 * np.random.default_rng(seed).standard_normal(uv.shape)
+        fit = palm_from_board([place_corners(uv + noise, PALM_BOARD, optics)], PALM_BOARD, MOUNTING)
+        by_board.append(_palm_error(fit.T_camera_palm, true))
+    yield from _palm_rows(
+        "palm by a board, corners 0.1 px", by_board, "one view; the ruler's error comes on top"
+    )
+    by_hand: list[tuple[float, float]] = []
+    sigma: list[float] = []
+    refused = 0
+    for seed in CURL_SEEDS:
+        try:
+            fit = palm_from_hand(*_curl(camera, rig, seed))
+        except FitError:
+            refused += 1
+            continue
+        sigma.append(float(np.degrees(fit.turn_sigma_rad)))
+        by_hand.append(_palm_error(fit.T_camera_palm, true))
+    if by_hand:
+        note = f"begun up to 6 deg and 6 mm off; stated sigma {np.median(sigma):.1f} deg; {refused} refused"
+        yield from _palm_rows("palm by a curl", by_hand, note)
+
+
+def _palm_rows(name: str, found: list[tuple[float, float]], note: str) -> Iterator[Row]:
+    turn, shift = np.array(found).T
+    yield Row(f"{name}: turn, median", float(np.median(turn)), "deg", f"largest {turn.max():.2f}; {note}")
+    yield Row(f"{name}: knuckles, median", float(np.median(shift)), "mm", f"largest {shift.max():.2f}")
+
+
+def _plane_of(seed: int) -> LaserPlane:
+    """A laser tilted by up to 6 degrees, 26 to 34 mm from the camera."""
+    rng = np.random.default_rng([seed, 1])
+    x, y, z = rotation_vector_to_matrix(np.radians(rng.uniform(-6.0, 6.0, 3)))[:, 1].tolist()
+    return LaserPlane(normal=(x, y, z), offset_m=0.03 + float(rng.uniform(-0.004, 0.004)))
+
+
+def _shown(
+    camera: CameraCalibration, rig: RigCalibration, plane: LaserPlane | None, count: int, seed: int
+) -> tuple[WristBoardScene, tuple[LitView, ...]]:
+    """A board before the device and its rendered views; without a plane anywhere, and without laser frames."""
+    own = rig if plane is None else replace(rig, laser_plane=plane, laser=None)
+    optics = CameraModel.of(camera, np.eye(4))
+    poses = board_poses(optics, BOARD.columns, BOARD.rows, BOARD.square_m, plane, count, seed)
+    scene = WristBoardScene(own, camera, BOARD.columns, BOARD.rows, BOARD.square_m, poses, seed=seed)
+    renderer = WristBoardRenderer(scene)
+    kinds = [lit for lit in Illumination if lit is not Illumination.NONE]
+    if plane is None:
+        kinds.remove(Illumination.LASER)
+    views: list[LitView] = []
+    for pose in range(count):
+        images = {lit: renderer.render(pose, lit) for lit in kinds}
+        views.append(LitView(str(pose), {lit: lambda image=image: image for lit, image in images.items()}))
+    return scene, tuple(views)
+
+
+def _first(seen: LinesSeen, count: int) -> tuple[ViewLine, ...]:
+    return tuple(line for line in seen.lines if int(line.name) < count)
+
+
+def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
+    """The camera with a lens that is off as a measured one is."""
+    lens = camera.intrinsics
+    assert lens is not None
+    rng = np.random.default_rng([seed, 2])
+    focal = float(rng.normal(0.0, LENS_SIGMA_PX[0]))
+    u, v = rng.normal(0.0, LENS_SIGMA_PX[1], 2).tolist()
+    off = replace(
+        lens, fx_px=lens.fx_px + focal, fy_px=lens.fy_px + focal, cx_px=lens.cx_px + u, cy_px=lens.cy_px + v
+    )
+    return CameraModel.of(replace(camera, intrinsics=off), np.eye(4))
+
+
+def _curl(camera: CameraCalibration, rig: RigCalibration, seed: int) -> tuple[Curled, WristSetup]:
+    """What a slave sees of a guided curl, and the device with a palm as wrong as a drawing."""
+    hand = load(CALIB / "hands" / f"{rig.hand}.json", HandProfile)
+    scene = WristScene.by_name("curl@indoor", rig, {camera.name: camera}, hand, seed)
+    rng = np.random.default_rng(seed)
+    truths = [scene.truth(t) for t in np.linspace(0.0, 0.5 * scene.period_s, 30)]
+    uv = np.array([truth.laser_uv[1:6] for truth in truths]) + rng.normal(0.0, 0.3, (30, 5, 2))
+    tip = np.array([np.where(truth.tip_visible[:, None], truth.tip_uv, np.nan) for truth in truths])
+    tip = tip + rng.normal(0.0, 2.0, tip.shape)
+    plane = rig.laser_plane
+    assert plane is not None
+    points = intersect_plane(np.zeros(3), scene.optics.ray(uv), np.array(plane.normal), plane.offset_m)
+    true = scene.T_camera_palm
+    turn = rotation_vector_to_matrix(np.radians(rng.uniform(-6.0, 6.0, 3)))
+    rough = rigid(turn @ true[:3, :3], true[:3, 3] + rng.uniform(-0.006, 0.006, 3))
+    setup = WristSetup.of(replace(rig, T_camera_palm=matrix_of(rough)), camera, HandModel.of(hand))
+    return Curled(points, tip), setup
+
+
+def _palm_error(T: Float, true: Float) -> tuple[float, float]:
+    """Turn [deg], and how far the knuckles are off [mm]."""
+    turn = float(np.degrees(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ true[:3, :3].T))))
+    return turn, float(1e3 * np.linalg.norm(transform(T, KNUCKLES) - transform(true, KNUCKLES)))
+
+
+def _angle_deg(a: Float, b: Float) -> float:
+    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
