@@ -39,6 +39,13 @@ _THICKEST_PX = 64
 _FEWEST = 3
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
 _LEAST_M = 2e-3
+# Standard deviations, by what the centroids of simulated hands of several seeds are off by.
+_LINE_PX = 0.5  # one whole line
+_IN_PARTS_PX = (
+    2.0  # a line of several parts, some of which may be another's or be hidden, or cut by the image's edge
+)
+_BALL_OF_THUMB = 4.0  # of the mean distance of doubtful pieces from the centroid of the thumb
+_UNSHOWN_PX = 10.0  # half a finger: no seam was seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,10 +97,12 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
     share = np.ones(len(points))
     thumb = finger == 0
     share[thumb] = reach.of_thumb(points[thumb])
-    return _centroids(points, runs, finger, share, view)
+    return _centroids(points, runs, finger, share, view, shown=fingers.shown)
 
 
-def _centroids(points: Float, runs: Runs, finger: Int, share: Float, view: WristView) -> LaserLines:
+def _centroids(
+    points: Float, runs: Runs, finger: Int, share: Float, view: WristView, *, shown: bool
+) -> LaserLines:
     """Centroids by length of the pieces of line, each with its share of the finger."""
     here = np.arange(len(points))
     kept = (runs.following != here) & (finger[runs.following] == finger)
@@ -128,7 +137,15 @@ def _centroids(points: Float, runs: Runs, finger: Int, share: Float, view: Wrist
     seen = line * depth / view.optics.matrix[0, 0] >= _LEAST_M
     away = whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0])
     doubt = np.bincount(owner, away, 6)[1:] / np.maximum(length, 1e-9)
-    sigma = np.hypot(0.3, doubt)
+    lines = np.bincount(finger[owners[0]] + 1, minlength=6)[1:]
+    column = points[:, 0]
+    edge = np.isin(np.arange(5), finger[(column < 1.0) | (column > view.optics.width_px - 2.0)])
+    sigma = np.sqrt(
+        _LINE_PX**2
+        + (_BALL_OF_THUMB * doubt) ** 2
+        + np.where((lines > 1) | edge, _IN_PARTS_PX, 0.0) ** 2
+        + (0.0 if shown else _UNSHOWN_PX) ** 2
+    )
     return LaserLines(
         np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
     )

@@ -18,6 +18,7 @@ from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
 INDEX = 1
+VISIBLE_M = 2e-3
 
 
 def drawn(
@@ -123,3 +124,26 @@ def laser_errors(name: str, count: int, seed: int) -> tuple[Float, float]:
         out[k] = np.linalg.norm(VIEW.on_plane(found.uv) - truth.laser_pt[1:6], axis=1)[1:]
     out[~seen] = np.nan
     return out, float((out[seen] < 6e-3).mean())
+
+
+def test_doubt_is_that_of_the_errors_and_more_where_the_leds_show_nothing() -> None:
+    one = scene("curl@indoor", 41)
+    renderer = WristRenderer(one, "wrist")
+    off: list[Float] = []
+    for k in range(12):
+        t = one.period_s * k / 12
+        ambient, laser, led = (lit(renderer.render(t, kind), BLACK) for kind in STROBE)
+        fingers = separate(lit(led, ambient), VIEW)
+        found = laser_lines(lit(laser, ambient), fingers, VIEW)
+        truth = one.truth(t)
+        off.append(
+            (np.abs(found.uv - truth.laser_uv[1:6]) / found.sigma_px[:, None])[
+                truth.laser_len_vis[1:6] > VISIBLE_M
+            ]
+        )
+        blind = laser_lines(lit(laser, ambient), separate(BLACK, VIEW), VIEW)
+        both = np.isfinite(found.sigma_px) & np.isfinite(blind.sigma_px)
+        assert (blind.sigma_px[both] > 9.0).all()
+    deviations = np.concatenate(off)
+    deviations = deviations[np.isfinite(deviations)]
+    assert 0.3 < np.quantile(deviations, 0.68) < 1.3
