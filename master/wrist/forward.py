@@ -26,7 +26,7 @@ from common.hand_model import HandModel
 from common.hand_presets import preset_couplings
 from master.wrist.laser_plane import PlaneAxes
 from master.wrist.setup import WristSetup
-from master.wrist.skin import Skin, first_hits
+from master.wrist.skin import ROOT, Skin, first_hits
 
 PIP, DIP = 2, 3
 CLOSED_RAD = np.radians(120.0)
@@ -179,7 +179,7 @@ class LaserCut:
         seen_at = first_hits(np.zeros(3), points / distance[..., None], spheres, radius).min(axis=-1)
         body = hits.argmin(axis=-1)
         # What the metacarpal of the thumb carries is its ball, and no finger.
-        own = lit & (seen_at > distance - _SEEN_M) & ((body > 2) | (f > 0))
+        own = lit & (seen_at > distance - _SEEN_M) & ((body >= ROOT - 1) | (f > 0))
         image = points[..., :2] / points[..., 2:]
         step, gap = np.diff(image, axis=-2), np.linalg.norm(np.diff(points, axis=-2), axis=-1)
         whole = own[..., 1:] & own[..., :-1] & (gap < _STRETCH * on_line[..., None])

@@ -26,27 +26,29 @@ from common.hand_model import CHAINS, Chains, HandModel
 
 SPREAD = 0.10  # of the palmar distance, standard deviation
 # Of the spheres of a finger: on which of its three bones, and at what share of it.
-PLACES = ((0, 0.0), (0, 0.5), (0, 0.75), (1, 0.0), (1, 0.5), (2, 0.0), (2, 1.0))
+PLACES = ((0, 0.0), (0, 0.3), (0, 0.5), (0, 0.75), (1, 0.0), (1, 0.5), (2, 0.0), (2, 1.0))
+ROOT = 4  # spheres of the first bone, which of a thumb is in its ball
 _BONE = np.array([bone for bone, _ in PLACES])
 _SHARE = np.array([share for _, share in PLACES])
-_JOINTS = (3, 5)  # spheres that sit on a joint, where the skin lies on the bisector
-# Palmar distance of the skin from the bone, and radius [share of the distance of the knuckles], thumb ... little.
+_JOINTS = (4, 6)  # spheres that sit on a joint, where the skin lies on the bisector
+# Palmar distance of the skin from the bone, and radius [share of the distance of the knuckles], thumb ... little. The
+# pads of the palm reach over the first half of a finger's first bone.
 _PALMAR = np.array(
     [
-        [0.200, 0.200, 0.200, 0.180, 0.173, 0.155, 0.133],
-        [0.168, 0.168, 0.163, 0.142, 0.128, 0.102, 0.100],
-        [0.188, 0.188, 0.183, 0.163, 0.133, 0.107, 0.105],
-        [0.166, 0.166, 0.145, 0.150, 0.133, 0.112, 0.104],
-        [0.117, 0.117, 0.114, 0.105, 0.104, 0.089, 0.081],
+        [0.200, 0.200, 0.200, 0.200, 0.180, 0.173, 0.155, 0.133],
+        [0.250, 0.205, 0.168, 0.163, 0.142, 0.128, 0.102, 0.100],
+        [0.300, 0.245, 0.188, 0.183, 0.163, 0.133, 0.107, 0.105],
+        [0.250, 0.200, 0.166, 0.145, 0.150, 0.133, 0.112, 0.104],
+        [0.230, 0.170, 0.117, 0.114, 0.105, 0.104, 0.089, 0.081],
     ]
 )
 _RADIUS = np.array(
     [
-        [0.200, 0.200, 0.200, 0.165, 0.155, 0.160, 0.140],
-        [0.153, 0.153, 0.142, 0.143, 0.133, 0.132, 0.112],
-        [0.137, 0.137, 0.135, 0.133, 0.133, 0.130, 0.119],
-        [0.127, 0.127, 0.132, 0.128, 0.120, 0.109, 0.100],
-        [0.135, 0.135, 0.125, 0.122, 0.112, 0.110, 0.100],
+        [0.200, 0.200, 0.200, 0.200, 0.165, 0.155, 0.160, 0.140],
+        [0.153, 0.153, 0.153, 0.142, 0.143, 0.133, 0.132, 0.112],
+        [0.137, 0.137, 0.137, 0.135, 0.133, 0.133, 0.130, 0.119],
+        [0.127, 0.127, 0.127, 0.132, 0.128, 0.120, 0.109, 0.100],
+        [0.135, 0.135, 0.135, 0.125, 0.122, 0.112, 0.110, 0.100],
     ]
 )
 
@@ -56,8 +58,8 @@ class Skin:
     """The skin of one hand.
 
     Attributes:
-        palmar_m: (5, 7) distance of the skin from the bone on the palmar side [m], finger by sphere.
-        radius_m: (5, 7) of the spheres [m].
+        palmar_m: (5, 8) distance of the skin from the bone on the palmar side [m], finger by sphere.
+        radius_m: (5, 8) of the spheres [m].
     """
 
     palmar_m: Float
@@ -75,7 +77,7 @@ class Skin:
         return cls(radius, radius)
 
     def spheres(self, chains: Chains) -> Float:
-        """Centres (..., 5, 7, 3) [m] of the spheres, in the frame of the chains."""
+        """Centres (..., 5, 8, 3) [m] of the spheres, in the frame of the chains."""
         bone = np.diff(chains.position_m, axis=-2)
         along = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
         dorsal = chains.rotation[..., :3, :, 1]

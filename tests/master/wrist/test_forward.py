@@ -80,9 +80,9 @@ def test_a_thumb_goes_through_the_same_share_of_each_range() -> None:
 
 def test_skin_is_that_of_the_hand_file_or_of_a_hand_of_its_size(setup: WristSetup) -> None:
     stated = Skin.of(setup.model)
-    np.testing.assert_allclose(stated.palmar_m[1, [0, 3, 5, 6]], setup.model.radius_m[[7, 8, 9, 10]])
+    np.testing.assert_allclose(stated.palmar_m[1, [0, 4, 6, 7]], setup.model.radius_m[[7, 8, 9, 10]])
     bare = HandModel.of(msgspec.structs.replace(setup.model.profile, radius_m=None))
-    thick = 2e3 * Skin.of(bare).radius_m[1:, 3]
+    thick = 2e3 * Skin.of(bare).radius_m[1:, 4]
     assert (np.diff(thick[1:]) < 0.0).all()  # middle, ring, little
     assert ((thick > 12.0) & (thick < 20.0)).all()  # of fingers at the PIP, mm
 
