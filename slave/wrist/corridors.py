@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Int
+from common.errors import CalibrationError
 from common.hand_limits import ABDUCTION
 from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, in_image, thumb_postures
 from slave.wrist.view import WristView
@@ -90,7 +91,11 @@ class Corridors:
 
 @lru_cache(maxsize=8)
 def corridors_of(view: WristView) -> Corridors:
-    """The corridors of one wrist rig and hand."""
+    """The corridors of one wrist rig and hand.
+
+    Raises:
+        CalibrationError: The palm lies so that no finger can be seen.
+    """
     knuckles = in_image(view, view.model.rest_position_m[[7, 12, 22]])[0]
     thumb_side = 1.0 if knuckles[0, 0] > knuckles[2, 0] else -1.0
     root = in_image(view, view.model.rest_position_m[2])[0]
@@ -132,6 +137,10 @@ def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, 
     """Middle and half width (S,) of the intervals low ... high (N,) that lie near each station."""
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
+    if not known.any():
+        raise CalibrationError(
+            "T_camera_palm: the camera does not see the fingers of this hand; calibrate the palm's pose"
+        )
     lows = np.array([np.quantile(low[row], 0.1) for row in near[known]])
     highs = np.array([np.quantile(high[row], 0.9) for row in near[known]])
     ends = [np.interp(stations, stations[known], end) for end in (lows, highs)]

@@ -2,10 +2,11 @@
 
 The palm stands still in the image (`slave.wrist.view`), so what the fingers of this hand can do says in which corridor
 each of the four seams runs (`slave.wrist.corridors`). Along the stations of a corridor a seam is the path of least
-energy, found by dynamic programming, all four at once. Energy is the brightness beside what is brightest within a
-finger's breadth, so that a dark crease between touching fingers is as good a valley as the open gap between spread
-ones, near the LEDs and far from them. Of paths as dark as each other the one nearer to the middle of the corridor is
-taken: in an image that shows nothing the seams are those of the hand's geometry alone.
+energy, found by dynamic programming: first the three among index ... little, side by side, then the thumb's, which
+lies over them where they meet. A pixel costs little where it is a valley, dark between brighter neighbours: a crease
+between touching fingers as well as the open gap between spread ones, near the LEDs and far from them. The skin of a
+finger costs so much that no seam crosses one. Of paths alike the one nearer to the middle of its corridor is taken: in
+an image that shows nothing the seams are those of the hand's geometry alone.
 """
 
 from dataclasses import dataclass
@@ -21,6 +22,9 @@ from slave.wrist.view import WristView
 NONE = -1  # no finger
 _DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
 _SHOWN = 24  # grey levels that the brightest of a lit hand exceeds
+_SKIN = 20.0  # energy of a bright, even surface: no seam crosses a finger
+_OPEN = 1.0  # energy in the dark beside one finger only
+_BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
 _ASIDE = 3.0  # energy at the edge of a corridor
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
 _ONE_VALLEY = 0.35  # of the distance of two corridors, and of the rows of the hand
@@ -136,10 +140,12 @@ def _near(corridors: Corridors, seams: Float) -> Bool:
 
 
 def _energy(strips: Image, crossed: int) -> Float32:
-    """Energy of the straightened corridors (S, K): 0 in the valley that is looked for, 1 in the dark, 3 on a finger.
+    """Energy of the straightened corridors (S, K), from 0 in a black valley to `_SKIN` on a finger.
 
-    A pixel is as much of a valley as it lies below the darker of its two sides. The thumb's seam has the thumb on one
-    side, and on the other perhaps nothing near: only the thumb's side counts.
+    A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
+    beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
+    counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
+    no thumb at all beyond it would mean that the seam lies outside of the thumb.
     """
     before = cv2.dilate(strips, _BESIDE, anchor=(MARGIN - 1, 0))
     behind = cv2.dilate(strips, _BESIDE, anchor=(0, 0))
@@ -150,15 +156,15 @@ def _energy(strips: Image, crossed: int) -> Float32:
     above = 1.0 - cv2.subtract(side, strips) / (side + np.float32(_DARK))
     energy = np.maximum(above, level)
     energy *= energy * energy
-    energy *= 20.0 * energy
+    energy *= _SKIN * energy  # the sixth power
     bare = side <= _DARK
-    energy[:, :thumb][bare[:, :thumb]] = 1.0
-    energy[crossed:, thumb:][bare[crossed:, thumb:]] = 0.2
+    energy[:, :thumb][bare[:, :thumb]] = _OPEN
+    energy[crossed:, thumb:][bare[crossed:, thumb:]] = _BEYOND_THUMB
     return energy
 
 
 def _least_paths(energy: Float32, count: int) -> Int:
-    """Path (count, S) of least energy through each corridor, as its sample at every station; at most one aside a step.
+    """Path (count, S) of least energy through each corridor, as its sample at every station; at most two aside a step.
 
     Args:
         energy: (S, K), the corridors side by side, fences between them.

@@ -1,10 +1,11 @@
-"""Where the laser meets each finger: the line in the laser image, cut by the seams, its centroid by length (D5).
+"""Where the laser meets each finger: the line in the laser image, cut between fingers, its centroid by length (D5).
 
 The line runs from side to side, so each column of the image holds it as short bright runs, one per surface. A run's
-row is its centre of mass above a high share of its own peak: a line that saturates has a flat top and a glow beneath
-it on either side, and only the flanks of the top tell where it is. Runs of adjacent columns are links of one line
-where they overlap; a jump is the border of another surface. A finger's centroid weighs its links by their length in
-the image, not by columns: at the sides of a finger the line falls steeply, and a column there is many pixels of line.
+row is its centre of mass above a share of its own peak: a line that saturates has a flat top and a glow on either side
+of it, and only the flanks of the top tell where it is. Runs of adjacent columns are one line where they overlap; a
+jump is the border of another surface. The seams say whose a line is; where they cut one, the cut is moved to the
+crease. A finger's centroid weighs its line by length in the image, not by columns: at the sides of a finger the line
+falls steeply, the last of it in less than a column.
 """
 
 from dataclasses import dataclass
@@ -24,25 +25,24 @@ _OF_BRIGHTEST = 0.1  # of the brightest of the image: less is glow
 _OF_NEIGHBOURHOOD = 0.5  # of the brightest within `_NEIGHBOURHOOD` rows: less is glow beside the line
 _NEIGHBOURHOOD = np.ones((1, 33), dtype=np.uint8)
 _DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
-_NEAR_PX = 24
+_NEAR_PX = 24  # cells in which lines are compared with what is near by
 _NEAR = np.ones((5, 3), dtype=np.uint8)
 _SECOND = 0.65  # of the brightest run of the same column
 _STEEPEST = 8.0  # px of row per root of a column: how fast a line goes round the side of a finger
 _FADED = 0.5  # of the brightest of the line: its edge, through the blur of the camera
-_SHORT = 8  # columns
-_GLOW_OF_SHORT = 0.7
-_GLOW = 0.4  # of the brightest near by
+_GLOW = 0.4  # of the brightest near by: a darker line is glow
+_SHORT, _GLOW_OF_SHORT = 8, 0.7  # of so few columns it must be brighter
 _TOP, _FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
 _OF_PEAK, _OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
-_JUMP_PX = 6.0
-_THICKEST_PX = 64
-_FEWEST = 3
+_JUMP_PX = 6.0  # between columns: another surface
+_THICKEST_PX = 64  # the line on a thumb right before the camera; what is thicker is no line
+_FEWEST = 3  # columns of a line
 _CREASE_PX = 20  # columns on either side of a seam in which the crease may be
-_LEAST_M = 2e-3
+_LEAST_M = 2e-3  # of line that must be seen
 # Standard deviations, by what the centroids of simulated hands of several seeds are off by.
 _LINE_PX = 0.5  # one whole line
 _IN_PARTS_PX = (
-    2.0  # a line of several parts, some of which may be another's or be hidden, or cut by the image's edge
+    2.0  # a line of several parts, some of which may be another's or hidden, or one cut by the image
 )
 _BALL_OF_THUMB = 4.0  # of the mean distance of doubtful pieces from the centroid of the thumb
 _UNSHOWN_PX = 10.0  # half a finger: no seam was seen
@@ -139,16 +139,18 @@ def _centroids(
     doubt = np.bincount(owner, away, 6)[1:] / np.maximum(length, 1e-9)
     lines = np.bincount(finger[owners[0]] + 1, minlength=6)[1:]
     column = points[:, 0]
-    edge = np.isin(np.arange(5), finger[(column < 1.0) | (column > view.optics.width_px - 2.0)])
-    sigma = np.sqrt(
-        _LINE_PX**2
-        + (_BALL_OF_THUMB * doubt) ** 2
-        + np.where((lines > 1) | edge, _IN_PARTS_PX, 0.0) ** 2
-        + (0.0 if shown else _UNSHOWN_PX) ** 2
-    )
+    cut = np.isin(np.arange(5), finger[(column < 1.0) | (column > view.optics.width_px - 2.0)])
+    sigma = _sigma_px(doubt, (lines > 1) | cut, shown=shown)
     return LaserLines(
         np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
     )
+
+
+def _sigma_px(doubt: Float, parts: Bool, *, shown: bool) -> Float:
+    """Standard deviations (5,) of the centroids: of what is whole, in parts, doubtful, and where no seam was seen."""
+    in_parts = np.where(parts, _IN_PARTS_PX, 0.0)
+    unshown = 0.0 if shown else _UNSHOWN_PX
+    return np.sqrt(_LINE_PX**2 + in_parts**2 + (_BALL_OF_THUMB * doubt) ** 2 + unshown**2)
 
 
 def _ends(points: Float, finger: Int, last: Int, back: Int, outwards: float) -> tuple[Float, Int]:
