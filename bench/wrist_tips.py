@@ -1,0 +1,144 @@
+"""Fingertips of the wrist device: how near, how many, how many of something else, and the time they take.
+
+On the recordings, where they are, and on simulated hands and palm poses of other seeds in every light. A tip counts as
+found within 6 px of the end of its finger; false is a report more than 25 px from it, or of an end that is not seen.
+Of the recordings the one shift by which their LED frames lie beside their truth is told and taken off.
+"""
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from msgspec.structs import replace
+
+from bench.row import Row, median_us
+from common.arrays import Bool, Float, Image
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.frame_recording import Illumination, open_recording
+from common.hand_profiles import generated_profile
+from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.scene import AMBIENTS, WristScene
+from slave.cameras.replay import read_png
+from slave.wrist.background import lit
+from slave.wrist.fingers import separate
+from slave.wrist.fingertips import fingertips
+from slave.wrist.view import WristView
+
+ROOT = Path(__file__).resolve().parents[1]
+RECORDINGS = ("curl", "mcp", "spread", "left_small")
+MOTIONS = ("curl", "poses", "spread")
+HAND_LENGTHS_M = (0.17, 0.185, 0.2)  # one for each seed
+SEEDS, POSES = (201, 202, 203), 14
+PALM_TURN_RAD, PALM_SHIFT_M = np.radians(3.0), 3e-3
+FOUND_PX, ELSEWHERE_PX = 6.0, 25.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """One difference of LED and ambient frame, its true ends of fingers (5, 2) [px], and which are seen (5,)."""
+
+    view: WristView
+    led: Image
+    truth_px: Float
+    seen: Bool
+
+
+def rows() -> Iterator[Row]:
+    """Rows of the recordings, of each light, and of the time."""
+    cv2.setNumThreads(1)
+    data = Path(os.environ.get("PHALANX_DATASETS", ROOT / "../shared/datasets")).resolve()
+    if (data / "wrist").is_dir():
+        yield from _scored(
+            "recordings", [one for name in RECORDINGS for one in recorded(data, name)], shifted=True
+        )
+    else:
+        yield Row("recordings: skipped", 0.0, "", f"none at {data}: set PHALANX_DATASETS")
+    shown: list[Shown] = []
+    for ambient in AMBIENTS:
+        shown = [
+            one
+            for motion in MOTIONS
+            for seed, length in zip(SEEDS, HAND_LENGTHS_M, strict=True)
+            for one in simulated(f"{motion}@{ambient}", seed, length)
+        ]
+        yield from _scored(f"simulated, {ambient}", shown, shifted=False)
+    one = max(shown, key=lambda each: int(each.seen.sum()))
+    fingers = separate(one.led, one.view)
+    middle, half = median_us(lambda: fingertips(one.led, fingers, one.view))
+    yield Row("fingertips of one triple", middle, "us", f"+-{half:.0f}; goal 600")
+
+
+def recorded(data: Path, name: str) -> list[Shown]:
+    """The triples of a recording."""
+    folder = data / "wrist" / name
+    recording = open_recording(folder)
+    rig = recording.manifest.wrist_rig()
+    camera = recording.manifest.cameras[rig.cameras[0]]
+    view = WristView.of(rig, camera, load(data / f"hands/{rig.hand}.json", HandProfile))
+    size = (camera.height_px, camera.width_px)
+    images = [read_png(folder / row.file, size, grey=True) for row in recording.frames_of(camera.name)]
+    truth = np.load(folder / "truth.npz")
+    return [
+        Shown(view, lit(images[3 * k + 2], images[3 * k]), truth["tip_uv"][k], truth["tip_visible"][k])
+        for k in range(len(images) // 3)
+    ]
+
+
+def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
+    """Poses of a generated hand before a palm that lies a little differently."""
+    rng = np.random.default_rng([seed, 6])
+    rig = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
+    camera = load(ROOT / f"calib_json/cameras/{rig.cameras[0]}.json", CameraCalibration)
+    hand = generated_profile(f"{hand_length_m:.3f} m", "right", hand_length_m)
+    palm = np.array(rig.T_camera_palm)
+    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, PALM_TURN_RAD, 3))[0] @ palm[:3, :3]
+    palm[:3, 3] += rng.normal(0.0, PALM_SHIFT_M, 3)
+    rows = [tuple(row) for row in palm.tolist()]
+    rig = replace(rig, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))
+    scene = WristScene.by_name(name, rig, {camera.name: camera}, hand, seed)
+    renderer, view = WristRenderer(scene, camera.name), WristView.of(rig, camera, hand)
+    out: list[Shown] = []
+    for t in (np.arange(POSES) * scene.period_s / POSES).tolist():
+        led, ambient = (renderer.render(t, kind) for kind in (Illumination.LED, Illumination.AMBIENT))
+        truth = scene.truth(t)
+        out.append(Shown(view, lit(led, ambient), truth.tip_uv, truth.tip_visible))
+    return out
+
+
+def _scored(name: str, shown: list[Shown], shifted: bool) -> Iterator[Row]:
+    found = [fingertips(one.led, separate(one.led, one.view), one.view) for one in shown]
+    off = np.array([tips.uv - one.truth_px for tips, one in zip(found, shown, strict=True)])
+    sigma = np.array([tips.sigma_px for tips in found])
+    seen = np.array([one.seen for one in shown])
+    reported = np.isfinite(off[..., 0])
+    note = ""
+    if shifted:
+        shift = np.median(off[seen & reported], axis=0)
+        off = off - shift
+        note = f"LED frames lie ({shift[0]:+.1f}, {shift[1]:+.1f}) px beside the truth; "
+    distance = np.linalg.norm(off, axis=2)
+    four = seen & (np.arange(5) > 0)
+    both = four & reported
+    yield Row(
+        f"{name}: median", float(np.median(distance[both])), "px", f"{note}{four.sum()} seen, thumbs apart"
+    )
+    yield Row(
+        f"{name}: found within 6 px",
+        100.0 * float((distance[four] <= FOUND_PX).mean()),
+        "%",
+        "goal 90, thumbs apart",
+    )
+    elsewhere = reported & (distance > ELSEWHERE_PX)
+    yield Row(
+        f"{name}: of something else",
+        100.0 * float(elsewhere.sum() / max(reported.sum(), 1)),
+        "%",
+        f"goal <= 5; of an end that is not seen {100.0 * float((reported & ~seen).sum() / max(reported.sum(), 1)):.1f}",
+    )
+    pull = off[both] / sigma[both][:, None]
+    yield Row(
+        f"{name}: error by sigma", float(np.median(np.abs(pull)) / 0.6745), "", "goal 1, of the middle half"
+    )
