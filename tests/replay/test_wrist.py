@@ -1,0 +1,156 @@
+"""The whole offline line on rendered recordings of the wrist camera with exact truth, by command line.
+
+The bars are those the project has set itself: laser points within 0.6 mm (median), on the right finger for 95 % of
+those with at least 2 mm of line in sight; 90 % of the visible fingertips within 6 px, at most 5 % of those reported
+none; of natural flexion the PIP within 2 degrees rms up to 85 degrees.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.frame_recording import FrameRecording, Illumination, open_recording
+from master.outputs.files import load_poses
+from master.rig import RigSetup, load_hand
+from master.solve import solve
+from tests.replay.test_datasets import command
+
+_TIPS = pytest.mark.xfail(strict=True, reason="tips are found 8 px beside the outermost skin, always alike")
+_THUMB = pytest.mark.xfail(
+    strict=True, reason="in two of six poses the thumb's point lies nearer to the thenar's"
+)
+_HIDDEN = pytest.mark.xfail(strict=True, reason="tips that just turned away are still reported")
+HANDS = {"curl": "right", "mcp": "right", "spread": "right", "left_small": "left-small"}
+
+
+@dataclass(frozen=True)
+class Replay:
+    """One replayed recording: its folder, its hand, and where the results are."""
+
+    recording: Path
+    hand: Path
+    out: Path
+
+    @property
+    def summary(self) -> dict[str, float]:
+        return json.loads((self.out / "summary.json").read_text())
+
+    def truth(self) -> dict[str, Float]:
+        with np.load(self.recording / "truth.npz") as file:
+            return {name: file[name] for name in file.files}
+
+
+@pytest.fixture(scope="module")
+def replays(datasets: Path, root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Replay]:
+    """Every wrist recording, replayed once by command line."""
+    if not (datasets / "wrist").is_dir():
+        pytest.skip(f"no rendered wrist recordings at {datasets / 'wrist'}")
+    done: dict[str, Replay] = {}
+    for name, hand in HANDS.items():
+        recording, profile = datasets / "wrist" / name, datasets / "hands" / f"webxr-{hand}.json"
+        out = tmp_path_factory.mktemp(name)
+        command(root, "deploy", "replay", str(recording), "--hand", str(profile), "--out", str(out))
+        done[name] = Replay(recording, profile, out)
+    return done
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_every_triple_becomes_a_pose(replays: dict[str, Replay], name: str) -> None:
+    summary, count = replays[name].summary, len(replays[name].truth()["angles"])
+    assert summary["poses"] == count
+    assert summary["triples_missed"] == summary["lost"] == 0
+    poses = load_poses(replays[name].out / "poses.npz")
+    assert poses.marker_count == 0
+    assert (np.diff(poses.t_ns) > 0).all()
+
+
+@pytest.mark.parametrize("name", ["curl", "mcp", "spread", pytest.param("left_small", marks=_THUMB)])
+def test_laser_points_are_on_the_right_finger(replays: dict[str, Replay], name: str) -> None:
+    assert replays[name].summary["laser_right"] >= 0.95
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_laser_points_are_where_the_laser_is(replays: dict[str, Replay], name: str) -> None:
+    assert replays[name].summary["laser_mm"] <= 0.6
+
+
+@_TIPS
+@pytest.mark.parametrize("name", HANDS)
+def test_visible_fingertips_are_found(replays: dict[str, Replay], name: str) -> None:
+    assert replays[name].summary["tip_within_6px"] >= 0.90
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["mcp", "spread", pytest.param("curl", marks=_HIDDEN), pytest.param("left_small", marks=_HIDDEN)],
+)
+def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> None:
+    assert replays[name].summary["tip_false"] <= 0.05
+
+
+def test_natural_flexion_is_told_by_the_laser_alone_up_to_85_degrees(replays: dict[str, Replay]) -> None:
+    summary = replays["curl"].summary
+    assert summary["pip_rms_deg"] <= 2.0
+    for finger in ("index", "middle", "ring", "little"):
+        assert summary[f"pip_rms_deg_{finger}"] <= 3.0, finger
+    truth = replays["curl"].truth()["angles"][:, [7, 11, 15, 19]]
+    assert summary["pip_untracked"] <= 0.1 * (truth <= np.radians(85.0)).sum()
+
+
+def test_beyond_the_point_where_the_laser_stands_still_the_output_says_so(replays: dict[str, Replay]) -> None:
+    poses = load_poses(replays["curl"].out / "poses.npz")
+    pip = replays["curl"].truth()["angles"][:, [7, 11, 15, 19]]
+    tip = [10, 15, 20, 25]
+    spread = np.sqrt(np.trace(poses.cov_m2[:, tip], axis1=2, axis2=3))
+    bent, open_ = pip > np.radians(100.0), pip < np.radians(70.0)
+    known = spread[open_ & np.isfinite(spread)]
+    # Either not tracked any more, or so uncertain that nobody takes it for a measurement.
+    unsure = ~poses.tracked[:, tip] | (spread > 3.0 * np.median(known))
+    assert unsure[bent].mean() >= 0.9
+
+
+def test_another_replay_writes_the_same_bytes(replays: dict[str, Replay], root: Path, tmp_path: Path) -> None:
+    first = replays["left_small"]
+    command(root, "deploy", "replay", str(first.recording), "--hand", str(first.hand), "--out", str(tmp_path))
+    for name in ("detections_wrist.npz", "poses.npz"):
+        assert (tmp_path / name).read_bytes() == (first.out / name).read_bytes()
+
+
+def write_exact(recording: FrameRecording, setup: RigSetup, out: Path) -> Path:
+    """Detections without errors: laser points and visible tips of the truth, at the times of the laser frames.
+
+    The points are projected: the set's `laser_uv` weighs the line by its brightness, `laser_pt` by its length.
+    """
+    with np.load(recording.folder / "truth.npz") as truth:
+        laser = setup.models["wrist"].project(truth["laser_pt"][:, 1:6])
+        tips = np.where(truth["tip_visible"][..., None], truth["tip_uv"], np.nan)
+    rows = [row for row in recording.rows if row.illumination is Illumination.LASER]
+    np.savez(
+        out / "detections_wrist.npz",
+        t_ns=np.array([row.t_ns for row in rows], np.int64),
+        seq=np.array([row.seq for row in rows], np.int64),
+        laser_uv=laser,
+        tip_uv=tips,
+    )
+    return out
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_of_exact_detections_the_master_leaves_nothing(datasets: Path, tmp_path: Path, name: str) -> None:
+    folder = datasets / "wrist" / name
+    if not folder.is_dir():
+        pytest.skip(f"no rendered wrist recording at {folder}")
+    recording = open_recording(folder)
+    rig = recording.manifest.wrist_rig()
+    hand = load_hand(None, rig.hand, datasets / "hands" / f"webxr-{HANDS[name]}.json")
+    setup = RigSetup.of(rig, recording.manifest.cameras, hand)
+    summary = solve(recording, setup, write_exact(recording, setup, tmp_path), tmp_path)
+    assert isinstance(summary["laser_mm"], float)
+    assert summary["laser_mm"] < 0.02  # a ray through the true centroid meets the plane in the true point
+    assert summary["laser_right"] == 1.0
+    assert summary["laser_missed"] == summary["triples_missed"] == 0.0
+    assert (summary["tip_px"], summary["tip_within_6px"], summary["tip_false"]) == (0.0, 1.0, 0.0)
