@@ -32,6 +32,7 @@ _BORDER = 0.3  # ... but never more of a square than this
 _NOISE_TIMES = 6.0
 _PAIRS = 300
 _MIN_PROFILES = 12
+_TOO_SHORT = "the laser line is seen on less than a square of the board: let it cross the board's middle"
 _LINE_FLOOR_PX = 0.015  # of a line's place: speckle and paper that no number of profiles averages out
 
 
@@ -149,6 +150,8 @@ def _profiles(
     from_border = np.abs(base / side - np.rint(base / side)).min(axis=1) * side
     clear = from_border > min(_BORDER_PX * pixel_m, _BORDER * side)
     s, base = s[inside & clear], base[inside & clear]
+    if len(s) < _MIN_PROFILES:  # such as a line along the border of two rows
+        raise FitError(_TOO_SHORT)
     d = np.arange(-_REACH_PX, _REACH_PX + 0.5 * _STEP_PX, _STEP_PX)
     places = base[:, None] + (d[:, None] * pixel_m) * across
     flat = np.concatenate([places, np.zeros((*places.shape[:2], 1))], axis=-1)
@@ -170,9 +173,7 @@ def _profiles(
     good = (np.abs(centre) < 0.5 * _REACH_PX) & (height > _NOISE_TIMES * noise) & (height > 3.0 * beside)
     s, centre = s[good], centre[good]
     if len(s) < _MIN_PROFILES or np.ptp(s) < side:
-        raise FitError(
-            "the laser line is seen on less than a square of the board: let it cross the board's middle"
-        )
+        raise FitError(_TOO_SHORT)
     kept = np.ones(len(s), dtype=np.bool_)
     slope = level = 0.0
     off = centre

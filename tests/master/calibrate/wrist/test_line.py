@@ -63,6 +63,19 @@ def test_specks_of_glare_on_the_board_do_not_bend_the_line() -> None:
     assert off_plane_mm(laser, frames[AMBIENT], placed) < 0.3
 
 
+def test_a_line_along_the_border_of_two_rows_is_refused() -> None:
+    frames, placed = first()
+    laser = frames[AMBIENT].copy()
+    ends = (
+        placed.T_camera_board[:3, 3]
+        + BOARD.square_m * np.array([[-1.0], [9.0]]) * placed.T_camera_board[:3, 0]
+    )
+    a, b = np.rint(OPTICS.project(ends)).astype(int).tolist()
+    cv2.line(laser, a, b, 255, 2)
+    with pytest.raises(FitError, match="less than a square"):
+        line_on_board(laser, frames[AMBIENT], placed, BOARD, OPTICS)
+
+
 @pytest.mark.parametrize(
     ("kind", "match"),
     [(AMBIENT, "no laser line"), (LED, "no laser line|less than a square|no straight line")],
