@@ -39,7 +39,10 @@ _SMALL = np.ones((3, 3), np.uint8)  # narrower than a finger, wider than a windo
 LED_LEAST = 0.08  # share of the cells that LEDs light broadly: a palm fills a sixth of the picture or more
 LED_NEVER = 0.04  # share up to which it is none: the halo of a laser on a near thumb, a hand that moved
 LASER_LEAST = 8  # cells of flash: the line on one finger
-LASER_OF_REST = 2.0  # times as many cells as flash elsewhere, or are thin and brighter in the ambient frame
+# How many times as many cells of flash on the hand as there are
+LASER_OF_ELSEWHERE = 2.0  # of flash elsewhere
+LASER_OF_OWN = 4.0  # of flash on the hand in the ambient frame: another laser frame has as many
+LASER_OF_EXCESS = 8.0  # of lines within the hand that the ambient frame has and another has not
 VALID_LEAST = 0.25  # share of the cells that are not saturated: with fewer nothing is told
 
 
@@ -59,7 +62,7 @@ class Evidence:
     Attributes:
         led: The LED frame has broad light that the ambient frame has not.
         laser: The laser frame has a flash where the LEDs light.
-        alone: There are no such lines in the ambient frame, nor flashes elsewhere, against that flash.
+        alone: There are no such lines in the ambient frame, nor as many flashes there or elsewhere.
         steady: Nothing broad came or went with the laser, or went with the LEDs.
     """
 
@@ -102,18 +105,20 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
         return Evidence(-inf, -inf, -inf, -inf)
     led_gain, laser_gain = _over(led, ambient), _over(laser, ambient)
     led_loss, laser_loss = _over(ambient, led), _over(ambient, laser)
-    skin = cv2.morphologyEx(_lit(np.minimum(led_gain, _over(led, laser))), cv2.MORPH_OPEN, _SMALL)
-    near = cv2.dilate(skin, _LINE_HIGH)
+    led_over_laser = _over(led, laser)
+    near = _near(np.minimum(led_gain, led_over_laser))
     inside = cv2.erode(cv2.morphologyEx(_lit(led_gain), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
     flash = _thin(np.minimum(laser_gain, _over(laser, led)))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
-    excess = [cv2.countNonZero(cv2.bitwise_and(_thin(loss), inside)) for loss in (led_loss, laser_loss)]
+    own = cv2.countNonZero(cv2.bitwise_and(_thin(np.minimum(laser_loss, led_loss)), _near(led_over_laser)))
+    excess = max(cv2.countNonZero(cv2.bitwise_and(_thin(loss), inside)) for loss in (led_loss, laser_loss))
+    rest = max(LASER_OF_ELSEWHERE * elsewhere, LASER_OF_OWN * own, LASER_OF_EXCESS * excess)
     came_or_went = max(_broad(laser_gain), _broad(laser_loss), _broad(led_loss)) / valid
     return Evidence(
         _octaves(_broad(led_gain) / valid, LED_LEAST),
         _octaves(on_hand, LASER_LEAST),
-        _octaves(on_hand, LASER_OF_REST * max(elsewhere, *excess)),
+        _octaves(on_hand, rest),
         -_octaves(came_or_went, LED_NEVER),
     )
 
@@ -131,6 +136,11 @@ def _over(bright: Image, dark: Image) -> Image:
 
 def _lit(over: Image) -> cv2.typing.MatLike:
     return cv2.threshold(over, 0, 255, cv2.THRESH_BINARY)[1]
+
+
+def _near(over: Image) -> cv2.typing.MatLike:
+    """What the LEDs light, and a line's height above and below."""
+    return cv2.dilate(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SMALL), _LINE_HIGH)
 
 
 def _broad(over: Image) -> int:
