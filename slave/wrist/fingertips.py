@@ -98,8 +98,10 @@ def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
         if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS:
             continue
         tip, spread = place(led, near, optics, line, bend)
-        if spread <= MOST_SIGMA_PX and fingers.finger_of(tip[None])[0] == finger:
+        if spread <= MOST_SIGMA_PX:
             uv[finger], sigma[finger], depth[finger] = tip, spread, bend.depth_m
+    strays = fingers.finger_of(uv) != np.arange(5)
+    uv[strays], sigma[strays], depth[strays] = np.nan, np.nan, np.nan
     return Fingertips(uv, sigma, depth)
 
 

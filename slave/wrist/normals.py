@@ -35,7 +35,9 @@ def normals_of(depth: Float32, ray: Float32, cosine: Float32) -> Float32:
     points = ray * smooth[..., None]
     across = points[1:-1, 2:] - points[1:-1, :-2]
     down = points[2:, 1:-1] - points[:-2, 1:-1]
-    steep = np.cross(down, across)  # x right, y down: towards the camera
+    steep = np.empty_like(down)  # down x across: x right, y down, so towards the camera
+    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
+        steep[..., k] = down[..., i] * across[..., j] - down[..., j] * across[..., i]
     view = -ray[1:-1, 1:-1] * cosine[1:-1, 1:-1, None]
     aside = steep - np.einsum("hwk,hwk->hw", steep, view)[..., None] * view
     aside /= np.sqrt(np.einsum("hwk,hwk->hw", aside, aside))[..., None] + _TINY
