@@ -14,6 +14,7 @@ import numpy.typing as npt
 from common.arrays import Float, Int
 from common.errors import CalibrationError
 from common.hand_limits import ABDUCTION
+from common.hand_model import CHAINS, METACARPALS
 from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, in_image, thumb_postures
 from slave.wrist.view import WristView
 
@@ -47,6 +48,7 @@ class Corridors:
         thumb_crosses: How many of the circles the thumb crosses however it is held.
         map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the shrunken image, float32; the corridors side
             by side, each with its margins.
+        palm: (P, 2) columns and rows of the shrunken image where the palm is; none where the image does not show it.
     """
 
     row: float
@@ -59,6 +61,7 @@ class Corridors:
     thumb_crosses: int
     map_x: Float32
     map_y: Float32
+    palm: Int
 
     def polar(self, uv: Float) -> tuple[Float, Float]:
         """Radius [px] and angle [rad], positive towards the thumb's side, of pixels (N, 2) about the thumb's root."""
@@ -103,7 +106,9 @@ def corridors_of(view: WristView) -> Corridors:
     stations = int((view.optics.height_px - _UNUSED_PX) // STATION_PX)
     row = view.optics.height_px - STATION_PX * stations
     empty = np.empty((4, stations))
-    still = Corridors(row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP)
+    still = Corridors(
+        row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP, _palm(view)
+    )
     *reach, crossed = _thumb_reach(view, still, stations)
     three = _between_fingers(view, row + STATION_PX * np.arange(stations, dtype=np.float64))
     middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
@@ -111,6 +116,16 @@ def corridors_of(view: WristView) -> Corridors:
     grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
     grid = np.concatenate(grids, axis=1) / SHRINK
     return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
+
+
+def _palm(view: WristView) -> Int:
+    """Columns and rows (P, 2) of the shrunken image along the outer half of the metacarpals of index ... little."""
+    rest = view.model.rest_position_m
+    roots, ends = rest[list(METACARPALS)], rest[CHAINS[1:, 0]]
+    uv = in_image(view, np.concatenate([roots + share * (ends - roots) for share in (0.5, 0.75, 1.0)]))[0]
+    cells = (uv / SHRINK).astype(np.int64)
+    inside = (cells >= 0).all(axis=1) & (cells[:, 0] < view.optics.width_px // SHRINK)
+    return cells[inside & (cells[:, 1] < view.optics.height_px // SHRINK)]
 
 
 def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:

@@ -21,7 +21,7 @@ from slave.wrist.view import WristView
 
 NONE = -1  # no finger
 _DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
-_SHOWN = 24  # grey levels that the brightest of a lit hand exceeds
+_SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
 _SKIN = 20.0  # energy of a bright, even surface: no seam crosses a finger
 _OPEN = 1.0  # energy in the dark beside one finger only
 _BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
@@ -80,7 +80,8 @@ def separate(led: Image, view: WristView) -> Fingers:
     corridors = corridors_of(view)
     size = (led.shape[1] // SHRINK, led.shape[0] // SHRINK)
     small = cv2.resize(cv2.erode(led, _CREASE), size, interpolation=cv2.INTER_NEAREST)
-    shown = bool(small.max() > _SHOWN)
+    palm = small[corridors.palm[:, 1], corridors.palm[:, 0]] if len(corridors.palm) else small
+    shown = bool(np.median(palm) > _SHOWN)
     strips = cv2.remap(
         small, corridors.map_x, corridors.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )

@@ -44,6 +44,7 @@ _LINE_PX = 0.5  # one whole line
 _IN_PARTS_PX = (
     2.0  # a line of several parts, some of which may be another's or hidden, or one cut by the image
 )
+_FAINT, _FAINT_PX = 3.0 * _FLOOR, 5.0  # a line no brighter: what is left of one where the sun saturates
 _BALL_OF_THUMB = 4.0  # of the mean distance of doubtful pieces from the centroid of the thumb
 _UNSHOWN_PX = 10.0  # half a finger: no seam was seen
 
@@ -140,15 +141,17 @@ def _centroids(
     lines = np.bincount(finger[owners[0]] + 1, minlength=6)[1:]
     column = points[:, 0]
     cut = np.isin(np.arange(5), finger[(column < 1.0) | (column > view.optics.width_px - 2.0)])
-    sigma = _sigma_px(doubt, (lines > 1) | cut, shown=shown)
+    brightest = np.zeros(6)
+    np.maximum.at(brightest, finger + 1, runs.peak)
+    sigma = _sigma_px(doubt, (lines > 1) | cut, brightest[1:] < _FAINT, shown=shown)
     return LaserLines(
         np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
     )
 
 
-def _sigma_px(doubt: Float, parts: Bool, *, shown: bool) -> Float:
-    """Standard deviations (5,) of the centroids: of what is whole, in parts, doubtful, and where no seam was seen."""
-    in_parts = np.where(parts, _IN_PARTS_PX, 0.0)
+def _sigma_px(doubt: Float, parts: Bool, faint: Bool, *, shown: bool) -> Float:
+    """Standard deviations (5,) of centroids: of lines whole, in parts, faint, doubtful, and where no seam was seen."""
+    in_parts = np.where(faint, _FAINT_PX, np.where(parts, _IN_PARTS_PX, 0.0))
     unshown = 0.0 if shown else _UNSHOWN_PX
     return np.sqrt(_LINE_PX**2 + in_parts**2 + (_BALL_OF_THUMB * doubt) ** 2 + unshown**2)
 
