@@ -6,7 +6,7 @@ probability for each. From it comes where the end of the finger lies between the
 above and the step below, whose places are then measured at full resolution; and how likely that end is seen at all.
 A finger that points away ends behind its own horizon, one that is folded shows its back: no tip is reported.
 
-The thumb shows its side to the wrist, its end is beyond the horizon; it is not sought.
+The thumb shows its side to the wrist and its end seldom, only where it is laid across the palm; it is not sought.
 """
 
 from dataclasses import dataclass

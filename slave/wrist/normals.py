@@ -20,8 +20,8 @@ _TINY = np.float32(1e-20)
 def normals(seen: RelativeDepth, optics: LedOptics) -> Float32:
     """Unit normals (h, w, 3), camera frame, of depths (h, w); NaN where a pixel or a neighbour has none.
 
-    Scale of the depth is of no matter. Exact where the surface faces the camera; within 5 degrees up to a slant of 60
-    degrees on things of a finger's breadth.
+    Scale of the depth is of no matter. On things of a finger's breadth they are within 5 degrees on average up
+    to a slant of 60 degrees; a broader surface looks flatter than it is.
     """
     return normals_of(seen.depth, optics.ray, optics.cosine)
 

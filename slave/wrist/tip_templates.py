@@ -27,11 +27,9 @@ PIP_RAD = np.radians((0.0, 120.0))  # the range of D8
 # How far a finger reaches beyond its tip joint, in radii of its end: the half sphere about the joint, and a pad of the
 # same thickness before it, as where the tip joint of a tracked hand lies within the last bone.
 OVERHANG = (1.0, 1.4, 1.8)
-SOFT = (
-    0.3  # share of the light that comes from inside the skin and from the skin around, whatever the incidence
-)
-# A fingertip's end is seen while it is on this side of the finger's own horizon, give or take 2 to 3 mm of a pad that
-# is thicker than the nail's side: pointing away it is seen a little longer, pointing down into the fist not at all.
+SOFT = 0.3  # of the light comes from inside the skin and from the skin around, whatever the incidence
+# Cosines towards the camera from which on the end of a finger counts as seen: a little beyond its own horizon, by what
+# 2 to 3 mm of the pad before it are; the pad's side is thicker than the nail's, which is before it in a fist.
 HORIZON_UP, HORIZON_DOWN = -0.25, -0.15
 PALM_ROWS = (2, 14)  # rows below the knuckle, where no finger but a folded one is seen
 LIKENESS = 5e-4  # of 1 - cosine between profile and template: what flesh differs from capsules
