@@ -9,7 +9,8 @@ PIP is that divided by 0.54 and its doubt is large, which the covariance says:
 
 R is the noise of the sensing, skin whose thickness is not known, and the part of the line that is not seen. The
 centroid of a line shorter than the table expects is off across by up to half of what is missing, and by a third of
-that along, as skin curves away.
+that along, as skin curves away. Near the end of the branch it is the finger's own last phalanx that hides the line,
+within some degrees: the shorter the line, the nearer to that end is the finger.
 """
 
 from dataclasses import dataclass
@@ -29,6 +30,9 @@ _ABDUCTION_RAD = np.radians(20.0)
 _WHOLE = 0.75  # a line seen to this share of its length is not missing a part
 _HARDLY = 0.5  # less of it than this is no measurement of the finger
 _CURVES = 1 / 3
+_FOLD_RAD = np.radians(
+    20.0
+)  # so near to the end of the branch a short line is one that the last phalanx hides
 _PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 _OFF_RAD = np.radians(
     5.0
@@ -90,7 +94,9 @@ class AngleBelief:
         aside = (closed.abduction_rad < low) | (closed.abduction_rad > high)
         off = seen & ~closed.past & (aside | (shown < _HARDLY))
         left = self._most - closed.closing_rad
-        closing = closed.closing_rad + np.where(closed.past, 0.5 * np.maximum(left, 0.0), 0.0)
+        closing = closed.closing_rad + np.where(
+            closed.past, 0.5 * np.maximum(left, 0.0), self._folded(closed, shown)
+        )
         angles = self._model.clamp(self._curve.angles(closing, closed.abduction_rad))
         noise = self._noise(closed, cov_m2, distance_m, shown)
         information = (
@@ -102,6 +108,14 @@ class AngleBelief:
         cov = np.asarray(np.linalg.inv(information), np.float64)
         cov[~seen] = np.nan
         return FingerAngles(angles, cov, seen & ~closed.past & ~off, closed.past, off)
+
+    def _folded(self, closed: Closed, shown: Float) -> Float:
+        """How much farther fingers (5,) are closed than their points say: their last phalanx hides part of the line."""
+        left = closed.end_rad - closed.closing_rad
+        folding = left < _FOLD_RAD
+        folding[0] = False  # a thumb never reaches its own tip
+        hidden = np.clip((_WHOLE - shown) / (_WHOLE - _HARDLY), 0.0, 1.0)
+        return np.where(folding, hidden * np.maximum(left, 0.0), 0.0)
 
     def _noise(self, closed: Closed, cov_m2: Float, distance_m: Float, shown: Float) -> Float:
         """How sure the points are, (5, 2, 2) [m^2], finite."""

@@ -31,6 +31,7 @@ class Closed:
         abduction_rad: (5,).
         by_angles: (5, 2, 4) how the point (across, along) moves with each angle by itself [m/rad].
         length_px: (5,) of the line that such a finger shows, undistorted.
+        end_rad: (5,) closing at which the branch ends there.
         past: (5,) the point is past the end of the branch: the finger is closed as far as `closing_rad` or more.
     """
 
@@ -38,6 +39,7 @@ class Closed:
     abduction_rad: Float
     by_angles: Float
     length_px: Float
+    end_rad: Float
     past: Bool
 
 
@@ -66,15 +68,16 @@ class Inverse:
         value[~seen, :2] = np.nan
         past = value[:, 3] > _PAST_M
         past &= seen
-        return Closed(value[:, 0], value[:, 1], value[:, 4:].reshape(5, 2, 4), value[:, 2], past)
+        by_angles = value[:, 5:].reshape(5, 2, 4)
+        return Closed(value[:, 0], value[:, 1], by_angles, value[:, 2], value[:, 4], past)
 
 
 def _finger(table: ForwardTable, f: int) -> tuple[Float, Float]:
     """What points of a grid on the plane say of finger `f`.
 
     Returns:
-        Its lowest point (2,) [m], and for its points (X, Y, 12): closing, abduction, length of line, how far past the
-        end of the branch [m], and how the point moves with the angles (2, 4).
+        Its lowest point (2,) [m], and for its points (X, Y, 13): closing, abduction, length of line, how far past the
+        end of the branch [m], closing at that end, and how the point moves with the angles (2, 4).
     """
     last = table.last[f]
     rows, columns = table.point_m.shape[1:3]
@@ -95,16 +98,17 @@ def _finger(table: ForwardTable, f: int) -> tuple[Float, Float]:
     at[:, 1] += np.where(closed, 0.0, (points[:, 0] - value[:, 0]) / steep)
     at[:, 1] = np.clip(at[:, 1], -_OUTSIDE[1], columns - 1.0 + _OUTSIDE[1])
     step = np.array([np.diff(table.closing_rad[f, :2])[0], np.diff(table.abduction_rad[f, :2])[0]])
-    out = np.empty((len(points), 12))
-    out[:, :2] = np.array([table.closing_rad[f, 0], table.abduction_rad[f, 0]]) + at * step
-    out[:, 2], out[:, 3] = value[:, 6], past
-    slope, by_angles = table.curve.slope[f], out[:, 4:].reshape(-1, 2, 4)
+    first = np.array([table.closing_rad[f, 0], table.abduction_rad[f, 0]])
+    out = np.empty((len(points), 13))
+    out[:, :2] = first + at * step
+    out[:, 2], out[:, 3], out[:, 4] = value[:, 6], past, first[0] + end[:, 0] * step[0]
+    slope, by_angles = table.curve.slope[f], out[:, 5:].reshape(-1, 2, 4)
     by_angles[..., ABDUCTION] = by_column[:, :2] / step[1]
     by_angles[..., FLEXION], by_angles[..., DIP] = value[:, 2:4], value[:, 4:6]
     by_angles[..., PIP] = (
         by_row[:, :2] / step[0] - slope[FLEXION] * value[:, 2:4] - slope[DIP] * value[:, 4:6]
     )
-    return low, out.reshape(int(count[0]), int(count[1]), 12)
+    return low, out.reshape(int(count[0]), int(count[1]), 13)
 
 
 def _search(table: ForwardTable, f: int, points: Float, nodes: Float, places: Int) -> Float:

@@ -306,3 +306,24 @@ def test_a_rendered_curl_from_exact_points(datasets: Path) -> None:
     assert usual.sum() > 60
     assert max(rms) < 2.0, dict(zip(FINGERS[1:], rms, strict=True))
     assert not tracked[pip > 101.0].any()
+
+
+def test_a_line_cut_short_by_the_folding_phalanx_is_nearer_to_the_end_of_the_branch(
+    alone: WristPipeline, setup: WristSetup
+) -> None:
+    bent = solved_with_share(alone, setup, 80.0, 1.0), solved_with_share(alone, setup, 80.0, 0.3)
+    far = solved_with_share(alone, setup, 45.0, 1.0), solved_with_share(alone, setup, 45.0, 0.3)
+    moved = bent[1].angles_rad[1:, 2] - bent[0].angles_rad[1:, 2]
+    assert (moved > np.radians(2.0)).any()
+    assert (moved < np.radians(20.0)).all()
+    assert not bent[1].tracked[CHAINS[1:, 3]].any()  # what hides a line may be another finger as well
+    assert np.allclose(far[0].angles_rad, far[1].angles_rad)
+
+
+def solved_with_share(pipeline: WristPipeline, setup: WristSetup, pip_deg: float, share: float) -> HandPose:
+    """The pose of a natural hand of which only that share of each line is seen, about its centre."""
+    angles = natural(setup, pip_deg)
+    length_px = LaserCut(setup)(angles[None, None])[1][:, 0, 0]
+    whole = message(shown(setup, angles), pipeline._last_ns + TRIPLE_NS)
+    (only,) = pipeline.push(msgspec.structs.replace(whole, laser_px=share * length_px))
+    return only.pose
