@@ -43,7 +43,7 @@ from master.wrist.setup import WristSetup
 CALIB = Path("calib_json")
 SEEDS = range(100, 120)
 VIEWS = (3, 4, 6, 10)
-FLAT_SEEDS, FLAT_VIEWS = range(200, 204), 24
+FLAT_SEEDS, FLAT_VIEWS = range(200, 204), 40
 CURL_SEEDS = range(300, 305)
 BOARD = Checkerboard(9, 6, 0.015)
 PALM_BOARD, MOUNTING = Checkerboard(7, 4, 0.010), Mounting(0.085, 0.0, 0.022, 1.0)
