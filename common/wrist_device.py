@@ -1,0 +1,99 @@
+"""A wrist device with its hand as arrays, checked: what its slave and the master know alike before the first frame.
+
+Everything is in the frame of the wrist camera. The device is strapped to the forearm and the palm pose is calibrated:
+so the palm stands still in the image, and the roots of the fingers are known pixels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import CameraCalibration, RigCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.geometry import intersect_plane
+from common.hand_model import HandModel
+
+_ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
+_ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
+_LEAST_M = 1e-3  # a plane nearer to the lens than this tells no distance
+_ORIGIN = np.zeros(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristDevice:
+    """Camera, laser plane, palm and hand.
+
+    Attributes:
+        optics: The camera; its rig frame is its own.
+        model: The hand, left or right.
+        T_camera_palm: Palm frame -> camera frame (4, 4) [m].
+        normal: Unit normal (3,) of the laser plane.
+        offset_m: The plane is normal . X = offset_m.
+    """
+
+    optics: CameraModel
+    model: HandModel
+    T_camera_palm: Float
+    normal: Float
+    offset_m: float
+
+    @staticmethod
+    def joined(rig: RigCalibration, camera: CameraCalibration, model: HandModel) -> "WristDevice":
+        """Bring the files together.
+
+        Raises:
+            CalibrationError: The rig is none of a wrist device, belongs to another camera, or lacks its laser plane
+                or palm pose; these are impossible; the camera lacks its intrinsics.
+        """
+        where = f"rig {rig.name!r}"
+        if rig.kind != "wrist":
+            raise CalibrationError(f"{where}: kind is {rig.kind!r}; a wrist device needs 'wrist'")
+        if rig.cameras != (camera.name,):
+            raise CalibrationError(
+                f"{where}: cameras: {', '.join(rig.cameras)}; the camera file is that of {camera.name!r}"
+            )
+        normal, offset_m = _plane(rig, where)
+        return WristDevice(CameraModel.of(camera, np.eye(4)), model, _palm(rig, where), normal, offset_m)
+
+    def on_plane(self, uv: Float) -> Float:
+        """Where the rays through pixels (..., 2) meet the laser plane (..., 3) [m] (D7).
+
+        NaN where the pixel is, and where the plane is behind the camera or along the ray.
+        """
+        return intersect_plane(_ORIGIN, self.optics.ray(uv), self.normal, self.offset_m)
+
+
+def _plane(rig: RigCalibration, where: str) -> tuple[Float, float]:
+    """Unit normal (3,) and offset [m] of the laser plane."""
+    if rig.laser_plane is None:
+        raise CalibrationError(
+            f"{where}: laser_plane is missing, which `phalanx-master calibrate laser-plane` measures"
+        )
+    normal = np.array(rig.laser_plane.normal)
+    length = float(np.linalg.norm(normal))
+    normal, offset_m = normal / length, rig.laser_plane.offset_m / length
+    if abs(normal[1]) < _ACROSS or offset_m * normal[1] < _LEAST_M:
+        raise CalibrationError(
+            f"{where}: laser_plane: normal {', '.join(f'{n:.3f}' for n in normal)}, offset_m {offset_m:.4f}: the plane"
+            " must cross the fingers on the palm's side of the lens, its normal about y and y positive where it is"
+        )
+    return normal, offset_m
+
+
+def _palm(rig: RigCalibration, where: str) -> Float:
+    """`T_camera_palm` (4, 4) [m]."""
+    if rig.T_camera_palm is None:
+        raise CalibrationError(
+            f"{where}: T_camera_palm is missing, which `phalanx-master calibrate palm` measures"
+        )
+    palm = np.array(rig.T_camera_palm, dtype=np.float64)
+    turned = palm[:3, :3]
+    if (
+        not np.allclose(turned @ turned.T, np.eye(3), atol=_ROTATION_WITHIN)
+        or np.linalg.det(turned) < 0.0
+        or not np.array_equal(palm[3], [0.0, 0.0, 0.0, 1.0])
+    ):
+        raise CalibrationError(f"{where}: T_camera_palm: not a rotation and a shift, last row 0 0 0 1")
+    return palm
