@@ -8,14 +8,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
+from slave.wrist.registration import shifted
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
+
+_NONE = np.zeros(2)
+_NONE.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,14 +62,15 @@ class WristDetector:
     Of a pose nothing is kept: two triples have nothing to do with each other.
     """
 
-    def __init__(self, view: WristView, frame_rate_hz: float) -> None:
+    def __init__(self, view: WristView, frame_rate_hz: float, led_shift_px: Float = _NONE) -> None:
         """Begin with no frame; it takes a second or two to prepare the view.
 
         Args:
             view: What the device knows of itself and of the hand.
             frame_rate_hz: Of the camera file: single frames per second, three per triple.
+            led_shift_px: (2,) how far the LED frames of a recording lie beside its laser frames.
         """
-        self._strobe = Strobe(frame_rate_hz)
+        self._strobe, self._led_shift = Strobe(frame_rate_hz), led_shift_px
         self._view = prepared(view)
 
     @property
@@ -75,7 +81,7 @@ class WristDetector:
     def push(self, frame: Frame) -> WristFound | None:
         """Take the next frame of the camera; what was found, where it completes a triple."""
         triple = self._strobe.push(frame)
-        return None if triple is None else find(triple, self._view)
+        return None if triple is None else find(triple, self._view, self._led_shift)
 
     def replace(self, view: WristView) -> None:
         """See with another view from the next triple on. Not from the loop's thread: it takes a second or two."""
@@ -92,10 +98,10 @@ def prepared(view: WristView) -> WristView:
     return view
 
 
-def find(triple: Triple, view: WristView) -> WristFound:
-    """What one triple shows of the five fingers."""
+def find(triple: Triple, view: WristView, led_shift_px: Float = _NONE) -> WristFound:
+    """What one triple shows of the five fingers; its LED frame lies `led_shift_px` (2,) beside its laser frame."""
     ambient = triple.ambient.image
-    led = lit(triple.led.image, ambient)
+    led = shifted(lit(triple.led.image, ambient), -led_shift_px)
     fingers = separate(led, view)
     laser = laser_lines(lit(triple.laser.image, ambient), fingers, view)
     return WristFound(triple, laser, fingertips(led, fingers, view))
