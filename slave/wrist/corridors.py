@@ -20,7 +20,6 @@ from slave.wrist.view import WristView
 
 Float32 = npt.NDArray[np.float32]
 
-SHRINK = 2  # the LED image is read at a quarter of its resolution
 STATION_PX = 10.0
 _FIRST_RADIUS_PX = 80.0  # nearer to its root the thumb has no seam
 _UNUSED_PX = 80.0  # rows left out: the fingers end below the upper edge of the image
@@ -46,9 +45,9 @@ class Corridors:
         middle: (4, S) middle of each corridor: u [px], or angle [rad].
         half: (4, S) half width.
         thumb_crosses: How many of the circles the thumb crosses however it is held.
-        map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the shrunken image, float32; the corridors side
+        map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the image, float32; the corridors side
             by side, each with its margins.
-        palm: (P, 2) columns and rows of the shrunken image where the palm is; none where the image does not show it.
+        palm: (P, 2) columns and rows of the image where the palm is; none where the image does not show it.
     """
 
     row: float
@@ -79,6 +78,11 @@ class Corridors:
         """Lateral positions (M, S) of samples (M, S) of some of the corridors."""
         count = np.array(LATERAL[seams])[:, None] - 1
         return self.middle[seams] + self.half[seams] * (2.0 * (path - MARGIN) / count - 1.0)
+
+    def sample(self, seam: int, lateral: Float) -> Float:
+        """Samples (..., S) of one corridor, with fractions, of lateral positions (..., S): `across` turned round."""
+        share = (lateral - self.middle[seam]) / self.half[seam]
+        return (share + 1.0) * (LATERAL[seam] - 1) / 2.0 + MARGIN
 
     def pixels(self, seam: int, lateral: Float) -> Float:
         """Pixels (S, ..., 2) of lateral positions (S, ...) of one seam."""
@@ -114,18 +118,18 @@ def corridors_of(view: WristView) -> Corridors:
     middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
     placed = replace(still, middle=middle, half=half, thumb_crosses=crossed)
     grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
-    grid = np.concatenate(grids, axis=1) / SHRINK
+    grid = np.concatenate(grids, axis=1)
     return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
 
 
 def _palm(view: WristView) -> Int:
-    """Columns and rows (P, 2) of the shrunken image along the outer half of the metacarpals of index ... little."""
+    """Columns and rows (P, 2) of the image along the outer half of the metacarpals of index ... little."""
     rest = view.model.rest_position_m
     roots, ends = rest[list(METACARPALS)], rest[CHAINS[1:, 0]]
     uv = in_image(view, np.concatenate([roots + share * (ends - roots) for share in (0.5, 0.75, 1.0)]))[0]
-    cells = (uv / SHRINK).astype(np.int64)
-    inside = (cells >= 0).all(axis=1) & (cells[:, 0] < view.optics.width_px // SHRINK)
-    return cells[inside & (cells[:, 1] < view.optics.height_px // SHRINK)]
+    cells = uv.astype(np.int64)
+    inside = (cells >= 0).all(axis=1) & (cells[:, 0] < view.optics.width_px)
+    return cells[inside & (cells[:, 1] < view.optics.height_px)]
 
 
 def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
