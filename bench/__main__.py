@@ -34,7 +34,9 @@ SECTIONS = {
     "wrist": "A strobed triple of the wrist device, step by step; baseline: undistorted images, a blob per finger",
     "wrist_strobe": "Triples of a stream of dropped, doubled and swapped frames; baseline: counting by three",
     "wrist_laser": "Laser points, recorded and simulated from dark to sun; baseline: the centroid of the blob",
+    "wrist_tips": "Fingertips, recorded and simulated from dark to sun; exact truth, no baseline",
     "wrist_forward": "Flexion by the place of the laser on the finger; baseline: the printed cubic",
+    "wrist_calibration": "Laser plane by number of views, flat field, palm by board and by curl; exact truth",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "volume": "A finger tip in 27 places of the volume that the rig desk states; exact truth, no baseline",
@@ -45,7 +47,7 @@ SECTIONS = {
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the sections asked for; return the exit code."""
-    sections = "\n".join(f"  {name:16s} {what}" for name, what in SECTIONS.items())
+    sections = "\n".join(f"  {name:18s} {what}" for name, what in SECTIONS.items())
     parser = argparse.ArgumentParser(
         prog="python -m bench",
         description=__doc__,
