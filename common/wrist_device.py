@@ -12,12 +12,14 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import intersect_plane
-from common.hand_model import HandModel
+from common.geometry import intersect_plane, transform
+from common.hand_model import CHAINS, HandModel
 
 _ROTATION_WITHIN = 1e-3  # of a rotation matrix: what rounding leaves of one
 _ACROSS = 0.5  # of the normal's length along y: a plane tilted by more than 60 degrees crosses no finger
 _LEAST_M = 1e-3  # a plane nearer to the lens than this tells no distance
+_BESIDE = 1.0  # image sizes from the middle: half an image beside it
+_FARTHEST_M = 0.5  # a forearm
 _ORIGIN = np.zeros(3)
 
 
@@ -55,7 +57,9 @@ class WristDevice:
                 f"{where}: cameras: {', '.join(rig.cameras)}; the camera file is that of {camera.name!r}"
             )
         normal, offset_m = _plane(rig, where)
-        return WristDevice(CameraModel.of(camera, np.eye(4)), model, _palm(rig, where), normal, offset_m)
+        palm, optics = _palm(rig, where), CameraModel.of(camera, np.eye(4))
+        _check_before(optics, transform(palm, model.rest_position_m[CHAINS[1:, 0]]), where)
+        return WristDevice(optics, model, palm, normal, offset_m)
 
     def on_plane(self, uv: Float) -> Float:
         """Where the rays through pixels (..., 2) meet the laser plane (..., 3) [m] (D7).
@@ -80,6 +84,18 @@ def _plane(rig: RigCalibration, where: str) -> tuple[Float, float]:
             " must cross the fingers on the palm's side of the lens, its normal about y and y positive where it is"
         )
     return normal, offset_m
+
+
+def _check_before(optics: CameraModel, knuckles_m: Float, where: str) -> None:
+    """Refuse a palm whose knuckles (4, 3) [m] lie behind the camera, or far beside its image: in another unit, say."""
+    size = np.array([optics.width_px, optics.height_px])
+    uv = optics.project(knuckles_m) / size
+    if not (np.abs(uv - 0.5) <= _BESIDE).all() or knuckles_m[:, 2].max() > _FARTHEST_M:
+        places = ", ".join(f"{1e3 * x:.0f} {1e3 * y:.0f} {1e3 * z:.0f}" for x, y, z in knuckles_m)
+        raise CalibrationError(
+            f"{where}: T_camera_palm: puts the knuckles of index ... little at {places} mm from the camera, where it"
+            " does not see them"
+        )
 
 
 def _palm(rig: RigCalibration, where: str) -> Float:

@@ -89,7 +89,9 @@ class AngleBelief:
             laser_px: (5,) length of the lines that were seen; NaN: not known.
         """
         seen = np.isfinite(closed.closing_rad)
-        shown = np.nan_to_num(laser_px / np.maximum(closed.length_px, 1.0), nan=1.0)
+        # A line longer than the whole is no better than a whole one.
+        whole = np.maximum(closed.length_px, 1.0)
+        shown = np.nan_to_num(np.clip(laser_px, 0.0, whole) / whole, nan=1.0)
         low, high = self._aside
         aside = (closed.abduction_rad < low) | (closed.abduction_rad > high)
         off = seen & ~closed.past & (aside | (shown < _HARDLY))

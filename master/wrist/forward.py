@@ -19,7 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
+from common.errors import CalibrationError
 from common.geometry import transform
 from common.hand_limits import ABDUCTION, FLEXION
 from common.hand_model import HandModel
@@ -106,7 +107,11 @@ class ForwardTable:
 
     @classmethod
     def of(cls, setup: WristSetup) -> "ForwardTable":
-        """Simulate it; takes one or two seconds."""
+        """Simulate it; takes one or two seconds.
+
+        Raises:
+            CalibrationError: The laser meets none of index ... little, however they are bent.
+        """
         model = setup.model
         curve = NaturalCurve.of(model)
         closing = _evenly(curve.range_rad, _CLOSINGS)
@@ -116,6 +121,11 @@ class ForwardTable:
         angles = curve.angles(*np.broadcast_arrays(closing.T[:, None], abduction.T[None]))  # (C, A, 5, 4)
         cut = LaserCut(setup)
         point, length, place = cut(angles)
+        if not (length[1:] > 0.0).any():
+            raise CalibrationError(
+                "laser_plane, T_camera_palm: the laser meets no finger of this hand however it is bent: calibrate plane"
+                " and palm"
+            )
         return cls(
             curve,
             closing,
@@ -126,6 +136,11 @@ class ForwardTable:
             length,
             _branch(length, place),
         )
+
+    @property
+    def met(self) -> Bool:
+        """(5,) whether the laser meets the finger in so many poses that its point can be followed."""
+        return ((self.length_px > 0.0).sum(axis=1) > 1).any(axis=1)
 
 
 def _evenly(ends: Float, count: int) -> Float:

@@ -27,7 +27,7 @@ class Closed:
     """How far fingers are closed, by their laser points.
 
     Attributes:
-        closing_rad: (5,) within the branch. NaN: not seen.
+        closing_rad: (5,) within the branch. NaN: not seen, or a finger that the laser cannot meet.
         abduction_rad: (5,).
         by_angles: (5, 2, 4) how the point (across, along) moves with each angle by itself [m/rad].
         length_px: (5,) of the line that such a finger shows, undistorted.
@@ -67,7 +67,7 @@ class Inverse:
         value = (weight[:, None] @ self._values[nodes])[:, 0]
         value[~seen, :2] = np.nan
         past = value[:, 3] > _PAST_M
-        past &= seen
+        past &= np.isfinite(value[:, 0])
         by_angles = value[:, 5:].reshape(5, 2, 4)
         return Closed(value[:, 0], value[:, 1], by_angles, value[:, 2], value[:, 4], past)
 
@@ -77,8 +77,13 @@ def _finger(table: ForwardTable, f: int) -> tuple[Float, Float]:
 
     Returns:
         Its lowest point (2,) [m], and for its points (X, Y, 13): closing, abduction, length of line, how far past the
-        end of the branch [m], closing at that end, and how the point moves with the angles (2, 4).
+        end of the branch [m], closing at that end, and how the point moves with the angles (2, 4). Of a finger that
+        the laser never meets closing and abduction are NaN.
     """
+    if not table.met[f]:
+        grid = np.zeros((2, 2, 13))
+        grid[..., :2] = np.nan
+        return np.zeros(2), grid
     last = table.last[f]
     rows, columns = table.point_m.shape[1:3]
     places = np.array([(row, column) for column in range(columns) for row in range(last[column] + 1)])

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Bool, Float
 from common.geometry import intersect_plane
 from master.wrist.setup import WristSetup
 
@@ -28,6 +28,12 @@ class LaserPoints:
 
     point_m: Float
     cov_m2: Float
+
+
+def in_image(setup: WristSetup, uv: Float, sigma_px: Float) -> Bool:
+    """Which pixels (N, 2) can have been seen (N,): in the image, and their standard deviations (N,) not beyond it."""
+    size = np.array([setup.optics.width_px, setup.optics.height_px])
+    return ((uv >= -0.5) & (uv <= size - 0.5)).all(axis=1) & (sigma_px <= size.max())
 
 
 def laser_points(setup: WristSetup, uv: Float, sigma_px: Float) -> LaserPoints:

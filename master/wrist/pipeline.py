@@ -29,7 +29,7 @@ from master.wrist.belief import AngleBelief, FingerAngles
 from master.wrist.cubic import CubicLaw
 from master.wrist.forward import ForwardTable
 from master.wrist.invert import Inverse
-from master.wrist.laser_plane import LaserPoints, PlaneAxes, laser_points
+from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
 from master.wrist.pose import PoseMaker
 from master.wrist.setup import WristSetup
 
@@ -77,8 +77,13 @@ class WristPipeline:
             return []
         self._last_ns = t_ns
         with self._stage("laser"):
-            points = laser_points(self._setup, message.laser_uv, message.laser_sigma_px)
-            self._count("no_plane", np.isfinite(message.laser_uv[:, 0]) & np.isnan(points.point_m[:, 0]))
+            told = np.isfinite(message.laser_uv).all(axis=1)
+            shown = in_image(self._setup, message.laser_uv, message.laser_sigma_px)
+            self._count("outside", told & ~shown)
+            points = laser_points(
+                self._setup, np.where(shown[:, None], message.laser_uv, np.nan), message.laser_sigma_px
+            )
+            self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("hand"):
             found = self._angles_of(t_ns, message, points)
             angles, cov, source = self._remembered(t_ns, found)

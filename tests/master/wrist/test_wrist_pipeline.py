@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, Volume, load
+from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGERS, METACARPALS, HandModel
 from common.messages import HandPose, Source, WristDetections
 from master.ik.priors import Priors
 from master.rig import RigSetup
-from master.wrist.forward import LaserCut
+from master.wrist.forward import ForwardTable, LaserCut
+from master.wrist.invert import Inverse
 from master.wrist.laser_plane import PlaneAxes
 from master.wrist.pipeline import WristPipeline
 from master.wrist.setup import WristSetup
@@ -138,6 +140,52 @@ def test_angles_stay_within_limits_whatever_is_reported(
     assert np.isfinite(pose.position_m[pose.valid]).all()
     assert (np.linalg.eigvalsh(pose.cov_m2[pose.valid]) > 0.0).all()
     assert (pose.tracked <= pose.valid).all()
+
+
+def test_what_no_camera_can_have_seen_is_counted_and_not_seen(
+    alone: WristPipeline, setup: WristSetup
+) -> None:
+    uv = shown(setup, natural(setup, 40.0))
+    uv[1], uv[2], uv[3] = [1e300, 240.0], [320.0, -1e12], [-1.0, 240.0]
+    before = alone.counts.copy()
+    with np.errstate(all="raise"):
+        pose = solved(alone, uv)
+        for sigma in (1e308, 700.0):
+            alone.push(message(uv, alone._last_ns + TRIPLE_NS, sigma))
+    for f, times in enumerate((2, 3, 3, 3, 2)):
+        assert alone.counts[f"outside.{FINGERS[f]}"] == before[f"outside.{FINGERS[f]}"] + times
+    assert not pose.valid[CHAINS[1:4]].any()
+    assert pose.tracked[CHAINS[[0, 4]]].all()
+
+
+def test_a_line_of_impossible_length_is_a_whole_one(alone: WristPipeline, setup: WristSetup) -> None:
+    uv = shown(setup, natural(setup, 40.0))
+    poses: list[HandPose] = []
+    for length in (1.7e308, 1e4):
+        whole = msgspec.structs.replace(message(uv, alone._last_ns + TRIPLE_NS), laser_px=np.full(5, length))
+        with np.errstate(all="raise"):
+            poses += [found.pose for found in alone.push(whole)]
+    np.testing.assert_array_equal(poses[0].position_m, poses[1].position_m)
+    assert poses[0].tracked.all()
+
+
+def test_a_finger_that_the_laser_cannot_meet_is_not_made_up(setup: WristSetup) -> None:
+    table = ForwardTable.of(setup)
+    none = table.length_px.copy()
+    none[1] = 0.0
+    inverse = Inverse(replace(table, length_px=none))
+    pipeline = WristPipeline(setup, continuous=False, inverse=inverse)
+    pose = solved(pipeline, shown(setup, natural(setup, 40.0)))
+    assert not pose.valid[CHAINS[1]].any()
+    assert np.isnan(pose.angles_rad[1]).all()
+    assert pose.tracked[CHAINS[[0, 2, 3, 4]]].all()
+
+
+def test_a_palm_that_the_laser_passes_by_is_refused(setup: WristSetup) -> None:
+    above = setup.T_camera_palm.copy()
+    above[1, 3] -= 0.1
+    with pytest.raises(CalibrationError, match="the laser meets no finger"):
+        ForwardTable.of(replace(setup, T_camera_palm=above))
 
 
 def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(
