@@ -4,6 +4,7 @@
     ├── CalibrationError   a JSON file is missing, broken, or says something impossible
     ├── RecordingError     a recording folder cannot be read or written
     ├── CameraError        a camera is gone, or refused a setting
+    ├── ImuError           an IMU is gone, or nothing here can read it
     ├── MessageError       bytes that are not a message of ours
     ├── BusError           the bus cannot be opened, or nobody answers
     └── FitError           observations do not determine the value asked for
@@ -27,6 +28,10 @@ class RecordingError(PhalanxError):
 
 class CameraError(PhalanxError):
     """A camera is gone or refused a setting. Never answered with a fake camera."""
+
+
+class ImuError(PhalanxError):
+    """An IMU is gone, or there is no driver for it. Never answered with a fake IMU."""
 
 
 class MessageError(PhalanxError):

@@ -15,8 +15,8 @@ import cv2
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
-from common.errors import CalibrationError, CameraError, PhalanxError
-from slave.arguments import CAMERAS, parser
+from common.errors import CalibrationError, CameraError, ImuError, PhalanxError
+from slave.arguments import CAMERAS, IMUS, parser
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 
@@ -67,6 +67,37 @@ def _run(options: argparse.Namespace) -> int:
         print(f"{options.name}: {line}", flush=True)
 
     run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say)
+    return 0
+
+
+def _imu(options: argparse.Namespace) -> int:
+    from common.keys import rig_key
+    from slave.imu.live import run_live
+    from slave.imu.synthetic import SyntheticImu
+    from slave.simulated import imu_of
+    from slave.uplink import Uplink
+
+    rig = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
+    if rig.imu is None or options.name != rig.imu.name:
+        has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
+        raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
+    if options.imu != "synthetic":
+        raise ImuError(
+            f"--imu {options.imu}: no such driver; there is {IMUS}, and none that reads an IMU on a serial port or "
+            "on I2C yet"
+        )
+    true_clock = SystemClock()
+    clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
+    key = rig_key(os.environ, options.key_file)
+    epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
+    imu = imu_of(options.imu, options.calibration, rig, options.scene, options.seed)
+
+    def say(line: str) -> None:
+        print(f"{options.name}: {line}", flush=True)
+
+    with _stop_by_signal() as stop:
+        uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+        run_live(options.name, SyntheticImu(imu, epoch_ns, clock, stop), uplink, clock, stop, say)
     return 0
 
 
@@ -250,7 +281,14 @@ def _colours(options: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {"run": _run, "record": _record, "join": _join, "detect": _detect, "colours": _colours}
+COMMANDS = {
+    "run": _run,
+    "imu": _imu,
+    "record": _record,
+    "join": _join,
+    "detect": _detect,
+    "colours": _colours,
+}
 
 
 if __name__ == "__main__":

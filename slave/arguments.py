@@ -2,6 +2,7 @@
 
 import argparse
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 from slave.cameras import real
@@ -26,6 +27,14 @@ HELP = {
         before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
         with a USB camera; docs/cameras.md says which settings are fixed and checked
+""",
+    ),
+    "imu": (
+        "send what an IMU measures",
+        """\
+  phalanx-slave imu --name imu --rig wrist --imu synthetic --bind 127.0.0.1 --key-file rig.key
+        waits for the master's start, then sends one sealed datagram per sample: that of the simulated hand; with
+        cameras in other processes, all with the same --scene, --seed and --scene-epoch-ns
 """,
     ),
     "record": (
@@ -63,6 +72,7 @@ HELP = {
     ),
 }
 CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
+IMUS = "synthetic"
 BEACON_PORT = 47800
 
 
@@ -75,7 +85,14 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     commands = whole.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    fill = {"run": _run, "record": _record, "join": _join, "detect": _detect, "colours": _colours}
+    fill = {
+        "run": _run,
+        "imu": _imu,
+        "record": _record,
+        "join": _join,
+        "detect": _detect,
+        "colours": _colours,
+    }
     for name, add_options in fill.items():
         purpose, examples = HELP[name]
         command = commands.add_parser(
@@ -90,15 +107,7 @@ def parser() -> argparse.ArgumentParser:
 
 def _run(run: argparse.ArgumentParser) -> None:
     _camera(run)
-    run.add_argument(
-        "--beacon-port", type=_port, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
-    )
-    run.add_argument(
-        "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
-    )
-    run.add_argument(
-        "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
-    )
+    _link(run)
     run.add_argument(
         "--colours",
         choices=("follow", "fixed", "none"),
@@ -112,6 +121,18 @@ def _run(run: argparse.ArgumentParser) -> None:
         default="numpy",
         help="what detects markers: numba is several times faster, needs the extra `fast` (default: %(default)s)",
     )
+
+
+def _imu(imu: argparse.ArgumentParser) -> None:
+    _place(imu, "IMU of this slave, that of the rig")
+    imu.add_argument(
+        "--imu",
+        required=True,
+        metavar="DRIVER",
+        help=f"{IMUS}: that of a simulated hand; none of a real IMU yet",
+    )
+    _link(imu)
+    _simulated(imu.add_argument_group("synthetic IMU").add_argument)
 
 
 def _record(record: argparse.ArgumentParser) -> None:
@@ -193,30 +214,49 @@ def _colours(colours: argparse.ArgumentParser) -> None:
 
 def _camera(command: argparse.ArgumentParser) -> None:
     """All that opening a camera asks for."""
-    command.add_argument("--name", required=True, help="camera of this slave, a member of the rig")
-    command.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
-    command.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+    _place(command, "camera of this slave, a member of the rig")
     command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
     real.add_options(command)
     sim = command.add_argument_group("synthetic camera")
+    _simulated(sim.add_argument)
     sim.add_argument(
+        "--start-offset-ms", type=_number, default=0.0, metavar="Z", help="its frames come later"
+    )
+
+
+def _place(command: argparse.ArgumentParser, who: str) -> None:
+    """Who this slave is, and whose."""
+    command.add_argument("--name", required=True, help=who)
+    command.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
+    command.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+
+
+def _link(command: argparse.ArgumentParser) -> None:
+    """How it finds its master."""
+    command.add_argument(
+        "--beacon-port", type=_port, default=BEACON_PORT, metavar="PORT", help="default: %(default)s"
+    )
+    command.add_argument(
+        "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
+    )
+    command.add_argument(
+        "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
+    )
+
+
+def _simulated(add: Callable[..., argparse.Action]) -> None:
+    """Which scene a simulated sensor senses, and by what clock."""
+    add(
         "--scene",
         default="standard",
         metavar="NAME",
         help="standard | lights | poses | hand-routine | leap:FILE.npz | board; before a wrist device "
         "standard | curl | poses | spread, each with @dark | @indoor | @bright | @sun, or board",
     )
-    sim.add_argument("--seed", type=int, default=7)
-    sim.add_argument(
-        "--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now"
-    )
-    sim.add_argument(
-        "--clock-offset-ms", type=_number, default=0.0, metavar="X", help="this machine's clock is ahead"
-    )
-    sim.add_argument("--clock-ppm", type=_number, default=0.0, metavar="Y", help="and gains on the true one")
-    sim.add_argument(
-        "--start-offset-ms", type=_number, default=0.0, metavar="Z", help="its frames come later"
-    )
+    add("--seed", type=int, default=7)
+    add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
+    add("--clock-offset-ms", type=_number, default=0.0, metavar="X", help="this machine's clock is ahead")
+    add("--clock-ppm", type=_number, default=0.0, metavar="Y", help="and gains on the true one")
 
 
 def _positive(text: str) -> float:

@@ -44,7 +44,7 @@ class Uplink:
         """Begin to listen for the beacon of a master that has the same rig `key`.
 
         Args:
-            name: Camera, a member of the rig's `cameras`.
+            name: Camera or IMU, as the rig's file calls it.
             key: Rig key (32 bytes).
             clock: The clock of all times that this slave sends.
             beacon_port: UDP port of the beacons; several slaves of one machine share it.

@@ -24,6 +24,7 @@ _HALF_STEP_S = 1e-3  # for rates and accelerations
 _GRAVITY_M_S2 = 9.81
 _MORE_S = 0.1
 _NOTHING = np.full(3, np.nan)
+_UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
 
 
 class SimulatedImu:
@@ -36,9 +37,7 @@ class SimulatedImu:
             CalibrationError: The rig's file does not say how the IMU is mounted, or how its world lies to the rig.
         """
         if imu.q_palm_imu is None or imu.q_rig_world is None:
-            raise CalibrationError(
-                "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
-            )
+            raise CalibrationError(_UNPLACED)
         self._motion, self._imu, self._seed = motion, imu, seed
         self._palm_imu = quaternion_to_matrix(np.array(imu.q_palm_imu))
         self._rig_world = quaternion_to_matrix(np.array(imu.q_rig_world))
@@ -50,6 +49,11 @@ class SimulatedImu:
         known = imu.heading_sigma_rad
         self._heading_rad = float(rng.uniform(-np.pi, np.pi) if known is None else known * rng.normal())
         self._tilt -= self._up * (self._up @ self._tilt)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples per second, by the IMU's own clock."""
+        return self._imu.rate_hz
 
     @property
     def _up(self) -> Float:
@@ -64,6 +68,8 @@ class SimulatedImu:
         """
         if scene.rig.imu is None:
             raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to simulate")
+        if not scene.rig.imu.placed:
+            raise CalibrationError(f"rig {scene.rig.name!r}: {_UNPLACED}")
         return cls(scene.motion, scene.rig.imu, scene.seed)
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:

@@ -1,0 +1,1 @@
+"""IMUs: one seam, one file per driver."""

@@ -1,0 +1,133 @@
+"""The loop of an IMU's slave: every sample is sent once, gaps are counted; and what its command refuses."""
+
+import threading
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.bus import LoopbackBus
+from common.calibration import ImuCalibration, RigCalibration, load, save
+from common.clock import SystemClock
+from common.errors import ImuError
+from common.messages import Command, ImuSample, Message
+from slave.__main__ import main
+from slave.imu.live import SampleTally, run
+from slave.report import Reporter
+from tests.network_helpers import until
+
+ROOT = Path(__file__).resolve().parents[3]
+
+
+def sample(seq: int) -> ImuSample:
+    nothing = np.full(3, np.nan)
+    return ImuSample("imu", 0, seq, 8_333_333 * seq, nothing, nothing, nothing, np.full(4, np.nan))
+
+
+class Source:
+    """An IMU with a list of samples; an exception in the list is raised."""
+
+    def __init__(self, samples: list[ImuSample | ImuError]) -> None:
+        self.samples = samples
+
+    def read(self) -> ImuSample | None:
+        if not self.samples:
+            return None
+        one = self.samples.pop(0)
+        if isinstance(one, ImuError):
+            raise one
+        return one
+
+    def close(self) -> None:
+        self.samples = []
+
+
+class Wire:
+    """Stands for the uplink."""
+
+    session = 77
+    zenoh_endpoint: str | None = "there"
+    counts: dict[str, int] = {"sent": 3, "unsent": 1}
+
+    def __init__(self) -> None:
+        self.sent: list[ImuSample] = []
+
+    def send(self, message: Message) -> None:
+        assert isinstance(message, ImuSample)
+        self.sent.append(message)
+
+
+def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted() -> None:
+    wire, tally = Wire(), SampleTally()
+    run(Source([sample(k) for k in (40, 41, 45, 46)]), wire, tally, threading.Event())
+    assert [(one.source, one.session, one.seq, one.t_ns) for one in wire.sent] == [
+        ("imu", 77, seq, 8_333_333 * seq) for seq in (40, 41, 45, 46)
+    ]
+    assert tally.counts() == {"samples": 4, "skipped": 3}
+    assert tally.gauges()["rate_hz"] > 0.0
+    assert set(tally.gauges()) == {"rate_hz"}
+
+
+def test_the_loop_ends_when_told_and_when_the_device_is_gone() -> None:
+    wire, stop = Wire(), threading.Event()
+    with pytest.raises(ImuError, match="unplugged"):
+        run(Source([sample(0), ImuError("unplugged"), sample(1)]), wire, SampleTally(), stop)
+    assert len(wire.sent) == 1
+    stop.set()
+    run(Source([sample(2)]), wire, SampleTally(), stop)
+    assert len(wire.sent) == 1
+
+
+def test_it_reports_and_stops_on_the_bus() -> None:
+    bus, stop, tally = LoopbackBus(), threading.Event(), SampleTally()
+    for seq in (1, 2, 4):
+        tally.sample(seq)
+    reporter = Reporter("imu", Wire(), tally, SystemClock(), lambda _endpoint: bus, stop.set, 0.01)
+    assert until(lambda: "imu" in bus.alive())
+    health = bus.ask(Command("imu", "report", ""), 5.0)
+    assert (health.source, health.session) == ("imu", 77)
+    assert health.counts == {"samples": 3, "skipped": 1, "sent": 3, "unsent": 1}
+    with pytest.raises(Exception, match="no command 'preview'; there are report, stop"):
+        bus.ask(Command("imu", "preview", ""), 5.0)
+    bus.ask(Command("imu", "stop", ""), 5.0)
+    assert stop.is_set()
+    reporter.close()
+
+
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        (["--name", "imu", "--rig", "desk"], "rig 'desk' has no IMU 'imu'; it has none"),
+        (["--name", "wrist"], "rig 'wrist' has no IMU 'wrist'; its IMU is 'imu'"),
+        (["--name", "imu", "--rig", "unplaced"], "rig 'unplaced': imu: q_palm_imu and q_rig_world: missing"),
+        (
+            ["--name", "imu", "--imu", "serial:/dev/ttyUSB0"],
+            "no such driver; there is synthetic, and none that",
+        ),
+        (["--name", "imu", "--imu", "synthetic:2"], "no such driver"),
+        (["--name", "imu", "--scene", "board"], "only a hand before a synthetic camera has one"),
+        (["--name", "imu", "--scene", "lights"], "for a wrist rig there are standard"),
+    ],
+)
+def test_what_it_cannot_be_is_said_at_the_start(
+    option: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("PHALANX_RIG_KEY", "00" * 32)
+    files = ROOT / "calib_json"
+    if "unplaced" in option:
+        files = tmp_path / "calib"
+        (files / "rigs").mkdir(parents=True)
+        rig = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
+        save(
+            files / "rigs/unplaced.json", msgspec.structs.replace(rig, name="unplaced", imu=ImuCalibration())
+        )
+        for kept in ("hands", "cameras"):
+            (files / kept).symlink_to(ROOT / "calib_json" / kept)
+    command = ["imu", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]
+    assert main([*command, *option, "--bind", "127.0.0.1"]) == 1
+    assert says in capsys.readouterr().err
