@@ -1,6 +1,7 @@
-"""The demo: every slave of a rig with a synthetic camera, the master and the viewer, as processes on this machine.
+"""The demo: a slave for each camera of a rig and for its IMU, all synthetic, the master and the viewer, as processes
+of this machine.
 
-Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The cameras' clocks
+Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The slaves' clocks
 have different zeros and rates, and each camera runs 5 ms after the one before.
 """
 
@@ -141,13 +142,15 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     bus = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     place = ["--rig", settings.rig, "--calibration", str(settings.calibration)]
     rows: list[tuple[str, list[str], dict[str, str]]] = []
-    for index, camera in enumerate(_cameras(settings)):
-        scene = ["--scene", settings.scene, "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
+    scene = ["--scene", settings.scene, "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
+    link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
+    cameras, imus = _sensors(settings)
+    for index, name in enumerate([*cameras, *imus]):
         clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index)]
-        link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
-        command = ["run", "--name", camera, *place, "--camera", "synthetic", *scene, *clock, *start, *link]
-        rows.append((camera, [sys.executable, "-m", "slave", *command], key))
+        sensor = ["imu", "--imu", "synthetic"] if name in imus else ["run", "--camera", "synthetic", *start]
+        command = [*sensor, "--name", name, *place, *scene, *clock, *link]
+        rows.append((name, [sys.executable, "-m", "slave", *command], key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
     rows.append(("master", [sys.executable, "-m", settings.master, "run", *place, *address, *files], key))
@@ -157,11 +160,14 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     return rows
 
 
-def _cameras(settings: DemoSettings) -> list[str]:
+def _sensors(settings: DemoSettings) -> tuple[list[str], list[str]]:
+    """Names of the rig's cameras, and of its IMU where it has one."""
     path = settings.calibration / "rigs" / f"{settings.rig}.json"
     try:
-        return cast(list[str], json.loads(path.read_text())["cameras"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        rig = json.loads(path.read_text())
+        imu = rig.get("imu")
+        return cast(list[str], rig["cameras"]), [] if imu is None else [str(imu.get("name", "imu"))]
+    except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
         raise DemoError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
         ) from error
