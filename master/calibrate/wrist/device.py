@@ -9,7 +9,7 @@ import typer
 
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
-from common.errors import CalibrationError
+from common.errors import CalibrationError, RecordingError
 from common.frame_recording import MANIFEST, open_recording
 from master.calibrate.tree_files import rig_in_tree, write_rig
 
@@ -50,7 +50,10 @@ def device_of(source: Path, rig_name: str | None, calibration: Path, out: Path |
     if rig_name is None and recorded is None:
         raise CalibrationError(f"{source}: is no recording, which would name its rig: give --rig NAME")
     if rig_name is None and recorded is not None:
-        rig = recorded.wrist_rig()
+        try:
+            rig = recorded.wrist_rig()
+        except RecordingError as error:
+            raise RecordingError(f"{source}/{error}: it is no recording of a wrist device") from error
         name, camera = rig.name, recorded.cameras[rig.cameras[0]]
     else:
         name = str(rig_name)

@@ -1,5 +1,6 @@
 """`phalanx-master calibrate flat-field`: how the LEDs and the lens of a wrist device light its image."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +20,7 @@ from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.device import Device, device_of, say, write_device
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, fit_flat_field, gathered, white_samples
 from master.calibrate.wrist.laser_command import Source
-from master.calibrate.wrist.lit_views import LitView, lit_views
+from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
 from master.calibrate.wrist.placed import placed_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.summary import write_summary
@@ -31,11 +32,11 @@ Picture = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class WhiteSeen:
-    """Samples of the views that have some, and the reason of every other view."""
+    """Samples of the views that have some, and of every other view the reason."""
 
     samples: WhiteSamples
     views: int
-    refused: tuple[str, ...]
+    refused: Mapping[str, str]
 
 
 def flat_field(
@@ -69,7 +70,8 @@ def flat_field(
     try:
         fit = fit_flat_field(seen.samples, device.optics)
     except FitError as error:
-        raise FitError(f"{source}: {error}" + "".join(f"\n  {reason}" for reason in seen.refused)) from error
+        reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
+        raise FitError(f"{source}: {error}{reasons}") from error
     say(report_lines(fit, seen, len(views), known_leds=bool(device.rig.led)))
     if picture is not None:
         from master.calibrate.wrist.picture import draw_flat_field  # matplotlib takes a second to import
@@ -84,7 +86,7 @@ def flat_field(
             "foretold_rms_percent": round(100 * fit.foretold_rms, 4),
             "samples": len(seen.samples.light),
             "views": seen.views,
-            "refused": list(seen.refused),
+            "refused": dict(seen.refused),
             "written": None if written is None else str(written),
         }
         write_summary(json_file, told)
@@ -97,7 +99,7 @@ def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_
         RecordingError: An image cannot be read.
     """
     found: list[tuple[Float, Float, Float]] = []
-    refused: list[str] = []
+    refused: dict[str, str] = {}
     for view in views:
         led, ambient = view.load(Illumination.LED), view.load(Illumination.AMBIENT)
         assert led is not None  # `lit_views` gives whole ones
@@ -106,10 +108,10 @@ def white_of(views: tuple[LitView, ...], board: Board, optics: CameraModel, led_
             placed = placed_board(view, board, optics)
             found.append(white_samples(led, ambient, placed, board, optics, led_m))
         except FitError as error:
-            refused.append(f"view {view.name}: {error}")
+            refused[view.name] = str(error)
     if not found:
         found.append((np.empty((0, 2)), np.empty((0, 2)), np.empty(0)))
-    return WhiteSeen(gathered(found), len(views) - len(refused), tuple(refused))
+    return WhiteSeen(gathered(found), len(views) - len(refused), refused)
 
 
 def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool) -> list[str]:
@@ -121,7 +123,10 @@ def report_lines(fit: FlatFit, seen: WhiteSeen, views: int, *, known_leds: bool)
     if not known_leds:
         lines.append("  the rig has no `led`: the LEDs were taken to be at the lens")
     if seen.refused:
-        lines += [f"left out ({len(seen.refused)}):", *(f"  {reason}" for reason in seen.refused)]
+        lines += [
+            f"left out ({len(seen.refused)}):",
+            *(f"  {reason}" for reason in told_by_reason(seen.refused)),
+        ]
     return lines
 
 

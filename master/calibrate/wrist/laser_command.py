@@ -1,5 +1,6 @@
 """`phalanx-master calibrate laser-plane`: the laser's plane in the wrist camera's frame, from views of a board."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +18,7 @@ from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareM
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.device import Device, device_of, say, write_device
 from master.calibrate.wrist.line import line_on_board
-from master.calibrate.wrist.lit_views import LitView, lit_views
+from master.calibrate.wrist.lit_views import LitView, lit_views, told_by_reason
 from master.calibrate.wrist.placed import placed_board
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
@@ -37,10 +38,10 @@ Picture = Annotated[
 
 @dataclass(frozen=True, slots=True)
 class LinesSeen:
-    """Lines of the views that show one, and the reason of every other view."""
+    """Lines of the views that show one, and of every other view the reason."""
 
     lines: tuple[ViewLine, ...]
-    refused: tuple[str, ...]
+    refused: Mapping[str, str]
 
 
 def laser_plane(
@@ -72,7 +73,7 @@ def laser_plane(
     try:
         fit = fit_plane(seen.lines)
     except FitError as error:
-        reasons = "".join(f"\n  {reason}" for reason in seen.refused)
+        reasons = "".join(f"\n  {reason}" for reason in told_by_reason(seen.refused))
         raise FitError(f"{source}: {error}{reasons}") from error
     say(report_lines(fit, seen, len(views)))
     if picture is not None:
@@ -94,7 +95,7 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
     """
     focal = float(np.sqrt(optics.matrix[0, 0] * optics.matrix[1, 1]))
     lines: list[ViewLine] = []
-    refused: list[str] = []
+    refused: dict[str, str] = {}
     for view in views:
         laser, ambient = view.load(Illumination.LASER), view.load(Illumination.AMBIENT)
         assert laser is not None  # `lit_views` gives whole ones
@@ -105,10 +106,10 @@ def lines_of(views: tuple[LitView, ...], board: Board, optics: CameraModel) -> L
                 raise FitError("its frames differ in size")
             line = line_on_board(laser, ambient, placed, board, optics)
         except FitError as error:
-            refused.append(f"view {view.name}: {error}")
+            refused[view.name] = str(error)
             continue
         lines.append(ViewLine.of(view.name, line, placed, focal))
-    return LinesSeen(tuple(lines), tuple(refused))
+    return LinesSeen(tuple(lines), refused)
 
 
 def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
@@ -126,9 +127,9 @@ def report_lines(fit: PlaneFit, seen: LinesSeen, views: int) -> list[str]:
         for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
         if not own
     ]
-    left_out = [*seen.refused, *wrong]
-    if left_out:
-        lines += [f"left out ({len(left_out)}):", *(f"  {reason}" for reason in left_out)]
+    if seen.refused or wrong:
+        reasons = (*told_by_reason(seen.refused), *wrong)
+        lines += [f"left out ({len(seen.refused) + len(wrong)}):", *(f"  {reason}" for reason in reasons)]
     return lines
 
 
@@ -145,7 +146,7 @@ def report_json(fit: PlaneFit, seen: LinesSeen) -> dict[str, object]:
             line.name: {"rms_mm": round(1e3 * float(off), 6), "used": bool(own), "points": len(line.points_m)}
             for line, own, off in zip(seen.lines, fit.used, fit.off_m, strict=True)
         },
-        "refused": list(seen.refused),
+        "refused": dict(seen.refused),
     }
 
 

@@ -19,7 +19,7 @@ from master.calibrate.cameras.options import Dictionary, MarkerMm, board_of
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.curled import read_curled
 from master.calibrate.wrist.device import Device, device_of, say, write_device
-from master.calibrate.wrist.lit_views import lit_views
+from master.calibrate.wrist.lit_views import lit_views, told_by_reason
 from master.calibrate.wrist.palm_board import Mounting, PalmFit, palm_from_board
 from master.calibrate.wrist.placed import PlacedBoard, placed_board
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
@@ -132,13 +132,13 @@ def _needed(value: float | None, option: str) -> float:
 
 def _by_board(source: Path, board: Board, mounting: Mounting, device: Device) -> PalmFit:
     placed: list[PlacedBoard] = []
-    reasons: list[str] = []
+    refused: dict[str, str] = {}
     for view in lit_views(source, device.camera.name, Illumination.LED):
         try:
             placed.append(placed_board(view, board, device.optics))
         except FitError as error:
-            reasons.append(f"view {view.name}: {error}")
-    say(f"left out: {reason}" for reason in reasons)
+            refused[view.name] = str(error)
+    say(f"left out: {reason}" for reason in told_by_reason(refused))
     return palm_from_board(placed, board, mounting)
 
 
