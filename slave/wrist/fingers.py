@@ -63,9 +63,9 @@ class Fingers:
         radius, angle = corridors.polar(uv)
         steps: Float = STATION_PX * np.arange(self.seams.shape[1], dtype=np.float64)
         finger: Int = np.ones(len(uv), dtype=np.int64)
-        for seam in self.seams[:3]:
-            across: Float = np.interp(uv[:, 1], corridors.row + steps, seam)
-            finger += corridors.thumb_side * (across - uv[:, 0]) > 0.0
+        across: list[Float] = [np.interp(uv[:, 1], corridors.row + steps, seam) for seam in self.seams[:3]]
+        for seam in across:
+            finger += corridors.thumb_side * (seam - uv[:, 0]) > 0.0
         finger[angle > np.interp(radius, corridors.radius + steps, self.seams[3])] = 0
         finger[np.isnan(radius)] = NONE
         return finger

@@ -13,6 +13,7 @@ hardly ever all at once. Of three frames the ambient one is nowhere brighter, as
 Where both frames are saturated neither is brighter: such cells tell nothing and are not counted.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from math import inf, log2
@@ -23,7 +24,6 @@ import numpy as np
 from common.arrays import Image
 
 _SIZE = (80, 60)  # cells across and down: 8 x 8 px of 640 x 480
-_ROWS = 4  # every how manieth row is looked at
 _NOISE = 6  # levels: five standard deviations of a cell near saturation (16 px of 5 levels of shot noise)
 _SWING = 0.125  # of the ambient light: how far lamps on the mains swing between two frames
 _EXPLAINED = (_NOISE + _SWING * np.arange(256)).astype(np.uint8)  # by the darker of two levels
@@ -78,8 +78,15 @@ class Evidence:
 
 
 def coarse(image: Image) -> Image:
-    """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3)."""
-    cells = cv2.resize(image[::_ROWS], _SIZE, interpolation=cv2.INTER_AREA)
+    """(60, 80) uint8 means over cells of a frame (H, W) or (H, W, 3).
+
+    By halves as far as that goes: means of two by two are what a processor is quickest at.
+    """
+    cells: cv2.typing.MatLike = image
+    while cells.shape[1] % (2 * _SIZE[0]) == 0 and cells.shape[0] % (2 * _SIZE[1]) == 0:
+        cells = cv2.resize(cells, (cells.shape[1] // 2, cells.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    if cells.shape[1::-1] != _SIZE:
+        cells = cv2.resize(cells, _SIZE, interpolation=cv2.INTER_AREA)
     return np.asarray(cells if cells.ndim == 2 else cells.max(axis=2), np.uint8)
 
 
@@ -88,7 +95,9 @@ def led_change(before: Image, after: Image) -> Led:
     valid = _valid(before, after)
     if valid < VALID_LEAST * before.size:
         return Led.UNSURE
-    on, off = _broad(_over(after, before)) / valid, _broad(_over(before, after)) / valid
+    on, off = (
+        _broad(over, LED_NEVER * valid) / valid for over in (_over(after, before), _over(before, after))
+    )
     if max(on, off) <= LED_NEVER:
         return Led.SAME
     if on >= LED_LEAST and off <= LED_NEVER:
@@ -107,12 +116,11 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     led_loss, laser_loss = _over(ambient, led), _over(ambient, laser)
     led_over_laser = _over(led, laser)
     near = _near(np.minimum(led_gain, led_over_laser))
-    inside = cv2.erode(cv2.morphologyEx(_lit(led_gain), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
     flash = _thin(np.minimum(laser_gain, _over(laser, led)))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
-    own = cv2.countNonZero(cv2.bitwise_and(_thin(np.minimum(laser_loss, led_loss)), _near(led_over_laser)))
-    excess = max(cv2.countNonZero(cv2.bitwise_and(_thin(loss), inside)) for loss in (led_loss, laser_loss))
+    own = _shared(np.minimum(laser_loss, led_loss), lambda: _near(led_over_laser))
+    excess = max(_shared(loss, lambda: _inside(led_gain)) for loss in (led_loss, laser_loss))
     rest = max(LASER_OF_ELSEWHERE * elsewhere, LASER_OF_OWN * own, LASER_OF_EXCESS * excess)
     came_or_went = max(_broad(laser_gain), _broad(laser_loss), _broad(led_loss)) / valid
     return Evidence(
@@ -143,8 +151,23 @@ def _near(over: Image) -> cv2.typing.MatLike:
     return cv2.dilate(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SMALL), _LINE_HIGH)
 
 
-def _broad(over: Image) -> int:
+def _inside(over: Image) -> cv2.typing.MatLike:
+    """What lies within what the LEDs light, a line's height bridged."""
+    return cv2.erode(cv2.morphologyEx(_lit(over), cv2.MORPH_CLOSE, _LINE_HIGH), _SMALL)
+
+
+def _broad(over: Image, least: float = 0.0) -> int:
+    """How many cells are broadly brighter; 0 where no more than `least` are brighter at all."""
+    if cv2.countNonZero(over) <= least:
+        return 0
     return cv2.countNonZero(cv2.morphologyEx(_lit(over), cv2.MORPH_OPEN, _SQUARE))
+
+
+def _shared(over: Image, where: Callable[[], cv2.typing.MatLike]) -> int:
+    """How many cells of thin lines lie there; `where` is asked only if there can be any."""
+    if cv2.minMaxLoc(over)[1] <= _LINE:
+        return 0
+    return cv2.countNonZero(cv2.bitwise_and(_thin(over), where()))
 
 
 def _thin(over: Image) -> cv2.typing.MatLike:

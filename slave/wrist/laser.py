@@ -23,7 +23,8 @@ _NOISE = 6.0  # standard deviations above the mean of what no laser reaches
 _ENOUGH_ROWS = 40  # above the laser's reach, to know the noise from
 _OF_BRIGHTEST = 0.1  # of the brightest of the image: less is glow
 _OF_NEIGHBOURHOOD = 0.5  # of the brightest within `_NEIGHBOURHOOD` rows: less is glow beside the line
-_NEIGHBOURHOOD = np.ones((1, 33), dtype=np.uint8)
+_NEIGHBOURHOOD = np.ones((33, 1), dtype=np.uint8)
+_FIVE = np.arange(5)[:, None]
 _DOUBLINGS = 10  # links followed: 2^10 columns, more than an image has
 _NEAR_PX = 24  # cells in which lines are compared with what is near by
 _NEAR = np.ones((5, 3), dtype=np.uint8)
@@ -56,7 +57,7 @@ class LaserLines:
     Attributes:
         uv: (5, 2) centroids by length [px].
         sigma_px: (5,) standard deviation per axis.
-        length_px: (5,) length; 0 where none was seen.
+        length_px: (5,) length.
     """
 
     uv: Float
@@ -86,15 +87,20 @@ class Runs:
     preceding: Int
 
 
+_NONE_INT: Int = np.empty(0, dtype=np.int64)
+_NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT)
+
+
 def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
     reach = reach_of(view)
     runs = line_runs(laser, reach.first_row)
-    points = np.stack([runs.column.astype(np.float64), runs.row], axis=-1)
+    points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
     if len(points):
-        finger = _at_creases(np.where(_lines(runs), finger, NONE), runs)
-        finger = np.where(reach.holds(finger, points), finger, NONE)
+        finger[~_lines(runs)] = NONE
+        finger = _at_creases(finger, runs)
+        finger[~reach.holds(finger, points)] = NONE
     share = np.ones(len(points))
     thumb = finger == 0
     share[thumb] = reach.of_thumb(points[thumb])
@@ -105,48 +111,42 @@ def _centroids(
     points: Float, runs: Runs, finger: Int, share: Float, view: WristView, *, shown: bool
 ) -> LaserLines:
     """Centroids by length of the pieces of line, each with its share of the finger."""
+    on = finger != NONE
     here = np.arange(len(points))
-    kept = (runs.following != here) & (finger[runs.following] == finger)
-    starts: list[Float] = []
-    stops: list[Float] = []
-    owners: list[Int] = []
-    for step, back, outwards in (
-        (runs.following, runs.preceding, 0.5),
-        (runs.preceding, runs.following, -0.5),
-    ):
-        last = here[(step == here) | (finger[step] != finger)]
-        end, inner = _ends(points, finger, last, back, outwards)
-        starts.append(points[inner])
-        stops.append(end)
-        owners.append(last)
-        bent = inner != last  # the links beyond `inner` are replaced by the piece to the end
-        first, second = (last[bent], back[last[bent]]) if outwards < 0.0 else (inner[bent], back[last[bent]])
-        kept[first] = kept[second] = False
-    a = here[kept]
-    start = np.concatenate([points[a], *starts])
-    stop = np.concatenate([points[runs.following[a]], *stops])
-    sure = np.concatenate([(share[a] + share[runs.following[a]]) / 2.0, *(share[last] for last in owners)])
-    owner = np.concatenate([finger[a], *(finger[last] for last in owners)]) + 1
-    middle, whole = (start + stop) / 2.0, np.hypot(*(stop - start).T)
-    line = np.bincount(owner, whole, 6)[1:]
-    length = np.bincount(owner, whole * sure, 6)[1:].astype(np.float64)
+    linked = on & (runs.following != here) & (finger[runs.following] == finger)
+    linked_back = on & (runs.preceding != here) & (finger[runs.preceding] == finger)
+    right, left = here[on & ~linked], here[on & ~linked_back]
+    last = np.concatenate([right, left])
+    # Runs to the left and to the right in one row, so that both kinds of ends are gone back from alike.
+    back = np.concatenate([runs.preceding, runs.following + len(here)])
+    end, inner = _ends(points, finger, last, len(right), back)
+    # The links beyond where a line is drawn straight are replaced by the piece to its end.
+    bent = right[inner[: len(right)] != right]
+    linked[runs.preceding[bent]] = linked[runs.preceding[runs.preceding[bent]]] = False
+    bent = left[inner[len(right) :] != left]
+    linked[bent] = linked[runs.following[bent]] = False
+    a = here[linked]
+    b = runs.following[a]
+    start = np.concatenate([points[a], points[inner]])
+    stop = np.concatenate([points[b], end])
+    sure = np.concatenate([(share[a] + share[b]) / 2.0, share[last]])
+    of: Bool = np.concatenate([finger[a], finger[last]]) == _FIVE
+    middle, piece = (start + stop) / 2.0, np.hypot(*(stop - start).T)
+    weight = piece * sure
+    line, length, u, v = (of @ np.stack([piece, weight, weight * middle[:, 0], weight * middle[:, 1]], -1)).T
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack(
-            [np.bincount(owner, whole * sure * middle[:, k], 6)[1:] / length for k in (0, 1)], axis=-1
-        )
-    depth = view.on_plane(uv)[:, 2]
-    seen = line * depth / view.optics.matrix[0, 0] >= _LEAST_M
-    away = whole * sure * (1.0 - sure) * np.abs(middle[:, 0] - uv[owner - 1, 0])
-    doubt = np.bincount(owner, away, 6)[1:] / np.maximum(length, 1e-9)
-    lines = np.bincount(finger[owners[0]] + 1, minlength=6)[1:]
+        uv = np.stack([u, v], axis=-1) / length[:, None]
+    seen = line * reach_of(view).metres_per_px(uv) >= _LEAST_M
+    away = of * np.abs(middle[:, 0] - uv[:, :1])
+    away[:, weight == 0.0] = 0.0
+    doubt = away @ (weight * (1.0 - sure)) / np.maximum(length, 1e-9)
+    ends = finger[right] == _FIVE
     column = points[:, 0]
-    cut = np.isin(np.arange(5), finger[(column < 1.0) | (column > view.optics.width_px - 2.0)])
-    brightest = np.zeros(6)
-    np.maximum.at(brightest, finger + 1, runs.peak)
-    sigma = _sigma_px(doubt, (lines > 1) | cut, brightest[1:] < _FAINT, shown=shown)
-    return LaserLines(
-        np.where(seen[:, None], uv, np.nan), np.where(seen, sigma, np.nan), np.where(seen, length, 0.0)
-    )
+    cut = finger[(column < 1.0) | (column > view.optics.width_px - 2.0)] == _FIVE
+    brightest = ((finger == _FIVE) * runs.peak).max(axis=1, initial=0.0)
+    sigma = _sigma_px(doubt, (ends.sum(axis=1) > 1) | cut.any(axis=1), brightest < _FAINT, shown=shown)
+    uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
+    return LaserLines(uv, sigma, length)
 
 
 def _sigma_px(doubt: Float, parts: Bool, faint: Bool, *, shown: bool) -> Float:
@@ -156,18 +156,31 @@ def _sigma_px(doubt: Float, parts: Bool, faint: Bool, *, shown: bool) -> Float:
     return np.sqrt(_LINE_PX**2 + in_parts**2 + (_BALL_OF_THUMB * doubt) ** 2 + unshown**2)
 
 
-def _ends(points: Float, finger: Int, last: Int, back: Int, outwards: float) -> tuple[Float, Int]:
+def _ends(points: Float, finger: Int, last: Int, rights: int, back: Int) -> tuple[Float, Int]:
     """Where lines end (E, 2) beyond their last runs (E,), and from which run (E,) on the line is drawn straight there.
 
     A line goes round a finger until it is seen no more: near its end it falls away as the root of the distance to the
     end does, most of it in less than a column, and dark. So it is continued from a few columns within.
+
+    Args:
+        points: (N, 2) of runs.
+        finger: (N,) of runs.
+        last: The runs, those at right ends first.
+        rights: How many they are.
+        back: (2 N,) run before each one, then N more than the run after each one.
     """
-    inner = back[back[last]]
-    deep = back[back[back[inner]]]
+    count = len(points)
+    k = last.copy()
+    k[rights:] += count
+    inner = back[back[k]]
+    deep = back[back[back[inner]]] % count
+    inner %= count
     smooth = (np.abs(points[last, 0] - points[deep, 0]) == 5.0) & (finger[deep] == finger[last])
     smooth &= (points[inner, 0] != points[last, 0]) & (finger[inner] == finger[last])
     bend = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, _STEEPEST)
-    end = points[last] + [outwards, 0.0]
+    end = points[last]
+    end[:rights, 0] += 0.5
+    end[rights:, 0] -= 0.5
     end[:, 1] = np.where(smooth, points[inner, 1] - bend * np.sqrt(2.5), end[:, 1])
     return end, np.where(smooth, inner, last)
 
@@ -199,44 +212,45 @@ def line_runs(laser: Image, first_row: int) -> Runs:
     band = laser[first_row:]
     mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= _ENOUGH_ROWS else laser)
     noise = float(mean[0, 0]) + _NOISE * float(deviation[0, 0])
-    threshold = max(_FLOOR, noise, _OF_BRIGHTEST * float(band.max()))
-    columns = np.flatnonzero(band.max(axis=0) >= threshold)
-    rows = np.flatnonzero(band.max(axis=1) >= threshold)
-    if not len(columns):
-        none = np.empty(0, dtype=np.int64)
-        return Runs(none, np.empty(0), none, none, np.empty(0), none, none)
-    left, top = int(columns[0]), int(rows[0])
-    part = cv2.transpose(band[top : rows[-1] + 1, left : columns[-1] + 1])
-    part = cv2.copyMakeBorder(part, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0)
-    least = cv2.convertScaleAbs(cv2.dilate(part, _NEIGHBOURHOOD), alpha=_OF_NEIGHBOURHOOD)
-    on = (part >= np.maximum(least, np.uint8(min(threshold, 255.0)))).ravel()
-    edges = np.flatnonzero(on[1:] != on[:-1])
-    start, end = edges[::2] + 1, edges[1::2] + 1
-    size = end - start
+    threshold = min(max(_FLOOR, noise, _OF_BRIGHTEST * cv2.minMaxLoc(band)[1]), 255.0)
+    band = cv2.threshold(band, np.ceil(threshold) - 1.0, 0.0, cv2.THRESH_TOZERO)[1]
+    left, top, width, height = cv2.boundingRect(band)
+    band = band[top : top + height, left : left + width]
+    if not band.size:
+        return _NO_RUNS
+    least = cv2.convertScaleAbs(cv2.dilate(band, _NEIGHBOURHOOD), alpha=_OF_NEIGHBOURHOOD, beta=-0.75)
+    bright = cv2.transpose(
+        cv2.compare(band, least, cv2.CMP_GT)
+    )  # above a half less 3/4: half or more, and not 0
+    bright = cv2.copyMakeBorder(bright, 0, 0, 1, 1, cv2.BORDER_CONSTANT, value=0).ravel()
+    edges = np.flatnonzero(bright[1:] != bright[:-1])
+    column, begin = np.divmod(edges[::2], height + 2)
+    size = edges[1::2] - edges[::2]
     good = size <= _THICKEST_PX
-    start, end, size = start[good], end[good], size[good]
-    if not len(start):
-        none = np.empty(0, dtype=np.int64)
-        return Runs(none, np.empty(0), none, none, np.empty(0), none, none)
-    flat = part.ravel()
-    first = np.cumsum(size) - size
-    of_run = np.repeat(np.arange(len(size)), size)
-    inside = np.arange(len(of_run)) - first[of_run]
-    level = flat[start[of_run] + inside].astype(np.float64)
+    column, begin, size = column[good], begin[good], size[good]
+    if not len(size):
+        return _NO_RUNS
+    centre, peak = _across(np.asarray(band, np.uint8), column, begin, size)
+    column += left
+    begin += top + first_row
+    return _linked(column, begin + centre, begin, begin + size, peak)
+
+
+def _across(band: Image, column: Int, begin: Int, size: Int) -> tuple[Float, Float]:
+    """Where the centres of runs (N,) are beyond their first rows [px], and their peaks (N,) [grey levels]."""
+    stop = np.cumsum(size)
+    first = stop - size
+    along = np.arange(int(stop[-1]))  # through all runs, one after another
+    width = band.shape[1]
+    pixels = np.repeat((begin - first) * width + column, size) + along * width
+    level = np.ascontiguousarray(band).ravel()[pixels].astype(np.float64)
     peak = np.maximum.reduceat(level, first)
-    flat = np.add.reduceat(level > _TOP * peak[of_run], first, dtype=np.int64) >= _FLAT_PX
-    above = np.maximum(level - (np.where(flat, _OF_FLAT, _OF_PEAK) * peak)[of_run], 0.0)
-    centre = np.add.reduceat(above * inside, first) / np.add.reduceat(above, first)
-    width = part.shape[1]
-    column = start // width
-    begin = start - column * width - 1 + top + first_row
-    runs = Runs(column + left, begin + centre, begin, begin + size, peak, column, column)
-    following = _following(runs)
-    here = np.arange(len(column))
-    preceding = here.copy()
-    on = following != here
-    preceding[following[on]] = here[on]
-    return Runs(runs.column, runs.row, runs.start, runs.end, peak, following, preceding)
+    flat = np.add.reduceat(level > np.repeat(_TOP * peak, size), first, dtype=np.int64) >= _FLAT_PX
+    level -= np.repeat(np.where(flat, _OF_FLAT, _OF_PEAK) * peak, size)
+    np.maximum(level, 0.0, out=level)
+    whole = np.add.reduceat(level, first)
+    level *= along
+    return np.add.reduceat(level, first) / whole - first, peak
 
 
 def _lines(runs: Runs) -> Bool:
@@ -273,16 +287,19 @@ def _climb(start: int, step: Int, row: Float, same: Bool) -> list[int]:
     return out
 
 
-def _following(runs: Runs) -> Int:
-    key = runs.column * 1024.0 + runs.row
-    here = np.arange(len(key))
+def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
+    """Runs (N,) with the nearest of those of the next column that each overlaps."""
+    here = np.arange(len(column))
+    key = column * 1024.0 + row
     after = np.searchsorted(key, key + 1024.0)
-    best = here.copy()
-    gap = np.full(len(key), np.inf)
-    for shift in (-1, 0):
-        k = np.clip(after + shift, 0, len(key) - 1)
-        ok = (runs.column[k] == runs.column + 1) & (runs.start[k] <= runs.end) & (runs.end[k] >= runs.start)
-        distance = np.where(ok, np.abs(runs.row[k] - runs.row), np.inf)
-        nearer = distance < np.minimum(gap, _JUMP_PX)
-        best, gap = np.where(nearer, k, best), np.where(nearer, distance, gap)
-    return best
+    near = np.stack(
+        [after - 1, np.minimum(after, len(key) - 1)]
+    )  # the next above and below in the next column
+    off = np.abs(row[near] - row)
+    off[(column[near] != column + 1) | (start[near] > end) | (end[near] < start)] = np.inf
+    nearest = near[(off[1] < off[0]).astype(np.int64), here]
+    following = np.where(off.min(axis=0) < _JUMP_PX, nearest, here)
+    preceding = here.copy()
+    on = following != here
+    preceding[following[on]] = here[on]
+    return Runs(column, row, start, end, peak, following, preceding)

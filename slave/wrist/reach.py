@@ -28,11 +28,13 @@ class Reach:
     Attributes:
         pixels: (5, H, W), thumb ... little.
         thumb_share: (H, W) how sure the laser on the thumb's line is beyond the ball of the thumb, 0 ... 1.
+        depth_per_focal_m: (H, W) how much of the plane one pixel shows there [m]; 0: none.
         first_row: Above it the laser meets no finger.
     """
 
     pixels: Bool
     thumb_share: Float32
+    depth_per_focal_m: Float32
     first_row: int
 
     def holds(self, finger: Int, uv: Float) -> Bool:
@@ -44,6 +46,11 @@ class Reach:
         """`thumb_share` (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
         return self.thumb_share[row, column].astype(np.float64)
+
+    def metres_per_px(self, uv: Float) -> Float:
+        """`depth_per_focal_m` (N,) at pixels (N, 2) of the image; 0 where they are NaN."""
+        column, row = self._cell(np.nan_to_num(uv))
+        return np.where(np.isnan(uv[:, 0]), 0.0, self.depth_per_focal_m[row, column])
 
     def _cell(self, uv: Float) -> tuple[Int, Int]:
         column, row = (uv + 0.5).astype(np.int64).T
@@ -65,10 +72,10 @@ def reach_of(view: WristView) -> Reach:
     pixels = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_NEAREST) for part in cells]).astype(
         np.bool_
     )
-    share = _share_of_thumb(view)
+    share, metres = _on_plane(view)
     pixels[1:] &= share > _LEAST_SHARE  # no finger is where the ball of the thumb is
     rows = np.flatnonzero(pixels.any(axis=(0, 2)))
-    return Reach(pixels, share, int(rows[0]) if len(rows) else size[1] - 1)
+    return Reach(pixels, share, metres, int(rows[0]) if len(rows) else size[1] - 1)
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
@@ -99,8 +106,9 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
     return out
 
 
-def _share_of_thumb(view: WristView) -> Float32:
-    """How sure it is (H, W) that a laser point of the thumb's line lies on the thumb and not on its ball (thenar).
+def _on_plane(view: WristView) -> tuple[Float32, Float32]:
+    """How sure it is (H, W) that a laser point of the thumb's line lies on the thumb and not on its ball (thenar); and
+    how much of the laser plane a pixel shows (H, W) [m].
 
     However the thumb is turned, the skin over its MCP lies about as far from its root (CMC); so the border is a sphere
     about the root, and a fixed line in the image.
@@ -112,4 +120,5 @@ def _share_of_thumb(view: WristView) -> Float32:
     points = view.on_plane(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
     away = np.linalg.norm(points - (T[:3, :3] @ root + T[:3, 3]), axis=1)
     share = np.clip(0.5 + (np.nan_to_num(away) - border) / (2.0 * _BORDER_M), _LEAST_SHARE, 1.0)
-    return share.reshape(u.shape).astype(np.float32)
+    metres = np.nan_to_num(points[:, 2]) / view.optics.matrix[0, 0]
+    return share.reshape(u.shape).astype(np.float32), metres.reshape(u.shape).astype(np.float32)

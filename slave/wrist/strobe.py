@@ -186,4 +186,4 @@ class Strobe:
 
 
 def _copied(last: _Seen, frame: Frame, cells: Image) -> bool:
-    return np.array_equal(last.cells, cells) and np.array_equal(last.frame.image, frame.image)
+    return last.cells.tobytes() == cells.tobytes() and np.array_equal(last.frame.image, frame.image)
