@@ -12,9 +12,6 @@ own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and de
 hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
 bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
 1.5 mm at most, and as much may be wrong for another person: `SPREAD`.
-
-A ray o + t d meets the side of a round cone where k2 t^2 + 2 k1 t + k0 = 0 with a foot between the spheres (Quilez,
-"Round cone - intersection"), or one of the spheres; the nearest of all is the skin.
 """
 
 from dataclasses import dataclass
@@ -23,6 +20,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, Chains, HandModel
+from common.round_cones import Cones, terms
+from common.round_cones import first_hits as cone_hits
 
 SPREAD = 0.10  # of the palmar distance, standard deviation
 # Of the spheres of a finger: on which of its three bones, and at what share of it.
@@ -95,25 +94,12 @@ def first_hits(origin: Float, rays: Float, centres: Float, radius: Float) -> Flo
     """How far along unit rays (..., R, 3) from `origin` (3,) each cone of a chain begins, (..., R, K - 1); inf: missed.
 
     Args:
-        centres: (..., K, 3) of the spheres of a chain, in the frame of the rays.
-        radius: (..., K).
+        origin: Outside of all cones.
+        rays: In the frame of the centres.
+        centres: (..., K, 3) of the spheres of a chain.
+        radius: (K,).
     """
-    a, b = centres[..., None, :-1, :], centres[..., None, 1:, :]
-    ra, rb = radius[..., None, :-1], radius[..., None, 1:]
-    d = rays[..., :, None, :]
-    axis, from_a, from_b, narrowing = b - a, origin - a, origin - b, ra - rb
-    m0, m1, m5 = np.vecdot(axis, axis), np.vecdot(axis, from_a), np.vecdot(from_a, from_a)
-    m2, m3, m6 = np.vecdot(axis, d), np.vecdot(from_a, d), np.vecdot(from_b, d)
-    d2 = m0 - narrowing * narrowing
-    k2 = d2 - m2 * m2
-    k1 = d2 * m3 - m1 * m2 + m2 * narrowing * ra
-    k0 = d2 * m5 - m1 * m1 + 2.0 * m1 * narrowing * ra - m0 * ra * ra
-    with np.errstate(invalid="ignore", divide="ignore"):
-        side = (-np.sqrt(k1 * k1 - k0 * k2) - k1) / k2
-        foot = m1 - ra * narrowing + side * m2
-        side[~((foot > 0.0) & (foot < d2) & (side > 0.0))] = np.inf
-        first = -m3 - np.sqrt(m3 * m3 - m5 + ra * ra)
-        second = -m6 - np.sqrt(m6 * m6 - np.vecdot(from_b, from_b) + rb * rb)
-    nearest = np.fmin(np.fmin(first, second), side)
-    nearest[~(nearest > 0.0)] = np.inf
-    return nearest
+    chain = Cones(centres[..., :-1, :], centres[..., 1:, :], radius[:-1], radius[1:])
+    known = terms(chain, origin, np.float64)[..., None, :]
+    hits: Float = cone_hits(known, np.moveaxis(rays, -1, 0)[..., None])
+    return hits

@@ -14,9 +14,9 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
 from common.hand_model import HandModel
+from common.round_cones import Cones, distances, first_hits, terms
 from common.sim.imu import SimulatedImu
 from common.sim.scenes import renderer_of, view_by_name
-from common.sim.wrist.cones import Cones, distances, first_hits, terms
 from common.sim.wrist.flesh import PALM_GROUP, THENAR_GROUP, THUMB_GROUP, Flesh
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.render import WristRenderer

@@ -12,7 +12,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import CHAINS, FINGERS, METACARPALS, WRIST, HandJoints, HandModel
-from common.sim.wrist.cones import Cones
+from common.round_cones import Cones
 
 GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6

@@ -15,7 +15,7 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.hand_model import HandJoints
-from common.sim.wrist.cones import Cones, distances
+from common.round_cones import Cones, distances
 from common.sim.wrist.flesh import GROUPS, Flesh
 
 RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel

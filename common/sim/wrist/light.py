@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image
-from common.sim.wrist.cones import Plane
+from common.round_cones import Plane
 
 BLACK_LEVEL = 2.0
 LED_LEVEL = 88.0  # of skin that faces the LEDs at SKIN_AT_M on the axis

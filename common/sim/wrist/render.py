@@ -12,8 +12,8 @@ import numpy as np
 from common.arrays import Float, Image
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
+from common.round_cones import Plane
 from common.sim.wrist import light
-from common.sim.wrist.cones import Plane
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.skin import Skin, SkinView
 from common.sim.wrist.stripe import draw_stripe

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
-from common.sim.wrist.cones import Cones, Plane, first_hits, terms
+from common.round_cones import Cones, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 
 CREASE_M, CREASE_DEPTH = 0.0008, 0.08

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.sim.wrist.cones import Cones, Plane
+from common.round_cones import Cones, Plane
 from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SKIN_AT_M
 from common.sim.wrist.scene import WristScene
 

@@ -21,7 +21,7 @@ _ALONG = 1e-6  # a ray within the cone's own angle of its axis meets the spheres
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cones:
-    """B round cones.
+    """B round cones, or several hands of them: (..., B).
 
     Attributes:
         start_m, stop_m: Centres of the spheres (B, 3) [m].
@@ -57,22 +57,23 @@ class Cones:
 
 
 def terms(cones: Cones, origin: Float, kind: type[np.float32] | type[np.float64]) -> Any:
-    """What `first_hits` needs to know of each body, seen from the origin (3,) [m] of the rays: (12, B) of a kind."""
+    """What `first_hits` needs to know of each body, seen from the rays' origin (3,) [m]: (12, ..., B) of a kind."""
     axis = cones.stop_m - cones.start_m
     r1, narrowing = cones.start_radius_m, cones.start_radius_m - cones.stop_radius_m
     away, beyond = origin - cones.start_m, origin - cones.stop_m
-    m0, m1, m5 = ((a * b).sum(axis=1) for a, b in ((axis, axis), (axis, away), (away, away)))
+    m0, m1, m5 = (np.vecdot(a, b) for a, b in ((axis, axis), (axis, away), (away, away)))
     d2 = m0 - narrowing**2
     k0 = d2 * m5 - m1**2 + 2.0 * m1 * narrowing * r1 - m0 * r1**2
-    ends = m5 - r1**2, (beyond * beyond).sum(axis=1) - cones.stop_radius_m**2
-    return np.array((*axis.T, *away.T, d2, k0, narrowing * r1 - m1, m1 - r1 * narrowing, *ends), dtype=kind)
+    ends = m5 - r1**2, np.vecdot(beyond, beyond) - cones.stop_radius_m**2
+    ways = np.moveaxis(axis, -1, 0), np.moveaxis(away, -1, 0)
+    return np.array((*ways[0], *ways[1], d2, k0, narrowing * r1 - m1, m1 - r1 * narrowing, *ends), dtype=kind)
 
 
 def first_hits(known: Any, directions: Real) -> Real:
     """How far along rays (3, ...) of unit length their body begins, each its own or all of them the same.
 
     Args:
-        known: `terms` of one body (12,), or of the body of each ray (12, ...).
+        known: `terms` of one body (12,), or of the body of each ray (12, ...), or what fits the rays by broadcasting.
         directions: The rays, from the origin of the terms.
 
     Returns:
