@@ -5,6 +5,7 @@ A camera that looks for markers sends of every frame, the camera of a wrist devi
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -121,11 +122,12 @@ def run_wrist(
     Raises:
         CameraError: The camera is gone.
     """
-    took_ns, parts = 0, 0
+    took_ns: deque[int] = deque(maxlen=3)  # of the frames that may be a triple; those before are none of it
+    parts = 0
     while not stop.is_set() and (frame := source.read()) is not None:
         began_ns = time.perf_counter_ns()
         found = detector.push(frame)
-        took_ns += time.perf_counter_ns() - began_ns
+        took_ns.append(time.perf_counter_ns() - began_ns)
         if found is None:
             tally.part(frame.seq)
             parts += 1
@@ -133,6 +135,6 @@ def run_wrist(
                 show(frame)
             continue
         sender.send(found.message(camera, sender.session))
-        tally.frame(frame.seq, took_ns, np.vstack([found.laser.uv, found.tips.uv]))
-        took_ns, parts = 0, 0
+        tally.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
+        parts = 0
         show(found.triple.led)

@@ -85,6 +85,8 @@ def _together(points: Float) -> Bool:
     length = np.linalg.norm(way, axis=1)
     # Neighbours tell no direction.
     far = length > np.quantile(length, 0.5)
+    if not far.any():  # all in one place
+        return np.ones(len(points), dtype=np.bool_)
     a, way = a[far], way[far] / length[far, None]
     arm = points[:, None] - a
     off = np.linalg.norm(arm - np.vecdot(arm, way)[..., None] * way, axis=2)

@@ -106,6 +106,19 @@ def test_while_there_are_no_triples_every_frame_is_shown_and_nothing_is_sent() -
     assert (tally.counts()["frames"], tally.counts()["empty"]) == (30, 0)
 
 
+def test_the_time_of_a_triple_is_that_of_its_three_frames_however_long_there_was_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    ticks = iter(range(0, 10**9, 1_000_000))  # every look at the clock a millisecond later
+    monkeypatch.setattr("slave.app.time.perf_counter_ns", lambda: next(ticks))
+    tally = Tally(NAMES)
+    # 300 frames of which none is the last of a triple: nobody before the device.
+    source = Source(frames([*(3 * k for k in range(300)), 900, 901, 902]))
+    run_wrist(source, ByNumber(), Wire(), "wrist", tally, threading.Event())
+    gauges = tally.gauges()
+    assert (gauges["detect_us"], gauges["detect_worst_us"]) == (3000.0, 3000.0)
+
+
 def test_the_loop_ends_when_told() -> None:
     wire, stop = Wire(), threading.Event()
     stop.set()

@@ -54,6 +54,12 @@ def test_a_finger_that_rests_or_is_not_seen_is_named_and_the_others_stay() -> No
     assert f"{MIN_POINTS - 1} points" in curls[4].reason
 
 
+def test_a_finger_seen_in_one_place_only_rested() -> None:
+    points = curl()
+    points[:, 2] = points[0, 2]
+    assert "moved by 0.0 mm" in fit_curls(points)[2].reason
+
+
 @pytest.mark.parametrize("triples", [0, 1, 30])
 def test_nothing_seen_is_refused_with_the_reason_of_each(triples: int) -> None:
     with pytest.raises(FitError, match=r"no finger curled .* thumb: 0 points.* little: 0 points"):
