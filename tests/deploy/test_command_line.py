@@ -10,6 +10,9 @@ from common.sim.scenes import NAMES
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import demo, replay
 from deploy.__main__ import main
+from slave.arguments import parser
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize(("command", "other"), [("demo", "replay"), ("replay", "demo")])
@@ -155,6 +158,35 @@ def test_a_length_that_is_none_is_refused(seconds: str, capsys: pytest.CaptureFi
         main(["demo", "--seconds", seconds])
     assert ended.value.code == 2
     assert " _" not in capsys.readouterr().err, "no name of a function"
+
+
+def rows(rig: str, calibration: Path, out: Path) -> dict[str, list[str]]:
+    """Process -> its command line, in the order of the table."""
+    settings = demo.DemoSettings(1.0, True, out, calibration, rig, 7, "standard")
+    return {name: command for name, command, _ in demo._table(settings, 10**12)}
+
+
+def test_the_demo_starts_a_slave_for_the_imu_of_a_rig_that_has_one(tmp_path: Path) -> None:
+    desk = json.loads((ROOT / "calib_json/rigs/desk.json").read_text())
+    (tmp_path / "rigs").mkdir()
+    (tmp_path / "rigs/desk-imu.json").write_text(json.dumps(desk | {"imu": {"name": "palm-imu"}}))
+    assert list(rows("desk", ROOT / "calib_json", tmp_path)) == ["left", "right", "master"]
+    assert list(rows("wrist", ROOT / "calib_json", tmp_path)) == ["wrist", "imu", "master"]
+    table = rows("desk-imu", tmp_path, tmp_path)
+    assert list(table) == ["left", "right", "palm-imu", "master"]
+    slaves = [parser().parse_args(table[name][3:]) for name in ("left", "right", "palm-imu")]
+    assert [one.command for one in slaves] == ["run", "run", "imu"]
+    assert {(one.scene, one.seed, one.scene_epoch_ns, one.rig) for one in slaves} == {
+        ("standard", 7, 10**12, "desk-imu")
+    }
+    assert len({(one.clock_offset_ms, one.clock_ppm) for one in slaves}) == 3  # a clock of its own
+
+
+def test_a_rig_whose_imu_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "rigs").mkdir()
+    (tmp_path / "rigs/odd.json").write_text(json.dumps({"cameras": ["left"], "imu": 5}))
+    with pytest.raises(demo.DemoError, match=r"odd\.json: cannot read the rig"):
+        rows("odd", tmp_path, tmp_path)
 
 
 def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:

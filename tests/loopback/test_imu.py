@@ -1,0 +1,118 @@
+"""The slave of an IMU as a process: its samples over sealed UDP, on the master's clock, and how it is told things."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from common.calibration import RigCalibration, load
+from common.clock import SystemClock
+from common.keys import new_key
+from common.messages import Command, ImuSample
+from common.sim.imu import SimulatedImu
+from common.sim.scene import Scene
+from common.zenoh_bus import ZenohBus
+from master.ingest import Ingest
+from slave.simulated import scene_of
+from slave.uplink import Uplink
+from tests.network_helpers import free_endpoint, free_udp_port, until
+
+ROOT = Path(__file__).resolve().parents[2]
+APART_NS = 20_000_000  # of clocks that are seconds apart: what a busy machine makes of an echo
+
+
+def calibration(folder: Path) -> Path:
+    """A calib_json tree whose rig `desk-imu` is a desk with an IMU on the back of the hand."""
+    files = folder / "calib"
+    (files / "rigs").mkdir(parents=True)
+    for kept in ("hands", "cameras"):
+        (files / kept).symlink_to(ROOT / "calib_json" / kept)
+    rig = json.loads((ROOT / "calib_json/rigs/desk.json").read_text())
+    imu = {"name": "palm-imu", "q_palm_imu": [0.5, 0.5, -0.5, 0.5], "q_rig_world": [0.6, 0.8, 0.0, 0.0]}
+    (files / "rigs/desk-imu.json").write_text(json.dumps(rig | {"name": "desk-imu", "imu": imu}))
+    return files
+
+
+def simulated(files: Path, rig: RigCalibration, seed: int) -> SimulatedImu:
+    scene = scene_of(files, rig, "standard", seed)
+    assert isinstance(scene, Scene)
+    return SimulatedImu.of(scene)
+
+
+@contextmanager
+def process(files: Path, log: Path, key: str, port: int, *more: str) -> Generator[subprocess.Popen[bytes]]:
+    command = [sys.executable, "-m", "slave", "imu", "--name", "palm-imu", "--rig", "desk-imu"]
+    command += ["--imu", "synthetic", "--calibration", str(files), "--seed", "5", "--bind", "127.0.0.1"]
+    with log.open("w") as out:
+        slave = subprocess.Popen(
+            [*command, "--beacon-port", str(port), *more],
+            cwd=ROOT,
+            env=os.environ | {"PHALANX_RIG_KEY": key},
+            stdout=out,
+            stderr=subprocess.STDOUT,
+        )
+    try:
+        yield slave
+    finally:
+        slave.kill()
+        slave.wait(20)
+
+
+def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path) -> None:
+    files, log = calibration(tmp_path), tmp_path / "imu.log"
+    key, port, endpoint, clock = new_key(), free_udp_port(), free_endpoint(), SystemClock()
+    raw, beacon, here = bytes.fromhex(key), ("127.255.255.255", port), ("127.0.0.1", 0)
+    epoch_ns = clock.now_ns() - 10_000_000_000  # it joins a scene that has run for a while
+    skew = ["--scene-epoch-ns", str(epoch_ns), "--clock-offset-ms", "4000", "--clock-ppm", "80"]
+    with ExitStack() as stack:
+        bus = ZenohBus(endpoint, None)
+        stack.callback(bus.close)
+        ingest = Ingest(("left", "right"), raw, clock, beacon, here, endpoint, imus=("palm-imu",))
+        stack.callback(ingest.close)
+        for name in ("left", "right"):  # the start waits for the cameras
+            stack.callback(Uplink(name, raw, clock, port, "127.0.0.1").close)
+        slave = stack.enter_context(process(files, log, key, port, *skew))
+        got: list[ImuSample] = []
+
+        def enough() -> bool:
+            message = ingest.get(0.1)
+            assert message is None or isinstance(message, ImuSample)
+            got.extend([] if message is None else [message])
+            return len(got) >= 60
+
+        assert until(enough, 60.0), log.read_text()
+        assert until(lambda: "palm-imu" in bus.alive(), 20.0), log.read_text()
+        health = bus.ask(Command("palm-imu", "report", ""), 10.0)
+        assert health.counts["samples"] >= health.counts["sent"] >= 60
+        assert health.counts["skipped"] >= 0
+        bus.ask(Command("palm-imu", "stop", ""), 10.0)
+        assert slave.wait(20) == 0, log.read_text()
+    assert "samples, sent" in log.read_text()
+    assert {one.source for one in got} == {"palm-imu"}
+    assert len({one.session for one in got}) == 1
+    assert got[0].session == health.session != 0
+    assert (np.diff([one.seq for one in got]) > 0).all()
+    assert got[0].seq > 1000
+    rig = load(files / "rigs/desk-imu.json", RigCalibration)
+    ours, other = simulated(files, rig, 5), simulated(files, rig, 6)
+    for one in got:
+        t_s = one.seq / 120.0  # up to the 80 ppm: 5 ms after a minute
+        assert abs(one.t_ns - epoch_ns - t_s * 1e9) < APART_NS
+        assert abs(one.orientation_wxyz @ ours.sample(one.seq, t_s, 0).orientation_wxyz) > 0.9999
+        assert abs(one.orientation_wxyz @ other.sample(one.seq, t_s, 0).orientation_wxyz) < 0.999
+
+
+def test_it_waits_for_a_master_and_a_signal_ends_it(tmp_path: Path) -> None:
+    log = tmp_path / "imu.log"
+    with process(calibration(tmp_path), log, new_key(), free_udp_port()) as slave:
+        assert until(lambda: "ready, waiting for the master" in log.read_text(), 60.0)
+        assert slave.poll() is None
+        slave.send_signal(signal.SIGINT)
+        assert slave.wait(20) == 0, log.read_text()
+    assert "0 samples, sent 0" in log.read_text()
