@@ -13,7 +13,7 @@ _EXAMPLES = {
     "demo": """examples:
   phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
-  phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera
+  phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
@@ -108,7 +108,8 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser(
         "demo",
         help="everything on this machine, without hardware",
-        description="Starts a slave with a synthetic camera for each camera of the rig, the master and the viewer.",
+        description="Starts a slave with a synthetic camera for each camera of the rig, one for its IMU where it has "
+        "one, the master and the viewer.",
         epilog=_EXAMPLES["demo"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
