@@ -336,7 +336,7 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         raise CalibrationError(f"{where}: volume: low_m must be below high_m in every axis")
     if rig.imu is not None:
         _check_imu(rig.imu, rig.cameras, where)
-    check_wrist(rig.laser_plane, rig.finger_lines, where)
+    check_wrist(rig.laser_plane, rig.laser, rig.finger_lines, where)
     check_flat_field(rig.flat_field, where)
     if rig.kind == "wrist":
         if len(rig.cameras) != 1:

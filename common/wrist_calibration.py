@@ -11,6 +11,7 @@ from common.errors import CalibrationError
 
 FLAT_FIELD_TERMS = (1, 3, 6, 10, 15, 21, 28)  # of polynomials in two variables, by degree
 _UNIT_WITHIN = 1e-2  # of the length of a direction: what rounding leaves of one
+_ACROSS = 0.2  # of a direction that should lie in a plane: 12 degrees, far more than a line laser is bent
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
@@ -57,14 +58,27 @@ class FingerLine(Part, frozen=True):
     residual_m: NonNegative
 
 
-def check_wrist(plane: LaserPlane | None, lines: Mapping[str, FingerLine], where: str) -> None:
+def check_wrist(
+    plane: LaserPlane | None, laser: Laser | None, lines: Mapping[str, FingerLine], where: str
+) -> None:
     """Refuse what the types alone cannot see.
 
     Raises:
         CalibrationError: With `where` and the key.
     """
-    if plane is not None and abs(math.hypot(*plane.normal) - 1.0) > _UNIT_WITHIN:
-        raise CalibrationError(f"{where}: laser_plane.normal: length {math.hypot(*plane.normal):.4g}, not 1")
+    directions = {
+        "laser_plane.normal": None if plane is None else plane.normal,
+        "laser.forward": None if laser is None else laser.forward,
+        "laser.right": None if laser is None else laser.right,
+    }
+    for key, way in directions.items():
+        if way is not None and abs(math.hypot(*way) - 1.0) > _UNIT_WITHIN:
+            raise CalibrationError(f"{where}: {key}: length {math.hypot(*way):.4g}, not 1")
+        if way is None or plane is None or not key.startswith("laser."):
+            continue
+        leaves = abs(sum(a * b for a, b in zip(plane.normal, way, strict=True)))
+        if leaves > _ACROSS:
+            raise CalibrationError(f"{where}: {key}: leaves laser_plane by {leaves:.2f} of its length")
     for finger, line in lines.items():
         if finger not in _FINGERS:
             raise CalibrationError(f"{where}: finger_lines: {finger!r} is none of {', '.join(_FINGERS)}")

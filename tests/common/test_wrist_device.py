@@ -3,13 +3,14 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 from msgspec.structs import replace
 
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse
 from common.errors import CalibrationError
 from common.hand_model import HandModel
-from common.wrist_calibration import LaserPlane
+from common.wrist_calibration import Laser, LaserPlane
 from common.wrist_device import WristDevice
 from master.wrist.setup import WristSetup
 from slave.wrist.view import WristView
@@ -83,3 +84,18 @@ def test_slave_and_master_place_the_same_plane_and_palm_also_where_the_file_is_r
     assert abs(slave.offset_m + RIG.laser_plane.offset_m) < 1e-6
     uv = slave.optics.project(slave.T_camera_palm[:3, 3] + slave.T_camera_palm[:3, 2] * 0.09)
     assert slave.on_plane(uv).tolist() == master.on_plane(uv).tolist()
+
+
+@pytest.mark.parametrize(
+    ("laser", "says"),
+    [
+        (Laser(forward=(0.0, 0.0, 0.0)), "laser.forward: length 0, not 1"),
+        (Laser(forward=(0.0, 0.0, 1000.0)), "laser.forward: length 1000, not 1"),
+        (Laser(right=(0.0, 0.0, 0.5)), "laser.right: length 0.5, not 1"),
+        (Laser(forward=(0.0, 1.0, 0.0)), "laser.forward: leaves laser_plane"),
+    ],
+)
+def test_a_laser_whose_light_goes_nowhere_or_out_of_its_plane_is_refused(laser: Laser, says: str) -> None:
+    data = msgspec.json.encode(replace(RIG, laser=laser))
+    with pytest.raises(CalibrationError, match=f"rig.json: {says}"):
+        parse(data, RigCalibration, "rig.json")
