@@ -25,7 +25,7 @@ def test_help_of_a_command_shows_its_own_examples_only(
     assert not [other for other in HELP if other != command and f"phalanx-slave {other} " in examples]
 
 
-@pytest.mark.parametrize("command", ["run", "record"])
+@pytest.mark.parametrize("command", ["run", "imu", "record"])
 def test_help_lists_every_scene(
     command: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
