@@ -16,8 +16,11 @@ from slave.wrist.view import WristView
 Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
-_BORDER_M = 1.5e-3  # how well the border between thumb and thenar is known
-_WEB = 1.1  # of the thumb's metacarpal: where the fold of its web ends, a little beyond the MCP
+# The border between thumb and thenar is where the head of the thumb's metacarpal ends, a little beyond the middle of
+# the joint. It is known no better than the bone's length (5 %) and than bending the joint by 40 degrees moves the
+# plane that halves its angle, at a finger's radius: 3 mm each.
+_WEB = 1.05  # of the metacarpal
+_BORDER_M = 3e-3
 _LEAST_SHARE = 0.005  # a line that lies on the ball of the thumb alone is the best that is known of the thumb
 
 
