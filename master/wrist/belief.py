@@ -30,13 +30,8 @@ _ABDUCTION_RAD = np.radians(20.0)
 _WHOLE = 0.75  # a line seen to this share of its length is not missing a part
 _HARDLY = 0.5  # less of it than this is no measurement of the finger
 _CURVES = 1 / 3
-_FOLD_RAD = np.radians(
-    20.0
-)  # so near to the end of the branch a short line is one that the last phalanx hides
+_FOLD_RAD = np.radians(20.0)  # so near to the end of the branch it is the last phalanx that hides a line
 _PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
-_OFF_RAD = np.radians(
-    5.0
-)  # beyond its limits of abduction by more than this, a point is not this finger bent naturally
 
 
 @dataclass(frozen=True, slots=True, eq=False)
