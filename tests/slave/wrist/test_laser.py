@@ -12,8 +12,9 @@ from common.sim.wrist.render import WristRenderer
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
-from slave.wrist.laser import laser_lines, line_runs
+from slave.wrist.laser import laser_lines
 from slave.wrist.reach import reach_of
+from slave.wrist.runs import line_runs
 from tests.slave.wrist.wrist_frames import VIEW, scene
 
 BLACK = np.zeros((480, 640), dtype=np.uint8)
