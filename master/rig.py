@@ -204,4 +204,7 @@ def pipeline_of(
     """
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
-    return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))
+    try:
+        return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))
+    except CalibrationError as error:
+        raise CalibrationError(f"rig {setup.rig.name!r}: {error}") from error

@@ -1,6 +1,7 @@
 """Tests of the way from JSON to pipeline: every contradiction is named."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,7 @@ from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.hand_profiles import generated_profile
 from master.calibrate.tree_files import load_marker_rig
-from master.rig import RigSetup, build_pipeline, load_hand, load_setup
+from master.rig import RigSetup, build_pipeline, load_hand, load_setup, pipeline_of
 from master.stages import StageTimes
 from tests.hand_helpers import RIGHT, camera_file, rig_file
 
@@ -130,3 +131,13 @@ def test_a_wrist_rig_without_a_part_names_it(root: Path, key: str) -> None:
         RigSetup.of(rig, cameras, RIGHT)
     with pytest.raises(CalibrationError, match="no camera file for 'wrist'"):
         RigSetup.of(rig, {}, RIGHT)
+
+
+def test_a_wrist_rig_whose_laser_passes_by_the_hand_is_refused_by_name(root: Path) -> None:
+    setup = load_setup(root / "calib_json", "wrist")
+    assert setup.wrist is not None
+    above = setup.wrist.T_camera_palm.copy()
+    above[1, 3] -= 0.1
+    passed_by = replace(setup, wrist=replace(setup.wrist, T_camera_palm=above))
+    with pytest.raises(CalibrationError, match=r"rig 'wrist': .*the laser meets no finger"):
+        pipeline_of(passed_by, StageTimes())
