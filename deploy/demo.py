@@ -161,12 +161,13 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
 
 
 def _sensors(settings: DemoSettings) -> tuple[list[str], list[str]]:
-    """Names of the rig's cameras, and of its IMU where it has one."""
+    """Names of the rig's cameras, and of its IMU where it has one whose mounting and world are known."""
     path = settings.calibration / "rigs" / f"{settings.rig}.json"
     try:
         rig = json.loads(path.read_text())
-        imu = rig.get("imu")
-        return cast(list[str], rig["cameras"]), [] if imu is None else [str(imu.get("name", "imu"))]
+        imu = rig.get("imu") or {}
+        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
+        return cast(list[str], rig["cameras"]), [str(imu.get("name", "imu"))] if placed else []
     except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
         raise DemoError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"

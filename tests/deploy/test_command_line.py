@@ -169,9 +169,13 @@ def rows(rig: str, calibration: Path, out: Path) -> dict[str, list[str]]:
 def test_the_demo_starts_a_slave_for_the_imu_of_a_rig_that_has_one(tmp_path: Path) -> None:
     desk = json.loads((ROOT / "calib_json/rigs/desk.json").read_text())
     (tmp_path / "rigs").mkdir()
-    (tmp_path / "rigs/desk-imu.json").write_text(json.dumps(desk | {"imu": {"name": "palm-imu"}}))
+    still = [1.0, 0.0, 0.0, 0.0]
+    placed = {"name": "palm-imu", "q_palm_imu": still, "q_rig_world": still}
+    (tmp_path / "rigs/desk-imu.json").write_text(json.dumps(desk | {"imu": placed}))
     assert list(rows("desk", ROOT / "calib_json", tmp_path)) == ["left", "right", "master"]
     assert list(rows("wrist", ROOT / "calib_json", tmp_path)) == ["wrist", "imu", "master"]
+    (tmp_path / "rigs/unplaced.json").write_text(json.dumps(desk | {"imu": {}}))
+    assert list(rows("unplaced", tmp_path, tmp_path)) == ["left", "right", "master"]
     table = rows("desk-imu", tmp_path, tmp_path)
     assert list(table) == ["left", "right", "palm-imu", "master"]
     slaves = [parser().parse_args(table[name][3:]) for name in ("left", "right", "palm-imu")]
