@@ -165,7 +165,7 @@ def _sensors(settings: DemoSettings) -> tuple[list[str], list[str]]:
     path = settings.calibration / "rigs" / f"{settings.rig}.json"
     try:
         rig = json.loads(path.read_text())
-        imu = rig.get("imu") or {}
+        imu = cast(dict[str, object], rig.get("imu") or {})
         placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
         return cast(list[str], rig["cameras"]), [str(imu.get("name", "imu"))] if placed else []
     except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
