@@ -86,7 +86,11 @@ class WristRecordingFound:
     def summary(self) -> str:
         """One line for a person."""
         parts = [f"{self.frames} frames", f"{len(self.detections.t_ns)} triples"]
-        parts += [f"{event} {count}" for event, count in self.counts.items() if count]
+        parts += [
+            f"{event.replace('_', ' ')} {count}"
+            for event, count in self.counts.items()
+            if count and event != "triples"
+        ]
         if self.mislabelled:
             parts.append(
                 f"{self.mislabelled} frames lit otherwise than frames.csv says (its illumination is not used)"

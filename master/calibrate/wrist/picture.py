@@ -43,7 +43,7 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
     off = [1e3 * float(np.mean(line.points_m @ normal - fit.plane.offset_m)) for line in lines]
     bars.bar(range(len(lines)), off, color=[_BLUE if own else _ORANGE for own in fit.used])
     bars.axhline(0.0, color=_GREY, linewidth=0.8)
-    bars.set(title="view's distance from the plane [mm]; orange: left out")
+    bars.set(title="views off the plane [mm]; orange: left out", xlabel="view")
     bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
     _save(figure, path)
 
@@ -109,7 +109,7 @@ def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
         axes.plot(ends[:1, 0], ends[:1, 2], "o", color=colour)
         axes.plot(ends[1:, 0], ends[1:, 2], "x", color=colour)
     axes.set(title="laser points from above [mm]: o straight, x bent", xlabel="x", ylabel="z", aspect="equal")
-    axes.legend(fontsize=8)
+    figure.legend(fontsize=8, loc="outside lower center", ncols=3)  # not on the fingers
     _save(figure, path)
 
 
