@@ -74,6 +74,25 @@ def test_the_centroid_weighs_length_and_not_columns() -> None:
     assert found.length_px[INDEX] == pytest.approx(flat + steep, rel=0.15)
 
 
+def test_a_line_in_parts_is_doubted_by_what_its_parts_would_move_it() -> None:
+    truth = scene("curl@dark").truth(0.0)
+    u0, v0 = truth.laser_uv[1 + INDEX]
+    renderer = WristRenderer(scene("curl@dark"), "wrist")
+    fingers = separate(
+        lit(renderer.render(0.0, Illumination.LED), renderer.render(0.0, Illumination.AMBIENT)), VIEW
+    )
+    doubt: list[float] = []
+    for apart in (0.0, 12.0, 24.0):
+
+        def row(u: Float, apart: float = apart) -> Float:
+            return np.where(u < u0, v0, v0 - apart)
+
+        found = laser_lines(drawn(row, (round(u0) - 14, round(u0) + 10), 220.0), fingers, VIEW)
+        doubt.append(float(found.sigma_px[INDEX]))
+    whole, near, far = doubt
+    assert whole < 1.0 < near < far
+
+
 @pytest.mark.parametrize("image", [BLACK, np.full_like(BLACK, 255), np.full_like(BLACK, 40)])
 def test_an_image_without_a_line_has_none(image: Image) -> None:
     found = laser_lines(image, separate(BLACK, VIEW), VIEW)
@@ -108,6 +127,23 @@ def test_rendered_fingers_are_met_within_six_tenths_of_a_millimetre(name: str) -
     errors, owned = laser_errors(name, 20, 31)
     assert np.nanmedian(errors, axis=0).max() < 0.6e-3
     assert owned >= 0.95
+
+
+def test_a_thumb_whose_line_runs_on_over_its_ball_is_met_within_half_a_finger_and_doubted() -> None:
+    one = scene("poses@indoor", 31)
+    renderer = WristRenderer(one, "wrist")
+    off: list[float] = []
+    for k in range(16):
+        t = one.period_s * k / 16
+        ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
+        found = laser_lines(lit(laser, ambient), separate(lit(led, ambient), VIEW), VIEW)
+        truth = one.truth(t)
+        if truth.laser_len_vis[1] >= VISIBLE_M:
+            off.append(float(np.linalg.norm(VIEW.on_plane(found.uv)[0] - truth.laser_pt[1])))
+            assert not (np.abs(found.uv[0] - truth.laser_uv[1]) > 3.0 * found.sigma_px[0]).any()
+    assert np.isfinite(off).sum() >= 5
+    assert np.nanmedian(off) < 4e-3
+    assert np.nanmax(off) < 8e-3
 
 
 def laser_errors(name: str, count: int, seed: int) -> tuple[Float, float]:
