@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from common.errors import CalibrationError
 from slave.tuning import CameraFiles, Prepare
-from slave.wrist.detector import WristDetector
+from slave.wrist.detector import WristDetector, prepared
 from slave.wrist.view import WristView
 
 
@@ -30,7 +30,7 @@ def wrist_changes(detector: WristDetector) -> Prepare:
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         if (old.camera.intrinsics, old.rig, old.hand) == (new.camera.intrinsics, new.rig, new.hand):
             return None
-        view = view_of(new)
+        view = prepared(view_of(new))  # a second or two, and the last thing that may refuse
         return lambda: detector.replace(view)
 
     return prepare

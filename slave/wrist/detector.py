@@ -84,8 +84,8 @@ class WristDetector:
         return None if triple is None else find(triple, self._view, self._led_shift)
 
     def replace(self, view: WristView) -> None:
-        """See with another view from the next triple on. Not from the loop's thread: it takes a second or two."""
-        self._view = prepared(view)
+        """See with another view, a prepared one, from the next triple on. From any thread."""
+        self._view = view
 
 
 def prepared(view: WristView) -> WristView:

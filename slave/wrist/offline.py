@@ -15,9 +15,10 @@ from common.arrays import Float, Int
 from common.calibration import HandProfile, RigCalibration, load
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording, Illumination, open_recording
+from common.messages import WristDetections
 from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
-from slave.wrist.detector import WristDetector, WristFound
+from slave.wrist.detector import WristDetector
 from slave.wrist.registration import led_shift
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
@@ -50,18 +51,17 @@ class RecordedWristDetections:
     tip_depth: Float
 
     @classmethod
-    def of(cls, found: list[WristFound]) -> "RecordedWristDetections":
+    def of(cls, found: list[WristDetections]) -> "RecordedWristDetections":
         """Row by row."""
-        laser = [one.triple.laser for one in found]
         return cls(
-            np.array([frame.t_ns for frame in laser], np.int64),
-            np.array([frame.seq for frame in laser], np.int64),
-            _stacked([one.laser.uv for one in found], 2),
-            _stacked([one.laser.sigma_px for one in found]),
-            _stacked([one.laser.length_px for one in found]),
-            _stacked([one.tips.uv for one in found], 2),
-            _stacked([one.tips.sigma_px for one in found]),
-            _stacked([one.tips.depth for one in found]),
+            np.array([one.t_ns for one in found], np.int64),
+            np.array([one.seq for one in found], np.int64),
+            _stacked([one.laser_uv for one in found], 2),
+            _stacked([one.laser_sigma_px for one in found]),
+            _stacked([one.laser_px for one in found]),
+            _stacked([one.tip_uv for one in found], 2),
+            _stacked([one.tip_sigma_px for one in found]),
+            _stacked([one.tip_depth for one in found]),
         )
 
 
@@ -173,11 +173,13 @@ def detect_wrist_recording(
     triples = (triple for frame in frames() if (triple := strobe.push(frame)) is not None)
     shift_px = led_shift(islice(triples, _TO_COMPARE), view.optics)
     detector = WristDetector(view, own.frame_rate_hz, shift_px)
-    found: list[WristFound] = []
+    found: list[
+        WristDetections
+    ] = []  # not their images, of which a long recording has more than memory holds
     mislabelled = 0
     for i, frame in enumerate(frames()):
         if (seen := detector.push(frame)) is not None:
-            found.append(seen)
+            found.append(seen.message(camera, session=0))
             mislabelled += _mislabelled(seen.triple)
         progress(i + 1, len(rows))
     detections = RecordedWristDetections.of(found)

@@ -7,7 +7,7 @@ import pytest
 
 from common.frame_recording import Illumination
 from slave.cameras.source import Frame
-from slave.wrist.detector import WristDetector, WristFound
+from slave.wrist.detector import WristDetector, WristFound, prepared
 from tests.slave.wrist.wrist_frames import CAMERA, FIRST_NS, PERIOD_NS, VIEW, scene, spoiled, strobed
 
 SHARE = 0.05
@@ -117,7 +117,7 @@ def test_another_view_is_used_from_the_next_triple_on() -> None:
     before = [found for frame in frames[:12] if (found := machine.push(frame)) is not None]
     moved = VIEW.T_camera_palm.copy()
     moved[0, 3] += 0.03
-    machine.replace(replace(VIEW, T_camera_palm=moved))
+    machine.replace(prepared(replace(VIEW, T_camera_palm=moved)))
     after = [found for frame in frames[12:] if (found := machine.push(frame)) is not None]
     np.testing.assert_array_equal(before[-1].laser.uv, plain[len(before) - 1].laser.uv)
     same = np.isclose(after[-1].laser.uv, plain[-1].laser.uv, equal_nan=True).all(axis=1)
