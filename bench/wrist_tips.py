@@ -2,7 +2,7 @@
 
 On the recordings, where they are, and on simulated hands and palm poses of other seeds in every light. A tip counts as
 found within 6 px of the end of its finger; false is a report more than 25 px from it, or of an end that is not seen.
-Of the recordings the one shift by which their LED frames lie beside their truth is told and taken off.
+Where the LED frames of a recording lie beside its laser frames, registration finds that and takes it off.
 """
 
 import os
@@ -22,9 +22,12 @@ from common.hand_profiles import generated_profile
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from slave.cameras.replay import read_png
+from slave.cameras.source import Frame
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
+from slave.wrist.registration import led_shift, shifted
+from slave.wrist.strobe import Triple
 from slave.wrist.view import WristView
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -51,9 +54,7 @@ def rows() -> Iterator[Row]:
     cv2.setNumThreads(1)
     data = Path(os.environ.get("PHALANX_DATASETS", ROOT / "../shared/datasets")).resolve()
     if (data / "wrist").is_dir():
-        yield from _scored(
-            "recordings", [one for name in RECORDINGS for one in recorded(data, name)], shifted=True
-        )
+        yield from _scored("recordings", [one for name in RECORDINGS for one in recorded(data, name)])
     else:
         yield Row("recordings: skipped", 0.0, "", f"none at {data}: set PHALANX_DATASETS")
     shown: list[Shown] = []
@@ -64,7 +65,7 @@ def rows() -> Iterator[Row]:
             for seed, length in zip(SEEDS, HAND_LENGTHS_M, strict=True)
             for one in simulated(f"{motion}@{ambient}", seed, length)
         ]
-        yield from _scored(f"simulated, {ambient}", shown, shifted=False)
+        yield from _scored(f"simulated, {ambient}", shown)
     one = max(shown, key=lambda each: int(each.seen.sum()))
     fingers = separate(one.led, one.view)
     middle, half = median_us(lambda: fingertips(one.led, fingers, one.view))
@@ -79,11 +80,16 @@ def recorded(data: Path, name: str) -> list[Shown]:
     camera = recording.manifest.cameras[rig.cameras[0]]
     view = WristView.of(rig, camera, load(data / f"hands/{rig.hand}.json", HandProfile))
     size = (camera.height_px, camera.width_px)
-    images = [read_png(folder / row.file, size, grey=True) for row in recording.frames_of(camera.name)]
+    frames = [
+        Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, size, grey=True))
+        for row in recording.frames_of(camera.name)
+    ]
+    triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
+    back = -led_shift(triples, view.optics)
     truth = np.load(folder / "truth.npz")
     return [
-        Shown(view, lit(images[3 * k + 2], images[3 * k]), truth["tip_uv"][k], truth["tip_visible"][k])
-        for k in range(len(images) // 3)
+        Shown(view, shifted(lit(triple.led.image, triple.ambient.image), back), tip_uv, seen)
+        for triple, tip_uv, seen in zip(triples, truth["tip_uv"], truth["tip_visible"], strict=True)
     ]
 
 
@@ -108,23 +114,16 @@ def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
     return out
 
 
-def _scored(name: str, shown: list[Shown], shifted: bool) -> Iterator[Row]:
+def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
     found = [fingertips(one.led, separate(one.led, one.view), one.view) for one in shown]
     off = np.array([tips.uv - one.truth_px for tips, one in zip(found, shown, strict=True)])
     sigma = np.array([tips.sigma_px for tips in found])
     seen = np.array([one.seen for one in shown])
     reported = np.isfinite(off[..., 0])
-    note = ""
-    if shifted:
-        shift = np.median(off[seen & reported], axis=0)
-        off = off - shift
-        note = f"LED frames lie ({shift[0]:+.1f}, {shift[1]:+.1f}) px beside the truth; "
     distance = np.linalg.norm(off, axis=2)
     four = seen & (np.arange(5) > 0)
     both = four & reported
-    yield Row(
-        f"{name}: median", float(np.median(distance[both])), "px", f"{note}{four.sum()} seen, thumbs apart"
-    )
+    yield Row(f"{name}: median", float(np.median(distance[both])), "px", f"{four.sum()} seen, thumbs apart")
     yield Row(
         f"{name}: found within 6 px",
         100.0 * float((distance[four] <= FOUND_PX).mean()),

@@ -11,14 +11,16 @@ The thumb shows its side to the wrist and its end seldom, only where it is laid 
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from common.arrays import Float, Image
+from common.arrays import Float, Image, Int
 from slave.wrist.fingers import Fingers
 from slave.wrist.led_depth import DARK, SATURATED, SHRINK, Float32, LedOptics, led_optics, nearness, shrink
-from slave.wrist.normals import normals_of
+from slave.wrist.normals import BREADTH, normals_of
 from slave.wrist.spines import borders, spines
-from slave.wrist.tip_templates import FOUR, GAIN_SIGMA, LIKENESS, PALM_ROWS, FingerTemplates, templates_of
+from slave.wrist.tip_templates import GAIN_SIGMA, LIKENESS, TipTemplates, templates_of
 from slave.wrist.view import WristView
 
 SHIFTS = np.arange(-3, 4)
@@ -28,7 +30,10 @@ SATURATED_NEAR = float(np.sqrt(SATURATED))
 _SHIFT_PRIOR = (0.5 * (SHIFTS * SHRINK / SHIFT_SIGMA_PX) ** 2).astype(np.float32)
 _GAIN_WEIGHT = np.float32(0.5 / GAIN_SIGMA**2)
 CAP_SHARE = 0.8  # of a fingertip's radius: how much of it is compared with a half sphere
+_BEYOND_STEP = 0.2125
+_BEYOND = [0.3 + _BEYOND_STEP * k for k in range(9)]  # radii beyond the end where a spine is read
 _NOISE = np.float32(np.sqrt(DARK))
+LEAST_PIXELS = 6  # of the shrunken image, that show a half sphere
 MODEL_PX = 3.0  # a pad is no half sphere
 LEAST_SEEN = 0.5  # probability that the end of the finger is seen
 MOST_SIGMA_PX = 6.0
@@ -83,103 +88,116 @@ class Bend:
 
 def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
     """Find them in the difference of LED and ambient frame (H, W)."""
-    optics = led_optics(view)
-    near = nearness(shrink(led), optics)
+    optics, bank = led_optics(view), templates_of(view)
+    near = nearness(shrink(led[: bank.all_rows * SHRINK]), optics)
     uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
-    bank = templates_of(view)
     gain = palm_gain(near, bank)
     if gain is None:
         return Fingertips(uv, sigma, depth)
-    sides = borders(fingers, bank, len(near))
-    lines = spines(near, sides)
-    for finger, templates, border, whole in zip(FOUR, bank, sides, lines, strict=True):
-        line = whole[: templates.rows]
-        bend = bend_of(profile(near, line, border), templates, gain)
-        if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS:
-            continue
-        tip, spread = place(led, near, optics, line, bend)
-        if spread <= MOST_SIGMA_PX:
-            uv[finger], sigma[finger], depth[finger] = tip, spread, bend.depth_m
-    strays = fingers.finger_of(uv) != np.arange(5)
-    uv[strays], sigma[strays], depth[strays] = np.nan, np.nan, np.nan
+    border = borders(fingers, view)
+    lines = spines(near, border, bank.unit.shape[2])
+    bends = bends_of(profiles(near, lines, border, bank), bank, gain)
+    along, columns = full_profiles(led, lines)
+    ends: list[End] = []
+    for k, bend in enumerate(bends):
+        if bend is not None and bend.seen >= LEAST_SEEN and bend.likeness >= LEAST_LIKENESS:
+            rows = int(bank.rows[k]) * SHRINK
+            ends += edges(k + 1, along[k, :rows], columns[k, :rows], bend)
+    facing = [end for end in ends if end.bend.facing > LEAST_FACING]
+    middles: dict[int, Float] = {}
+    if facing:
+        guess = np.array([end.middle for end in facing])
+        centres = half_spheres(near, optics, guess, np.array([end.bend.radius_px for end in facing]))
+        known: list[bool] = np.isfinite(centres[:, 0]).tolist()
+        middles = {end.finger: at for end, at, ok in zip(facing, centres, known, strict=True) if ok}
+    for end in ends:
+        u, v, spread = end.place(middles.get(end.finger))
+        low, high = border[end.finger - 1, :, min(max(int(v) // SHRINK, 0), border.shape[2] - 1)].tolist()
+        if spread <= MOST_SIGMA_PX and low <= (u - 0.5 * (SHRINK - 1)) / SHRINK <= high:
+            uv[end.finger], sigma[end.finger], depth[end.finger] = (u, v), spread, end.bend.depth_m
     return Fingertips(uv, sigma, depth)
 
 
-def palm_gain(near: Float32, bank: tuple[FingerTemplates, ...]) -> float | None:
+def palm_gain(near: Float32, bank: TipTemplates) -> float | None:
     """Logarithm of nearness [grey levels^0.5] by nearness [1/m] of the palm below the knuckles; None: it is dark."""
-    gains: list[float] = []
-    for templates in bank:
-        u, v = (int(x) // SHRINK for x in templates.root_uv)
-        patch = near[v + PALM_ROWS[0] : v + PALM_ROWS[1], max(u, 0) : u + 1]
-        if patch.size and float(patch.mean()) ** 2 > DARK:
-            gains.append(float(np.log(patch.mean() / templates.palm)))
-    return float(np.median(gains)) if gains else None
+    palm = near.ravel()[bank.palm_at].mean(axis=1)
+    lit = palm * palm > DARK
+    return float(np.median(np.log(palm[lit] / bank.palm[lit]))) if lit.any() else None
 
 
-def profile(near: Float32, line: Float, border: Float) -> Float32:
-    """Nearness (rows,) along a spine, the mean of three pixels; 0 where it leaves the finger's region."""
-    columns = np.clip(np.rint(line).astype(np.int64), 1, near.shape[1] - 2)
-    rows = np.arange(len(line))
-    seen = (near[rows, columns - 1] + near[rows, columns] + near[rows, columns + 1]) / np.float32(3.0)
-    low, high = border[:, : len(line)]
-    return np.where((line >= low - 0.5) & (line <= high + 0.5), seen, np.float32(0.0))
+def profiles(near: Float32, lines: Float, border: Float32, bank: TipTemplates) -> Float32:
+    """Nearness (4, R) along the spines, the mean of three pixels; 0 where they leave the finger's region."""
+    width = near.shape[1]
+    row: Int = np.arange(lines.shape[1], dtype=np.int64)
+    at = np.rint(lines).astype(np.int64).clip(1, width - 2) + row * width
+    flat = near.ravel()
+    seen = (flat[at - 1] + flat[at] + flat[at + 1]) / np.float32(3.0)
+    low, high = border[:, 0, : len(row)], border[:, 1, : len(row)]
+    inside = (lines >= low - 0.5) & (lines <= high + 0.5) & (row < bank.rows[:, None])
+    return seen * (inside & (seen > _NOISE))
 
 
-def bend_of(seen: Float32, templates: FingerTemplates, gain: float) -> Bend | None:
-    """Weigh all bends of a finger by its profile (rows,); None: there is no finger in it."""
-    if np.count_nonzero(seen > np.sqrt(DARK)) < 4:
-        return None
-    unit, log_length = templates.unit, templates.log_length
-    cap = float(seen.max())
-    if cap > SATURATED_NEAR:
-        unit, log_length = _capped(templates, cap / np.exp(gain))
-    few = np.argpartition(_score(unit, log_length, seen[:, None], gain)[1][:, 0], -KEEP)[-KEEP:]
-    shifted = np.zeros((len(seen), len(SHIFTS)), dtype=np.float32)
-    for k, s in enumerate(SHIFTS):
-        shifted[max(-s, 0) : len(seen) - max(s, 0), k] = seen[max(s, 0) : len(seen) + min(s, 0)]
-    likeness, score = _score(unit[few], log_length[few], shifted, gain)
+def bends_of(seen: Float32, bank: TipTemplates, gain: float) -> list[Bend | None]:
+    """Weigh all bends of each finger by its profile (4, R); None: there is no finger in it."""
+    there = np.count_nonzero(seen > _NOISE, axis=1) >= 4
+    _, score = _score(bank.screen, bank.log_length, seen.reshape(4, -1, 2).mean(axis=2)[..., None], gain)
+    few = np.argpartition(score[..., 0], -KEEP, axis=1)[:, -KEEP:]
+    which = np.arange(4, dtype=np.int64)[:, None]
+    unit, log_length = bank.unit[which, few], bank.log_length[which, few]
+    cap = seen.max(axis=1)
+    if cap.max() > SATURATED_NEAR:
+        cap = np.where(cap > SATURATED_NEAR, cap / np.exp(gain), np.inf)
+        unit, log_length = _capped(unit, log_length, cap.astype(np.float32))
+    reach = len(SHIFTS) // 2
+    padded = np.pad(seen, ((0, 0), (reach, reach)))
+    shifted = sliding_window_view(padded, seen.shape[1], axis=1).swapaxes(1, 2)
+    likeness, score = _score(unit, log_length, shifted, gain)
     score -= _SHIFT_PRIOR
-    weight = np.exp(score - score.max())
-    weight /= weight.sum()
-    of_bend = weight.sum(axis=1)
-    table = templates.table[:, few]
-    mean = table @ of_bend
-    spread = np.sqrt(np.maximum((table * table) @ of_bend - mean * mean, 0.0))
-    shift = SHRINK * float(weight.sum(axis=0) @ SHIFTS)
-    below, above, top, bottom, radius, depth, facing, end_seen = mean.tolist()
-    return Bend(
-        below,
-        float(spread[0]),
-        above,
-        float(spread[1]),
-        top + shift,
-        bottom + shift,
-        radius,
-        depth,
-        facing,
-        end_seen,
-        float(likeness.flat[int(score.argmax())]),
-    )
+    weight = np.exp(score - score.max(axis=(1, 2), keepdims=True))
+    weight /= weight.sum(axis=(1, 2), keepdims=True)
+    table = bank.table[
+        which[..., None], np.arange(bank.table.shape[1], dtype=np.int64)[:, None], few[:, None]
+    ]
+    of_bend = weight.sum(axis=2)[..., None]
+    mean = (table @ of_bend)[..., 0]
+    spread = np.sqrt(np.maximum(((table[:, :2] ** 2) @ of_bend)[..., 0] - mean[:, :2] ** 2, 0.0))
+    mean[:, 2:4] += SHRINK * (weight.sum(axis=1) @ SHIFTS)[:, None]
+    best = likeness.reshape(4, -1)[np.arange(4, dtype=np.int64), score.reshape(4, -1).argmax(axis=1)]
+    return [
+        Bend(below, below_sigma, above, above_sigma, top, bottom, radius, depth, facing, end_seen, like)
+        if shown
+        else None
+        for (below, above, top, bottom, radius, depth, facing, end_seen), (
+            below_sigma,
+            above_sigma,
+        ), like, shown in zip(mean.tolist(), spread.tolist(), best.tolist(), there.tolist(), strict=True)
+    ]
 
 
 def _score(unit: Float32, log_length: Float32, seen: Float32, gain: float) -> tuple[Float32, Float32]:
-    """Likeness and log probability (T, S) of templates (T, rows) for profiles (rows, S)."""
+    """Likeness and log probability (4, T, S) of templates (4, T, R) for profiles (4, R, S)."""
     product = np.maximum(unit @ seen, np.float32(1e-6))
-    likeness = product / (np.sqrt(np.einsum("rs,rs->s", seen, seen)) + np.float32(1e-6))
-    away = np.log(product) - (log_length[:, None] + np.float32(gain))
+    likeness = product / (np.sqrt((seen * seen).sum(axis=1, keepdims=True)) + np.float32(1e-6))
+    away = np.log(product) - (log_length[..., None] + np.float32(gain))
     return likeness, (likeness - np.float32(1.0)) * np.float32(1.0 / LIKENESS) - away * away * _GAIN_WEIGHT
 
 
-def _capped(templates: FingerTemplates, cap: float) -> tuple[Float32, Float32]:
-    """The templates as a saturated image shows them: nowhere nearer than `cap` [1/m]."""
-    near = np.minimum(templates.unit * np.exp(templates.log_length)[:, None], np.float32(cap))
-    length = np.sqrt(np.einsum("tr,tr->t", near, near))
-    return near / length[:, None], np.log(length)
+def _capped(unit: Float32, log_length: Float32, cap: Float32) -> tuple[Float32, Float32]:
+    """Templates (4, T, R) as a saturated image shows them: nowhere nearer than `cap` (4,) [1/m]."""
+    near = np.minimum(unit * np.exp(log_length)[..., None], cap[:, None, None])
+    length = np.sqrt((near * near).sum(axis=2))
+    return near / length[..., None], np.log(length)
 
 
-def place(led: Image, near: Float32, optics: LedOptics, line: Float, bend: Bend) -> tuple[Float, float]:
-    """Where the end of a finger is (2,) [px], and its standard deviation."""
-    along, column = full_profile(led, line)
+def edges(finger: int, along: Float, column: Float, bend: Bend) -> list["End"]:
+    """The end of a finger by the edges that are seen of it; none where none is.
+
+    Args:
+        finger: 1 index ... 4 little.
+        along: (rows,) grey levels along its spine.
+        column: (rows,) of the spine [px].
+        bend: Of the finger.
+    """
     found: list[tuple[float, float]] = []
     radius = bend.radius_px
     top = top_edge(along, bend.top_v, radius)
@@ -189,63 +207,118 @@ def place(led: Image, near: Float32, optics: LedOptics, line: Float, bend: Bend)
         bottom = bottom_edge(along, bend.bottom_v, radius)
         if bottom is not None:
             found.append((bottom - bend.above_bottom, bend.above_bottom_sigma))
-    middle: Float | None = None
-    if found and bend.facing > LEAST_FACING:
-        guess = sum(v for v, _ in found) / len(found) + bend.above_bottom - radius
-        at = float(column[int(np.clip(guess, 0, len(column) - 1))])
-        middle = half_sphere(near, optics, (at, guess), radius)
+    return [End(finger, bend, column, tuple(found))] if found else []
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class End:
+    """The end of a finger as its edges tell it.
+
+    Attributes:
+        finger: 1 index ... 4 little.
+        bend: What is believed of its bend.
+        column: (rows,) of its spine [px].
+        found: At which row each edge puts the end, and the standard deviation of that by the bend [px].
+    """
+
+    finger: int
+    bend: Bend
+    column: Float
+    found: tuple[tuple[float, float], ...]
+
+    @property
+    def middle(self) -> tuple[float, float]:
+        """Where the middle of the fingertip is by its edges alone [px]."""
+        bend, last = self.bend, len(self.column) - 1
+        v = sum(v for v, _ in self.found) / len(self.found) + bend.above_bottom - bend.radius_px
+        return float(self.column[min(max(int(v), 0), last)]), v
+
+    def place(self, middle: Float | None) -> tuple[float, float, float]:
+        """Where it is and its standard deviation [px], with the middle (2,) of its half sphere where that is known."""
+        bend, found, last = self.bend, list(self.found), len(self.column) - 1
         if middle is not None:
-            found.append((middle[1] + radius - bend.above_bottom, bend.above_bottom_sigma))
-    if not found:
-        return np.full(2, np.nan), np.inf
-    weights = [1.0 / (MODEL_PX**2 + sigma**2) for _, sigma in found]
-    v = sum(w * x for w, (x, _) in zip(weights, found, strict=True)) / sum(weights)
-    away = -radius if bend.above_bottom < bend.below_top else radius
-    rows = np.linspace(v + 0.3 * away, v + 2.0 * away, 9).clip(0, len(column) - 1)
-    columns = column[rows.astype(np.int64)]
-    slope = np.clip((columns[6:].mean() - columns[:3].mean()) / (1.275 * away), -MOST_LEAN, MOST_LEAN)
-    u = columns.mean() + slope * (v - rows.mean())
-    if middle is not None:
-        u = middle[0] + slope * (v - middle[1])
-    return np.array([u, v]), float(np.sqrt(1.0 / sum(weights)))
+            found.append((float(middle[1]) + bend.radius_px - bend.above_bottom, bend.above_bottom_sigma))
+        weights = [1.0 / (MODEL_PX**2 + sigma**2) for _, sigma in found]
+        v = sum(w * x for w, (x, _) in zip(weights, found, strict=True)) / sum(weights)
+        away = -bend.radius_px if bend.above_bottom < bend.below_top else bend.radius_px
+        rows = [min(max(v + x * away, 0.0), last) for x in _BEYOND]
+        columns = [float(self.column[int(row)]) for row in rows]
+        slope = (sum(columns[6:]) - sum(columns[:3])) / 3.0 / (6.0 * _BEYOND_STEP * away)
+        slope = min(max(slope, -MOST_LEAN), MOST_LEAN)
+        if middle is None:
+            u = (sum(columns) + slope * (len(rows) * v - sum(rows))) / len(rows)
+        else:
+            u = float(middle[0]) + slope * (v - float(middle[1]))
+        return u, v, (1.0 / sum(weights)) ** 0.5
 
 
-def half_sphere(near: Float32, optics: LedOptics, guess: tuple[float, float], radius: float) -> Float | None:
-    """Centre (2,) [px] of the half sphere whose normals are nearest to those of the image, by squared distance.
+def half_spheres(near: Float32, optics: LedOptics, guess: Float, radius: Float) -> Float:
+    """Centres (N, 2) [px] of the half spheres whose normals are nearest to those of the image, by squared distance.
 
     At p the half sphere of centre c leans by (p - c) / radius aside from the way to the camera, the image by t; the
-    sum of squares of the difference is least where c is the mean of p - radius t.
+    sum of squares of the difference is least where c is the mean of p - radius t. NaN: too little is lit, or c is
+    nowhere near.
+
+    Args:
+        near: (h, w) nearness [grey levels^0.5].
+        optics: Of the same.
+        guess: (N, 2) where they are sought [px].
+        radius: (N,) [px].
     """
-    reach = int(radius / SHRINK) + 3
-    u, v = (round(x / SHRINK) for x in guess)
-    rows, columns = slice(max(v - reach, 0), v + reach + 1), slice(max(u - reach, 0), u + reach + 1)
-    part = near[rows, columns]
-    if part.size == 0:
-        return None
-    ray, cosine = optics.ray[rows, columns], optics.cosine[rows, columns]
+    height, width = near.shape
+    reach = int(radius.max() / SHRINK) + 3
+    around: Int = np.arange(-reach, reach + 1, dtype=np.int64)
+    beside: Int = np.arange(
+        -reach, reach + 1 + BREADTH // 2, dtype=np.int64
+    )  # a gap between one window and the next
+    cell = np.rint(guess / SHRINK).astype(np.int64)
+    row, column = cell[:, 1] + around[:, None], cell[:, :1] + beside
+    at = row.clip(0, height - 1)[..., None] * width + column.clip(0, width - 1)
+    part = near.ravel()[at]
+    outside = (column < 0) | (column >= width)
+    outside[:, 2 * reach + 1 :] = True
+    part[(part <= _NOISE) | outside | ((row < 0) | (row >= height))[..., None]] = np.nan
+    ray, cosine = optics.ray.reshape(-1, 3)[at], optics.cosine.ravel()[at]
+    size = len(around), at.shape[1] * at.shape[2]
+    full = normals_of((cosine / part).reshape(size), ray.reshape(*size, 3), cosine.reshape(size)).reshape(
+        ray.shape
+    )
     view = -ray * cosine[..., None]
-    lit = np.where(part > _NOISE, part, np.float32(np.nan)).astype(np.float32)
-    full = normals_of(cosine / lit, ray, cosine)
-    lean = full[..., :2] - (full * view).sum(axis=-1, keepdims=True) * view[..., :2]
-    down, across = np.indices(part.shape, dtype=np.float64)
-    at: Float = np.stack([across + columns.start, down + rows.start], axis=-1) * SHRINK + 0.5 * (SHRINK - 1)
-    centre: Float = np.array(guess)
+    lean = full[..., :2] - np.einsum("...k,...k->...", full, view)[..., None] * view[..., :2]
+    scale = radius.astype(np.float32)[:, None]
+    u, v = (
+        (column * SHRINK + 0.5 * (SHRINK - 1)).astype(np.float32),
+        (row * SHRINK + 0.5 * (SHRINK - 1)).astype(np.float32),
+    )
+    finite = np.isfinite(lean[..., 0])
+    lean = np.where(finite[..., None], lean, np.float32(0.0))
+    toward_u, toward_v = u - scale * lean[..., 0], v[..., None] - scale * lean[..., 1]
+    centre: Float = guess.copy()
     for _ in range(2):
-        inside = (((at - centre) ** 2).sum(axis=-1) < (CAP_SHARE * radius) ** 2) & np.isfinite(lean[..., 0])
-        if np.count_nonzero(inside) < 6:
-            return None
-        centre = (at[inside] - radius * lean[inside]).mean(axis=0)
-    return centre if np.hypot(*(centre - np.array(guess))) < radius else None
+        apart = (u - centre[:, :1]) ** 2 + ((v - centre[:, 1]) ** 2)[..., None]
+        inside = (apart < (CAP_SHARE * scale) ** 2) & finite
+        count = np.count_nonzero(inside, axis=(0, 2))
+        some = np.where(count < LEAST_PIXELS, np.nan, count)
+        centre = (
+            np.stack([(toward_u * inside).sum(axis=(0, 2)), (toward_v * inside).sum(axis=(0, 2))], axis=1)
+            / some[:, None]
+        )
+    centre[np.hypot(*(centre - guess).T) >= radius] = np.nan
+    return centre
 
 
-def full_profile(led: Image, line: Float) -> tuple[Float, Float]:
-    """Grey levels along a spine in the rows of the full image, the mean of five pixels; and its columns [px]."""
-    rows = np.arange(len(line) * SHRINK)
-    offset = 0.5 * (SHRINK - 1)
-    column = np.interp(rows, np.arange(len(line)) * SHRINK + offset, line * SHRINK + offset)
-    middle = np.clip(np.rint(column).astype(np.int64), 2, led.shape[1] - 3)
-    across = led[rows[:, None], middle[:, None] + np.arange(-2, 3)]
-    return across.mean(axis=1), column
+def full_profiles(led: Image, lines: Float) -> tuple[Float, Float]:
+    """Grey levels (4, rows) along spines in the rows of the full image, the mean of five pixels; their columns [px]."""
+    count = lines.shape[1] * SHRINK
+    column = cv2.resize(
+        lines * SHRINK + 0.5 * (SHRINK - 1), (count, len(lines)), interpolation=cv2.INTER_LINEAR
+    )
+    width = led.shape[1]
+    at = np.rint(column).astype(np.int64).clip(2, width - 3) + np.arange(count, dtype=np.int64) * width
+    flat = led.ravel()
+    across = sum(flat[at + aside].astype(np.float32) for aside in range(-2, 3))
+    along: Float = np.asarray(across, dtype=np.float64) / 5.0
+    return along, np.asarray(column, dtype=np.float64)
 
 
 def top_edge(along: Float, near_v: float, radius: float) -> float | None:

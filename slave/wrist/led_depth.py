@@ -67,8 +67,8 @@ def shrink(led: Image) -> Float32:
 
 
 def nearness(grey: Float32, optics: LedOptics) -> Float32:
-    """sqrt(I / F) (h, w) of grey levels; 0 where it is dark."""
-    return np.sqrt(np.maximum(grey, np.float32(0.0))) * optics.level
+    """sqrt(I / F) (h, w) of grey levels >= 0, NaN where they are; h rows from the top of the image."""
+    return np.sqrt(grey) * optics.level[: len(grey)]
 
 
 def relative_depth(grey: Float32, optics: LedOptics) -> RelativeDepth:

@@ -14,7 +14,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
+from common.errors import CalibrationError
 from common.hand_model import CHAINS, FINGER_JOINTS
 from slave.wrist.led_depth import SHRINK, Float32, image_rows
 from slave.wrist.view import WristView
@@ -34,40 +35,78 @@ HORIZON_UP, HORIZON_DOWN = -0.25, -0.15
 PALM_ROWS = (2, 14)  # rows below the knuckle, where no finger but a folded one is seen
 LIKENESS = 5e-4  # of 1 - cosine between profile and template: what flesh differs from capsules
 GAIN_SIGMA = 0.15  # of the logarithm of what a finger returns beside the palm: skin, creases, stray light
-FINGER_ENDS = 10  # rows above the knuckle: the web between the fingers, about half of the first bone
+FINGER_ENDS = 0  # rows above the knuckle: so far down the end of a folded finger is seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FingerTemplates:
-    """All bends of one finger.
+class TipTemplates:
+    """All bends of index ... little: T of each, profiles of R rows of the shrunken image.
 
     Attributes:
-        rows: A profile is that of image rows 0 ... rows - 1 of the shrunken image.
-        unit: (T, rows) profiles of unit length.
-        log_length: (T,) logarithm of what they were divided by [1/m].
-        palm: Nearness of the palm below the knuckle, on average [1/m].
-        root_uv: (2,) the knuckle [px].
-        table: (8, T) of the end of the finger: how far it is below the finger's highest row [px] and above the lowest
-            row of the fingertip [px], those two rows [px], the fingertip's radius [px], depth along the optical axis
-            [m], cosine between the last bone and the way to the camera (1: it points at the camera), and whether the
-            end is seen.
+        rows: (4,) the rows that belong to each finger; beyond them its profiles are 0.
+        unit: (4, T, R) profiles of unit length.
+        screen: (4, T, R / 2) the same, two rows in one.
+        log_length: (4, T) logarithm of what they were divided by [1/m].
+        palm: (4,) nearness of the palm below the knuckle, on average [1/m].
+        palm_at: (4, P) pixels of the shrunken image, counted row by row, that show the palm there.
+        root_uv: (4, 2) the knuckles [px].
+        table: (4, 8, T) of the end of the finger: how far it is below the finger's highest row [px] and above the
+            lowest row of the fingertip [px], those two rows [px], the fingertip's radius [px], depth along the optical
+            axis [m], cosine between the last bone and the way to the camera (1: it points at the camera), and whether
+            the end is seen.
     """
 
-    rows: int
+    rows: Int
     unit: Float32
+    screen: Float32
     log_length: Float32
-    palm: float
+    palm: Float
+    palm_at: Int
     root_uv: Float
     table: Float
 
+    @property
+    def all_rows(self) -> int:
+        """How many rows of the shrunken image are read: the longest profile and the palm below it."""
+        return int(self.rows.max()) + FINGER_ENDS + PALM_ROWS[1]
+
 
 @lru_cache(maxsize=8)
-def templates_of(view: WristView) -> tuple[FingerTemplates, ...]:
-    """The templates of index ... little of one wrist rig and hand; made once."""
-    return tuple(_templates(view, finger) for finger in FOUR)
+def templates_of(view: WristView) -> TipTemplates:
+    """The templates of one wrist rig and hand; made once.
+
+    Raises:
+        CalibrationError: The camera does not see the fingers of this hand above its palm.
+    """
+    made = [_templates(view, finger) for finger in FOUR]
+    near, table, root_uv = (np.stack([one[k] for one in made]) for k in range(3))
+    row, width, height = root_uv[:, 1] / SHRINK, view.optics.width_px // SHRINK, near.shape[2]
+    rows = row.astype(np.int64) - FINGER_ENDS
+    if rows.min() < 20 or rows.max() + FINGER_ENDS >= height:
+        raise CalibrationError(
+            "T_camera_palm: the camera does not see the fingers of this hand; calibrate the palm's pose"
+        )
+    below = np.minimum(row.astype(np.int64)[:, None] + np.arange(*PALM_ROWS), height - 1)
+    palm = np.take_along_axis(near.mean(axis=1), below, axis=1).mean(axis=1)
+    column = (root_uv[:, :1] / SHRINK).astype(np.int64) + np.repeat([-1, 0], len(below[0]))
+    most = int(rows.max() + 1) // 2 * 2
+    own = near[:, :, :most] * (np.arange(most) < rows[:, None])[:, None]
+    length = np.linalg.norm(own, axis=2)
+    unit = own / np.where(length > 0.0, length, 1.0)[..., None]
+    return TipTemplates(
+        rows=rows,
+        unit=unit.astype(np.float32),
+        screen=unit.reshape(*unit.shape[:2], -1, 2).sum(axis=3).astype(np.float32),
+        log_length=np.log(np.where(length > 0.0, length, 1.0)).astype(np.float32),
+        palm=palm,
+        palm_at=np.tile(below, (1, 2)) * width + column.clip(0, width - 1),
+        root_uv=root_uv,
+        table=table,
+    )
 
 
-def _templates(view: WristView, finger: int) -> FingerTemplates:
+def _templates(view: WristView, finger: int) -> tuple[Float, Float, Float]:
+    """Profiles (T, rows of the shrunken image) [1/m], table (8, T) and knuckle (2,) [px] of one finger."""
     mcp, pip = (_steps(float(low), float(high)) for low, high in (MCP_RAD, PIP_RAD))
     grid = np.stack(np.meshgrid(mcp, pip, OVERHANG, indexing="ij"), axis=-1).reshape(-1, 3)
     angles = np.zeros((len(grid), 5, 4))
@@ -85,10 +124,6 @@ def _templates(view: WristView, finger: int) -> FingerTemplates:
     uv = view.optics.project(points)
     size = radius * view.optics.matrix[1, 1] / points[..., 2]
     near = _profiles(view, points, radius, root_uv, uv[:, -1])
-    rows = int(root_uv[1] / SHRINK) - FINGER_ENDS
-    length = np.linalg.norm(near[:, :rows], axis=1)
-    kept = length > 0.0
-    palm = slice(*(int(root_uv[1] / SHRINK) + row for row in PALM_ROWS))
     toward = -apex / np.linalg.norm(apex, axis=-1, keepdims=True)
     facing: Float = (along * toward).sum(axis=-1)
     down = apex_uv[:, 1] > uv[:, -1, 1]
@@ -99,14 +134,7 @@ def _templates(view: WristView, finger: int) -> FingerTemplates:
     table: Float = np.array(
         [apex_v - top, bottom - apex_v, top, bottom, size[:, -1], apex[:, 2], facing, seen]
     )
-    return FingerTemplates(
-        rows=rows,
-        unit=(near[kept, :rows] / length[kept, None]).astype(np.float32),
-        log_length=np.log(length[kept]).astype(np.float32),
-        palm=float(near[:, palm].mean()),
-        root_uv=root_uv,
-        table=table[:, kept],
-    )
+    return near, table, root_uv
 
 
 def _steps(low: float, high: float) -> Float:
