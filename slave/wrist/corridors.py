@@ -30,6 +30,7 @@ _RARE = 0.02  # share of the postures of a sweep left out at either end
 _OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
 _LEAST_OF_SPACING = 0.25
 _MOST_OF_SPACING = 0.7  # half width of a corridor, in spacings of fingers: beyond lies another seam
+_UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate the palm's pose"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,9 +158,7 @@ def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, 
     near = np.abs(at[None] - stations[:, None]) <= STATION_PX
     known = near.any(axis=1)
     if not known.any():
-        raise CalibrationError(
-            "T_camera_palm: the camera does not see the fingers of this hand; calibrate the palm's pose"
-        )
+        raise CalibrationError(_UNSEEN.format("fingers"))
     lows = np.array([np.quantile(low[row], 0.1) for row in near[known]])
     highs = np.array([np.quantile(high[row], 0.9) for row in near[known]])
     ends = [np.interp(stations, stations[known], end) for end in (lows, highs)]
@@ -170,6 +169,9 @@ def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, 
 def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[float, float, int]:
     """The thumb's corridor: middle and half width [rad] on the finger's side of all that its axis can reach; and how
     many stations the thumb crosses however it is held.
+
+    Raises:
+        CalibrationError: No posture of the thumb, or of its tip, is before the camera.
     """
     points = along_bones(view, thumb_postures(view, 7, 7, 3, 3))[:, 0, PER_BONE:]  # beyond the metacarpal
     uv, depth = in_image(view, points)
@@ -177,7 +179,10 @@ def _thumb_reach(view: WristView, still: Corridors, stations: int) -> tuple[floa
     scale = view.optics.matrix[0, 0] / np.maximum(depth, NEAREST_M).ravel()
     breadth = np.arcsin(np.minimum(scale * view.model.radius_m[4] / np.maximum(radius, 1.0), 0.9))
     seen = (depth > NEAREST_M).ravel()
+    ends = depth[:, -1] > NEAREST_M
+    if not ends.any():
+        raise CalibrationError(_UNSEEN.format("thumb"))
     low, high = np.quantile((angle - breadth)[seen], (_RARE, 1.0 - _RARE))
     tips = radius.reshape(len(points), -1)[:, -1]
-    crossed = (np.quantile(tips[depth[:, -1] > NEAREST_M], _RARE) - _FIRST_RADIUS_PX) / STATION_PX
+    crossed = (np.quantile(tips[ends], _RARE) - _FIRST_RADIUS_PX) / STATION_PX
     return (low + high) / 2.0, (high - low) / 2.0, int(np.clip(crossed, 0, stations))

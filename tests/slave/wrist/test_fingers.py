@@ -1,12 +1,16 @@
 """Seams between fingers: beside every finger of a rendered hand, never crossing, and there in the dark, too."""
 
+import dataclasses
+
 import cv2
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from common.arrays import Image
+from common.errors import CalibrationError
 from common.frame_recording import Illumination
+from common.geometry import axis_rotation
 from common.hand_profiles import mirrored_profile
 from common.sim.wrist.render import WristRenderer
 from slave.wrist.background import lit
@@ -89,3 +93,11 @@ def test_a_crease_between_touching_fingers_is_the_seam() -> None:
     found = separate(image, VIEW).seams[0]
     inside = slice(12, 36)
     assert np.abs(found - crease)[inside].max() < 8.0
+
+
+@pytest.mark.parametrize(("turned_deg", "part"), [(-80.0, "fingers"), (60.0, "thumb")])
+def test_a_palm_whose_fingers_the_camera_cannot_see_is_refused(turned_deg: float, part: str) -> None:
+    T = VIEW.T_camera_palm.copy()
+    T[:3, :3] = axis_rotation(0, np.radians(turned_deg)) @ T[:3, :3]
+    with pytest.raises(CalibrationError, match=f"T_camera_palm: the camera does not see the {part}"):
+        corridors_of(dataclasses.replace(VIEW, T_camera_palm=T))
