@@ -19,11 +19,14 @@ from master.rig import RigSetup, load_hand
 from master.solve import solve
 from tests.replay.test_datasets import command
 
-_TIPS = pytest.mark.xfail(strict=True, reason="tips are found 8 px beside the outermost skin, always alike")
+_TIPS = pytest.mark.xfail(
+    strict=True,
+    reason="8 of 11 and 8 of 12 visible tips are within 6 px: two are not found, the others 7 to 9 px off",
+)
 _THUMB = pytest.mark.xfail(
     strict=True, reason="in two of six poses the thumb's point lies nearer to the thenar's"
 )
-_HIDDEN = pytest.mark.xfail(strict=True, reason="tips that just turned away are still reported")
+_HIDDEN = pytest.mark.xfail(strict=True, reason="6 of 67 reported tips of the curl have just turned away")
 HANDS = {"curl": "right", "mcp": "right", "spread": "right", "left_small": "left-small"}
 
 
@@ -78,15 +81,17 @@ def test_laser_points_are_where_the_laser_is(replays: dict[str, Replay], name: s
     assert replays[name].summary["laser_mm"] <= 0.6
 
 
-@_TIPS
-@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize(
+    "name",
+    ["curl", "spread", pytest.param("mcp", marks=_TIPS), pytest.param("left_small", marks=_TIPS)],
+)
 def test_visible_fingertips_are_found(replays: dict[str, Replay], name: str) -> None:
     assert replays[name].summary["tip_within_6px"] >= 0.90
 
 
 @pytest.mark.parametrize(
     "name",
-    ["mcp", "spread", pytest.param("curl", marks=_HIDDEN), pytest.param("left_small", marks=_HIDDEN)],
+    ["mcp", "spread", "left_small", pytest.param("curl", marks=_HIDDEN)],
 )
 def test_fingertips_are_not_invented(replays: dict[str, Replay], name: str) -> None:
     assert replays[name].summary["tip_false"] <= 0.05
