@@ -17,7 +17,17 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from common.arrays import Float, Image, Int
 from slave.wrist.fingers import Fingers
-from slave.wrist.led_depth import DARK, SATURATED, SHRINK, Float32, LedOptics, led_optics, nearness, shrink
+from slave.wrist.led_depth import (
+    DARK,
+    SATURATED,
+    SHRINK,
+    Float32,
+    LedOptics,
+    depth_about,
+    led_optics,
+    nearness,
+    shrink,
+)
 from slave.wrist.normals import BREADTH, normals_of
 from slave.wrist.spines import borders, spines
 from slave.wrist.tip_templates import GAIN_SIGMA, LIKENESS, TipTemplates, templates_of
@@ -114,7 +124,8 @@ def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
         u, v, spread = end.place(middles.get(end.finger))
         low, high = border[end.finger - 1, :, min(max(int(v) // SHRINK, 0), border.shape[2] - 1)].tolist()
         if spread <= MOST_SIGMA_PX and low <= (u - 0.5 * (SHRINK - 1)) / SHRINK <= high:
-            uv[end.finger], sigma[end.finger], depth[end.finger] = (u, v), spread, end.bend.depth_m
+            uv[end.finger], sigma[end.finger] = (u, v), spread
+            depth[end.finger] = depth_about(near, optics, u, v, end.bend.radius_px)
     return Fingertips(uv, sigma, depth)
 
 

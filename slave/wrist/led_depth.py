@@ -78,6 +78,18 @@ def relative_depth(grey: Float32, optics: LedOptics) -> RelativeDepth:
     return RelativeDepth(optics.cosine / near, grey >= SATURATED)
 
 
+def depth_about(near: Float32, optics: LedOptics, u: float, v: float, radius_px: float) -> float:
+    """Relative depth of what is nearest within a radius [px] about a pixel of the image, of nearness (h, w).
+
+    The nearest faces the camera, so it is the least inclined. NaN: too dark to tell.
+    """
+    row, column, reach = round(v / SHRINK), round(u / SHRINK), max(round(radius_px / SHRINK), 1)
+    about = (slice(max(row - reach, 0), row + reach + 1), slice(max(column - reach, 0), column + reach + 1))
+    lit = near[about] > np.sqrt(DARK) * optics.level[: len(near)][about]
+    depth = optics.cosine[: len(near)][about][lit] / near[about][lit]
+    return float(depth.min()) if len(depth) else float("nan")
+
+
 def image_rows(view: WristView) -> Float:
     """Rows of the image [px] at the centres of the shrunken image's rows."""
     return _centres(view.optics.height_px)

@@ -4,6 +4,7 @@ What the recording says of the illumination of a frame is not used: the strobe t
 disagree it is counted, because one of them is wrong then.
 """
 
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -23,6 +24,7 @@ from slave.wrist.registration import led_shift
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
 
+_LOG = logging.getLogger(__name__)
 _TO_COMPARE = 30  # triples of which laser and LED frames are compared
 
 
@@ -128,6 +130,14 @@ def view_of(
         if not hand_file.exists():
             raise CalibrationError(f"{hand_file}: no such hand profile: give --hand FILE")
     hand = load(hand_file, HandProfile)
+    if hand.name != rig.hand:
+        _LOG.warning(
+            "%s: hand %r (%s), while the recording is of hand %r: its palm pose is that of the other",
+            hand_file,
+            hand.name,
+            hand.side,
+            rig.hand,
+        )
     try:
         return WristView.of(rig, recording.manifest.cameras[rig.cameras[0]], hand)
     except CalibrationError as error:

@@ -81,6 +81,7 @@ def templates_of(view: WristView) -> TipTemplates:
     made = [_templates(view, finger) for finger in FOUR]
     near, table, root_uv = (np.stack([one[k] for one in made]) for k in range(3))
     row, width, height = root_uv[:, 1] / SHRINK, view.optics.width_px // SHRINK, near.shape[2]
+    row = np.where(np.isfinite(row), row, -1.0)  # a knuckle behind the camera
     rows = row.astype(np.int64) - FINGER_ENDS
     if rows.min() < 20 or rows.max() + FINGER_ENDS >= height:
         raise CalibrationError(

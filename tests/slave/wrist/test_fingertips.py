@@ -23,7 +23,7 @@ from slave.wrist.registration import led_shift, shifted
 from slave.wrist.strobe import Triple
 from slave.wrist.tip_templates import templates_of
 from slave.wrist.view import WristView
-from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene, strobed
 
 HANDS = {"default": HAND, "small": generated_profile("small", "right", 0.17)}
 ELSEWHERE_PX = 25.0  # a report that far from the end of its finger is of something else
@@ -172,3 +172,16 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
     assert (distance[visible] <= 6.0).mean() >= 0.85
     assert (distance[reported] > ELSEWHERE_PX).mean() <= 0.02
     assert (~visible[reported]).mean() <= 0.08
+
+
+def test_relative_depth_orders_the_tips_by_their_distance() -> None:
+    told: list[tuple[float, float]] = []
+    for start_s in np.arange(0.0, 60.0, 3.0):
+        ambient, _, led = strobed("standard", 1, 5, float(start_s))
+        truth = scene("standard", 5).truth(float(start_s) + 2.0 / CAMERA.frame_rate_hz)
+        tips = found(lit(led.image, ambient.image))
+        near = np.linalg.norm(tips.uv - truth.tip_uv, axis=1) < ELSEWHERE_PX
+        told += zip(tips.depth[near].tolist(), truth.tip_xyz[near, 2].tolist(), strict=True)
+    pairs = [(a, b) for a in told for b in told if a[1] > 1.3 * b[1]]
+    assert len(pairs) > 50
+    assert np.mean([a[0] > b[0] for a, b in pairs]) > 0.9

@@ -164,3 +164,13 @@ def test_hand_is_an_option_of_wrist_cameras_only(tmp_path: Path, capsys: pytest.
     assert main(command) == 1
     assert "only a wrist camera knows a hand" in capsys.readouterr().err
     assert HAND.name == RIG.hand
+
+
+def test_another_hand_than_that_of_the_recording_is_told(
+    curl: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    detect_wrist_recording(curl, "wrist", hand_file=HAND_FILE)
+    assert not caplog.records
+    detect_wrist_recording(curl, "wrist", hand_file=TREE / "hands/default-left.json")
+    assert "default-left" in caplog.text
+    assert RIG.hand in caplog.text
