@@ -17,10 +17,11 @@ from slave.cameras.replay import read_png
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
-from slave.wrist.fingertips import Fingertips, bends_of, fingertips
+from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.led_depth import SHRINK
 from slave.wrist.registration import led_shift, shifted
 from slave.wrist.strobe import Triple
+from slave.wrist.tip_bends import bends_of
 from slave.wrist.tip_templates import templates_of
 from slave.wrist.view import WristView
 from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene, strobed
