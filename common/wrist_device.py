@@ -56,7 +56,7 @@ class WristDevice:
             raise CalibrationError(
                 f"{where}: cameras: {', '.join(rig.cameras)}; the camera file is that of {camera.name!r}"
             )
-        normal, offset_m = _plane(rig, where)
+        normal, offset_m = laser_plane_of(rig, where)
         palm, optics = _palm(rig, where), CameraModel.of(camera, np.eye(4))
         _check_before(optics, transform(palm, model.rest_position_m[CHAINS[1:, 0]]), where)
         return WristDevice(optics, model, palm, normal, offset_m)
@@ -69,8 +69,12 @@ class WristDevice:
         return intersect_plane(_ORIGIN, self.optics.ray(uv), self.normal, self.offset_m)
 
 
-def _plane(rig: RigCalibration, where: str) -> tuple[Float, float]:
-    """Unit normal (3,) and offset [m] of the laser plane."""
+def laser_plane_of(rig: RigCalibration, where: str) -> tuple[Float, float]:
+    """Unit normal (3,) and offset [m] of the laser plane, camera frame; `where` names the rig in errors.
+
+    Raises:
+        CalibrationError: It is not measured, or crosses no finger.
+    """
     if rig.laser_plane is None:
         raise CalibrationError(
             f"{where}: laser_plane is missing, which `phalanx-master calibrate laser-plane` measures"

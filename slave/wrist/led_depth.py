@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image
-from common.wrist_calibration import FlatField
+from common.flat_field import flat_of
 from slave.wrist.view import WristView
 
 Float32: TypeAlias = npt.NDArray[np.float32]
@@ -29,7 +29,6 @@ Float32: TypeAlias = npt.NDArray[np.float32]
 SHRINK = 4  # the LED image is read at a quarter of its resolution
 DARK = 4.0  # grey levels: what the noise of a difference of two frames leaves
 SATURATED = 250.0  # grey levels of a difference of two frames whose white is 255
-_LEAST_FLAT = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,11 +111,3 @@ def led_optics(view: WristView) -> LedOptics:
         (1.0 / np.sqrt(flat)).astype(np.float32),
         ray.astype(np.float32),
     )
-
-
-def flat_of(field: FlatField, xy: Float) -> Float:
-    """The flat field (...) at normalised image points (..., 2), never less than a fiftieth of that on the axis."""
-    x, y = xy[..., 0], xy[..., 1]
-    powers = [x ** (n - k) * y**k for n in range(7) for k in range(n + 1)]
-    flat = sum(c * p for c, p in zip(field.coefficients, powers, strict=False))
-    return np.maximum(flat, _LEAST_FLAT)

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Int
+from common.flat_field import flat_of
 from common.round_cones import Cones, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
 
@@ -155,13 +156,7 @@ def _flat_field(scene: WristScene, rays: Float) -> Float:
     """What the rig's file says of the brightness across the image, at rays (N, 3); 1 where it says nothing."""
     if scene.rig.flat_field is None:
         return np.ones(len(rays))
-    coefficients = iter(scene.rig.flat_field.coefficients)
-    x, y = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    powers = (
-        (degree - k, k) for degree in range(len(scene.rig.flat_field.coefficients)) for k in range(degree + 1)
-    )
-    total = sum(c * x**i * y**j for c, (i, j) in zip(coefficients, powers, strict=False))
-    return np.maximum(np.asarray(total), 0.02)
+    return flat_of(scene.rig.flat_field, rays[:, :2] / rays[:, 2:])
 
 
 def _texture(rng: np.random.Generator) -> Plane:

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from common.arrays import Float
-from common.errors import CalibrationError
 from common.geometry import intersect_plane
+from common.wrist_device import laser_plane_of
 from master.calibrate.wrist.device import Device
 from master.recorded import recorded_triples
 
@@ -30,17 +30,11 @@ def read_curled(detections: Path, device: Device) -> Curled:
 
     Raises:
         RecordingError: The file is missing or broken.
-        CalibrationError: The rig has no laser plane yet.
+        CalibrationError: The rig has no laser plane yet, or one that crosses no finger.
     """
-    plane = device.rig.laser_plane
-    if plane is None:
-        raise CalibrationError(
-            f"rig {device.file_name!r}: laser_plane is missing, which `phalanx-master calibrate laser-plane` measures"
-        )
+    normal, offset_m = laser_plane_of(device.rig, f"rig {device.file_name!r}")
     triples = list(recorded_triples(detections, device.camera.name))
     uv = np.array([triple.laser_uv for triple in triples]).reshape(-1, 5, 2)
     tips = np.array([triple.tip_uv for triple in triples]).reshape(-1, 5, 2)
-    normal = np.array(plane.normal)
-    length = float(np.linalg.norm(normal))
-    points = intersect_plane(np.zeros(3), device.optics.ray(uv), normal / length, plane.offset_m / length)
+    points = intersect_plane(np.zeros(3), device.optics.ray(uv), normal, offset_m)
     return Curled(points, tips)

@@ -21,8 +21,9 @@ import numpy as np
 from common.arrays import Float, Image, Int
 from common.camera_model import CameraModel
 from common.errors import FitError
+from common.flat_field import terms_of
 from common.geometry import transform
-from common.wrist_calibration import FLAT_FIELD_TERMS, FlatField
+from common.wrist_calibration import FlatField
 from master.calibrate.cameras.boards import Board, grid_shape
 from master.calibrate.wrist.placed import PlacedBoard
 
@@ -189,17 +190,6 @@ def fit_flat_field(samples: WhiteSamples, optics: CameraModel) -> FlatFit:
             f" {100 * _WORST_RMS:.0f} %): matt paper, nothing else in the light, LED positions as in the rig's `led`?"
         )
     return fit
-
-
-def terms_of(xy: Float, degree: int) -> Float:
-    """Terms (S, T) of the polynomial, in the order of `FlatField.coefficients`."""
-    x, y = xy[:, 0], xy[:, 1]
-    return np.stack([x ** (d - k) * y**k for d in range(degree + 1) for k in range(d + 1)], axis=1)
-
-
-def field_at(field: FlatField, xy: Float) -> Float:
-    """The flat field (S,) at normalised image points (S, 2)."""
-    return terms_of(xy, FLAT_FIELD_TERMS.index(len(field.coefficients))) @ np.array(field.coefficients)
 
 
 def _law(xy: Float, light: Float) -> Float:

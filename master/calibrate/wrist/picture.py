@@ -10,9 +10,10 @@ from matplotlib.figure import Figure
 
 from common.camera_model import CameraModel
 from common.errors import RecordingError
+from common.flat_field import field_at
 from common.replacing import replacing
 from master.calibrate.wrist.curl import FingerCurl
-from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples, field_at
+from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
 from master.calibrate.wrist.plane import PlaneFit, ViewLine
 
 _FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")

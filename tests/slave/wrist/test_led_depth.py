@@ -5,11 +5,11 @@ import pytest
 from msgspec.structs import replace
 
 from common.arrays import Bool, Float
+from common.flat_field import flat_of
 from common.wrist_calibration import FlatField
 from slave.wrist.led_depth import (
     SATURATED,
     Float32,
-    flat_of,
     led_optics,
     nearness,
     relative_depth,

@@ -5,14 +5,13 @@ import pytest
 
 from common.arrays import Float
 from common.errors import FitError
+from common.flat_field import field_at, terms_of
 from common.frame_recording import Illumination
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer
 from common.wrist_calibration import FLAT_FIELD_TERMS
 from master.calibrate.wrist.flat_field import (
     WhiteSamples,
-    field_at,
     fit_flat_field,
-    terms_of,
     white_samples,
 )
 from master.calibrate.wrist.placed import placed_board

@@ -1,0 +1,24 @@
+"""The flat field of a wrist device's LEDs as a function of the image: the polynomial that `FlatField` describes."""
+
+import numpy as np
+
+from common.arrays import Float
+from common.wrist_calibration import FLAT_FIELD_TERMS, FlatField
+
+_LEAST = 0.02  # a polynomial beyond where it was measured must not turn the image inside out
+
+
+def terms_of(xy: Float, degree: int) -> Float:
+    """Terms (..., T) of the polynomial at normalised image points (..., 2), ordered as `FlatField.coefficients`."""
+    x, y = xy[..., 0], xy[..., 1]
+    return np.stack([x ** (d - k) * y**k for d in range(degree + 1) for k in range(d + 1)], axis=-1)
+
+
+def field_at(field: FlatField, xy: Float) -> Float:
+    """The polynomial (...) at normalised image points (..., 2)."""
+    return terms_of(xy, FLAT_FIELD_TERMS.index(len(field.coefficients))) @ np.array(field.coefficients)
+
+
+def flat_of(field: FlatField, xy: Float) -> Float:
+    """The flat field (...) at normalised image points (..., 2), never less than a fiftieth of that on the axis."""
+    return np.maximum(field_at(field, xy), _LEAST)
