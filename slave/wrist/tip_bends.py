@@ -30,7 +30,7 @@ class Bend:
         below_top, below_top_sigma: How far its end is below the finger's highest row [px].
         above_bottom, above_bottom_sigma: How far it is above the lowest row of the fingertip.
         top_v, bottom_v: Where these rows are expected [px].
-        radius_px, depth_m, facing: Of the fingertip.
+        radius_px, facing: Of the fingertip.
         seen: Probability that its end is seen.
         likeness: Of the best template, 1 at most.
     """
@@ -42,7 +42,6 @@ class Bend:
     top_v: float
     bottom_v: float
     radius_px: float
-    depth_m: float
     facing: float
     seen: float
     likeness: float
@@ -94,10 +93,10 @@ def bends_of(seen: Float32, bank: TipTemplates, gain: float) -> list[Bend | None
     mean[:, 2:4] += SHRINK * (weight.sum(axis=1) @ SHIFTS)[:, None]
     best = likeness.reshape(4, -1)[np.arange(4, dtype=np.int64), score.reshape(4, -1).argmax(axis=1)]
     return [
-        Bend(below, below_sigma, above, above_sigma, top, bottom, radius, depth, facing, end_seen, like)
+        Bend(below, below_sigma, above, above_sigma, top, bottom, radius, facing, end_seen, like)
         if shown
         else None
-        for (below, above, top, bottom, radius, depth, facing, end_seen), (
+        for (below, above, top, bottom, radius, facing, end_seen), (
             below_sigma,
             above_sigma,
         ), like, shown in zip(mean.tolist(), spread.tolist(), best.tolist(), there.tolist(), strict=True)

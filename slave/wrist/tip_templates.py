@@ -50,10 +50,9 @@ class TipTemplates:
         palm: (4,) nearness of the palm below the knuckle, on average [1/m].
         palm_at: (4, P) pixels of the shrunken image, counted row by row, that show the palm there.
         root_uv: (4, 2) the knuckles [px].
-        table: (4, 8, T) of the end of the finger: how far it is below the finger's highest row [px] and above the
-            lowest row of the fingertip [px], those two rows [px], the fingertip's radius [px], depth along the optical
-            axis [m], cosine between the last bone and the way to the camera (1: it points at the camera), and whether
-            the end is seen.
+        table: (4, 7, T) of the end of the finger: how far it is below the finger's highest row [px] and above the
+            lowest row of the fingertip [px], those two rows [px], the fingertip's radius [px], cosine between the last
+            bone and the way to the camera (1: it points at the camera), and whether the end is seen.
     """
 
     rows: Int
@@ -107,7 +106,7 @@ def templates_of(view: WristView) -> TipTemplates:
 
 
 def _templates(view: WristView, finger: int) -> tuple[Float, Float, Float]:
-    """Profiles (T, rows of the shrunken image) [1/m], table (8, T) and knuckle (2,) [px] of one finger."""
+    """Profiles (T, rows of the shrunken image) [1/m], table (7, T) and knuckle (2,) [px] of one finger."""
     mcp, pip = (_steps(float(low), float(high)) for low, high in (MCP_RAD, PIP_RAD))
     grid = np.stack(np.meshgrid(mcp, pip, OVERHANG, indexing="ij"), axis=-1).reshape(-1, 3)
     angles = np.zeros((len(grid), 5, 4))
@@ -132,9 +131,7 @@ def _templates(view: WristView, finger: int) -> tuple[Float, Float, Float]:
     seen: Float = (facing > horizon).astype(np.float64)
     top, bottom = (uv[..., 1] - size)[:, 1:].min(axis=1), (uv[..., 1] + size)[:, -1]
     apex_v = apex_uv[:, 1]
-    table: Float = np.array(
-        [apex_v - top, bottom - apex_v, top, bottom, size[:, -1], apex[:, 2], facing, seen]
-    )
+    table: Float = np.array([apex_v - top, bottom - apex_v, top, bottom, size[:, -1], facing, seen])
     return near, table, root_uv
 
 
