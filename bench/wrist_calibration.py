@@ -15,6 +15,7 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import FitError
+from common.flat_field import field_at
 from common.frame_recording import Illumination
 from common.geometry import (
     intersect_plane,
@@ -31,7 +32,7 @@ from master.calibrate.cameras.boards import Checkerboard, board_corners
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.wrist.curled import Curled
 from master.calibrate.wrist.flat_command import white_of
-from master.calibrate.wrist.flat_field import field_at, fit_flat_field
+from master.calibrate.wrist.flat_field import fit_flat_field
 from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board

@@ -6,7 +6,6 @@ nearer to the truth of its finger than half a finger's breadth. The baseline is 
 bright blob between seams, as the paper has it; both see the same seams.
 """
 
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import cycle
@@ -14,29 +13,24 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from msgspec.structs import replace
 
 from bench.markers import interleaved
 from bench.row import Row
+from bench.wrist_shown import RECORDINGS, ROOT, datasets, other_palm, recorded
 from common.arrays import Bool, Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import open_recording
 from common.hand_model import FINGERS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
-from slave.cameras.replay import read_png
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.fingers import Fingers, separate
 from slave.wrist.laser import laser_lines
 from slave.wrist.view import WristView
 
-ROOT = Path(__file__).resolve().parents[1]
-RECORDINGS = ("curl", "mcp", "spread", "left_small")
 MOTIONS = ("curl", "poses", "spread")
 POSES, SEEDS, RATE_HZ = 20, (101, 102), 90.0
 VISIBLE_M, ON_FINGER_M = 2e-3, 8e-3
-PALM_TURN_RAD, PALM_SHIFT_M = np.radians(3.0), 3e-3
 BRIGHT = 24  # levels: the baseline's threshold
 Find = Callable[[Image, Fingers, WristView], Float]
 
@@ -62,11 +56,11 @@ class Shown:
 def rows() -> Iterator[Row]:
     """Rows of the recordings, of each light, and of the time."""
     cv2.setNumThreads(1)
-    data = Path(os.environ.get("PHALANX_DATASETS", ROOT / "../shared/datasets")).resolve()
+    data = datasets()
     timed: list[Shown] = []
     if (data / "wrist").is_dir():
         for name in RECORDINGS:
-            shown = recorded(data, name)
+            shown = of_recording(data, name)
             timed = timed or shown
             yield from _scored(name, shown)
     else:
@@ -78,26 +72,12 @@ def rows() -> Iterator[Row]:
     yield from _times(timed)
 
 
-def recorded(data: Path, name: str) -> list[Shown]:
+def of_recording(data: Path, name: str) -> list[Shown]:
     """The triples of a recording."""
-    folder = data / "wrist" / name
-    recording = open_recording(folder)
-    rig = recording.manifest.wrist_rig()
-    camera = recording.manifest.cameras[rig.cameras[0]]
-    view = WristView.of(rig, camera, load(data / f"hands/{rig.hand}.json", HandProfile))
-    size = (camera.height_px, camera.width_px)
-    images = [read_png(folder / row.file, size, grey=True) for row in recording.frames_of(camera.name)]
-    truth = np.load(folder / "truth.npz")
-    return [
-        Shown(
-            view,
-            lit(images[3 * k + 1], images[3 * k]),
-            lit(images[3 * k + 2], images[3 * k]),
-            truth["laser_pt"][k, 1:6],
-            truth["laser_len_vis"][k, 1:6],
-        )
-        for k in range(len(images) // 3)
-    ]
+    all_of = recorded(data, name)
+    points, lengths = all_of.truth["laser_pt"][:, 1:6], all_of.truth["laser_len_vis"][:, 1:6]
+    shown = zip(all_of.laser, all_of.led, points, lengths, strict=True)
+    return [Shown(all_of.view, *each) for each in shown]
 
 
 def simulated(motion: str, ambient: str, seed: int) -> list[Shown]:
@@ -106,11 +86,7 @@ def simulated(motion: str, ambient: str, seed: int) -> list[Shown]:
     rig = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
     camera = load(ROOT / f"calib_json/cameras/{rig.cameras[0]}.json", CameraCalibration)
     hand = load(ROOT / f"calib_json/hands/{rig.hand}.json", HandProfile)
-    palm = np.array(rig.T_camera_palm)
-    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, PALM_TURN_RAD, 3))[0] @ palm[:3, :3]
-    palm[:3, 3] += rng.normal(0.0, PALM_SHIFT_M, 3)
-    rows = [tuple(row) for row in palm.tolist()]
-    rig = replace(rig, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))
+    rig = other_palm(rig, rng)
     scene = WristScene.by_name(f"{motion}@{ambient}", rig, {camera.name: camera}, hand, seed)
     renderer, view = WristRenderer(scene, camera.name), WristView.of(rig, camera, hand)
     out: list[Shown] = []

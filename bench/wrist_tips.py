@@ -5,37 +5,29 @@ found within 6 px of the end of its finger; false is a report more than 25 px fr
 Where the LED frames of a recording lie beside its laser frames, registration finds that and takes it off.
 """
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from msgspec.structs import replace
 
 from bench.row import Row, median_us
+from bench.wrist_shown import RECORDINGS, ROOT, datasets, other_palm, recorded
 from common.arrays import Bool, Float, Image
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
-from common.frame_recording import Illumination, open_recording
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.frame_recording import Illumination
 from common.hand_profiles import generated_profile
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
-from slave.cameras.replay import read_png
-from slave.cameras.source import Frame
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import fingertips
-from slave.wrist.registration import led_shift, shifted
-from slave.wrist.strobe import Triple
 from slave.wrist.view import WristView
 
-ROOT = Path(__file__).resolve().parents[1]
-RECORDINGS = ("curl", "mcp", "spread", "left_small")
 MOTIONS = ("curl", "poses", "spread")
 HAND_LENGTHS_M = (0.17, 0.185, 0.2)  # one for each seed
 SEEDS, POSES = (201, 202, 203), 14
-PALM_TURN_RAD, PALM_SHIFT_M = np.radians(3.0), 3e-3
 FOUND_PX, ELSEWHERE_PX = 6.0, 25.0
 
 
@@ -52,9 +44,9 @@ class Shown:
 def rows() -> Iterator[Row]:
     """Rows of the recordings, of each light, and of the time."""
     cv2.setNumThreads(1)
-    data = Path(os.environ.get("PHALANX_DATASETS", ROOT / "../shared/datasets")).resolve()
+    data = datasets()
     if (data / "wrist").is_dir():
-        yield from _scored("recordings", [one for name in RECORDINGS for one in recorded(data, name)])
+        yield from _scored("recordings", [one for name in RECORDINGS for one in of_recording(data, name)])
     else:
         yield Row("recordings: skipped", 0.0, "", f"none at {data}: set PHALANX_DATASETS")
     shown: list[Shown] = []
@@ -72,25 +64,11 @@ def rows() -> Iterator[Row]:
     yield Row("fingertips of one triple", middle, "us", f"+-{half:.0f}; goal 600")
 
 
-def recorded(data: Path, name: str) -> list[Shown]:
+def of_recording(data: Path, name: str) -> list[Shown]:
     """The triples of a recording."""
-    folder = data / "wrist" / name
-    recording = open_recording(folder)
-    rig = recording.manifest.wrist_rig()
-    camera = recording.manifest.cameras[rig.cameras[0]]
-    view = WristView.of(rig, camera, load(data / f"hands/{rig.hand}.json", HandProfile))
-    size = (camera.height_px, camera.width_px)
-    frames = [
-        Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, size, grey=True))
-        for row in recording.frames_of(camera.name)
-    ]
-    triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
-    back = -led_shift(triples, view.optics)
-    truth = np.load(folder / "truth.npz")
-    return [
-        Shown(view, shifted(lit(triple.led.image, triple.ambient.image), back), tip_uv, seen)
-        for triple, tip_uv, seen in zip(triples, truth["tip_uv"], truth["tip_visible"], strict=True)
-    ]
+    all_of = recorded(data, name)
+    shown = zip(all_of.led, all_of.truth["tip_uv"], all_of.truth["tip_visible"], strict=True)
+    return [Shown(all_of.view, *each) for each in shown]
 
 
 def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
@@ -99,11 +77,7 @@ def simulated(name: str, seed: int, hand_length_m: float) -> list[Shown]:
     rig = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
     camera = load(ROOT / f"calib_json/cameras/{rig.cameras[0]}.json", CameraCalibration)
     hand = generated_profile(f"{hand_length_m:.3f} m", "right", hand_length_m)
-    palm = np.array(rig.T_camera_palm)
-    palm[:3, :3] = cv2.Rodrigues(rng.normal(0.0, PALM_TURN_RAD, 3))[0] @ palm[:3, :3]
-    palm[:3, 3] += rng.normal(0.0, PALM_SHIFT_M, 3)
-    rows = [tuple(row) for row in palm.tolist()]
-    rig = replace(rig, T_camera_palm=(rows[0], rows[1], rows[2], (0.0, 0.0, 0.0, 1.0)))
+    rig = other_palm(rig, rng)
     scene = WristScene.by_name(name, rig, {camera.name: camera}, hand, seed)
     renderer, view = WristRenderer(scene, camera.name), WristView.of(rig, camera, hand)
     out: list[Shown] = []
