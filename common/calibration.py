@@ -154,7 +154,8 @@ class RigCalibration(Part, frozen=True):
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
     finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
-    -> the line along which its laser point moves.
+    -> the line along which its laser point moves. `level`: fingers from the laser alone, bent as habit has it (fk),
+    from laser and fingertip, without a tip not at all (ik), or from what there is (auto).
     """
 
     version: Literal[1]
@@ -180,6 +181,7 @@ class RigCalibration(Part, frozen=True):
     flat_field: FlatField | None = None
     finger_lines: dict[Name, FingerLine] = {}
     forward: Literal["table", "cubic"] = "table"
+    level: Literal["fk", "ik", "auto"] = "auto"
     imu: ImuCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:

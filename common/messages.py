@@ -19,7 +19,7 @@ from msgspec import Meta, Struct, field
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 5
+WIRE_VERSION = 6
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
@@ -42,6 +42,14 @@ class Source(IntEnum):
     SOLVED = 2
     HELD = 3
     WRIST = 4
+
+
+class Level(IntEnum):
+    """What a wrist device solved a finger from (Digits, UIST 2012: two levels)."""
+
+    NONE = 0
+    FK = 1
+    IK = 2
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
@@ -119,6 +127,7 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
         tip_depth: (5,) distance of the fingertips by the fall-off of the LED light, relative: the unit is the rig's
             own and constant, not the metre.
         t_sigma_ns: Standard deviation of `t_ns` [ns], as in `MarkerDetections`.
+        exposure_us: Exposure time [us] of the frames; 0: not known.
     """
 
     camera: Name
@@ -133,6 +142,7 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     tip_sigma_px: Float
     tip_depth: Float
     t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+    exposure_us: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
 
     def __post_init__(self) -> None:
         for name in ("laser_uv", "tip_uv"):
@@ -205,6 +215,12 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
             the publication of this pose [ns]; 0 in an offline run.
         laser_m: (5, 3) where the laser of a wrist device meets thumb ... little [m], frame of its camera. NaN: not
             seen, or no such device.
+        level: (5,) `Level` codes: what a wrist device solved each finger from.
+        ambiguous: (5,) another pose of the finger explains what the wrist device saw as well; this is the one that
+            fits the past, or habit.
+        palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
+            vertical. NaN: not known, or no such device.
+        palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
     """
 
     hand: Name
@@ -223,6 +239,10 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     inside_volume: Bool
     latency_ns: TimeNs = 0
     laser_m: Float = field(default_factory=lambda: _NO_LASER)
+    level: Code = field(default_factory=lambda: _NO_LEVEL)
+    ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
+    palm_world_wxyz: Float = field(default_factory=lambda: _NO_ROTATION)
+    palm_world_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
         j = JOINT_COUNT
@@ -244,6 +264,12 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "markers_cov_m2", np.float64, (m, 3, 3))
         _freeze(self, "inside_volume", np.bool_, (j,))
         _freeze(self, "laser_m", np.float64, (FINGER_COUNT, 3))
+        _freeze(self, "level", np.uint8, (FINGER_COUNT,))
+        if self.level.max() > max(Level):
+            raise ValueError(f"level: {self.level.max()} is no Level code")
+        _freeze(self, "ambiguous", np.bool_, (FINGER_COUNT,))
+        _freeze(self, "palm_world_wxyz", np.float64, (4,))
+        _freeze(self, "palm_world_sigma_rad", np.float64, (2,))
 
 
 class Health(Message, frozen=True, eq=False, tag=True):
@@ -324,7 +350,11 @@ AnyMessage: TypeAlias = (
 _JPEG_START = b"\xff\xd8\xff"
 _NONE = np.empty((0, 2))
 _NO_LASER = np.full((FINGER_COUNT, 3), np.nan)
-_NO_LASER.flags.writeable = False
+_NO_LEVEL = np.zeros(FINGER_COUNT, dtype=np.uint8)
+_NOT_AMBIGUOUS = np.zeros(FINGER_COUNT, dtype=np.bool_)
+_NO_ROTATION, _NO_SIGMA = np.full(4, np.nan), np.full(2, np.nan)
+for _nothing in (_NO_LASER, _NO_LEVEL, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA):
+    _nothing.flags.writeable = False
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
     MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still,

@@ -1,6 +1,7 @@
 """What the master knows of one wrist device before the first message: device and hand, its laser, how to read it."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -19,6 +20,7 @@ class WristSetup(WristDevice):
         laser_m: (3,) where the laser light comes from, in its plane.
         lines: Finger -> the measured line its laser point moves along; of none, the simulated one counts.
         cubic: Flexion by the cubic printed in the paper and not by the table of this hand.
+        level: What fingers are solved from: "fk", "ik" or "auto".
         filter: Of the laser points, where frames follow each other.
         volume: What the rig states, or None.
         late_ns: How much later frames are taken than their stamps say [ns].
@@ -27,6 +29,7 @@ class WristSetup(WristDevice):
     laser_m: Float
     lines: dict[str, FingerLine]
     cubic: bool
+    level: Literal["fk", "ik", "auto"]
     filter: FilterCalibration
     volume: Volume | None = None
     late_ns: int = 0
@@ -54,6 +57,7 @@ class WristSetup(WristDevice):
             laser_m=laser + (offset_m - laser @ normal) * normal,
             lines={name: rig.finger_lines[name] for name in FINGERS if name in rig.finger_lines},
             cubic=rig.forward == "cubic",
+            level=rig.level,
             filter=rig.filter,
             volume=rig.volume,
             late_ns=round(1e3 * rig.stamp_offset_us.get(camera.name, 0.0)),

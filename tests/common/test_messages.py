@@ -25,6 +25,7 @@ from common.messages import (
     HandPose,
     Health,
     ImuSample,
+    Level,
     MarkerDetections,
     Message,
     Preview,
@@ -86,6 +87,7 @@ def triples(draw: st.DrawFn) -> WristDetections:
         tip_sigma_px=positive(draw, np.asarray(~np.isnan(tip).any(axis=1))),
         tip_depth=draw(floats(FINGER_COUNT)),
         t_sigma_ns=draw(st.floats(0.0, 1e18)),
+        exposure_us=draw(st.floats(0.0, 1e9)),
     )
 
 
@@ -109,6 +111,10 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         inside_volume=draw(arrays(np.bool_, j)),
         latency_ns=draw(times),
         laser_m=draw(floats(FINGER_COUNT, 3)),
+        level=draw(arrays(np.uint8, FINGER_COUNT, elements=st.sampled_from(list(Level)).map(int))),
+        ambiguous=draw(arrays(np.bool_, FINGER_COUNT)),
+        palm_world_wxyz=draw(floats(4)),
+        palm_world_sigma_rad=draw(floats(2)),
     )
 
 
@@ -356,7 +362,12 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (WristDetections, {"tip_sigma_px": np.full(5, 0.1).tobytes()}),  # the thumb is not seen
         (WristDetections, {"tip_depth": b"\0" * 8}),
         (WristDetections, {"uv": b""}),
+        (WristDetections, {"exposure_us": -1.0}),
         (HandPose, {"laser_m": b"\0" * 8 * 14}),
+        (HandPose, {"level": b"\3\0\0\0\0"}),
+        (HandPose, {"ambiguous": b"\0" * 4}),
+        (HandPose, {"palm_world_wxyz": b"\0" * 8 * 3}),
+        (HandPose, {"palm_world_sigma_rad": np.full(2, np.inf).tobytes()}),
     ],
 )
 def test_one_wrong_field_is_refused(sample: type[Message], change: dict[str, object]) -> None:
@@ -366,12 +377,18 @@ def test_one_wrong_field_is_refused(sample: type[Message], change: dict[str, obj
         decode(msgspec.msgpack.encode(content | change))
 
 
+DEFAULTED = {
+    *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
+    *("t_sigma_ns", "exposure_us", "body"),
+}
+
+
 @pytest.mark.parametrize("message", SAMPLES, ids=lambda m: type(m).__name__)
 def test_a_missing_field_is_refused_unless_it_has_a_default(message: Message) -> None:
     content = as_map(message)
     for field in content:
         wire = msgspec.msgpack.encode({key: value for key, value in content.items() if key != field})
-        if field in ("latency_ns", "laser_m", "t_sigma_ns", "body"):
+        if field in DEFAULTED:
             decode(wire)
             continue
         with pytest.raises(MessageError):

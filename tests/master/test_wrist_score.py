@@ -9,7 +9,7 @@ import pytest
 from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
-from common.messages import WristDetections
+from common.messages import Level, WristDetections
 from master.outputs.poses import Poses
 from master.wrist_score import GROUPS, WristTruth, load_wrist_truth, score_tips, score_wrist, triples_missed
 from tests.hand_helpers import camera_file
@@ -54,6 +54,10 @@ def poses(exact: WristTruth) -> Poses:
         inside_volume=np.ones((N, 26), np.bool_),
         latency_ns=np.zeros(N, np.int64),
         laser_m=exact.laser_m[:, 1:6],
+        level=np.full((N, 5), Level.FK, np.uint8),
+        ambiguous=np.zeros((N, 5), np.bool_),
+        palm_world_wxyz=np.full((N, 4), np.nan),
+        palm_world_sigma_rad=np.full((N, 2), np.nan),
     )
 
 
