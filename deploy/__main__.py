@@ -18,6 +18,7 @@ _EXAMPLES = {
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
   phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
+  phalanx replay CURL --hand HAND.json --level fk --out out/fk   its fingers from the laser alone, to compare
 """,
 }
 _LABELS = {
@@ -73,7 +74,9 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _replay(options: argparse.Namespace) -> int:
-    settings = ReplaySettings(options.recording, options.out, options.calibration, options.hand)
+    settings = ReplaySettings(
+        options.recording, options.out, options.calibration, options.hand, options.level
+    )
     _finish(run_replay(settings, _say), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")
     return 0
@@ -155,6 +158,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     replay.add_argument(
         "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"
+    )
+    replay.add_argument(
+        "--level",
+        choices=("fk", "ik", "auto"),
+        help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
+        "there is (auto); default: what its rig says",
     )
     return parser
 

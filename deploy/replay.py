@@ -22,12 +22,14 @@ class ReplaySettings:
         out: Folder for detections, poses and summary; those of a wrist rig beside a marker rig go to out/wrist.
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
+        level: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
     """
 
     recording: Path
     out: Path
     calibration: Path | None
     hand: Path | None
+    level: str | None = None
 
 
 def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str, object]:
@@ -37,6 +39,8 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
         ReplayError: The recording is unreadable, or a step failed (its own message is on stderr).
     """
     rigs = _rigs(settings.recording)
+    if settings.level is not None and all(rig.kind != "wrist" for rig in rigs):
+        raise ReplayError(f"--level: {settings.recording} is of no wrist device, which alone has levels")
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
         raise ReplayError(f"{settings.hand}: no such hand profile")
     summaries = [_replay_rig(settings, rig, settings.out, say) for rig in rigs[:1]]
@@ -74,7 +78,8 @@ def _replay_rig(
         _step("slave", "detect", recording, "--camera", camera, *calibration, *needs, *target)
     say("solving ...")
     results = ["--rig", rig.name, "--detections", str(out), "--out", str(out)]
-    _step("master", "solve", recording, *calibration, *hand, *results)
+    level = [] if settings.level is None or rig.kind != "wrist" else ["--level", settings.level]
+    _step("master", "solve", recording, *calibration, *hand, *level, *results)
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))
 
 

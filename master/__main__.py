@@ -5,7 +5,7 @@ import os
 import sys
 import threading
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 try:
     import typer
@@ -14,7 +14,9 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
     ) from error
 
-from common.errors import BusError, PhalanxError
+from msgspec.structs import replace
+
+from common.errors import BusError, CalibrationError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
 from common.sim.scenes import NAMES, scene_by_name
@@ -45,6 +47,7 @@ from master.tuning import RigFiles
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
+Level = Literal["fk", "ik", "auto"]
 _TRY_AGAIN_S = 0.3
 
 
@@ -112,15 +115,28 @@ def solve_command(
             help="Which rig of the recording; default: of markers, or the wrist device where that is all.",
         ),
     ] = None,
+    level: Annotated[
+        Level | None,
+        typer.Option(
+            help="Of a wrist device: fingers from the laser alone (fk), from laser and fingertip (ik), or from what "
+            "there is (auto); default: what the rig says."
+        ),
+    ] = None,
 ) -> None:
     """Solve recorded detections offline and deterministically: no clock, no network.
 
     Examples:
 
       phalanx-master solve RECORDING --detections DIR --out DIR
+
+      phalanx-master solve CURL --detections DIR --out DIR --hand HAND.json --level fk
     """
     opened = open_recording(recording)
     rig = opened.manifest.rig_named(rig_name)
+    if level is not None:
+        if rig.kind != "wrist":
+            raise CalibrationError(f"--level: rig {rig.name!r} is of markers; a wrist device has levels")
+        rig = replace(rig, level=level)
     setup = RigSetup.of(rig, opened.manifest.cameras, load_hand(calibration, rig.hand, hand))
     out.mkdir(parents=True, exist_ok=True)
     solve(opened, setup, detections, out, lambda done, total: _progress("solving", done, total))

@@ -31,7 +31,7 @@ def wrist_truth_of(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progres
         tip_uv=np.array([one.tip_uv for one in now]),
         tip_visible=np.array([one.tip_visible for one in now], np.bool_),
         joints_m=np.array([one.joints.position_m[1:] for one in now]),
-        pip_rad=np.array([one.angles_rad[1:, 2] for one in now]),
+        pip_rad=np.array([one.angles_rad[:, 2] for one in now]),
     )
 
 

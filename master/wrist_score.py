@@ -12,7 +12,7 @@ from common.arrays import Bool, Float, Int
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Illumination
 from common.hand_model import FINGER_JOINTS, FINGERS
-from common.messages import FINGER_COUNT, WristDetections
+from common.messages import FINGER_COUNT, Level, WristDetections
 from common.npz import read_npz
 from master.outputs.poses import Poses
 from master.score import put
@@ -42,7 +42,7 @@ class WristTruth:
         tip_uv: (N, 5, 2) fingertips [px], whether seen or not.
         tip_visible: (N, 5) whether they are seen.
         joints_m: (N, 25, 3) WebXR joints.
-        pip_rad: (N, 4) PIP of index ... little.
+        pip_rad: (N, 5) PIP of index ... little, before them the MCP of the thumb.
     """
 
     t_ns: Int
@@ -66,7 +66,7 @@ class WristTruth:
             ("tip_uv", (n, FINGER_COUNT, 2)),
             ("tip_visible", (n, FINGER_COUNT)),
             ("joints_m", (n, 25, 3)),
-            ("pip_rad", (n, 4)),
+            ("pip_rad", (n, FINGER_COUNT)),
         ):
             if (found := getattr(self, name).shape) != shape:
                 raise ValueError(f"{name} has shape {found}, expected {shape}")
@@ -103,7 +103,7 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
             tip_uv=data["tip_uv"],
             tip_visible=np.asarray(data["tip_visible"], np.bool_),
             joints_m=data["joints"],
-            pip_rad=data["angles"][:, [7, 11, 15, 19]],
+            pip_rad=data["angles"][:, [3, 7, 11, 15, 19]],
         )
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(
@@ -122,15 +122,18 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
         pip_rms_deg, pip_rms_deg_<finger>: RMS error of the PIP up to 85 degrees, of fingers that are tracked;
             pip_untracked: how many others there are.
         pip_deg, joint_mm: Mean over the fingers, and joints, that are valid.
+        both_<finger>: Triples in which laser (2 mm of line or more) and fingertip are seen, by the truth;
+            both_ik_<finger>: those of them that were solved from both; both_pip_deg_<finger>: mean error of the PIP
+            (thumb: MCP) in those where the finger is valid.
         frames_without_pose: Poses of which nothing is valid.
     """
     row = _rows_at(truth.t_ns, poses.t_ns)
-    out = _score_laser(_at(poses.laser_m, row), truth)
+    out = _score_laser(_at(poses.laser_m, row), truth) | _score_both(poses, row, truth)
     there = row >= 0
     found = row[there]
-    error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there])
+    error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there, 1:])
     tracked = _any_of(poses.tracked[found]) & np.isfinite(error)
-    usual = truth.pip_rad[there] <= _STRAIGHT_RAD
+    usual = truth.pip_rad[there, 1:] <= _STRAIGHT_RAD
     put(out, "pip_rms_deg", error[tracked & usual], _rms)
     for f, name in enumerate(FINGERS[1:]):
         put(out, f"pip_rms_deg_{name}", error[:, f][(tracked & usual)[:, f]], _rms)
@@ -175,7 +178,7 @@ def _score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
     to_groups = 1e3 * np.linalg.norm(found[:, :, None] - truth.laser_m[:, None], axis=3)
     own = np.stack([to_groups[:, f, 1 + f] for f in range(FINGER_COUNT)], axis=1)
     reported = np.isfinite(found).all(axis=2)
-    clear = (truth.laser_seen_m >= _CLEAR_M)[:, _OF_FINGERS] & np.isfinite(truth.laser_m[:, _OF_FINGERS, 0])
+    clear = _clear(truth)
     nearest = np.nan_to_num(to_groups, nan=np.inf).min(axis=2)
     right = reported & (own <= nearest)
     out: dict[str, float] = {}
@@ -185,6 +188,24 @@ def _score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
     put(out, "laser_right", right[clear].astype(np.float64), np.mean)
     out["laser_missed"] = float((clear & ~reported).sum())
     return out
+
+
+def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
+    """What became of the fingers whose laser line and tip are both in sight; `row` (N,) of the poses."""
+    both = _clear(truth) & truth.tip_visible
+    error = np.abs(np.degrees(_at(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
+    by_ik = _at((poses.level == Level.IK).astype(np.float64), row) == 1.0
+    out: dict[str, float] = {}
+    for f, name in enumerate(FINGERS):
+        out[f"both_{name}"] = float(both[:, f].sum())
+        out[f"both_ik_{name}"] = float((both & by_ik)[:, f].sum())
+        put(out, f"both_pip_deg_{name}", error[:, f][both[:, f] & np.isfinite(error[:, f])], np.mean)
+    return out
+
+
+def _clear(truth: WristTruth) -> Bool:
+    """(N, 5) whether enough of the line is seen on a finger."""
+    return (truth.laser_seen_m >= _CLEAR_M)[:, _OF_FINGERS] & np.isfinite(truth.laser_m[:, _OF_FINGERS, 0])
 
 
 def _rows_at(truth_ns: Int, t_ns: Int) -> Int:

@@ -29,14 +29,14 @@ def truth() -> WristTruth:
         tip_uv=np.tile(100.0 * np.arange(5.0)[:, None], (N, 1, 2)),
         tip_visible=np.ones((N, 5), np.bool_),
         joints_m=np.zeros((N, 25, 3)),
-        pip_rad=np.radians(np.tile([10.0, 40.0, 80.0, 100.0], (N, 1))),
+        pip_rad=np.radians(np.tile([15.0, 10.0, 40.0, 80.0, 100.0], (N, 1))),
     )
 
 
 def poses(exact: WristTruth) -> Poses:
     """What an errorless device makes of it."""
     angles = np.zeros((N, 5, 4))
-    angles[:, 1:, 2] = exact.pip_rad
+    angles[:, :, 2] = exact.pip_rad
     return Poses(
         hand="made",
         t_ns=exact.t_ns,
@@ -95,6 +95,24 @@ def test_a_point_on_the_neighbour_is_wrong_and_a_missing_one_missed() -> None:
     assert got["laser_missed"] == 1.0
     assert got["laser_mm_middle"] == 0.0  # the median of 0, 0, 0 and 3
     assert got["laser_mm"] == 0.0
+
+
+def test_fingers_with_laser_and_tip_in_sight_are_scored_apart() -> None:
+    exact = truth()
+    visible, seen = exact.tip_visible.copy(), exact.laser_seen_m.copy()
+    visible[0, 1] = False  # the index in triple 0: no tip
+    seen[1, 2] = 0.0019  # and in triple 1 too little line
+    angles = poses(exact).angles_rad.copy()
+    angles[:, 1, 2] += np.radians([50.0, 50.0, 4.0, -8.0])
+    angles[3, 3, 2] = np.nan
+    level = np.full((N, 5), Level.FK, np.uint8)
+    level[1:3, 1] = Level.IK
+    exact = replace(exact, tip_visible=visible, laser_seen_m=seen)
+    got = score_wrist(replace(poses(exact), angles_rad=angles, level=level), exact)
+    assert (got["both_index"], got["both_ik_index"]) == (2.0, 1.0)
+    assert got["both_pip_deg_index"] == pytest.approx(6.0)
+    assert (got["both_ring"], got["both_pip_deg_ring"], got["both_ik_ring"]) == (4.0, 0.0, 0.0)
+    assert got["both_pip_deg_thumb"] == 0.0
 
 
 def test_little_line_and_no_line_are_not_scored() -> None:
@@ -197,7 +215,7 @@ def recording(folder: Path, triples: int) -> FrameRecording:
 
 def write_truth(folder: Path, exact: WristTruth, **changes: Float | Bool | Int) -> None:
     angles = np.zeros((N, 21))
-    angles[:, [7, 11, 15, 19]] = exact.pip_rad
+    angles[:, [3, 7, 11, 15, 19]] = exact.pip_rad
     arrays = {
         "laser_pt": exact.laser_m,
         "laser_len_vis": exact.laser_seen_m,
