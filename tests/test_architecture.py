@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("common", "slave", "master", "deploy")
 OURS = frozenset(PACKAGES)
-DRIVERS = frozenset({"serial", "smbus2", "picamera2", "libcamera"})
+DRIVERS = frozenset({"serial", "smbus2", "picamera2", "libcamera", "gpiod"})
 
 # Who may not import whom. `rerun` in master and the drivers in slave have files of their own, see ONLY_IN.
 FORBIDDEN: dict[str, frozenset[str]] = {
@@ -30,7 +30,9 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "rerun": ("master/outputs/rerun*.py",),
     "rerun_cli": ("master/outputs/rerun*.py",),
     "serial": ("slave/imu/*.py",),
-    "smbus2": ("slave/imu/*.py",),
+    "smbus2": ("slave/imu/*.py", "slave/lights/*.py"),
+    "gpiod": ("slave/lights/gpio*.py",),
+    "imufusion": ("common/imu_fusion.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),
     "numba": ("slave/markers/fast*.py",),
@@ -116,6 +118,8 @@ def undeclared(path: str, text: str) -> set[str]:
     promised = [*project["dependencies"]]
     if path.startswith(("master/", "deploy/")):
         promised += project["optional-dependencies"]["master"]
+    if fnmatch(path, "slave/lights/gpio*.py"):
+        promised += project["optional-dependencies"]["wrist"]
     if fnmatch(path, "slave/markers/fast*.py"):
         promised += project["optional-dependencies"]["fast"]
     have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())

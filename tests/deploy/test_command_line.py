@@ -74,7 +74,7 @@ def test_of_both_kinds_each_rig_is_replayed_with_results_of_its_own(
     (tmp_path / "recording.json").write_text(json.dumps({"rigs": [wrist, markers]}))
     (tmp_path / "hand.json").write_text("{}")
     out = tmp_path / "out"
-    settings = replay.ReplaySettings(tmp_path, out, None, tmp_path / "hand.json")
+    settings = replay.ReplaySettings(tmp_path, out, None, tmp_path / "hand.json", "fk")
     assert replay.run_replay(settings, lambda _line: None) == {"poses": 3}
     assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == [
         "left",
@@ -82,6 +82,7 @@ def test_of_both_kinds_each_rig_is_replayed_with_results_of_its_own(
         "palm",
     ]
     assert ["--hand" in step for step in steps] == [False, False, True, True, True]  # markers know no hand
+    assert ["--level" in step for step in steps] == [False, False, False, False, True]  # nor levels
     assert [step[step.index("--rig") + 1] for step in steps if "solve" in step] == ["d", "w"]
     assert steps[3][-1] == str(out / "wrist/detections_palm.npz")
     assert steps[4][-1] == str(out / "wrist")
@@ -133,6 +134,13 @@ def test_a_missing_hand_is_said_before_the_work(tmp_path: Path, capsys: pytest.C
     printed = capsys.readouterr()
     assert "nobody.json: no such hand profile" in printed.err
     assert "detecting" not in printed.out
+
+
+def test_levels_of_a_marker_rig_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = {"name": "desk", "kind": "markers", "cameras": ["left", "right"]}
+    (tmp_path / "recording.json").write_text(json.dumps({"rig": rig}))
+    assert main(["replay", str(tmp_path), "--out", str(tmp_path / "out"), "--level", "ik"]) == 1
+    assert "of no wrist device" in capsys.readouterr().err
 
 
 def test_a_missing_rig_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
