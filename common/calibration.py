@@ -257,12 +257,16 @@ class Couplings(Part, frozen=True):
 
 
 Preset = Literal["K", "D"]
+Finger = Literal["thumb", "index", "middle", "ring", "little"]
+PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
 
 
 class HandProfile(Part, frozen=True):
-    """hands/<name>.json: bones and markers of one hand, optionally radii, limits and couplings.
+    """hands/<name>.json: bones and markers of one hand, optionally radii, skin, limits and couplings.
 
     Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
+    `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand tell,
+    as a wrist device measures it; 1 where a finger is not named.
     """
 
     version: Literal[1]
@@ -271,6 +275,7 @@ class HandProfile(Part, frozen=True):
     rest_joints: dict[str, RestJoint]
     markers: dict[Name, MarkerMount]
     radius_m: dict[str, Positive] | None = None
+    palmar_scale: dict[Finger, PalmarScale] = {}
     limits_rad: Limits | Preset | None = None
     couplings: Couplings | Preset | None = None
     provenance: dict[str, Provenance] = {}

@@ -11,14 +11,17 @@ of its fingers (Buchholz, Armstrong, "An ellipsoidal representation of human han
 own rig bends it to a PIP of 50 degrees, because skin folds. The breadths and depths by breadth of hand of the scalable
 hand of Sancho-Bru et al. (0.23 and 0.23 of it at the proximal bone of the index finger, 0.17 and 0.16 at the middle
 bone of the little finger), with 0.57 of the depth on the palmar side of the bone, give the same within 0.8 mm RMS and
-1.5 mm at most, and as much may be wrong for another person: `SPREAD`.
+1.5 mm at most, and as much may be wrong for another person: `SPREAD`. What a guided motion tells of a person
+(`phalanx-master calibrate wearer`) is the file's `palmar_scale`, which multiplies both.
 """
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from common.arrays import Float
+from common.calibration import Finger
 from common.hand_model import CHAINS, Chains, HandModel
 from common.round_cones import Cones, terms
 from common.round_cones import first_hits as cone_hits
@@ -66,13 +69,14 @@ class Skin:
 
     @classmethod
     def of(cls, model: HandModel) -> "Skin":
-        """That of a hand file, or else of a hand of its size."""
+        """That of a hand file, or else of a hand of its size; as thick as the file's `palmar_scale` says."""
+        thick = np.array([[model.profile.palmar_scale.get(finger, 1.0)] for finger in get_args(Finger)])
         if model.profile.radius_m is None:
             knuckles = model.rest_position_m[CHAINS[[1, 4], 0]]
             size = float(np.linalg.norm(knuckles[1] - knuckles[0]))
-            return cls(size * _PALMAR, size * _RADIUS)
+            return cls(thick * size * _PALMAR, thick * size * _RADIUS)
         near, far = (model.radius_m[CHAINS[:, _BONE + k]] for k in (0, 1))
-        radius = near + _SHARE * (far - near)
+        radius = thick * (near + _SHARE * (far - near))
         return cls(radius, radius)
 
     def spheres(self, chains: Chains) -> Float:
