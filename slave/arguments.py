@@ -251,7 +251,7 @@ def _simulated(add: Callable[..., argparse.Action]) -> None:
         default="standard",
         metavar="NAME",
         help="standard | lights | poses | hand-routine | leap:FILE.npz | board; before a wrist device "
-        "standard | curl | poses | spread, each with @dark | @indoor | @bright | @sun, or board",
+        "standard | curl | wearer | poses | spread, each with @dark | @indoor | @bright | @sun, or board",
     )
     add("--seed", type=int, default=7)
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")

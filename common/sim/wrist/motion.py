@@ -25,6 +25,9 @@ MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
 CURL_PIP_DEG = 110.0
 MCP_PER_PIP, DIP_PER_PIP = 0.54, 0.84  # row D8, Kamper's ratios
+WEARER_S = 16.0
+KNUCKLES_S, FIST_S = (0.8, 7.2), (8.8, 15.2)  # of the two bends within it, there and back
+WOBBLE = np.radians(1.0)
 THUMB_OPEN_DEG, THUMB_CLOSED_DEG = (-6.0, -4.0, 0.0, 0.0), (-2.0, 18.0, 18.0, 26.0)
 FOREARM_TURN = np.radians(12.0)
 _HALF_BENT = ((8, 2, 6), (0, 22, 36), (0, 22, 36), (0, 22, 36), (0, 22, 36))
@@ -131,10 +134,51 @@ class GuidedCurl:
         return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
 
 
-def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCurl | None:
+class GuidedWearer:
+    """What `calibrate wearer` asks for: flat hand, straight fingers bent at their knuckles and back, fist and back.
+
+    Nobody does it exactly: each seed is a person whose flat hand is not quite flat, whose straight fingers follow a
+    little, and whose fist has ratios of its own. The state it holds is that person, fixed by the constructor.
+    """
+
+    def __init__(self, model: HandModel, seed: int) -> None:
+        """Of one hand; the same seed, the same person."""
+        rng = np.random.default_rng([seed, 13])
+        self._model = model
+        self._open, self._closed = np.radians(THUMB_OPEN_DEG), np.radians(THUMB_CLOSED_DEG)
+        self._flat = np.radians(rng.normal(0.0, (2.0, 2.0, 2.0, 2.0), (4, 4)))
+        knuckle, follows = np.radians(rng.uniform(72.0, 88.0, (4, 1))), rng.uniform(0.0, 0.06, (4, 2))
+        self._bent = knuckle * np.concatenate([np.zeros((4, 1)), np.ones((4, 1)), follows], axis=1)
+        ratios = np.array([0.0, MCP_PER_PIP, 1.0, DIP_PER_PIP])
+        own = 1.0 + rng.normal(0.0, (0.0, 0.10, 0.03, 0.06), (4, 4))
+        self._fist = np.radians(CURL_PIP_DEG - 5.0) * ratios * own
+        self._cycles, self._phase = rng.integers(2, 5, (4, 4)), rng.uniform(0.0, 2.0 * np.pi, (4, 4))
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return WEARER_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % WEARER_S
+        bend, fist = (
+            0.5 - 0.5 * np.cos(2.0 * np.pi * np.clip((t - first) / (last - first), 0.0, 1.0))
+            for first, last in (KNUCKLES_S, FIST_S)
+        )
+        wobble = WOBBLE * np.sin(2.0 * np.pi * self._cycles * t / WEARER_S + self._phase)
+        angles = np.empty((5, 4))
+        angles[0] = self._open + fist * (self._closed - self._open)
+        angles[1:] = self._flat + wobble + bend * self._bent + fist * self._fist
+        return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+
+
+def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCurl | GuidedWearer | None:
     """The motion of a scene's name; None: there is no such."""
     if name == "curl":
         return GuidedCurl(model)
+    if name == "wearer":
+        return GuidedWearer(model, seed)
     if name == "standard":
         return Stations(model, _STANDARD, seed)
     if name == "spread":

@@ -20,7 +20,7 @@ from common.sim.wrist.motion import wrist_motion
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
-MOTIONS = ("standard", "curl", "poses", "spread")
+MOTIONS = ("standard", "curl", "wearer", "poses", "spread")
 WRIST_NAMES = f"{' | '.join(MOTIONS)}, each with @{' | @'.join(AMBIENTS)}"
 
 
