@@ -5,6 +5,7 @@
     ├── RecordingError     a recording folder cannot be read or written
     ├── CameraError        a camera is gone, or refused a setting
     ├── ImuError           an IMU is gone, or nothing here can read it
+    ├── LightsError        laser or LEDs cannot be switched, or would be on for longer than is safe
     ├── MessageError       bytes that are not a message of ours
     ├── BusError           the bus cannot be opened, or nobody answers
     └── FitError           observations do not determine the value asked for
@@ -32,6 +33,10 @@ class CameraError(PhalanxError):
 
 class ImuError(PhalanxError):
     """An IMU is gone, or there is no driver for it. Never answered with a fake IMU."""
+
+
+class LightsError(PhalanxError):
+    """Laser or LEDs cannot be switched, or would be on for longer than is safe. Never answered with fake ones."""
 
 
 class MessageError(PhalanxError):
