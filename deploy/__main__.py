@@ -141,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
         "--scene",
         default="standard",
         help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz; of a wrist "
-        "device standard, curl, poses or spread, each with @dark, @indoor, @bright or @sun",
+        "device standard, curl, wearer, poses or spread, each with @dark, @indoor, @bright or @sun",
     )
     replay = commands.add_parser(
         "replay",
