@@ -5,10 +5,8 @@ where the hand file does not say otherwise. The joints of a thumb go through the
 has two unknowns, how far it is *closed* (its PIP; a thumb's MCP) and its abduction, and its laser point has two
 coordinates on the plane. The table holds that point over both unknowns; `master.wrist.invert` turns it round.
 
-For each pose of the grid the bones go where forward kinematics puts them, the skin around them (`master.wrist.skin`)
-is cut by a fan of rays from the laser, what of the line the camera sees is kept, and its centroid in the
-image is put back on the plane: that is what the sensing calls the laser point. Other fingers, which may cover it, are
-left out.
+For each pose of the grid the bones go where forward kinematics puts them, and the laser is made to meet the skin
+around them (`master.wrist.laser_cut`).
 
 **The branch.** A bending finger moves its point towards the device, by 15 mm for 5 degrees when straight and by 1 mm
 when bent by 80. At about 95 the last phalanx folds into the light: the line jumps to it and then hardly moves. The
@@ -21,13 +19,11 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.errors import CalibrationError
-from common.geometry import transform
 from common.hand_limits import ABDUCTION, FLEXION
 from common.hand_model import HandModel
 from common.hand_presets import preset_couplings
-from master.wrist.laser_plane import PlaneAxes
+from master.wrist.laser_cut import LaserCut
 from master.wrist.setup import WristSetup
-from master.wrist.skin import ROOT, Skin, first_hits
 
 PIP, DIP = 2, 3
 CLOSED_RAD = np.radians(120.0)
@@ -35,9 +31,6 @@ _CLOSINGS, _ABDUCTIONS = 61, 9
 _NUDGED_ROWS = 4
 _ASIDE_RAD = np.radians(20.0)  # abduction of preset D
 _BEYOND_RAD = np.radians(5.0)  # the grid goes beyond the limits of abduction, for noise and skin
-_RAYS = 128
-_SEEN_M = 3e-4  # a lit point this near behind the first the camera sees is seen
-_STRETCH = 0.25  # share of the fan that the rays of one line may leave out: more is a jump from part to part
 _JUMP = 0.3  # spheres by which the line's mean place on the finger may rise while it bends
 _WHOLE = 0.7  # share of the line as it was a few rows before; less is partly hidden by the last phalanx
 _FADE = 0.97  # by which a line may shorten from row to row
@@ -148,7 +141,7 @@ def _evenly(ends: Float, count: int) -> Float:
     return ends[:, :1] + np.linspace(0.0, 1.0, count) * (ends[:, 1:] - ends[:, :1])
 
 
-def _nudged(cut: "LaserCut", angles_rad: Float, joint: int) -> Float:
+def _nudged(cut: LaserCut, angles_rad: Float, joint: int) -> Float:
     """How the point moves with one joint [m/rad], (5, C, A, 2): found on some rows, between them interpolated."""
     rows = np.arange(0, _CLOSINGS, _NUDGED_ROWS)
     ends: list[Float] = []
@@ -161,65 +154,6 @@ def _nudged(cut: "LaserCut", angles_rad: Float, joint: int) -> Float:
     before = np.minimum(at.astype(np.int64), len(rows) - 2)
     share = (at - before)[:, None, None]
     return (1.0 - share) * some[:, before] + share * some[:, before + 1]
-
-
-class LaserCut:
-    """Cuts the fingers of one hand with the laser of one device. What it holds was prepared by the constructor."""
-
-    def __init__(self, setup: WristSetup) -> None:
-        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
-
-    def __call__(self, angles_rad: Float) -> tuple[Float, Float, Float]:
-        """Laser points (5, C, A, 2) [m] of angles (C, A, 5, 4), and where on the finger they lie.
-
-        Returns:
-            The points, NaN where the laser misses; the length of their lines (5, C, A) [px]; the mean number of the
-            cone that they lie on (5, C, A).
-        """
-        spheres = self._skin.spheres(self._setup.model.chains(angles_rad))
-        spheres = np.moveaxis(transform(self._setup.T_camera_palm, spheres), 2, 0)  # (5, C, A, K, 3)
-        found = [self._finger(f, spheres[f]) for f in range(5)]
-        point, length, place = (np.stack(part) for part in zip(*found, strict=True))
-        return point, length, place
-
-    def _finger(self, f: int, spheres: Float) -> tuple[Float, Float, Float]:
-        """The same of one finger, whose spheres are at (C, A, K, 3)."""
-        radius, laser = self._skin.radius_m[f], self._setup.laser_m
-        rays, on_line = self._fan(spheres, radius)
-        hits = first_hits(laser, rays, spheres, radius)
-        far = hits.min(axis=-1)
-        lit = np.isfinite(far)
-        points = laser + np.where(lit, far, 1.0)[..., None] * rays
-        distance = np.linalg.norm(points, axis=-1)
-        seen_at = first_hits(np.zeros(3), points / distance[..., None], spheres, radius).min(axis=-1)
-        body = hits.argmin(axis=-1)
-        # What the metacarpal of the thumb carries is its ball, and no finger.
-        own = lit & (seen_at > distance - _SEEN_M) & ((body >= ROOT - 1) | (f > 0))
-        image = points[..., :2] / points[..., 2:]
-        step, gap = np.diff(image, axis=-2), np.linalg.norm(np.diff(points, axis=-2), axis=-1)
-        whole = own[..., 1:] & own[..., :-1] & (gap < _STRETCH * on_line[..., None])
-        weight = np.where(whole, np.linalg.norm(step, axis=-1), 0.0)
-        total = weight.sum(axis=-1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            share = weight / total[..., None]
-        centre = np.einsum("...r,...rk->...k", share, image[..., 1:, :] - 0.5 * step)
-        ray = np.concatenate([centre, np.ones((*centre.shape[:-1], 1))], axis=-1)
-        point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[..., None]
-        place = (share * body[..., 1:]).sum(axis=-1)
-        return self._axes.flat(point), total * self._setup.optics.matrix[0, 0], place
-
-    def _fan(self, spheres: Float, radius: Float) -> tuple[Float, Float]:
-        """Rays (C, A, R, 3) in the laser plane that take in the whole finger, and how wide it is (C, A) [m]."""
-        flat = self._axes.flat(spheres)
-        distance = np.linalg.norm(flat, axis=-1)
-        turn = np.arctan2(flat[..., 0], flat[..., 1])
-        room = np.arcsin(np.minimum(radius / distance, 1.0))
-        low, high = (turn - room).min(axis=-1), (turn + room).max(axis=-1)
-        turn = low[..., None] + (high - low)[..., None] * np.linspace(0.0, 1.0, _RAYS)
-        across, along = self._axes.axes
-        return np.sin(turn)[..., None] * across + np.cos(turn)[
-            ..., None
-        ] * along, 2.0 * radius.max() + 0.0 * low
 
 
 def _continued(values: Float) -> Float:
