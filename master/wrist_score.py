@@ -127,8 +127,8 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
             (thumb: MCP) in those where the finger is valid.
         frames_without_pose: Poses of which nothing is valid.
     """
-    row = _rows_at(truth.t_ns, poses.t_ns)
-    out = _score_laser(_at(poses.laser_m, row), truth) | _score_both(poses, row, truth)
+    row = rows_at(truth.t_ns, poses.t_ns)
+    out = _score_laser(at_rows(poses.laser_m, row), truth) | _score_both(poses, row, truth)
     there = row >= 0
     found = row[there]
     error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there, 1:])
@@ -148,7 +148,7 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
 
 def triples_missed(poses: Poses, truth: WristTruth) -> int:
     """Triples of a recording without a pose."""
-    return int((_rows_at(truth.t_ns, poses.t_ns) < 0).sum())
+    return int((rows_at(truth.t_ns, poses.t_ns) < 0).sum())
 
 
 def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, float]:
@@ -162,7 +162,7 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
     """
     at_ns = np.array([message.t_ns for message in messages], np.int64)
     uv = np.array([message.tip_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
-    found = _at(uv, _rows_at(truth.t_ns, at_ns))
+    found = at_rows(uv, rows_at(truth.t_ns, at_ns))
     off = np.linalg.norm(found - truth.tip_uv, axis=2)
     reported = np.isfinite(found).all(axis=2)
     out: dict[str, float] = {}
@@ -178,7 +178,7 @@ def _score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
     to_groups = 1e3 * np.linalg.norm(found[:, :, None] - truth.laser_m[:, None], axis=3)
     own = np.stack([to_groups[:, f, 1 + f] for f in range(FINGER_COUNT)], axis=1)
     reported = np.isfinite(found).all(axis=2)
-    clear = _clear(truth)
+    clear = clear_line(truth)
     nearest = np.nan_to_num(to_groups, nan=np.inf).min(axis=2)
     right = reported & (own <= nearest)
     out: dict[str, float] = {}
@@ -192,9 +192,9 @@ def _score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
 
 def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
     """What became of the fingers whose laser line and tip are both in sight; `row` (N,) of the poses."""
-    both = _clear(truth) & truth.tip_visible
-    error = np.abs(np.degrees(_at(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
-    by_ik = _at((poses.level == Level.IK).astype(np.float64), row) == 1.0
+    both = clear_line(truth) & truth.tip_visible
+    error = np.abs(np.degrees(at_rows(poses.angles_rad[:, :, 2], row) - truth.pip_rad))
+    by_ik = at_rows((poses.level == Level.IK).astype(np.float64), row) == 1.0
     out: dict[str, float] = {}
     for f, name in enumerate(FINGERS):
         out[f"both_{name}"] = float(both[:, f].sum())
@@ -203,12 +203,12 @@ def _score_both(poses: Poses, row: Int, truth: WristTruth) -> dict[str, float]:
     return out
 
 
-def _clear(truth: WristTruth) -> Bool:
+def clear_line(truth: WristTruth) -> Bool:
     """(N, 5) whether enough of the line is seen on a finger."""
     return (truth.laser_seen_m >= _CLEAR_M)[:, _OF_FINGERS] & np.isfinite(truth.laser_m[:, _OF_FINGERS, 0])
 
 
-def _rows_at(truth_ns: Int, t_ns: Int) -> Int:
+def rows_at(truth_ns: Int, t_ns: Int) -> Int:
     """For each triple of the truth the row of `t_ns` (T,), in rising order, that is of its time; -1: there is none."""
     if not len(t_ns):
         return np.full(len(truth_ns), -1)
@@ -218,7 +218,7 @@ def _rows_at(truth_ns: Int, t_ns: Int) -> Int:
     return np.where(np.abs(t_ns[row] - truth_ns) <= _MATCH_NS, row, -1)
 
 
-def _at(values: Float, row: Int) -> Float:
+def at_rows(values: Float, row: Int) -> Float:
     """Rows of values (T, ...); NaN where `row` is -1."""
     out = np.full((len(row), *values.shape[1:]), np.nan)
     out[row >= 0] = values[row[row >= 0]]

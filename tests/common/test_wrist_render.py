@@ -1,5 +1,6 @@
 """Simulated wrist frames: the line is drawn where the truth says, light falls off as light does, the sensor is one."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -147,3 +148,23 @@ def test_the_coarse_grid_of_real_time_shows_what_the_fine_one_shows() -> None:
 def test_another_camera_is_refused() -> None:
     with pytest.raises(CalibrationError, match="no camera 'left'"):
         WristRenderer(scene("curl"), "left")
+
+
+def test_skin_that_gives_back_a_fifth_less_light_is_darker_by_that_and_lies_where_it_lay() -> None:
+    usual, dull = scene("poses@dark"), replace(scene("poses@dark"), reflectance=0.8)
+    bright = WristRenderer(usual, "wrist").render(2.0, LED).astype(np.float64)
+    dark = WristRenderer(dull, "wrist").render(2.0, LED).astype(np.float64)
+    skin = (bright > 40.0) & (bright < 250.0)
+    assert skin.sum() > 10_000
+    assert np.median((dark[skin] - 2.0) / (bright[skin] - 2.0)) == pytest.approx(0.8, abs=0.01)
+    dim = [WristRenderer(one, "wrist").exposed(60.0, np.full(3, 0.01)) for one in (usual, dull)]
+    line, duller = (one.render(2.0, LASER).astype(np.float64) - 2.0 for one in dim)
+    lit = (line > 12.0) & (line < 250.0)
+    assert np.median(duller[lit] / line[lit]) == pytest.approx(0.8, abs=0.05)
+    np.testing.assert_array_equal(dull.truth(2.0).laser_uv, usual.truth(2.0).laser_uv)
+
+
+@pytest.mark.parametrize("reflectance", [0.0, -1.0, np.nan, np.inf])
+def test_skin_that_gives_back_no_light_is_refused(reflectance: float) -> None:
+    with pytest.raises(CalibrationError, match="reflectance"):
+        replace(scene("poses"), reflectance=reflectance)

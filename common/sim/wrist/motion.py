@@ -77,31 +77,35 @@ _SPREAD: tuple[Posture, ...] = (
 
 
 class Stations:
-    """Postures one after another, closed over 60 s. The state it holds is its script, fixed by the constructor."""
+    """Postures one after another, in 60 s. The state it holds is its script, fixed by the constructor."""
 
-    def __init__(self, model: HandModel, postures: tuple[Posture, ...], seed: int) -> None:
+    def __init__(
+        self, model: HandModel, postures: tuple[Posture, ...], seed: int, period_s: float = PERIOD_S
+    ) -> None:
         """Write the script: every posture is hit nearly, as people do.
 
         Args:
             model: Whose limits and coupling hold.
             postures: (5, 3) each [deg]: abduction, flexion, PIP.
             seed: Same seed, same motion.
+            period_s: Time [s] after which the first comes again; it is closed there where that is 60 s.
         """
         rng = np.random.default_rng([seed, 11])
         self._model, self._drift = model, Drift(rng)
         self._postures = np.array(postures, dtype=np.float64)
         self._postures += rng.normal(0.0, (1.0, 2.5, 4.0), self._postures.shape)
-        self._each_s = PERIOD_S / len(postures)
+        self._period_s = period_s
+        self._each_s = period_s / len(postures)
         self._move_s = min(MOVE_S, 0.7 * self._each_s)
 
     @property
     def period_s(self) -> float:
         """Time [s] after which the motion repeats."""
-        return PERIOD_S
+        return self._period_s
 
     def at(self, t_s: float) -> HandState:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
-        t = max(t_s, 0.0) % PERIOD_S
+        t = max(t_s, 0.0) % self._period_s
         place = min(int(t / self._each_s), len(self._postures) - 1)
         share = smooth_step((t - place * self._each_s) / self._move_s)
         before = self._postures[place - 1]  # that of the first is the last

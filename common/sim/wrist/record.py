@@ -12,6 +12,7 @@ from typing import TypeVar
 import msgspec
 import numpy as np
 
+from common.calibration import RigCalibration
 from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest
 from common.frame_writing import RecordingWriter, encode_png
@@ -66,6 +67,7 @@ def record_wrist(
     poses_s: Sequence[float] = (),
     faults: Callable[[list[Shot]], list[Shot]] | None = None,
     step: int = 1,
+    rig: RigCalibration | None = None,
 ) -> int:
     """Render a scene as its camera takes it; return the number of triples.
 
@@ -77,6 +79,7 @@ def record_wrist(
         poses_s: Scene times [s] instead: every triple is a pose of its own, in which the hand stands still.
         faults: Makes of all frames those that are delivered, such as `with_faults`; stamps and numbers go on rising.
         step: Pixels between the rays that shade skin (`WristRenderer`).
+        rig: What the manifest says of the device; None: the truth.
 
     Raises:
         RecordingError: The folder holds something already, or cannot be written.
@@ -90,7 +93,7 @@ def record_wrist(
         version=1,
         kind="wrist",
         cameras={name: scene.cameras[name]},
-        rig=scene.rig,
+        rig=rig or scene.rig,
         continuous=not poses_s,
         note=f"rendered wrist scene, {scene.ambient} light, seed {scene.seed}",
     )

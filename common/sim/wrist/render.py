@@ -88,7 +88,7 @@ class WristRenderer:
         if lit is Illumination.LED:
             shade += self._leds.on_skin(skin.points, skin.normals) * self._skin.flat[skin.pixel]
         level = behind.copy()
-        level.reshape(-1)[skin.pixel] = shade * skin.albedo
+        level.reshape(-1)[skin.pixel] = shade * skin.albedo * np.float32(self._scene.reflectance)
         return level
 
 

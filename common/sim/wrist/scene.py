@@ -67,6 +67,7 @@ class WristScene:
         motion: How it moves; its `T_rig_palm` is the forearm's way through the room, which an IMU feels.
         ambient: The light of the room.
         seed: Of flesh, skin, room and noise.
+        reflectance: How much light the skin gives back, of whatever light, against usual skin.
         optics: The camera.
         flesh: The hand's surface.
         sheet: The laser.
@@ -79,6 +80,7 @@ class WristScene:
     motion: HandMotion
     ambient: Ambient = "indoor"
     seed: int = STANDARD_SEED
+    reflectance: float = 1.0
     optics: CameraModel = field(init=False)
     flesh: Flesh = field(init=False)
     sheet: LaserSheet = field(init=False)
@@ -94,6 +96,10 @@ class WristScene:
         for key in ("laser_plane", "laser", "T_camera_palm", "led"):
             if not getattr(self.rig, key):
                 raise CalibrationError(f"{where}: {key}: missing; a wrist device is simulated as it is built")
+        if not 0.0 < self.reflectance < np.inf:
+            raise CalibrationError(
+                f"{where}: reflectance {self.reflectance}: expected a positive number, 1 is usual"
+            )
         optics = CameraModel.of(self.cameras[name], np.eye(4))
         object.__setattr__(self, "optics", optics)
         object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))

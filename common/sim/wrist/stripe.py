@@ -38,7 +38,8 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> 
     heights = LAYERS * SHEET_SIGMA_M
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
     reach = np.linalg.norm(points - sheet.origin, axis=1)
-    amount = (LASER_LEVEL * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(-0.5 * LAYERS**2)
+    strength = LASER_LEVEL * scene.reflectance
+    amount = (strength * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(-0.5 * LAYERS**2)
     place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]
     _spread(level, place.reshape(-1, 2), amount.ravel(), hand)
 
