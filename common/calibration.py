@@ -27,6 +27,7 @@ from common.calibration_parts import (
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
 from common.replacing import replacing
+from common.strobe_calibration import StrobeCalibration, check_strobe
 from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, check_flat_field, check_wrist
 
 Hsv = tuple[
@@ -155,7 +156,8 @@ class RigCalibration(Part, frozen=True):
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
     finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
     -> the line along which its laser point moves. `level`: fingers from the laser alone, bent as habit has it (fk),
-    from laser and fingertip, without a tip not at all (ik), or from what there is (auto).
+    from laser and fingertip, without a tip not at all (ik), or from what there is (auto). `strobe`: laser and LEDs as
+    lights, and how long they may shine.
     """
 
     version: Literal[1]
@@ -183,6 +185,7 @@ class RigCalibration(Part, frozen=True):
     forward: Literal["table", "cubic"] = "table"
     level: Literal["fk", "ik", "auto"] = "auto"
     imu: ImuCalibration | None = None
+    strobe: StrobeCalibration | None = None
 
     def camera_pose(self, camera: str) -> Float:
         """`T_rig_camera` (4, 4) [m] of one camera; the frame of a wrist rig is that of its camera.
@@ -345,6 +348,7 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
         _check_imu(rig.imu, rig.cameras, where)
     check_wrist(rig.laser_plane, rig.laser, rig.finger_lines, where)
     check_flat_field(rig.flat_field, where)
+    check_strobe(rig.strobe, None if rig.laser is None else rig.laser.fan_rad, where)
     if rig.kind == "wrist":
         if len(rig.cameras) != 1:
             raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")

@@ -1,4 +1,4 @@
-"""The seam between the slave and whatever switches laser and LEDs: real or synthetic; nothing behind it can tell which."""
+"""The seam between the slave and what switches laser and LEDs: real or synthetic; nothing behind it can tell which."""
 
 from typing import Protocol
 
@@ -24,4 +24,8 @@ class Lights(Protocol):
 
     def close(self) -> None:
         """Leave it dark and give the device back. Safe to call twice."""
+        ...
+
+    def counts(self) -> dict[str, int]:
+        """Event of the device -> how often."""
         ...
