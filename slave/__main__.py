@@ -126,12 +126,8 @@ def _source(
     stop: threading.Event | None = None,
 ) -> FrameSource:
     """Open the camera; with `stop`, a real one that is lost later is opened again until that is set."""
-    if rig.kind == "wrist" and str(options.camera).partition(":")[0] in real.DRIVERS:
-        raise CameraError(
-            f"--camera {options.camera}: gives colour frames; the camera of a wrist device gives grey ones, lit in "
-            "turn by its laser and its LEDs, and no driver of such a camera is here yet: synthetic, or replay:FOLDER"
-        )
-    if (found := real.open_real(options.camera, options, camera, clock, stop)) is not None:
+    wrist = rig.kind == "wrist"
+    if (found := real.open_real(options.camera, options, camera, clock, stop, wrist=wrist)) is not None:
         return found
     kind, _, folder = str(options.camera).partition(":")
     if kind == "replay" and folder:

@@ -4,7 +4,7 @@ Settings are part of the configuration, so the first frames already have them. l
 it reports is what was asked for; then exposure, gains, frame duration and focus of three frames in a row must be
 those of the camera file. Image and metadata always come from the same captured request, which is released whatever
 happens. When a frame was taken, and its number, are in `picamera2_frames`; whether cameras run in step, in
-`picamera2_sync`.
+`picamera2_sync`, which streams there are in `picamera2_streams`.
 
 Exposure and gains can be changed while frames are read: another thread writes the controls and watches the metadata
 of the frames that the loop reads, until three in a row show them.
@@ -22,10 +22,11 @@ from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.grey import Pixels
 from slave.cameras.passing import Passing
-from slave.cameras.picamera2_frames import Timeline, without_padding
-from slave.cameras.picamera2_library import Request, open_library
-from slave.cameras.picamera2_modes import choose_mode, read_modes, view_text
+from slave.cameras.picamera2_frames import Timeline
+from slave.cameras.picamera2_library import open_library
+from slave.cameras.picamera2_modes import choose_mode, choose_raw_mode, read_modes, view_text
 from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
     Picamera2Options,
@@ -34,8 +35,9 @@ from slave.cameras.picamera2_settings import (
     read_figures,
     wanted_settings,
 )
+from slave.cameras.picamera2_streams import Streams
 from slave.cameras.picamera2_sync import SyncWatch, wait_in_step
-from slave.cameras.settings import change, demand, differences
+from slave.cameras.settings import as_values, change, demand, differences
 from slave.cameras.source import Frame
 
 BUFFERS = 6  # picamera2's own number for video: the pipeline never starves while one frame is held
@@ -113,7 +115,15 @@ class Picamera2Camera:
             if place is None:
                 continue
             self._lores = lores
-            return Frame(*place, self._clock.now_ns(), image, t_sigma_ns=self._timeline.sigma_ns)
+            exposure = as_values(metadata.get("ExposureTime"))
+            return Frame(
+                *place,
+                self._clock.now_ns(),
+                image,
+                self._options.pixels.illumination,
+                self._timeline.sigma_ns,
+                exposure[0] if exposure else 0.0,
+            )
         return None
 
     def close(self) -> None:
@@ -168,7 +178,7 @@ class Picamera2Camera:
         available = self._library.camera_controls
         try:
             asked = controls(camera, self._options, self._enums, available)
-            live = {name: asked[name] for name in LIVE_CONTROLS}
+            live = {name: asked[name] for name in LIVE_CONTROLS if name in asked}
             check_ranges(live, available)
         except CameraError as error:
             raise CameraError(f"{self._where}: {error}") from error
@@ -194,22 +204,14 @@ class Picamera2Camera:
         need_hz = camera.frame_rate_hz * (1.0 if self._options.sync == "off" else SYNC_MARGIN)
         try:
             modes = read_modes(library.sensor_modes)
-            mode = choose_mode(modes, need_hz, size)
+            choose = choose_raw_mode if self._options.pixels is Pixels.GREY else choose_mode
+            mode = choose(modes, need_hz, size)
             asked = controls(camera, self._options, self._enums, library.camera_controls)
-            parts: dict[str, Any] = {
-                "main": {
-                    "size": size,
-                    "format": "RGB888",
-                },  # named from the low byte up in a word: B, G, R in memory
-                "raw": None,
-                "sensor": {"output_size": mode.size, "bit_depth": mode.bit_depth},
-                "controls": asked,
-                "buffer_count": BUFFERS,
-            }
-            if self._options.lores is not None:
-                parts["lores"] = {"size": self._options.lores, "format": "YUV420"}
-            library.configure(library.create_video_configuration(**parts))
-            self._check_streams(size)
+            streams = Streams(self._options.pixels, size, mode, self._options.lores)
+            library.configure(
+                library.create_video_configuration(**streams.parts(), controls=asked, buffer_count=BUFFERS)
+            )
+            self._streams = streams.taken(library.camera_configuration())
             check_ranges(asked, library.camera_controls)  # of the mode just configured
             library.start()
         except CameraError as error:
@@ -218,20 +220,6 @@ class Picamera2Camera:
             raise CameraError(f"{self._where}: cannot be started: {error}") from error
         model = library.camera_properties.get("Model", "unknown model")
         _LOG.info("%s: %s, mode %s", self._where, model, view_text(mode, modes))
-
-    def _check_streams(self, size: tuple[int, int]) -> None:
-        """libcamera adjusts what it cannot do; a frame of another size or format is not what was calibrated."""
-        taken = self._library.camera_configuration()
-        expected = {"main": (size, "RGB888")}
-        if self._options.lores is not None:
-            expected["lores"] = (self._options.lores, "YUV420")
-        for name, (asked, image_format) in expected.items():
-            got = (tuple(taken[name]["size"]), taken[name]["format"])
-            if got != (asked, image_format):
-                raise CameraError(
-                    f"stream {name}: wanted {asked[0]}x{asked[1]} {image_format}, the camera makes "
-                    f"{got[0][0]}x{got[0][1]} {got[1]} of it; use a size with even width and height"
-                )
 
     def _settle(self, camera: CameraCalibration, frames: Iterable[Mapping[str, object]]) -> None:
         """Wait until some frames in a row have every setting of `camera`.
@@ -243,7 +231,7 @@ class Picamera2Camera:
         Raises:
             CameraError: They do not; every setting that differs is named.
         """
-        wanted = wanted_settings(camera, self._library.camera_controls)
+        wanted = wanted_settings(camera, self._library.camera_controls, self._options.pixels)
         good, metadata = 0, dict[str, object]()
         for metadata in frames:
             good = 0 if differences(wanted, metadata) else good + 1
@@ -268,7 +256,7 @@ class Picamera2Camera:
         )
 
     def _capture(self, with_image: bool) -> tuple[dict[str, object], Image, Image | None]:
-        """Metadata, image (H, W, 3) BGR and small image of one request; empty images where not asked for.
+        """Metadata, image and small image of one request; empty images where not asked for.
 
         Raises:
             CameraError: No frame came, or the library failed.
@@ -280,7 +268,7 @@ class Picamera2Camera:
                 metadata = dict(request.get_metadata())
                 if not with_image:
                     return metadata, empty, None
-                return metadata, self._image(request), self._small(request)
+                return metadata, self._streams.image(request), self._streams.small(request)
             finally:
                 request.release()
         except TimeoutError as error:
@@ -291,15 +279,3 @@ class Picamera2Camera:
         except (RuntimeError, OSError, AssertionError) as error:
             self._lost = True
             raise CameraError(f"{self._where}: failed: {error}") from error
-
-    def _image(self, request: Request) -> Image:
-        image = np.asarray(request.make_array("main"))
-        shape = (self._calibration.height_px, self._calibration.width_px, 3)
-        if image.shape != shape or image.dtype != np.uint8:
-            raise RuntimeError(f"a frame is {image.shape} {image.dtype}, not {shape} uint8")
-        return image
-
-    def _small(self, request: Request) -> Image | None:
-        if self._options.lores is None:
-            return None
-        return without_padding(request.make_array("lores"), *self._options.lores)

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
+from slave.cameras.grey import Pixels
 from slave.cameras.picamera2_library import Enums
 from slave.cameras.settings import Setting, as_values
 
@@ -40,12 +41,14 @@ class Picamera2Options:
         sync: Whether frames follow another camera's ("client"), lead ("server") or run free.
         sync_timeout_s: How long to wait for the others [s].
         lores: Width and height of a second, small YUV420 image of each frame [px], or None.
+        pixels: What the frames are to be.
     """
 
     index: int = 0
     sync: Sync = "off"
     sync_timeout_s: float = 60.0
     lores: tuple[int, int] | None = None
+    pixels: Pixels = Pixels.COLOUR
 
 
 def controls(
@@ -76,6 +79,10 @@ def controls(
         "ColourGains": camera.colour_gains,
         "FrameDurationLimits": (period_us, period_us),
     }
+    if options.pixels is not Pixels.COLOUR and "ColourGains" not in available:
+        if camera.colour_gains != (1.0, 1.0):
+            raise CameraError("colour_gains: its sensor has no colours: write [1, 1] into the camera file")
+        del asked["AwbEnable"], asked["ColourGains"]
     if "NoiseReductionMode" in available:  # a camera without it has none to switch off
         asked["NoiseReductionMode"] = enums.noise_reduction_off
     asked |= _focus(camera, enums, available) | _sync(options, enums, available)
@@ -142,7 +149,9 @@ def check_ranges(asked: Mapping[str, Any], available: Mapping[str, tuple[Any, An
         raise CameraError(f"in this mode {'; '.join(wrong)}: change the camera file")
 
 
-def wanted_settings(camera: CameraCalibration, available: Mapping[str, object]) -> tuple[Setting, ...]:
+def wanted_settings(
+    camera: CameraCalibration, available: Mapping[str, object], pixels: Pixels = Pixels.COLOUR
+) -> tuple[Setting, ...]:
     """What the metadata of a captured frame must say; tolerances as in the text above."""
     row_us = camera.row_time_us if camera.row_time_us > 0.0 else GLOBAL_SHUTTER_ROW_US
     exposure = row_us + EXPOSURE_SHARE * camera.exposure_us
@@ -153,9 +162,10 @@ def wanted_settings(camera: CameraCalibration, available: Mapping[str, object]) 
         Setting("ExposureTime", (camera.exposure_us,), exposure, "us", "exposure_us"),
         Setting("AnalogueGain", (camera.analogue_gain,), gain, "", "analogue_gain"),
         Setting("DigitalGain", (1.0,), digital, "", "no brightening behind the sensor"),
-        Setting("ColourGains", camera.colour_gains, COLOUR_GAIN, "", "colour_gains"),
         Setting("FrameDuration", (1e6 / camera.frame_rate_hz,), row_us + 1.0, "us", rate),
     ]
+    if pixels is Pixels.COLOUR or "ColourGains" in available:
+        wanted.append(Setting("ColourGains", camera.colour_gains, COLOUR_GAIN, "", "colour_gains"))
     if "AfMode" in available and camera.focus_m is not None:
         wanted.append(Setting("LensPosition", (1.0 / camera.focus_m,), DIOPTRES, "dioptres", "focus_m"))
     return tuple(wanted)

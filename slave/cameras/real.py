@@ -8,6 +8,7 @@ from pathlib import Path
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.grey import Pixels
 from slave.cameras.picamera2 import Picamera2Camera
 from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reopening import ReopeningCamera
@@ -27,6 +28,12 @@ OPTIONS: dict[str, tuple[str, object]] = {
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of the real cameras."""
+    parser.add_argument(
+        "--luma",
+        action="store_true",
+        help="wrist device with a colour camera (without infrared filter): its luma in place of grey frames of a "
+        "monochrome sensor; it is not linear in the light",
+    )
     pi = parser.add_argument_group("Pi camera (picamera2)")
     pi.add_argument(
         "--sync",
@@ -64,6 +71,8 @@ def open_real(
     camera: CameraCalibration,
     clock: Clock,
     stop: threading.Event | None,
+    *,
+    wrist: bool = False,
 ) -> FrameSource | None:
     """Open the camera that `--camera DRIVER[:PLACE]` names.
 
@@ -73,6 +82,7 @@ def open_real(
         camera: The camera file.
         clock: The slave's clock.
         stop: Set when the slave is to end; until then a lost camera is opened again. None: losing it is an error.
+        wrist: Whether it is the camera of a wrist device, whose frames are grey.
 
     Returns:
         The camera, or None if the driver is none of a real camera.
@@ -81,17 +91,32 @@ def open_real(
         CameraError: An option is of another driver or makes no sense, or the camera cannot be opened.
     """
     kind, _, place = driver.partition(":")
+    pixels = _pixels(kind, options.luma, wrist)
     for name, (owner, unset) in OPTIONS.items():
         if owner != kind and getattr(options, name) != unset:
             flag = "--" + name.replace("_", "-")
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     if kind == "picamera2":
-        pi = Picamera2Options(_index(place), options.sync, options.sync_timeout)
+        pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, pixels=pixels)
         return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop)
     if kind == "v4l2":
-        usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing))
+        usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing), pixels)
         return _lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop)
     return None
+
+
+def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
+    if as_luma and kind not in DRIVERS:
+        raise CameraError(
+            f"--luma is an option of --camera {' and '.join(DRIVERS)}, not of {kind}: leave it away"
+        )
+    if as_luma and not wrist:
+        raise CameraError(
+            "--luma: makes grey frames for a wrist device; this rig looks for painted markers, by colour"
+        )
+    if wrist:
+        return Pixels.LUMA if as_luma else Pixels.GREY
+    return Pixels.COLOUR
 
 
 def _lasting(

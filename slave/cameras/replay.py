@@ -57,14 +57,14 @@ class ReplayCamera:
             return None
         row = self._rows[self._next]
         self._next += 1
-        image = self._load(row)
+        image, exposure_us = self._load(row), self._calibration.exposure_us
         if not self._paced:
-            return Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination)
+            return Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=exposure_us)
         if self._shift_ns is None:
             self._shift_ns = self._clock.now_ns() - row.t_ns
         t_ns = row.t_ns + self._shift_ns
         self._wait_until(t_ns)
-        return Frame(row.seq, t_ns, self._clock.now_ns(), image, row.illumination)
+        return Frame(row.seq, t_ns, self._clock.now_ns(), image, row.illumination, exposure_us=exposure_us)
 
     def close(self) -> None:
         """End the stream."""

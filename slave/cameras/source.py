@@ -16,8 +16,9 @@ class Frame:
         t_ns: Middle of the exposure of row 0 [ns], slave's clock.
         ready_t_ns: When the frame was handed to the slave [ns], same clock.
         image: (H, W, 3) BGR, or (H, W) grey, uint8. Nobody writes to it any more: others may still look at it.
-        illumination: What lit the scene.
+        illumination: What lit the scene; NONE: not known.
         t_sigma_ns: Standard deviation of `t_ns` [ns], as far as the driver knows its camera; 0: exact.
+        exposure_us: Exposure time [us]; 0: not known.
     """
 
     seq: int
@@ -26,6 +27,7 @@ class Frame:
     image: Image
     illumination: Illumination = Illumination.AMBIENT
     t_sigma_ns: float = 0.0
+    exposure_us: float = 0.0
 
 
 class FrameSource(Protocol):

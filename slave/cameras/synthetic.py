@@ -98,7 +98,7 @@ class SyntheticCamera:
         due = self._true_ns(t_ns + self._readout_ns)
         while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
             self._sleep(min(left_s, STEP_S))
-        return Frame(seq, t_ns, self._clock.now_ns(), image, lit)
+        return Frame(seq, t_ns, self._clock.now_ns(), image, lit, exposure_us=self._camera.exposure_us)
 
     def close(self) -> None:
         """End the stream."""

@@ -32,10 +32,11 @@ from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
+from slave.cameras.grey import Pixels
 from slave.cameras.passing import Passing
 from slave.cameras.source import Frame
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
-from slave.cameras.v4l2_formats import Offer, choose_offer, decode, read_offers
+from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
 from slave.cameras.v4l2_settings import SETTLE_FRAMES, TIMEOUT_S, V4l2Settings
 
 BUFFERS = 4
@@ -56,11 +57,13 @@ class V4l2Options:
         path: Device; a path below /dev/v4l/by-id stays the same when the camera is plugged in anew.
         controls: Control -> value, in codes of the maker.
         allow_missing: Which of exposure, gain, white_balance the camera may lack.
+        pixels: What its frames are to be.
     """
 
     path: Path = Path("/dev/video0")
     controls: Mapping[str, int] = field(default_factory=dict[str, int])
     allow_missing: tuple[str, ...] = ()
+    pixels: Pixels = Pixels.COLOUR
 
 
 class V4l2Camera:
@@ -91,7 +94,7 @@ class V4l2Camera:
         self._buffers: list[memoryview] = []
         self._seq = -1
         self._sequence: int | None = None
-        self._pixel_format = self._stride = 0
+        self._layout: Layout | None = None
         self._streaming = False
         self._settings: V4l2Settings | None = None
         self._rate_hz = 0.0
@@ -126,7 +129,15 @@ class V4l2Camera:
             if image is None:
                 self.broken += 1
                 continue
-            return Frame(self._seq, t_ns, self._clock.now_ns(), image, t_sigma_ns=self._sigma_ns)
+            return Frame(
+                self._seq,
+                t_ns,
+                self._clock.now_ns(),
+                image,
+                self._options.pixels.illumination,
+                self._sigma_ns,
+                self._calibration.exposure_us,
+            )
         return None
 
     def close(self) -> None:
@@ -183,9 +194,12 @@ class V4l2Camera:
         camera, options = self._calibration, self._options
         name = self._check_capabilities(device)
         size = (camera.width_px, camera.height_px)
-        offer = choose_offer(read_offers(device, size), size, camera.frame_rate_hz)
-        self._set_format(device, offer)
-        self._settings = settings = V4l2Settings(device, camera, options.controls, options.allow_missing)
+        offer = choose_offer(read_offers(device, size), size, camera.frame_rate_hz, options.pixels)
+        self._layout = set_format(device, offer, options.pixels)
+        self._set_rate(device, size)
+        self._settings = settings = V4l2Settings(
+            device, camera, options.controls, options.allow_missing, options.pixels
+        )
         self._stream(device)
         self._settle(device)
         settings.check(lambda: self._settle(device))
@@ -205,17 +219,7 @@ class V4l2Camera:
             )
         return name
 
-    def _set_format(self, device: abi.Device, offer: Offer) -> None:
-        """Set size, format and rate, and see what the driver made of them."""
-        asked = abi.Format(type=abi.CAPTURE)
-        pix = asked.fmt.pix
-        pix.width, pix.height = offer.size
-        pix.pixelformat, pix.field = offer.pixel_format, abi.FIELD_NONE
-        device.ioctl(abi.S_FMT, asked)
-        if (pix.width, pix.height, pix.pixelformat) != (*offer.size, offer.pixel_format):
-            got = abi.fourcc_text(pix.pixelformat)
-            raise CameraError(f"format: wanted {offer.text()}, got {got} {pix.width}x{pix.height}")
-        self._pixel_format, self._stride = offer.pixel_format, int(pix.bytesperline)
+    def _set_rate(self, device: abi.Device, size: tuple[int, int]) -> None:
         rate_hz = self._calibration.frame_rate_hz
         parameters = abi.StreamParameters(type=abi.CAPTURE, numerator=1000, denominator=round(rate_hz * 1000))
         try:
@@ -225,7 +229,7 @@ class V4l2Camera:
                 raise
             return  # a fixed rate: it is measured below
         got_hz = parameters.denominator / max(parameters.numerator, 1)
-        if not Offer(0, offer.size, (got_hz,)).reaches(rate_hz):
+        if not Offer(0, size, (got_hz,)).reaches(rate_hz):
             raise CameraError(f"frame_rate_hz: wanted {rate_hz:g}, the driver set {got_hz:.4g}")
 
     def _stream(self, device: abi.Device) -> None:
@@ -261,7 +265,8 @@ class V4l2Camera:
 
     def _next(self, device: abi.Device) -> tuple[Image | None, abi.Buffer]:
         """Newest frame (None: damaged) and its buffer, which the driver has back already."""
-        size = (self._calibration.width_px, self._calibration.height_px)
+        layout = self._layout
+        assert layout is not None  # the format is set before the stream starts
         while True:
             if not device.wait(TIMEOUT_S):
                 raise CameraError(f"no frame for {TIMEOUT_S:g} s; check its cable")
@@ -276,7 +281,7 @@ class V4l2Camera:
             image: Image | None = None
             if not stale and not damaged:
                 data = self._buffers[int(newest.index)][: int(newest.bytesused)]
-                image = decode(data, self._pixel_format, size, self._stride)
+                image = layout.image(data)
             done = abi.Buffer.from_buffer_copy(newest)
             device.ioctl(abi.QBUF, newest)
             if not stale:

@@ -19,6 +19,11 @@ MMAP = 1  # V4L2_MEMORY_MMAP
 FIELD_ANY, FIELD_NONE = 0, 1
 CAP_CAPTURE, CAP_STREAMING, CAP_DEVICE_CAPS = 0x1, 0x0400_0000, 0x8000_0000
 DISCRETE = 1  # V4L2_FRMSIZE_TYPE_DISCRETE, V4L2_FRMIVAL_TYPE_DISCRETE
+DEFAULT_RANGE, FULL_RANGE = (
+    0,
+    1,
+)  # V4L2_QUANTIZATION_DEFAULT, of YUV the full range where the colorspace is JPEG
+COLORSPACE_JPEG = 7
 BUF_ERROR = 0x40
 STAMP_CLOCK, STAMP_MONOTONIC = 0xE000, 0x2000
 STAMP_SOURCE, STAMP_START_OF_EXPOSURE = 0x7_0000, 0x1_0000
@@ -300,8 +305,8 @@ class KernelDevice:
 
 
 def fourcc(text: str) -> int:
-    """Number of a pixel format such as "YUYV"."""
-    return int.from_bytes(text.encode("ascii"), "little")
+    """Number of a pixel format such as "YUYV", or "Y10", whose fourth letter is a space."""
+    return int.from_bytes(text.ljust(4).encode("ascii"), "little")
 
 
 def fourcc_text(number: int) -> str:

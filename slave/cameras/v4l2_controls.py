@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
+from slave.cameras.grey import Pixels
 from slave.cameras.settings import Setting
 from slave.cameras.v4l2_abi import (
     CTRL_DISABLED,
@@ -179,6 +180,7 @@ def plan(
     controls: Mapping[str, Control],
     given: Mapping[str, int],
     missing: Iterable[str],
+    pixels: Pixels = Pixels.COLOUR,
 ) -> tuple[Setting, ...]:
     """What to write, in this order, and to find again: automatics off, exposure, then what was given.
 
@@ -187,6 +189,7 @@ def plan(
         controls: What the camera has.
         given: Control -> value, from the command line.
         missing: Which of exposure, gain, white_balance the camera may lack.
+        pixels: What its frames are; without colours it may lack a white balance, but none that it has is left alone.
 
     Raises:
         CameraError: A control is unknown, out of range, or needed and not given. The text says what to write.
@@ -214,7 +217,7 @@ def plan(
         if not controls[name].allows(value):
             raise CameraError(f"--control {name}={value}: out of range; {controls[name].text()}")
         settings[name] = Setting(name, (float(value),), 0.0, "", "--control")
-    _check_needs(camera, controls, given, allowed)
+    _check_needs(controls, given, allowed | (set() if pixels is Pixels.COLOUR else {"white_balance"}))
     return tuple(settings.values())
 
 
@@ -229,9 +232,7 @@ def _exposure(camera: CameraCalibration, control: Control) -> Setting:
     return Setting(control.name, (wanted,), 0.5 * control.step, "x 100 us", "exposure_us")
 
 
-def _check_needs(
-    camera: CameraCalibration, controls: Mapping[str, Control], given: Mapping[str, int], allowed: set[str]
-) -> None:
+def _check_needs(controls: Mapping[str, Control], given: Mapping[str, int], allowed: set[str]) -> None:
     """Every value that the image depends on is known, or its absence was allowed."""
     say: list[str] = []
     for need, ways in NEEDS.items():

@@ -1,4 +1,4 @@
-"""In which format a V4L2 camera delivers: what it offers, which offer is taken, and how its bytes become BGR.
+"""In which format a V4L2 camera delivers: what it offers, which offer is taken, and how its bytes become an image.
 
 Uncompressed formats are preferred because JPEG moves colours at the edges of the markers; it is taken where only it
 reaches size and rate, as with most USB 2 cameras above 640x480 at 30 Hz. The size must be offered exactly and the rate
@@ -15,13 +15,20 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import CameraError
+from slave.cameras.grey import GREY_FORMATS, LUMA_FORMATS, Pixels, grey, luma
 from slave.cameras.v4l2_abi import (
     CAPTURE,
+    COLORSPACE_JPEG,
+    DEFAULT_RANGE,
     DISCRETE,
     ENUM_FMT,
     ENUM_FRAMEINTERVALS,
     ENUM_FRAMESIZES,
+    FIELD_NONE,
+    FULL_RANGE,
+    S_FMT,
     Device,
+    Format,
     FormatDescription,
     FrameIntervals,
     FrameSizes,
@@ -31,7 +38,17 @@ from slave.cameras.v4l2_abi import (
 
 RATE_SHARE = 0.01  # 59.94 Hz serves 60 Hz
 MOST = 256  # entries of an enumeration; a driver that never ends it is broken
-PREFERENCE = tuple(fourcc(text) for text in ("BGR3", "RGB3", "YUYV", "UYVY", "MJPG", "JPEG"))
+PREFERENCE = {
+    Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", "MJPG", "JPEG"),
+    Pixels.GREY: GREY_FORMATS,
+    Pixels.LUMA: LUMA_FORMATS,
+}
+
+_WHY_NOT = {
+    Pixels.COLOUR: "which Phalanx does not read",
+    Pixels.GREY: "which are not grey; of a colour camera without infrared filter --luma takes the luma",
+    Pixels.LUMA: "which hold no luma",
+}
 
 EntryT = TypeVar("EntryT", FormatDescription, FrameSizes, FrameIntervals)
 
@@ -79,37 +96,82 @@ def read_offers(device: Device, wanted: tuple[int, int]) -> tuple[Offer, ...]:
     return tuple(offers)
 
 
-def choose_offer(offers: Sequence[Offer], size: tuple[int, int], rate_hz: float) -> Offer:
-    """The best format that has exactly this size [px] and this rate [Hz].
+def choose_offer(
+    offers: Sequence[Offer], size: tuple[int, int], rate_hz: float, pixels: Pixels = Pixels.COLOUR
+) -> Offer:
+    """The best format for these pixels that has exactly this size [px] and this rate [Hz].
 
     Raises:
         CameraError: There is none; the text lists what there is.
     """
-    able = [o for o in offers if o.pixel_format in PREFERENCE and o.size == size and o.reaches(rate_hz)]
+    wanted = [fourcc(name) for name in PREFERENCE[pixels]]
+    able = [o for o in offers if o.pixel_format in wanted and o.size == size and o.reaches(rate_hz)]
     if not able:
-        listed = "; ".join(offer.text() for offer in offers if offer.pixel_format in PREFERENCE) or "nothing"
-        known = ", ".join(fourcc_text(number) for number in PREFERENCE)
-        foreign = sorted({fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in PREFERENCE})
-        unread = f" (and {', '.join(foreign)}, which Phalanx does not read)" if foreign else ""
+        listed = "; ".join(offer.text() for offer in offers if offer.pixel_format in wanted) or "nothing"
+        known = ", ".join(PREFERENCE[pixels])
+        foreign = sorted({fourcc_text(o.pixel_format) for o in offers if o.pixel_format not in wanted})
+        unread = f" (and {', '.join(foreign)}, {_WHY_NOT[pixels]})" if foreign else ""
         raise CameraError(
             f"does not offer {size[0]}x{size[1]} at {rate_hz:g} Hz in a known format ({known}). It offers: "
             f"{listed}{unread}. Set width_px, height_px and frame_rate_hz of the camera file to one of these"
         )
-    return min(able, key=lambda offer: PREFERENCE.index(offer.pixel_format))
+    return min(able, key=lambda offer: wanted.index(offer.pixel_format))
 
 
-def decode(data: memoryview, pixel_format: int, size: tuple[int, int], stride: int) -> Image | None:
-    """New BGR image (H, W, 3) from the bytes of one frame; None for a frame that is cut or broken.
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How the bytes of a frame lie.
 
-    Args:
-        data: The bytes the driver filled.
-        pixel_format: Number of the format, one of `PREFERENCE`.
+    Attributes:
+        pixels: What is made of them.
+        name: Four letters of the format, one of `PREFERENCE[pixels]`.
         size: Width and height [px].
         stride: Bytes from row to row; meaningless for JPEG.
+        full_range: Whether luma is coded as 0 to 255, and not as 16 to 235.
     """
+
+    pixels: Pixels
+    name: str
+    size: tuple[int, int]
+    stride: int
+    full_range: bool = False
+
+    def image(self, data: memoryview) -> Image | None:
+        """New image, BGR (H, W, 3) or grey (H, W); None for a frame that is cut or broken.
+
+        Raises:
+            CameraError: Its values do not lie where they should.
+        """
+        raw = np.frombuffer(data, np.uint8)
+        if self.pixels is Pixels.COLOUR:
+            return _colours(raw, self.name, self.size, self.stride)
+        if self.pixels is Pixels.LUMA:
+            return luma(raw, self.name, self.size, self.stride, full_range=self.full_range)
+        return grey(raw, self.name, self.size, self.stride)
+
+
+def set_format(device: Device, offer: Offer, pixels: Pixels) -> Layout:
+    """Set size and format, and see what the driver made of them.
+
+    Raises:
+        CameraError: Something else.
+        OSError: The driver refuses.
+    """
+    asked = Format(type=CAPTURE)
+    pix = asked.fmt.pix
+    pix.width, pix.height = offer.size
+    pix.pixelformat, pix.field = offer.pixel_format, FIELD_NONE
+    device.ioctl(S_FMT, asked)
+    name = fourcc_text(pix.pixelformat)
+    if (pix.width, pix.height, pix.pixelformat) != (*offer.size, offer.pixel_format):
+        raise CameraError(f"format: wanted {offer.text()}, got {name} {pix.width}x{pix.height}")
+    of_jpeg = pix.quantization == DEFAULT_RANGE and pix.colorspace == COLORSPACE_JPEG
+    full_range = of_jpeg or pix.quantization == FULL_RANGE
+    return Layout(pixels, name, offer.size, int(pix.bytesperline), full_range)
+
+
+def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image | None:
     width, height = size
-    raw = np.frombuffer(data, np.uint8)
-    name = fourcc_text(pixel_format)
     if name in ("MJPG", "JPEG"):
         image = cv2.imdecode(raw, cv2.IMREAD_COLOR)  # None where the end is missing (OpenCV 4.12 and 5.0)
         whole = image is not None and image.shape == (height, width, 3)

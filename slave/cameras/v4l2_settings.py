@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
+from slave.cameras.grey import Pixels
 from slave.cameras.passing import Passing
 from slave.cameras.settings import change, demand, differences
 from slave.cameras.v4l2_abi import Device
@@ -34,7 +35,12 @@ class V4l2Settings:
     """Holds the device until `end`, its controls, and what they are to be."""
 
     def __init__(
-        self, device: Device, camera: CameraCalibration, given: Mapping[str, int], missing: Iterable[str]
+        self,
+        device: Device,
+        camera: CameraCalibration,
+        given: Mapping[str, int],
+        missing: Iterable[str],
+        pixels: Pixels = Pixels.COLOUR,
     ) -> None:
         """Write all settings, before the stream starts.
 
@@ -43,15 +49,16 @@ class V4l2Settings:
             camera: The camera file.
             given: Control -> value, from the command line.
             missing: Which of exposure, gain, white_balance the camera may lack.
+            pixels: What its frames are.
 
         Raises:
             CameraError: A control is unknown, out of range, refused, or needed and not given.
             OSError: The device is gone.
         """
         self._device: Device | None = device
-        self._given, self._missing = given, tuple(missing)
+        self._given, self._missing, self._pixels = given, tuple(missing), pixels
         self._controls = read_controls(device)
-        self._wanted = plan(camera, self._controls, given, self._missing)
+        self._wanted = plan(camera, self._controls, given, self._missing, pixels)
         self._asking = threading.Lock()  # the device is not closed while another thread asks it
         write(device, self._controls, self._wanted)
 
@@ -120,7 +127,7 @@ class V4l2Settings:
                 f"exposure_us {camera.exposure_us:g} does not fit into a frame of {period_us:.0f} us"
             )
         controls = self._controls
-        wanted = plan(camera, controls, self._given, self._missing)
+        wanted = plan(camera, controls, self._given, self._missing, self._pixels)
         exposure = [setting for setting in wanted if setting.name == EXPOSURE]
         self._ask(lambda device: write(device, controls, exposure))
         for _ in frames.following(SETTLE_FRAMES, TIMEOUT_S):

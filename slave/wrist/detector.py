@@ -53,6 +53,7 @@ class WristFound:
             self.tips.sigma_px,
             self.tips.depth,
             triple.laser.t_sigma_ns,
+            triple.laser.exposure_us,
         )
 
 

@@ -177,7 +177,7 @@ def detect_wrist_recording(
     def frames() -> Iterator[Frame]:
         for row in rows:
             image = read_png(folder / row.file, (own.height_px, own.width_px), grey=True)
-            yield Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination)
+            yield Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=own.exposure_us)
 
     view, strobe = view_of(recording, rig, calibration, hand_file), Strobe(own.frame_rate_hz)
     triples = (triple for frame in frames() if (triple := strobe.push(frame)) is not None)

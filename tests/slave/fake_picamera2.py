@@ -23,12 +23,19 @@ STRIDE = 64
 Mode = dict[str, Any]
 
 
-def mode(size: tuple[int, int], fps: float, crop: tuple[int, int, int, int], row_us: float) -> Mode:
+def mode(
+    size: tuple[int, int],
+    fps: float,
+    crop: tuple[int, int, int, int],
+    row_us: float,
+    raw: str = "SBGGR10_CSI2P",
+) -> Mode:
     """One entry of `sensor_modes`."""
+    unpacked = raw.partition("_")[0]
     return {
-        "format": "SBGGR10_CSI2P",
-        "unpacked": "SBGGR10",
-        "bit_depth": 10,
+        "format": raw,
+        "unpacked": unpacked,
+        "bit_depth": int(unpacked.lstrip("SRGB")),
         "size": size,
         "fps": fps,
         "crop_limits": crop,
@@ -52,6 +59,18 @@ OV5647 = (
 )
 
 
+OV7251 = tuple(mode((640, 480), 120.0, (0, 0, 640, 480), 16.0, raw) for raw in ("R8", "R10_CSI2P"))
+OV9281 = tuple(
+    mode(size, fps, crop, 9.1, raw)
+    for raw in ("R8", "R10_CSI2P")
+    for size, fps, crop in (
+        ((640, 400), 260.42, (0, 0, 1280, 800)),
+        ((1280, 720), 144.4, (0, 40, 1280, 720)),
+        ((1280, 800), 120.76, (0, 0, 1280, 800)),
+    )
+)
+
+
 @dataclass
 class Sensor:
     """The camera that the fake library finds, and what goes wrong with it.
@@ -64,6 +83,7 @@ class Sensor:
         sync_ready_at: Frame from which on the cameras are in step; None: never.
         loses: Writings of controls that come while a request is recycled, and are lost.
         fails: Methods of a request that raise, by name.
+        pi_5: Whether raw words have the sensor's bits on top, and no padding after 8 of them.
         start_ns: Time of frame 0. Frames come as fast as they are asked for, so the first one is 4.5 s old.
     """
 
@@ -83,6 +103,7 @@ class Sensor:
     loses: int = 0
     fails: frozenset[str] = frozenset()
     busy: bool = False
+    pi_5: bool = False
     start_ns: int = field(default_factory=lambda: time.monotonic_ns() - 4_500_000_000)
     opened: list["Picamera2"] = field(default_factory=list["Picamera2"])
 
@@ -213,6 +234,15 @@ class Picamera2:
             if config[name] is not None:
                 width = config[name]["size"][0] * (3 if config[name]["format"] == "RGB888" else 1)
                 config[name]["stride"] = -(-width // STRIDE) * STRIDE
+        if config["raw"] is not None:
+            raw = config["raw"]
+            if raw["format"] != self._mode["unpacked"]:
+                raise RuntimeError(f"Unrecognised raw format {raw['format']}")
+            raw["size"] = self._mode["size"]
+            if self._sensor.pi_5 and raw["format"] != "R8":
+                raw["format"] = "R16"
+            width = raw["size"][0] * (1 if raw["format"] == "R8" else 2)
+            raw["stride"] = -(-width // STRIDE) * STRIDE + (STRIDE if raw["format"] == "R10" else 0)
         self._sensor.adjust(config)
         self._config = config
 
@@ -331,12 +361,28 @@ class CompletedRequest:
             image = np.zeros((height, width, 3), np.uint8)
             image[..., 0], image[..., 1], image[..., 2] = 200, 100, self._number % 256  # blue, green, red
             return image
+        if name == "raw":
+            return self._raw(config)
         padded = np.full((height * 3 // 2, config["stride"]), 255, np.uint8)
         padded[:height, :width] = np.arange(width) % 128
         chroma = padded[height:].reshape(height, config["stride"] // 2)
         chroma[: height // 2, : width // 2] = 130  # U
         chroma[height // 2 :, : width // 2] = 140  # V
         return padded
+
+    def _raw(self, config: Mapping[str, Any]) -> np.ndarray:
+        """(H, stride) bytes with the padding: 10 bits, in column 0 four times the frame's number, rising by one."""
+        width, height = config["size"]
+        tens = np.minimum(4 * (self._number % 256) + np.arange(width), 1023)
+        words = {
+            "R8": (tens >> 2).astype(np.uint8),
+            "R10": tens.astype("<u2"),
+            "R16": (tens << 6).astype("<u2"),
+        }
+        rows = np.full((height, config["stride"]), 0xAA, np.uint8)
+        used = words[config["format"]].view(np.uint8)
+        rows[:, : len(used)] = used
+        return rows
 
     def get_metadata(self) -> dict[str, Any]:
         self._check("get_metadata")

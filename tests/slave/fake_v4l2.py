@@ -9,13 +9,14 @@ import ctypes as c
 import errno
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from slave.cameras import v4l2_abi as abi
+from slave.cameras.grey import GREY_FORMATS
 
 MANUAL = 1
 
@@ -82,6 +83,8 @@ class Camera:
         skip: Frame numbers the camera lost.
         damaged: Frame numbers that arrive with the error flag.
         cut: Frame numbers whose bytes end early.
+        low_words: Its words of 16 bits hold 10, at their low ends.
+        pictures: What it sees, frame by frame, (H, W) grey, sent as Y10.
         gone_after: From this frame on the device is unplugged; `silent_after`: it just sends nothing.
     """
 
@@ -103,6 +106,9 @@ class Camera:
     counts: bool = True
     queue: int = 1
     padding: int = 0
+    quantization: int = abi.DEFAULT_RANGE
+    low_words: bool = False
+    pictures: Sequence[np.ndarray] = ()
     skip: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     cut: frozenset[int] = frozenset()
@@ -128,6 +134,7 @@ class FakeDevice:
         self.camera = camera
         self.frame = 0
         self._size, self._format, self._rate_hz, self._stride = (0, 0), "", 30.0, 0
+        self._bytes = 0
         self._memory: list[bytearray] = []
         self._empty: list[int] = []
         self._full: list[tuple[int, int, int]] = []  # index, frame, bytes
@@ -190,7 +197,11 @@ class FakeDevice:
         if not self._empty or not self._streaming:
             return
         index = self._empty.pop(0)
-        data = encode(self._format, self._size, self._stride, number)
+        name = "Y10" if camera.low_words else self._format
+        if camera.pictures:
+            data = as_y10(camera.pictures[number % len(camera.pictures)], self._stride)
+        else:
+            data = encode(name, self._size, self._stride, number)
         if number in camera.cut:
             data = data[: len(data) // 2]
         self._memory[index][: len(data)] = data
@@ -229,10 +240,12 @@ class FakeDevice:
     def _s_fmt(self, asked: abi.Format) -> None:
         pix = asked.fmt.pix
         self._format, self._size = abi.fourcc_text(pix.pixelformat), (pix.width, pix.height)
-        width = {"MJPG": 0, "BGR3": 3, "RGB3": 3}.get(self._format, 2) * pix.width
+        width = row_bytes(self._format, pix.width)
         self._stride = width + self.camera.padding if width else 0
         pix.bytesperline = self._stride
-        pix.sizeimage = self._stride * pix.height or 500_000
+        pix.quantization = self.camera.quantization
+        self._bytes = self._stride * pix.height * (3 if self._format == "NV12" else 2) // 2 or 500_000
+        pix.sizeimage = self._bytes
 
     def _s_parm(self, asked: abi.StreamParameters) -> None:
         sizes = self.camera.formats[self._format]
@@ -278,7 +291,7 @@ class FakeDevice:
         return next(knob for knob in self.camera.knobs if knob.number == number)
 
     def _reqbufs(self, request: abi.RequestBuffers) -> None:
-        self._memory = [bytearray(self._stride * self._size[1] or 500_000) for _ in range(request.count)]
+        self._memory = [bytearray(self._bytes) for _ in range(request.count)]
 
     def _querybuf(self, buffer: abi.Buffer) -> None:
         buffer.length, buffer.offset = len(self._memory[buffer.index]), buffer.index * 0x100000
@@ -308,19 +321,71 @@ class FakeDevice:
         self._streaming = False
 
 
+def level(number: int) -> int:
+    """Grey of frame `number` at its left edge, of 10 bits; it rises by one from pixel to pixel, up to the end."""
+    return 64 + 16 * (number % 20)
+
+
+def row_bytes(name: str, width: int) -> int:
+    """Bytes of a row without padding; 0 of JPEG."""
+    groups = {"Y10P": (5, 4), "Y12P": (3, 2)}
+    if name in groups:
+        size, pixels = groups[name]
+        return -(-width // pixels) * size
+    return {"MJPG": 0, "BGR3": 3, "RGB3": 3, "GREY": 1, "NV12": 1, "BA81": 1}.get(name, 2) * width
+
+
+def encode_grey(name: str, width: int, number: int) -> np.ndarray:
+    """One row (bytes,) of a monochrome sensor of 10 bits, bit by bit as the kernel documents the format."""
+    tens = np.minimum(level(number) + np.arange(width), 1023)
+    words = {"Y10": tens, "Y12": tens << 2, "Y16": tens << 6}
+    if name in words:
+        return words[name].astype("<u2").view(np.uint8)
+    if name == "GREY":
+        return (tens >> 2).astype(np.uint8)
+    out = bytearray()
+    per = 4 if name == "Y10P" else 2
+    for begin in range(0, width, per):
+        group = [int(value) for value in tens[begin : begin + per]] + [0] * (
+            per - len(tens[begin : begin + per])
+        )
+        if name == "Y10P":
+            out += bytes(value >> 2 for value in group)
+            out.append(sum((value & 3) << 2 * place for place, value in enumerate(group)))
+        else:
+            twelve = [value << 2 for value in group]
+            out += bytes(value >> 4 for value in twelve)
+            out.append((twelve[0] & 15) | (twelve[1] & 15) << 4)
+    return np.frombuffer(bytes(out), np.uint8)
+
+
+def as_y10(image: np.ndarray, stride: int) -> bytes:
+    """A picture (H, W) of 8 bits as words of 10, with padding."""
+    rows = np.full((image.shape[0], stride), 0x55, np.uint8)
+    rows[:, : 2 * image.shape[1]] = (image.astype("<u2") << 2 | 1).view(np.uint8)
+    return rows.tobytes()
+
+
 def encode(name: str, size: tuple[int, int], stride: int, number: int) -> bytes:
     """A plain frame in the camera's format, its rows padded to the stride."""
     width, height = size
+    rows = np.zeros((height, stride), np.uint8)
+    if name in GREY_FORMATS:
+        rows[:, : row_bytes(name, width)] = encode_grey(name, width, number)
+        return rows.tobytes()
     image = np.full((height, width, 3), colour(number), np.uint8)
     if name == "MJPG":
         return cv2.imencode(".jpg", image)[1].tobytes() + b"\0\0"  # cameras pad
     if name == "RGB3":
         image = image[..., ::-1]
-    if name == "YUYV":
+    if name in ("YUYV", "UYVY", "NV12"):
         y, cr, cb = cv2.split(cv2.cvtColor(image[:1, :1], cv2.COLOR_BGR2YCrCb))
         luma, u, v = (round(16 + float(y[0, 0]) * 219 / 255), *_narrow(cb[0, 0], cr[0, 0]))
-        image = np.tile(np.array([luma, u, luma, v], np.uint8), (height, width // 2))
-    rows = np.zeros((height, stride), np.uint8)
+        if name == "NV12":
+            rows[:, :width] = luma
+            return rows.tobytes() + np.tile(np.array([u, v], np.uint8), height // 2 * stride // 2).tobytes()
+        pair = [luma, u, luma, v] if name == "YUYV" else [u, luma, v, luma]
+        image = np.tile(np.array(pair, np.uint8), (height, width // 2))
     rows[:, : image.reshape(height, -1).shape[1]] = image.reshape(height, -1)
     return rows.tobytes()
 

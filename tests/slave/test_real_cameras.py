@@ -11,6 +11,7 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras import real, reopening
+from slave.cameras.grey import Pixels
 from slave.cameras.real import add_options, open_real
 from slave.cameras.reopening import ReopeningCamera
 from slave.cameras.source import FrameSource
@@ -31,10 +32,11 @@ CALIBRATION = CameraCalibration(
 )
 
 
-def opened(driver: str, *arguments: str) -> FrameSource | None:
+def opened(driver: str, *arguments: str, wrist: bool = False) -> FrameSource | None:
     parser = argparse.ArgumentParser()
     add_options(parser)
-    return open_real(driver, parser.parse_args(arguments), CALIBRATION, SystemClock(), threading.Event())
+    options = parser.parse_args(arguments)
+    return open_real(driver, options, CALIBRATION, SystemClock(), threading.Event(), wrist=wrist)
 
 
 @pytest.fixture
@@ -65,6 +67,19 @@ def test_a_usb_camera_is_named_by_number_or_path(seen: list[V4l2Options], driver
     source.close()
     assert str(seen[0].path) == path
     assert seen[0].controls == {"gain": 32, "white_balance_temperature": 4600}
+
+
+def test_the_camera_of_a_wrist_device_is_grey_and_luma_only_by_name(seen: list[V4l2Options]) -> None:
+    codes = ("--control", "gain=32", "--control", "white_balance_temperature=4600")
+    with pytest.raises(CameraError, match=r"MJPG, YUYV, which are not grey; .* --luma takes the luma"):
+        opened("v4l2", *codes, wrist=True)
+    source = opened("v4l2", *codes, "--luma", wrist=True)
+    assert source is not None
+    frame = source.read()
+    source.close()
+    assert frame is not None
+    assert frame.image.shape == (480, 640)
+    assert [options.pixels for options in seen] == [Pixels.GREY, Pixels.LUMA]
 
 
 def test_without_a_stop_a_lost_camera_is_an_error(seen: list[V4l2Options]) -> None:
@@ -106,6 +121,8 @@ def test_other_drivers_are_not_its_business() -> None:
             "--sync-timeout is an option of --camera picamera2, not of synthetic",
         ),
         ("synthetic", ("--allow-missing", "gain"), "--allow-missing is an option of --camera v4l2"),
+        ("synthetic", ("--luma",), "--luma is an option of --camera picamera2 and v4l2, not of synthetic"),
+        ("v4l2", ("--luma",), "this rig looks for painted markers, by colour"),
         ("v4l2", ("--control", "gain"), "write NAME=NUMBER"),
         ("v4l2", ("--control", "gain=1", "--control", "gain=2"), "--control gain is given twice"),
     ],
@@ -144,3 +161,21 @@ def test_an_unplugged_camera_comes_back_with_all_its_settings(monkeypatch: pytes
     assert (second.knob("Gain").value, second.knob("Exposure Time").value) == (32, 50)
     source.close()
     assert (first.closed, second.closed) == (1, 1)
+
+
+def test_a_lost_grey_camera_comes_back_grey(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    formats = {"Y10P": {(640, 480): (30.0,)}}
+    plugged = [Camera(formats=formats, gone_after=14, padding=16), Camera(formats=formats, padding=16)]
+    asked = V4l2Options(controls={"gain": 32, "white_balance_temperature": 4600}, pixels=Pixels.GREY)
+    clock = SystemClock()
+    source = ReopeningCamera(
+        lambda file: V4l2Camera(file, asked, clock, lambda _path: FakeDevice(plugged.pop(0))),
+        CALIBRATION,
+        clock,
+        threading.Event(),
+    )
+    shapes = [frame.image.shape for _ in range(4) if (frame := source.read()) is not None]
+    source.close()
+    assert shapes == [(480, 640)] * 4
+    assert source.lost == 1

@@ -15,9 +15,10 @@ from common.calibration import CameraCalibration
 from common.clock import SystemClock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
+from slave.cameras.grey import Pixels
 from slave.cameras.v4l2 import BUFFERS, V4l2Camera, V4l2Options
 from slave.cameras.v4l2_controls import plain_name, read_controls
-from slave.cameras.v4l2_formats import choose_offer, decode, read_offers
+from slave.cameras.v4l2_formats import Layout, choose_offer, read_offers
 from tests.slave.fake_v4l2 import Camera, FakeDevice, Knob, colour, encode
 
 GIVEN = {"gain": 32, "white_balance_temperature": 4600}
@@ -103,6 +104,8 @@ def test_requests_have_the_numbers_of_the_kernel() -> None:
     assert abi.fourcc("YUYV") == 0x56595559
     assert abi.fourcc("MJPG") == 0x47504A4D
     assert abi.fourcc_text(0x33524742) == "BGR3"
+    assert abi.fourcc("Y10") == 0x20303159
+    assert abi.fourcc_text(0x20363159) == "Y16"
 
 
 def test_automatics_are_off_before_values_are_written_and_all_are_as_asked() -> None:
@@ -409,14 +412,16 @@ def test_an_absent_device_is_an_error_with_what_there_is(tmp_path: Path) -> None
 
 
 def test_a_frame_of_too_few_bytes_or_another_size_is_no_image() -> None:
+    yuyv = Layout(Pixels.COLOUR, "YUYV", (64, 48), 128)
     data = memoryview(encode("YUYV", (64, 48), 128, 0))
-    assert decode(data, abi.fourcc("YUYV"), (64, 48), 128) is not None
-    assert decode(data[:-1], abi.fourcc("YUYV"), (64, 48), 128) is None
+    assert yuyv.image(data) is not None
+    assert yuyv.image(data[:-1]) is None
+    whole = Layout(Pixels.COLOUR, "MJPG", (32, 48), 0)
     jpeg = memoryview(cv2.imencode(".jpg", np.zeros((48, 32, 3), np.uint8))[1].tobytes())
-    assert decode(jpeg, abi.fourcc("MJPG"), (64, 48), 0) is None
-    assert decode(jpeg, abi.fourcc("MJPG"), (32, 48), 0) is not None
+    assert Layout(Pixels.COLOUR, "MJPG", (64, 48), 0).image(jpeg) is None
+    assert whole.image(jpeg) is not None
     for kept in (10, len(jpeg) // 2, len(jpeg) - 2):
-        assert decode(jpeg[:kept], abi.fourcc("MJPG"), (32, 48), 0) is None
+        assert whole.image(jpeg[:kept]) is None
 
 
 def real_devices() -> list[Path]:
