@@ -1,30 +1,30 @@
 """Whether an inertial sensor lies still: rate and force have stayed near their own mean for a while.
 
 What is constant cannot be told from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
-off, is taken to lie still. Thresholds and time are those of VQF (Laidig, Seel 2023); the mean is that of some seconds,
-so that a slow tilt leaves it, by what gravity shows of it.
+off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
+VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by one degree, seen by
+gravity, or half a degree per second more or less is a motion.
 """
 
 from math import radians
 
 from common.arrays import Float
 
-_RATE_RAD_S = radians(2.0)
-_FORCE_M_S2 = 0.5
 _FOR_S = 1.5
+_SAMPLE_RAD_S, _SAMPLE_M_S2 = radians(2.0), 0.5
+_SHORT_S, _SHORT_RAD_S, _SHORT_M_S2 = 0.3, radians(0.5), 0.15
+_LONG_S = 4.0
 _BIAS_RAD_S = radians(
     5.0
 )  # a faster mean is a turn: +-5 deg/s is the zero of an ICM-20948 (DS-000189, table 1)
-_MEAN_S = 4.0
 
 
 class Stillness:
-    """Push machine. Holds the means of rate and force since the sensor may have come to rest."""
+    """Push machine. Holds means of rate and force: a short one, and one since the sensor may have come to rest."""
 
     def __init__(self) -> None:
         """Know of no rest."""
-        self._since_s = 0.0
-        self._mean: tuple[Float, Float] | None = None
+        self.moved()
 
     @property
     def still(self) -> bool:
@@ -33,22 +33,34 @@ class Stillness:
 
     def moved(self) -> None:
         """Begin anew: what happened is not known."""
-        self._since_s, self._mean = 0.0, None
+        self._since_s = 0.0
+        self._rate: _Means | None = None
+        self._force: _Means | None = None
 
     def push(self, step_s: float, gyro_rad_s: Float, accel_m_s2: Float) -> None:
         """Take rate and specific force (3,), so long after the last ones."""
-        if self._mean is None:
-            self._mean = gyro_rad_s, accel_m_s2
-            return
-        rate, force = self._mean
-        rate_off, force_off = gyro_rad_s - rate, accel_m_s2 - force
-        if (
-            rate_off @ rate_off > _RATE_RAD_S**2
-            or force_off @ force_off > _FORCE_M_S2**2
-            or rate @ rate > _BIAS_RAD_S**2
-        ):
-            self.moved()
+        if self._rate is None or self._force is None:
+            self._rate, self._force = _Means(gyro_rad_s), _Means(accel_m_s2)
             return
         self._since_s += step_s
-        share = step_s / min(self._since_s + step_s, _MEAN_S)
-        self._mean = rate + share * rate_off, force + share * force_off
+        if (
+            self._rate.left(self._since_s, step_s, gyro_rad_s, _SAMPLE_RAD_S, _SHORT_RAD_S)
+            or self._force.left(self._since_s, step_s, accel_m_s2, _SAMPLE_M_S2, _SHORT_M_S2)
+            or self._rate.long @ self._rate.long > _BIAS_RAD_S**2
+        ):
+            self.moved()
+
+
+class _Means:
+    """A vector's (3,) mean over a short and a long time."""
+
+    def __init__(self, value: Float) -> None:
+        self.short = self.long = value
+
+    def left(self, since_s: float, step_s: float, value: Float, sample: float, short: float) -> bool:
+        """Take the next one; whether it, or the short mean, is farther from the long mean than that."""
+        off = value - self.long
+        self.short = self.short + step_s / min(since_s + step_s, _SHORT_S) * (value - self.short)
+        self.long = self.long + step_s / min(since_s + step_s, _LONG_S) * off
+        apart = self.short - self.long
+        return bool(off @ off > sample**2 or apart @ apart > short**2)
