@@ -1,4 +1,4 @@
-"""Command line of the master: `phalanx-master run | solve | view | report | camera | calibrate`."""
+"""Command line of the master: `phalanx-master run | solve | view | report | camera | calibrate | evaluate`."""
 
 import logging
 import os
@@ -41,6 +41,7 @@ from master.options import (
 from master.rig import RigSetup, load_hand, load_setup
 from master.solve import solve
 from master.stopping import stop_on_signals
+from master.study.command import evaluate_app
 from master.summary import read_summary, write_summary
 from master.tuning import RigFiles
 
@@ -224,6 +225,7 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     app.add_typer(calibrate_app(), name="calibrate")
+    app.add_typer(evaluate_app(), name="evaluate")
     app.command()(camera)
     try:
         app()

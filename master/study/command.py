@@ -1,0 +1,179 @@
+"""`phalanx-master evaluate study`: the paper's study repeated with simulated people, or of given recordings."""
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.errors import CalibrationError
+from master.options import CALIB_JSON, Calibration
+from master.study.line import Level
+from master.study.one import CAUSES, Condition, Task
+from master.study.paper import BLOCKS, PARTICIPANTS
+from master.study.participant import Known
+
+_MOST_BLOCKS = 50
+Recordings = Annotated[
+    list[Path] | None,
+    typer.Argument(
+        help="Recordings of wrist devices instead of simulated people: each one participant, with truth.npz and"
+        " trials.csv (or the key label in truth.npz).",
+        show_default=False,
+    ),
+]
+
+
+def evaluate_app() -> typer.Typer:
+    """The commands as one program, to be put under a name."""
+    app = typer.Typer(no_args_is_help=True, add_completion=False, callback=_about)
+    app.command("study")(study)
+    return app
+
+
+def study(
+    recordings: Recordings = None,
+    out: Annotated[
+        Path, typer.Option(help="Folder for study.json, study.md, study.png and all files.")
+    ] = Path("out/study"),
+    participants: Annotated[int, typer.Option(min=1, max=99, help="Simulated people.")] = PARTICIPANTS,
+    blocks: Annotated[
+        int, typer.Option(min=1, max=_MOST_BLOCKS, help="How often each makes the six poses.")
+    ] = BLOCKS,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same people, same poses.")] = 1,
+    known: Annotated[
+        Known,
+        typer.Option(
+            help="Of the participants: bones and mounting as our own calibration finds them (calibrated), exactly"
+            " (all), or the rig's usual hand and its file's mounting (nothing)."
+        ),
+    ] = "calibrated",
+    causes: Annotated[
+        bool,
+        typer.Option(
+            help="Judge all trials also with everything known, with nothing known, and with exact laser points and"
+            " tips: where does the error come from?"
+        ),
+    ] = False,
+    level: Annotated[
+        Level | None,
+        typer.Option(
+            help="Fingers from the laser alone, from laser and fingertip, or from what there is; default: the rig's."
+        ),
+    ] = None,
+    rig: Annotated[str, typer.Option(help="Wrist rig: a file of CALIBRATION/rigs, without .json.")] = "wrist",
+    hand: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of recordings: the hand file; default: what their rig names, in CALIBRATION/hands."
+        ),
+    ] = None,
+    calibration: Calibration = CALIB_JSON,
+    jobs: Annotated[
+        int, typer.Option(min=0, max=64, help="Participants at a time; 0: as many as there are cores.")
+    ] = 0,
+    step: Annotated[
+        int, typer.Option(min=1, max=8, help="Rendering: px between the rays that shade skin.")
+    ] = 2,
+    guided: Annotated[
+        int, typer.Option(min=16, max=480, help="Triples of the guided motion before the trials.")
+    ] = 96,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            help="Take what an earlier study of the same settings rendered and detected in --out; solve anew."
+        ),
+    ] = False,
+    keep: Annotated[
+        bool, typer.Option(help="Keep all frames to look at: 140 MB for each participant.")
+    ] = False,
+) -> None:
+    """Repeat the paper's study: people of different hands, six poses, several blocks, errors and repeatability.
+
+    Each simulated person does the guided motion of the calibration, then the poses in random order. Everything goes
+    through the real line: rendered frames, `phalanx-slave detect`, calibration, this master. The study is open loop;
+    the paper's was closed loop.
+
+    Of recordings the same tables are made from their truth: truth.npz with angles, and trials.csv with the columns
+    block,pose,from_ns,to_ns (docs/study.md).
+
+    Examples:
+
+      phalanx-master evaluate study --out out/study
+
+      phalanx-master evaluate study --causes --jobs 2 --out out/study          where errors come from; 6 min on 2 cores
+
+      phalanx-master evaluate study --level fk --resume --out out/study        solve again, without rendering
+
+      phalanx-master evaluate study --participants 2 --blocks 2 --known all --out out/small
+
+      phalanx-master evaluate study recordings/anna recordings/ben --hand me.json --out out/people
+    """
+    from master.study.run import Study, finish, recorded, simulate
+
+    begun = time.monotonic()
+
+    def progress(done: int, total: int, what: str) -> None:
+        spent = time.monotonic() - begun
+        left = f", about {_spell(spent * (total - done) / done)} left" if done < total else ""
+        typer.echo(f"study: {what} done, {done} of {total} after {_spell(spent)}{left}", err=True)
+
+    if recordings:
+
+        def hand_of(name: str) -> tuple[Path, HandProfile]:
+            file = hand or calibration / "hands" / f"{name}.json"
+            if not file.exists():
+                raise CalibrationError(f"{file}: no such hand profile: give --hand FILE")
+            return file, load(file, HandProfile)
+
+        result = recorded(recordings, hand_of, level, out, progress)
+    else:
+        if hand is not None:
+            raise CalibrationError("--hand: is for recordings; simulated people have hands of their own")
+        judged: Condition = (known, "detected")
+        conditions = tuple(dict.fromkeys((judged, *CAUSES))) if causes else (judged,)
+        task = _task(rig, calibration, seed, blocks, conditions, level, step, guided, out, resume, keep)
+        workers = jobs or min(os.cpu_count() or 1, participants)
+        typer.echo(
+            f"study: {participants} participants x {blocks} blocks x 6 poses, {workers} at a time, into {out}",
+            err=True,
+        )
+        result = simulate(Study(task, participants, workers, judged), progress)
+    for line in finish(result, out):
+        typer.echo(line)
+    typer.echo(f"\nwrote {out / 'study.json'}, {out / 'study.md'}, {out / 'study.png'}")
+
+
+def _task(
+    rig_name: str,
+    calibration: Path,
+    seed: int,
+    blocks: int,
+    conditions: tuple[Condition, ...],
+    level: Level | None,
+    step: int,
+    guided: int,
+    out: Path,
+    resume: bool,
+    keep: bool,
+) -> Task:
+    rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
+    if rig.kind != "wrist":
+        raise CalibrationError(f"--rig {rig_name}: kind is {rig.kind!r}; the study is of a wrist device")
+    if rig.T_camera_palm is None:
+        raise CalibrationError(
+            f"--rig {rig_name}: T_camera_palm is missing: people wear the device about there"
+        )
+    camera = load(calibration / "cameras" / f"{rig.cameras[0]}.json", CameraCalibration)
+    hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
+    return Task(rig, camera, hand, seed, blocks, conditions, level, step, guided, out, resume, keep)
+
+
+def _spell(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90.0 else f"{seconds / 60.0:.1f} min"
+
+
+def _about() -> None:
+    """Judge the whole line against truth."""

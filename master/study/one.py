@@ -1,0 +1,215 @@
+"""One participant from start to end: the guided motion, its calibration, the trials, and what the line made of them."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from msgspec import Struct
+
+from common.arrays import Float
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, save
+from common.errors import FitError, RecordingError
+from common.frame_recording import open_recording
+from common.geometry import transform
+from master.calibrate.wrist.wearer import calibrate_wearer
+from master.recorded import recorded_triples
+from master.study.line import Inputs, Level, claim, detect, solved, write_exact
+from master.study.participant import Known, Participant, participant
+from master.study.session import record_guided, record_trials
+from master.study.trials import Trial, trials_of
+from master.summary import read_summary, write_summary
+
+Condition = tuple[Known, Inputs]
+CAUSES: tuple[Condition, ...] = (
+    ("all", "exact"),
+    ("all", "detected"),
+    ("calibrated", "exact"),
+    ("calibrated", "detected"),
+    ("nothing", "detected"),
+)
+GUIDED, TRIALS = "guided", "trials"  # recordings
+DONE, RIG, HAND, SAID = "made.json", "rig.json", "hand.json", "calibration.json"
+_KNUCKLES_M = np.array([0.0, 0.0, 0.08])  # palm frame
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """A study as one participant needs it.
+
+    Attributes:
+        rig, camera, hand: The device as its file says, its camera, and the usual hand.
+        seed: Of the study.
+        blocks: How often the six poses are made.
+        conditions: What is known and from what inputs fingers are solved, in which all trials are judged.
+        level: Of the master; None: what the rig file says.
+        step: Pixels between the rays that shade skin.
+        guided: Triples of the guided motion.
+        out: Folder of the study.
+        resume: Take rendered and detected recordings that are there from a study of the same settings.
+        keep: Keep all frames, 140 MB for a participant of three blocks.
+    """
+
+    rig: RigCalibration
+    camera: CameraCalibration
+    hand: HandProfile
+    seed: int
+    blocks: int
+    conditions: tuple[Condition, ...]
+    level: Level | None
+    step: int
+    guided: int
+    out: Path
+    resume: bool
+    keep: bool
+
+
+class Calibrated(Struct, frozen=True, kw_only=True):
+    """What calibration made of a participant's device.
+
+    Attributes:
+        said: Its report; where it was refused, why, and the rig file's palm pose and the measured bones are used.
+        refused: Whether it was.
+        turn_deg, shift_mm: How far the palm's pose is from the truth, at the knuckles.
+        nominal_turn_deg, nominal_shift_mm: The same of the rig file.
+    """
+
+    said: tuple[str, ...]
+    refused: bool
+    turn_deg: float
+    shift_mm: float
+    nominal_turn_deg: float
+    nominal_shift_mm: float
+
+
+class Outcome(Struct, frozen=True, kw_only=True):
+    """A participant's results: trials by condition, such as "calibrated, detected"."""
+
+    participant: str
+    reflectance: float
+    calibrated: Calibrated | None
+    trials: dict[str, list[Trial]]
+
+
+def name_of(condition: Condition) -> str:
+    """How files and tables call it."""
+    return ", ".join(condition)
+
+
+def run_participant(task: Task, number: int) -> Outcome:
+    """Let one participant do everything; files go into OUT/participant-NN.
+
+    Raises:
+        PhalanxError: Files cannot be written, or the slave ended with an error.
+    """
+    who = participant(task.seed, number, task.rig, task.hand)
+    folder, camera = task.out / who.name, task.camera.name
+    asked: dict[Known, list[Inputs]] = {}
+    for known, inputs in task.conditions:
+        asked.setdefault(known, []).append(inputs)
+    _perform(task, who, folder)
+    trials: dict[str, list[Trial]] = {}
+    for known, kinds in asked.items():
+        rig, hand = _knowledge(task, who, folder, known)
+        claim(folder / TRIALS, rig)
+        for inputs in kinds:
+            there = folder / name_of((known, inputs)).replace(", ", "-")
+            if inputs == "exact":
+                write_exact(folder / TRIALS, camera, there)
+            elif not (there / f"detections_{camera}.npz").exists():
+                detect(folder / TRIALS, camera, folder / known / HAND, there)
+            poses = solved(folder / TRIALS, hand, there, task.level)
+            opened = open_recording(folder / TRIALS)
+            trials[name_of((known, inputs))] = trials_of(opened, camera, who.name, poses)
+    if not task.keep:
+        for recording in (GUIDED, TRIALS):
+            shutil.rmtree(folder / recording / camera, ignore_errors=True)
+    write_summary(folder / DONE, _settings(task))
+    calibrated = load(folder / "calibrated" / SAID, Calibrated) if "calibrated" in asked else None
+    return Outcome(
+        participant=who.name, reflectance=round(who.reflectance, 3), calibrated=calibrated, trials=trials
+    )
+
+
+def _settings(task: Task) -> dict[str, object]:
+    """What must be alike for a study to go on from the files of another."""
+    return {
+        "seed": task.seed,
+        "blocks": task.blocks,
+        "step": task.step,
+        "guided": task.guided,
+        "rig": task.rig.name,
+        "hand": task.hand.name,
+        "conditions": [name_of(one) for one in task.conditions],
+    }
+
+
+def _perform(task: Task, who: Participant, folder: Path) -> None:
+    """Render what this participant does, unless it was already and may be taken."""
+    if task.resume and (folder / DONE).exists() and read_summary(folder / DONE) == _settings(task):
+        return
+    try:
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
+    if any(known == "calibrated" for known, _ in task.conditions):
+        record_guided(folder / GUIDED, who, task.camera, task.guided, task.step)
+    record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step)
+
+
+def _knowledge(
+    task: Task, who: Participant, folder: Path, known: Known
+) -> tuple[RigCalibration, HandProfile]:
+    """Rig and hand as they are known of this participant, and their files."""
+    there = folder / known
+    if not (there / HAND).exists():  # else they are what the detections were made with
+        there.mkdir()
+        rig, hand = task.rig, task.hand
+        if known == "all":
+            rig, hand = who.rig, who.hand
+        elif known == "calibrated":
+            rig, hand, told = _calibrated(task, who, folder / GUIDED, there)
+            save(there / SAID, told)
+        save(there / RIG, rig)
+        save(there / HAND, hand)
+    return load(there / RIG, RigCalibration), load(there / HAND, HandProfile)
+
+
+def _calibrated(
+    task: Task, who: Participant, guided: Path, there: Path
+) -> tuple[RigCalibration, HandProfile, Calibrated]:
+    """Rig and hand as our own calibration makes them of this participant's guided motion."""
+    rig, hand, refused = task.rig, who.measured, False
+    claim(guided, rig)
+    save(there / "measured.json", hand)
+    detect(guided, task.camera.name, there / "measured.json", there)
+    try:
+        found = calibrate_wearer(list(recorded_triples(there, task.camera.name)), rig, task.camera, hand)
+        rig, hand, said = found.rig, found.hand, tuple(found.report)
+    except FitError as error:
+        said, refused = (str(error),), True
+    turn, shift = _off(rig, who.rig)
+    nominal_turn, nominal_shift = _off(task.rig, who.rig)
+    told = Calibrated(
+        said=said,
+        refused=refused,
+        turn_deg=round(turn, 3),
+        shift_mm=round(shift, 3),
+        nominal_turn_deg=round(nominal_turn, 3),
+        nominal_shift_mm=round(nominal_shift, 3),
+    )
+    return rig, hand, told
+
+
+def _off(rig: RigCalibration, true: RigCalibration) -> tuple[float, float]:
+    """How far a palm pose is turned [deg] and, at the knuckles, shifted [mm]."""
+    pose, exact = _pose(rig), _pose(true)
+    cosine = 0.5 * (float(np.trace(pose[:3, :3] @ exact[:3, :3].T)) - 1.0)
+    shift = transform(pose, _KNUCKLES_M) - transform(exact, _KNUCKLES_M)
+    return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), 1e3 * float(np.linalg.norm(shift))
+
+
+def _pose(rig: RigCalibration) -> Float:
+    return np.array(rig.T_camera_palm, dtype=np.float64)

@@ -1,0 +1,110 @@
+"""What a participant does before the camera: every block has the six poses in an order of its own, each made anew.
+
+From one pose to the next the fingers go within half a second, then hold for a fifth of one: a trial is what is held.
+Nobody makes a pose twice alike: each trial has its own posture, near the pose, and drifts slowly as hands do
+(`common.sim.wrist.motion.Stations`). The truth is kept for every triple; trials.csv says which of them are held.
+"""
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.calibration import CameraCalibration
+from common.errors import RecordingError
+from common.hand_model import HandModel
+from common.sim.motion import POSES, REST
+from common.sim.record import FIRST_NS
+from common.sim.wrist.motion import WEARER_S, GuidedWearer, Stations
+from common.sim.wrist.record import record_wrist
+from common.sim.wrist.scene import WristScene
+from master.study.participant import Participant
+
+TRIALS = "trials.csv"
+COLUMNS = ("block", "pose", "from_ns", "to_ns")
+TRIAL_S = 0.7  # the way there and the hold
+MOVED_S = 0.5  # after which a pose is held
+_FIRST_S = TRIAL_S - 0.2  # of the recording: the hand rests, then begins
+_STREAM = 62
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """One trial: which pose of which block (1, 2, ...), and when it was held [ns], ends included."""
+
+    block: int
+    pose: str
+    from_ns: int
+    to_ns: int
+
+
+def orders(blocks: int, seed: int) -> tuple[tuple[str, ...], ...]:
+    """The poses of each block in the order in which they are asked for."""
+    rng = np.random.default_rng([seed, _STREAM])
+    names = np.array(list(POSES))
+    return tuple(tuple(str(name) for name in rng.permutation(names)) for _ in range(blocks))
+
+
+def record_trials(folder: Path, who: Participant, camera: CameraCalibration, blocks: int, step: int) -> None:
+    """Render all trials of a participant as a recording with its truth and trials.csv.
+
+    Args:
+        folder: New or empty.
+        who: Whose.
+        camera: That of the device.
+        blocks: How often the six poses are made.
+        step: Pixels between the rays that shade skin.
+
+    Raises:
+        RecordingError: The folder cannot be written.
+        CalibrationError: The rig lacks what a simulated device needs.
+    """
+    order = orders(blocks, who.seed)
+    names = [(block + 1, pose) for block, poses in enumerate(order) for pose in poses]
+    model = HandModel.of(who.hand)
+    postures = (REST, *(POSES[pose] for _, pose in names))
+    motion = Stations(model, postures, who.seed, period_s=TRIAL_S * len(postures))
+    scene = WristScene(who.rig, {camera.name: camera}, model, motion, "indoor", who.seed, who.reflectance)
+    seconds = TRIAL_S * len(postures) - _FIRST_S
+    record_wrist(folder, scene, seconds, start_s=_FIRST_S, step=step)
+    held = [
+        Held(block, pose, _stamp(TRIAL_S * (k + 1) + MOVED_S), _stamp(TRIAL_S * (k + 2)))
+        for k, (block, pose) in enumerate(names)
+    ]
+    write_trials(folder / TRIALS, held)
+
+
+def record_guided(folder: Path, who: Participant, camera: CameraCalibration, count: int, step: int) -> None:
+    """Render the guided motion of `calibrate wearer` in `count` triples, evenly over it; arguments as above.
+
+    The motion is slow: within a triple the hand is taken to stand still.
+
+    Raises:
+        RecordingError, CalibrationError: As of `record_trials`.
+    """
+    model = HandModel.of(who.hand)
+    motion = GuidedWearer(model, who.seed)
+    scene = WristScene(who.rig, {camera.name: camera}, model, motion, "indoor", who.seed, who.reflectance)
+    instants: list[float] = (np.arange(count) * (WEARER_S / count)).tolist()
+    record_wrist(folder, scene, poses_s=instants, step=step)
+
+
+def write_trials(path: Path, held: list[Held]) -> None:
+    """Write trials.csv.
+
+    Raises:
+        RecordingError: It cannot be written.
+    """
+    try:
+        with path.open("w", newline="") as file:
+            rows = csv.writer(file, lineterminator="\n")
+            rows.writerow(COLUMNS)
+            rows.writerows((one.block, one.pose, one.from_ns, one.to_ns) for one in held)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
+
+
+def _stamp(scene_s: float) -> int:
+    """Stamp [ns] of a scene time in a recording of trials."""
+    return FIRST_NS + round(1e9 * (scene_s - _FIRST_S))
