@@ -15,7 +15,8 @@ from common.calibration import ImuCalibration
 from common.errors import CalibrationError
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from master.ik.hand import HandSolution
-from master.ik.orientation import REACH_NS, OrientationTrack, slerp
+from master.ik.orientation import OrientationTrack
+from master.ik.orientation_samples import REACH_NS, slerp
 from master.ik.palm import Orientation
 from tests.hand_helpers import any_rotation
 
