@@ -42,12 +42,15 @@ class DeviceClock:
         self._last_ns: int | None = None
         self._suspects = 0
 
-    def push(self, stamp_ns: int, arrival_ns: int) -> int | None:
-        """When on the slave's clock the sensor's clock showed `stamp_ns` [ns]; None: an impossible stamp.
+    def observe(self, stamp_ns: int, arrival_ns: int) -> bool:
+        """Learn from one stamp; of stamps that came together, all before the first is turned into a time.
 
         Args:
             stamp_ns: What the sensor said, later than the last time [ns].
             arrival_ns: A moment at which it had said it, slave's clock [ns].
+
+        Returns:
+            Whether it can be: it is not older than the last, and not from the future.
 
         Raises:
             ClockSteppedError: Impossible stamps came one after another.
@@ -59,15 +62,8 @@ class DeviceClock:
             self._suspects += 1
             if self._suspects >= SUSPECTS:
                 raise ClockSteppedError
-            return None
+            return False
         self._suspects, self._last_ns = 0, stamp_ns
-        self._take(stamp_ns, lag)
-        return stamp_ns + round(self._line(stamp_ns)) - self._least_delay_ns
-
-    def _line(self, stamp_ns: int) -> float:
-        return self._foot[1] + self._slope * (stamp_ns - self._foot[0])
-
-    def _take(self, stamp_ns: int, lag: int) -> None:
         bucket = stamp_ns // BUCKET_NS
         if bucket != self._bucket:
             self._least.append((stamp_ns, lag))
@@ -77,6 +73,14 @@ class DeviceClock:
             self._least[-1] = (stamp_ns, lag)
         if lag < self._line(stamp_ns):  # nothing arrives before it was sent: the line is lower
             self._foot = (stamp_ns, lag)
+        return True
+
+    def at(self, stamp_ns: int) -> int:
+        """When on the slave's clock the sensor's clock showed `stamp_ns` [ns]."""
+        return stamp_ns + round(self._line(stamp_ns)) - self._least_delay_ns
+
+    def _line(self, stamp_ns: int) -> float:
+        return self._foot[1] + self._slope * (stamp_ns - self._foot[0])
 
     def _fit(self) -> None:
         """The edge of the lower hull over the mean stamp; no steeper than two clocks can differ."""

@@ -126,8 +126,11 @@ class Ximu3Imu:
         """
         self._name, self._place, self._clock, self._stop = name, place, clock, stop
         self._divisor = divisor(rate_hz)
+        self._half_ns = round(
+            0.5e9 * (self._divisor - 1) / SAMPLE_RATE_HZ
+        )  # of what a message is the mean of
         self._decoder = Decoder()
-        self._came: deque[tuple[int, Data]] = deque()  # arrival [ns]
+        self._came: deque[Data] = deque()
         self._answers: deque[Answer] = deque()
         self._counts: Counter[str] = Counter()
         self._gauges: dict[str, float] = {}
@@ -138,13 +141,13 @@ class Ximu3Imu:
         self._closed = False
         with self._errors("cannot be opened"):
             self._port = opener(place)
+        least_ns = 0 if place.baud is None else round(1e9 * MESSAGE_BITS / place.baud)
+        self._device_clock = DeviceClock(CLOCK_ERROR, least_ns)
         try:
             self._begin()
         except ImuError:
             self.close()
             raise
-        least_ns = 0 if place.baud is None else round(1e9 * MESSAGE_BITS / place.baud)
-        self._device_clock = DeviceClock(CLOCK_ERROR, least_ns)
 
     def read(self) -> ImuSample | None:
         """Next sample; None once closed or stopped."""
@@ -153,7 +156,7 @@ class Ximu3Imu:
                 if self._silent >= SILENT_READS:
                     raise ImuError(f"{self._place.path}: the x-IMU3 sends no samples any more")
                 self._receive()
-            elif (sample := self._take(*self._came.popleft())) is not None:
+            elif (sample := self._take(self._came.popleft())) is not None:
                 return sample
         return None
 
@@ -189,7 +192,6 @@ class Ximu3Imu:
             self._write(key, value)
         if self._ask("apply", None) is None:
             raise ImuError(f"{self._place.path}: the x-IMU3 does not answer to apply its settings")
-        self._came.clear()  # what was sent with other settings
         self._silent = 0
 
     def _write(self, key: str, value: bool | int) -> None:
@@ -226,17 +228,28 @@ class Ximu3Imu:
         for message in self._decoder.push(data):
             if isinstance(message, Data):
                 self._counts[f"imu.{message.kind.name.lower()}"] += 1
-                self._came.append((arrival_ns, message))
+                if message.kind is not Kind.INERTIAL or self._dated(message, arrival_ns):
+                    self._came.append(message)
             elif isinstance(message, Answer):
                 self._answers.append(message)
+                self._came.clear()  # what was sent with other settings
             elif isinstance(message, Fault):
                 self._counts[f"broken.{message.name.lower()}"] += 1
 
-    def _take(self, arrival_ns: int, message: Data) -> ImuSample | None:
+    def _dated(self, message: Data, arrival_ns: int) -> bool:
+        """Whether a message can have been measured when it says."""
+        try:
+            possible = self._device_clock.observe(message.t_us * 1000, arrival_ns)
+        except ClockSteppedError:
+            raise ImuError(f"{self._place.path}: the x-IMU3 began anew, or its clock was set") from None
+        self._counts["broken.time"] += not possible
+        return possible
+
+    def _take(self, message: Data) -> ImuSample | None:
         """The sample in a message, or what else there is in it kept."""
         match message.kind:
             case Kind.INERTIAL:
-                return self._inertial(arrival_ns, message)
+                return self._inertial(message)
             case Kind.MAGNETOMETER:
                 mag = np.array(message.values) * TESLA_UNIT_UT
                 self._mag = np.where(np.isfinite(mag), mag, np.nan)
@@ -252,14 +265,7 @@ class Ximu3Imu:
                 pass
         return None
 
-    def _inertial(self, arrival_ns: int, message: Data) -> ImuSample | None:
-        try:
-            t_ns = self._device_clock.push(message.t_us * 1000, arrival_ns)
-        except ClockSteppedError:
-            raise ImuError(f"{self._place.path}: the x-IMU3 began anew, or its clock was set") from None
-        if t_ns is None:
-            self._counts["broken.time"] += 1
-            return None
+    def _inertial(self, message: Data) -> ImuSample | None:
         self._silent = 0
         gyro = np.radians(message.values[:3])
         accel = np.array(message.values[3:]) * STANDARD_GRAVITY
@@ -269,9 +275,9 @@ class Ximu3Imu:
         period_us = 1e6 * self._divisor / SAMPLE_RATE_HZ
         passed = 1 if self._stamp_us is None else max(1, round((message.t_us - self._stamp_us) / period_us))
         self._seq, self._stamp_us = self._seq + passed, message.t_us
-        middle_ns = round(0.5e9 * (self._divisor - 1) / SAMPLE_RATE_HZ)
+        t_ns = self._device_clock.at(message.t_us * 1000) - self._half_ns
         mag, self._mag = self._mag, _NONE[0]
-        return ImuSample(self._name, 0, self._seq, t_ns - middle_ns, gyro, accel, mag, _NONE[1])
+        return ImuSample(self._name, 0, self._seq, t_ns, gyro, accel, mag, _NONE[1])
 
     def _gauge(self, name: str, value: float) -> None:
         if math.isfinite(value):

@@ -29,7 +29,7 @@ _BINARY = 0x80
 _FALSE_ESCAPE = re.compile(rb"\xdb(?![\xdc\xdd])")
 _COMMA = r"[ \t\r\n]*,[ \t\r\n]*+"
 _STAMP = rf"[A-Z]{_COMMA}\+?(\d+)"
-_FLOAT = rf"{_COMMA}([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?)"
+_FLOAT = rf"{_COMMA}([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d*)?)"  # half an exponent makes it broken
 _TEXT = re.compile(rf"{_STAMP}{_COMMA}([^\n]+)\n")
 
 
@@ -176,7 +176,7 @@ def _text(kind: Kind, line: bytes) -> Data | Fault:
         return Fault.TEXT
     if not kind.numbers:
         return Data(kind, int(stamp), (), values[0].encode())
-    if not all(value.isascii() for value in values):
+    if not all(value.isascii() and value[-1] not in "e+-" for value in values):
         return Fault.TEXT
     return Data(kind, int(stamp), tuple(float(value) for value in values))
 
