@@ -9,9 +9,11 @@ import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from common.frame_recording import FrameRecording
+from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, read_imu
 from common.messages import Detections, HandPose, ImuSample, WristDetections
 from master.outputs.files import PosesFile
@@ -26,6 +28,10 @@ from master.stages import StageTimes
 from master.summary import write_summary
 from master.wrist_score import load_wrist_truth, score_tips, score_wrist, triples_missed
 
+_UNPLACED = (
+    "imu.q_palm_imu and imu.q_rig_world do not both say how the IMU is mounted and how its world lies to the rig; a "
+    "wrist rig needs the former"
+)
 _LOG = logging.getLogger(__name__)
 
 
@@ -53,13 +59,14 @@ def solve(
         CalibrationError: The depth model does not fit the rig.
     """
     stages = StageTimes()
+    samples, setup = _samples(recording, setup)
     pipeline = pipeline_of(setup, stages, continuous=recording.manifest.continuous)
     messages = _messages(setup, detections)
     poses: list[HandPose] = []
     rates = CameraRates()
     sink = PosesFile(out / "poses.npz", setup.hand.profile.name, len(setup.markers))
     done = 0
-    for message in heapq.merge(_samples(recording, setup), messages, key=lambda message: message.t_ns):
+    for message in heapq.merge(samples, messages, key=lambda message: message.t_ns):
         if isinstance(message, ImuSample):
             pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
             continue
@@ -120,19 +127,26 @@ def _messages(setup: RigSetup, folder: Path) -> list[Detections]:
     return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
 
 
-def _samples(recording: FrameRecording, setup: RigSetup) -> tuple[ImuSample, ...]:
-    """What the recording's IMU measured; nothing, with a warning, where the rig does not say how that lies."""
+def _samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[ImuSample, ...], RigSetup]:
+    """What the recording's IMU measured, with its orientation, and the setup that knows what that is worth.
+
+    A recording without quaternions is of a sensor that measures only rates and forces: the filter of a live slave makes
+    its orientation of them. The heading of that begins anywhere, whatever the rig's file says of it.
+    """
     imu = setup.rig.imu
-    if imu is not None and imu.placed:
-        return read_imu(recording.folder, imu.name)
-    if (path := recording.folder / IMU).exists():
-        _LOG.warning(
-            "%s: not used: rig %r: imu.q_palm_imu and imu.q_rig_world do not both say how the IMU is mounted and how "
-            "its world lies to the rig",
-            path,
-            setup.rig.name,
-        )
-    return ()
+    if imu is None or not (imu.placed if setup.wrist is None else imu.q_palm_imu is not None):
+        if (path := recording.folder / IMU).exists():
+            _LOG.warning("%s: not used: rig %r: %s", path, setup.rig.name, _UNPLACED)
+        return (), setup
+    samples = read_imu(recording.folder, imu.name)
+    if not samples or any(np.isfinite(one.orientation_wxyz).all() for one in samples):
+        return samples, setup
+    if imu.heading_sigma_rad is not None:
+        _LOG.warning("%s: no quaternions: imu.heading_sigma_rad not used", recording.folder / IMU)
+        rig = msgspec.structs.replace(setup.rig, imu=msgspec.structs.replace(imu, heading_sigma_rad=None))
+        setup = RigSetup.of(rig, setup.cameras, setup.hand)
+    fusion = OrientationFilter(imu.rate_hz)
+    return tuple(fusion.push(one) for one in samples), setup
 
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:

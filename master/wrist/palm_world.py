@@ -22,7 +22,7 @@ from master.ik.orientation import TURN_RAD_S, turn_of
 from master.ik.orientation_samples import OrientationSamples
 
 _ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
-_NONE = np.full(4, np.nan), np.full(2, np.nan)
+NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)
 
 
 class PalmWorld:
@@ -56,7 +56,7 @@ class PalmWorld:
         found = self._samples.between(t_ns)
         if found is None:
             self.counts["orientation.absent"] += 1
-            return _NONE
+            return NO_WORLD
         self.counts["orientation.used"] += 1
         q, away_s = found
         tilt = hypot(self._imu.orientation_sigma_rad, TURN_RAD_S * away_s)

@@ -30,6 +30,7 @@ from master.wrist.cubic import CubicLaw
 from master.wrist.forward import ForwardTable
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
+from master.wrist.palm_world import NO_WORLD, PalmWorld
 from master.wrist.pose import PoseMaker
 from master.wrist.setup import WristSetup
 
@@ -64,6 +65,7 @@ class WristPipeline:
         self._believe = AngleBelief(setup, table)
         self._cubic = CubicLaw(setup, table) if setup.cubic else None
         self._pose = PoseMaker(setup)
+        self._palm_world = None if setup.imu is None else PalmWorld(setup.imu, self.counts)
         self._smooth = _point_filter(setup, self._axes) if continuous else None
         self._last_ns = _NEVER_NS
         self._angles, self._cov = np.full((5, 4), np.nan), np.full((5, 4, 4), np.nan)
@@ -87,7 +89,8 @@ class WristPipeline:
         with self._stage("hand"):
             found = self._angles_of(t_ns, message, points)
             angles, cov, source = self._remembered(t_ns, found)
-            pose = self._pose(t_ns, angles, cov, source, found.told, points.point_m)
+            world = NO_WORLD if self._palm_world is None else self._palm_world.at(t_ns)
+            pose = self._pose(t_ns, angles, cov, source, found.told, points.point_m, world)
         self._count("past", found.past)
         self._count("off", found.off)
         self._count("held", source == Source.HELD)
@@ -96,8 +99,11 @@ class WristPipeline:
         return [SolvedPose(pose, message.ready_t_ns)]
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
-        """Count what the IMU says of its own orientation (4,): the palm does not move against the camera."""
-        self.counts["orientation.unused"] += 1
+        """Take what the IMU says of its own orientation (4,): that of the forearm, and so of the palm, in its world."""
+        if self._palm_world is None:
+            self.counts["orientation.unplaced"] += 1
+        else:
+            self._palm_world.push(t_ns, orientation_wxyz)
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: nothing waits."""

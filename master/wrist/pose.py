@@ -12,6 +12,7 @@ from common.hand_model import CHAINS, METACARPALS, PALM, WRIST
 from common.messages import HandPose, Source
 from master.ik.priors import Priors
 from master.volume import inside
+from master.wrist.palm_world import NO_WORLD
 from master.wrist.setup import WristSetup
 
 _NO_MARKERS = np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 3, 3))
@@ -29,7 +30,14 @@ class PoseMaker:
         self._low, self._high = np.moveaxis(setup.model.limits_rad, -1, 0)
 
     def __call__(
-        self, t_ns: int, angles_rad: Float, cov_rad2: Float, source: Code, tracked: Bool, laser_m: Float
+        self,
+        t_ns: int,
+        angles_rad: Float,
+        cov_rad2: Float,
+        source: Code,
+        tracked: Bool,
+        laser_m: Float,
+        world: tuple[Float, Float] = NO_WORLD,
     ) -> HandPose:
         """The pose at `t_ns`.
 
@@ -40,6 +48,7 @@ class PoseMaker:
             source: (5,) of each finger; NONE: its joints are not valid, and NaN.
             tracked: (5,) fingers that are observed now.
             laser_m: (5, 3) where the laser meets them [m].
+            world: The palm in the IMU's world (4,), and how sure that is (2,), as of `PalmWorld.at`.
         """
         model, T = self._model, self._setup.T_camera_palm
         chains = model.chains(angles_rad)
@@ -70,6 +79,8 @@ class PoseMaker:
             markers_cov_m2=_NO_MARKERS[2],
             inside_volume=inside(self._setup.volume, position),
             laser_m=laser_m,
+            palm_world_wxyz=world[0],
+            palm_world_sigma_rad=world[1],
         )
 
     def _moving_cov(self, angles_rad: Float, cov_rad2: Float) -> Float:

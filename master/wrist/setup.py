@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, FilterCalibration, RigCalibration, Volume
+from common.calibration import CameraCalibration, FilterCalibration, ImuCalibration, RigCalibration, Volume
 from common.hand_model import FINGERS, HandModel
 from common.wrist_calibration import FingerLine
 from common.wrist_device import WristDevice
@@ -24,6 +24,7 @@ class WristSetup(WristDevice):
         filter: Of the laser points, where frames follow each other.
         volume: What the rig states, or None.
         late_ns: How much later frames are taken than their stamps say [ns].
+        imu: The IMU on the forearm, where it is known how that is mounted; or None.
     """
 
     laser_m: Float
@@ -33,6 +34,7 @@ class WristSetup(WristDevice):
     filter: FilterCalibration
     volume: Volume | None = None
     late_ns: int = 0
+    imu: ImuCalibration | None = None
 
     @classmethod
     def of(cls, rig: RigCalibration, camera: CameraCalibration, model: HandModel) -> "WristSetup":
@@ -61,4 +63,5 @@ class WristSetup(WristDevice):
             filter=rig.filter,
             volume=rig.volume,
             late_ns=round(1e3 * rig.stamp_offset_us.get(camera.name, 0.0)),
+            imu=rig.imu if rig.imu is not None and rig.imu.q_palm_imu is not None else None,
         )

@@ -9,6 +9,7 @@ import pytest
 from common.arrays import Float
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording, FrameRow, Illumination, Manifest
+from common.geometry import quaternion_to_matrix
 from common.messages import WristDetections
 from common.sim.wrist.scene import WristTruth
 from master.outputs.files import load_poses
@@ -130,19 +131,53 @@ def test_unrelated_poses_do_not_depend_on_their_order(
     np.testing.assert_array_equal(angles["there"], angles["back"][::-1])
 
 
-def test_samples_of_its_imu_are_taken_and_change_nothing(
+def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
     tmp_path: Path, setup: RigSetup, triples: list[WristDetections]
 ) -> None:
     write_detections(tmp_path, triples)
     solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
-    without = (tmp_path / "poses.npz").read_bytes()
+    without = load_poses(tmp_path / "poses.npz")
+    assert np.isnan(without.palm_world_wxyz).all()
     rows = [f"{START_NS + 8_000_000 * k},0,0,0,0,0,9.81,1,0,0,0" for k in range(40)]
     (tmp_path / "imu.csv").write_text("\n".join(["t_ns,gx,gy,gz,ax,ay,az,qw,qx,qy,qz", *rows]) + "\n")
     summary = solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
-    assert (tmp_path / "poses.npz").read_bytes() == without
+    found = load_poses(tmp_path / "poses.npz")
+    np.testing.assert_array_equal(found.position_m, without.position_m)
+    np.testing.assert_array_equal(found.angles_rad, without.angles_rad)
+    imu = setup.rig.imu
+    assert imu is not None
+    assert imu.q_palm_imu is not None
+    heard = (
+        np.abs(found.t_ns - START_NS - 156_000_000) <= 206_000_000
+    )  # the last sample is at 312 ms, and 50 ms
+    assert heard.any()
+    np.testing.assert_array_equal(np.isfinite(found.palm_world_wxyz[:, 0]), heard)
+    np.testing.assert_allclose(
+        quaternion_to_matrix(found.palm_world_wxyz[heard]),
+        np.broadcast_to(quaternion_to_matrix(np.array(imu.q_palm_imu)).T, (heard.sum(), 3, 3)),
+        atol=1e-9,
+    )
     counts = summary["counts"]
     assert isinstance(counts, dict)
-    assert counts["orientation.unused"] == 40
+    assert counts["orientation.used"] == heard.sum()
+    assert counts.get("orientation.absent", 0) == (~heard).sum()
+
+
+def test_an_imu_that_gives_no_orientation_is_led_by_gravity(
+    tmp_path: Path, setup: RigSetup, triples: list[WristDetections]
+) -> None:
+    write_detections(tmp_path, triples)
+    force = 9.81 * np.array([0.0, 0.5, np.sqrt(0.75)])
+    rows = [f"{START_NS + 8_000_000 * k},0,0,0,{','.join(map(str, force.tolist()))}" for k in range(-120, 60)]
+    (tmp_path / "imu.csv").write_text("\n".join(["t_ns,gx,gy,gz,ax,ay,az", *rows]) + "\n")
+    solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
+    found = load_poses(tmp_path / "poses.npz")
+    imu = setup.rig.imu
+    assert imu is not None
+    assert imu.q_palm_imu is not None
+    up = quaternion_to_matrix(found.palm_world_wxyz)[:, 2] @ quaternion_to_matrix(np.array(imu.q_palm_imu))
+    np.testing.assert_allclose(up, np.broadcast_to(force / 9.81, up.shape), atol=1e-4)
+    np.testing.assert_allclose(found.palm_world_sigma_rad[:, 0], imu.orientation_sigma_rad, rtol=0.3)
 
 
 def test_nothing_seen_in_any_triple_is_no_crash_and_no_score(
