@@ -7,9 +7,7 @@ PIP is that divided by 0.54 and its doubt is large, which the covariance says:
 
     information = G' R^-1 G + H      G (2, 4): how the point moves with each angle, R: how sure the point is, H: habits
 
-R is the noise of the sensing, skin whose thickness is not known, and the part of the line that is not seen. The
-centroid of a line shorter than the table expects is off across by up to half of what is missing, and by a third of
-that along, as skin curves away. Near the end of the branch it is the finger's own last phalanx that hides the line,
+R is that of `master.wrist.sight`. Near the end of the branch it is the finger's own last phalanx that hides the line,
 within some degrees: the shorter the line, the nearer to that end is the finger.
 """
 
@@ -17,21 +15,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Code, Float
 from common.hand_limits import ABDUCTION, FLEXION
+from common.messages import Level
 from master.ik.priors import Priors
 from master.wrist.forward import DIP, PIP, ForwardTable
 from master.wrist.invert import Closed
 from master.wrist.setup import WristSetup
-from master.wrist.skin import SPREAD, Skin
+from master.wrist.sight import HARDLY, SightNoise
 
 _ANYWHERE_RAD = np.radians(35.0)  # closings of hands at work, about their mean
 _ABDUCTION_RAD = np.radians(20.0)
-_WHOLE = 0.75  # a line seen to this share of its length is not missing a part
-_HARDLY = 0.5  # less of it than this is no measurement of the finger
-_CURVES = 1 / 3
 _FOLD_RAD = np.radians(20.0)  # so near to the end of the branch it is the last phalanx that hides a line
-_PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,10 +36,12 @@ class FingerAngles:
     Attributes:
         angles_rad: (5, 4) within the limits.
         cov_rad2: (5, 4, 4).
-        told: (5,) the laser point tells how far the finger is closed.
+        told: (5,) what was seen tells how the finger is bent.
         past: (5,) it tells only that it is closed at least to the end of the branch; the angles are the middle of what
             is left.
         off: (5,) it fits no natural finger: most of its line is hidden, or it lies aside of all abductions.
+        level: (5,) `Level` codes.
+        ambiguous: (5,) another pose explains as much.
     """
 
     angles_rad: Float
@@ -52,6 +49,8 @@ class FingerAngles:
     told: Bool
     past: Bool
     off: Bool
+    level: Code
+    ambiguous: Bool
 
 
 class AngleBelief:
@@ -60,9 +59,7 @@ class AngleBelief:
     def __init__(self, setup: WristSetup, table: ForwardTable, priors: Priors | None = None) -> None:
         priors = priors or Priors()
         self._model, self._curve = setup.model, table.curve
-        skin_m = SPREAD * Skin.of(setup.model).palmar_m.mean(axis=1)
-        self._skin_m2 = skin_m**2
-        self._focal_px = setup.optics.matrix[0, 0]
+        self._sight = SightNoise(setup)
         self._most = np.minimum(table.curve.range_rad[:, 1], setup.model.limits_rad[:, PIP, 1])
         self._aside = table.abduction_rad[:, [0, -1]].T
         self._habits = np.zeros((5, 4, 4))
@@ -84,18 +81,17 @@ class AngleBelief:
             laser_px: (5,) length of the lines that were seen; NaN: not known.
         """
         seen = np.isfinite(closed.closing_rad)
-        # A line longer than the whole is no better than a whole one.
-        whole = np.maximum(closed.length_px, 1.0)
-        shown = np.nan_to_num(np.clip(laser_px, 0.0, whole) / whole, nan=1.0)
+        shown = self._sight.shown(closed.length_px, laser_px)
         low, high = self._aside
         aside = (closed.abduction_rad < low) | (closed.abduction_rad > high)
-        off = seen & ~closed.past & (aside | (shown < _HARDLY))
+        off = seen & ~closed.past & (aside | (shown < HARDLY))
         left = self._most - closed.closing_rad
         closing = closed.closing_rad + np.where(
             closed.past, 0.5 * np.maximum(left, 0.0), self._folded(closed, shown)
         )
         angles = self._model.clamp(self._curve.angles(closing, closed.abduction_rad))
-        noise = self._noise(closed, cov_m2, distance_m, shown)
+        noise = self._sight.laser_m2(cov_m2, distance_m, closed.length_px, shown)
+        noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
         information = (
             np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self._habits
         )
@@ -104,26 +100,16 @@ class AngleBelief:
         information[:, PIP, PIP] += 1.0 / spread**2
         cov = np.asarray(np.linalg.inv(information), np.float64)
         cov[~seen] = np.nan
-        return FingerAngles(angles, cov, seen & ~closed.past & ~off, closed.past, off)
+        level: Code = np.where(seen, np.uint8(Level.FK), np.uint8(Level.NONE))
+        told = seen & ~closed.past & ~off
+        return FingerAngles(angles, cov, told, closed.past, off, level, np.zeros(5, np.bool_))
 
     def _folded(self, closed: Closed, shown: Float) -> Float:
         """How much farther fingers (5,) are closed than their points say: their last phalanx hides part of the line."""
         left = closed.end_rad - closed.closing_rad
         folding = left < _FOLD_RAD
         folding[0] = False  # a thumb never reaches its own tip
-        hidden = np.clip((_WHOLE - shown) / (_WHOLE - _HARDLY), 0.0, 1.0)
-        return np.where(folding, hidden * np.maximum(left, 0.0), 0.0)
-
-    def _noise(self, closed: Closed, cov_m2: Float, distance_m: Float, shown: Float) -> Float:
-        """How sure the points are, (5, 2, 2) [m^2], finite."""
-        seen = np.isfinite(closed.closing_rad)
-        noise = np.where(seen[:, None, None], cov_m2, 0.0)
-        missing = np.clip(_WHOLE - shown, 0.0, None) * closed.length_px / self._focal_px * distance_m
-        hidden = np.where(seen, 0.5 * missing, 0.0) ** 2 / 3.0
-        noise[:, 0, 0] += 0.25 * self._skin_m2 + _PALM_M2 + hidden
-        noise[:, 1, 1] += self._skin_m2 + _PALM_M2 + _CURVES**2 * hidden
-        noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
-        return noise
+        return np.where(folding, self._sight.hidden(shown) * np.maximum(left, 0.0), 0.0)
 
 
 def _inverse(a: Float) -> Float:

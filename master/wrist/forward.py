@@ -29,8 +29,8 @@ PIP, DIP = 2, 3
 CLOSED_RAD = np.radians(120.0)
 _CLOSINGS, _ABDUCTIONS = 61, 9
 _NUDGED_ROWS = 4
-_ASIDE_RAD = np.radians(20.0)  # abduction of preset D
-_BEYOND_RAD = np.radians(5.0)  # the grid goes beyond the limits of abduction, for noise and skin
+ASIDE_RAD = np.radians(20.0)  # abduction of preset D
+BEYOND_RAD = np.radians(5.0)  # the grid goes beyond the limits of abduction, for noise and skin
 _JUMP = 0.3  # spheres by which the line's mean place on the finger may rise while it bends
 _WHOLE = 0.7  # share of the line as it was a few rows before; less is partly hidden by the last phalanx
 _FADE = 0.97  # by which a line may shorten from row to row
@@ -109,7 +109,7 @@ class ForwardTable:
         curve = NaturalCurve.of(model)
         closing = _evenly(curve.range_rad, _CLOSINGS)
         # A limit of 0, as preset K has for the middle finger, keeps no real finger from moving aside.
-        most = np.maximum(np.abs(model.limits_rad[:, ABDUCTION]), _ASIDE_RAD) + _BEYOND_RAD
+        most = np.maximum(np.abs(model.limits_rad[:, ABDUCTION]), ASIDE_RAD) + BEYOND_RAD
         abduction = _evenly(np.array([-1.0, 1.0]) * most, _ABDUCTIONS)
         angles = curve.angles(*np.broadcast_arrays(closing.T[:, None], abduction.T[None]))  # (C, A, 5, 4)
         cut = LaserCut(setup)
@@ -123,7 +123,7 @@ class ForwardTable:
             curve,
             closing,
             abduction,
-            _continued(point),
+            continued(point),
             _nudged(cut, angles, FLEXION),
             _nudged(cut, angles, DIP),
             length,
@@ -149,14 +149,14 @@ def _nudged(cut: LaserCut, angles_rad: Float, joint: int) -> Float:
         nudged = angles_rad[rows]
         nudged[..., joint] += sign * _NUDGE_RAD
         ends.append(cut(nudged)[0])
-    some = _continued((ends[1] - ends[0]) / (2.0 * _NUDGE_RAD))
+    some = continued((ends[1] - ends[0]) / (2.0 * _NUDGE_RAD))
     at = np.arange(_CLOSINGS) / _NUDGED_ROWS
     before = np.minimum(at.astype(np.int64), len(rows) - 2)
     share = (at - before)[:, None, None]
     return (1.0 - share) * some[:, before] + share * some[:, before + 1]
 
 
-def _continued(values: Float) -> Float:
+def continued(values: Float) -> Float:
     """Values (5, C, A, N) with straight lines along C in place of NaN; 0 where a column holds no two numbers."""
     out = values.copy()
     rows = np.arange(values.shape[1], dtype=np.float64)

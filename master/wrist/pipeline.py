@@ -1,11 +1,12 @@
-"""The wrist device's straight line: detections -> laser points on their plane -> natural angles -> pose.
+"""The wrist device's straight line: detections -> laser points on their plane, fingertips -> angles -> pose.
 
 `WristPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages and get
 the same poses.
 
 What it says of a finger:
 
-- **seen**: its laser point tells how far it is closed; joints tracked.
+- **seen**: laser point and tip tell its angles, or its laser point how far it is closed by habit (`level`); tracked.
+- **ambiguous**: so, but another pose explains as much; tracked, and its doubt holds both.
 - **past the branch**: bent so far that the point no longer moves with it: not tracked, the angles are the middle of
   what is left, with its whole width as doubt.
 - **off**: the point fits no natural finger: angles as found, not tracked.
@@ -16,26 +17,30 @@ What it says of a finger:
 
 from collections import Counter
 from contextlib import nullcontext
+from dataclasses import replace
 
 import numpy as np
 
 from common.arrays import Bool, Code, Float
 from common.hand_model import FINGERS
-from common.messages import Source, WristDetections
+from common.messages import Level, Source, WristDetections
 from master.filters import OneEuroParameters, PointFilter
 from master.ik.hidden import strayed_rad2
 from master.stereo.pipeline import SolvedPose, Stage
 from master.wrist.belief import AngleBelief, FingerAngles
 from master.wrist.cubic import CubicLaw
 from master.wrist.forward import ForwardTable
+from master.wrist.inverse import InverseModel
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
+from master.wrist.levels import Levels, Sighting
 from master.wrist.palm_world import NO_WORLD, PalmWorld
 from master.wrist.pose import PoseMaker
 from master.wrist.setup import WristSetup
 
 _FORGET_S = 0.5
 _NEVER_NS = -(2**62)
+_AWAY_M = 0.1  # of fingertips from the camera, where a filter must know millimetres
 
 
 class WristPipeline:
@@ -48,6 +53,7 @@ class WristPipeline:
         continuous: bool = True,
         stage: Stage = lambda name: nullcontext(),
         inverse: Inverse | None = None,
+        model: InverseModel | None = None,
     ) -> None:
         """Join the parts.
 
@@ -56,6 +62,7 @@ class WristPipeline:
             continuous: False: every message is an unrelated pose; no filter, no memory.
             stage: Opens a timer by stage name.
             inverse: The table of this device and hand; None: a new one, which takes a second or two.
+            model: The inverse model of the same, for levels above "fk"; None: a new one, which takes a second.
         """
         self.counts: Counter[str] = Counter()
         self._setup, self._stage, self._continuous = setup, stage, continuous
@@ -64,9 +71,12 @@ class WristPipeline:
         table = self.inverse.table
         self._believe = AngleBelief(setup, table)
         self._cubic = CubicLaw(setup, table) if setup.cubic else None
+        self._levels = None if setup.level == "fk" else Levels(setup, model or InverseModel(setup))
         self._pose = PoseMaker(setup)
         self._palm_world = None if setup.imu is None else PalmWorld(setup.imu, self.counts)
-        self._smooth = _point_filter(setup, self._axes) if continuous else None
+        self._smooth, self._smooth_tips = (
+            _point_filter(setup, self._axes) if continuous else None for _ in range(2)
+        )
         self._last_ns = _NEVER_NS
         self._angles, self._cov = np.full((5, 4), np.nan), np.full((5, 4, 4), np.nan)
         self._seen_ns = np.full(5, _NEVER_NS)
@@ -88,11 +98,12 @@ class WristPipeline:
             self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("hand"):
             found = self._angles_of(t_ns, message, points)
-            angles, cov, source = self._remembered(t_ns, found)
+            shown, source = self._remembered(t_ns, found)
             world = NO_WORLD if self._palm_world is None else self._palm_world.at(t_ns)
-            pose = self._pose(t_ns, angles, cov, source, found.told, points.point_m, world)
+            pose = self._pose(t_ns, shown, source, points.point_m, world)
         self._count("past", found.past)
         self._count("off", found.off)
+        self._count("ambiguous", found.ambiguous)
         self._count("held", source == Source.HELD)
         self._count("unseen", source == Source.NONE)
         self.counts["poses"] += 1
@@ -110,23 +121,50 @@ class WristPipeline:
         return []
 
     def _angles_of(self, t_ns: int, message: WristDetections, points: LaserPoints) -> FingerAngles:
-        """What the laser says of the fingers."""
+        """What laser and tips say of the fingers."""
         point = points.point_m
         if self._smooth is not None:
             point = self._smooth.push(t_ns, point, points.cov_m2)
-        flat = self._axes.flat(point)
+        flat, cov = self._axes.flat(point), self._axes.flat_cov(points.cov_m2)
         closed = self.inverse(flat)
         if self._cubic is not None:
             closed = self._cubic(flat, closed)
-        return self._believe(closed, self._axes.flat_cov(points.cov_m2), point[:, 2], message.laser_px)
+        natural = self._believe(closed, cov, point[:, 2], message.laser_px)
+        if self._levels is None:
+            return natural
+        tip, sigma_px = self._tips(t_ns, message)
+        sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px)
+        fresh = self._continuous & (1e-9 * (t_ns - self._seen_ns) <= _FORGET_S)
+        last = np.where(fresh[:, None], self._angles, np.nan)
+        found, refused = self._levels(natural, sight, last)
+        self._count("tip_refused", refused)
+        self._count("ik", found.level == Level.IK)
+        return found
 
-    def _remembered(self, t_ns: int, found: FingerAngles) -> tuple[Float, Float, Code]:
-        """Angles (5, 4), covariances (5, 4, 4) and sources (5,), with those of fingers that were seen a moment ago."""
+    def _tips(self, t_ns: int, message: WristDetections) -> tuple[Float, Float]:
+        """Fingertips (5, 2) as x / z, y / z, and their standard deviations (5,) [px]; NaN: not seen.
+
+        They are filtered like the laser points, as if all were as far away as a hand usually is: in step with these.
+        """
+        told = np.isfinite(message.tip_uv).all(axis=1)
+        shown = in_image(self._setup, message.tip_uv, message.tip_sigma_px)
+        self._count("tip_outside", told & ~shown)
+        tip = self._setup.optics.undistort(np.where(shown[:, None], message.tip_uv, np.nan))
+        sigma_px = np.where(shown, message.tip_sigma_px, np.nan)
+        if self._smooth_tips is not None:
+            point = _AWAY_M * np.concatenate([tip, np.ones((5, 1))], axis=1)
+            noise_m = _AWAY_M * sigma_px / self._setup.optics.matrix[0, 0]
+            cov = (noise_m**2)[:, None, None] * np.eye(3)
+            tip = self._smooth_tips.push(t_ns, point, cov)[:, :2] / _AWAY_M
+        return tip, sigma_px
+
+    def _remembered(self, t_ns: int, found: FingerAngles) -> tuple[FingerAngles, Code]:
+        """The fingers with those that were seen a moment ago, and their sources (5,)."""
         seen = np.isfinite(found.angles_rad[:, 0])
         source: Code = np.where(seen, np.uint8(Source.WRIST), np.uint8(Source.NONE))
         if not self._continuous or seen.all():
             self._remember(t_ns, found, seen)
-            return found.angles_rad, found.cov_rad2, source
+            return found, source
         gone_s = 1e-9 * (t_ns - self._seen_ns)
         held = ~seen & (gone_s <= _FORGET_S)
         source[held] = Source.HELD
@@ -134,7 +172,7 @@ class WristPipeline:
         angles[held] = self._angles[held]
         cov[held] = self._cov[held] + strayed_rad2(gone_s[held])[:, None, None] * np.eye(4)
         self._remember(t_ns, found, seen)
-        return angles, cov, source
+        return replace(found, angles_rad=angles, cov_rad2=cov), source
 
     def _remember(self, t_ns: int, found: FingerAngles, seen: Bool) -> None:
         self._angles[seen], self._cov[seen], self._seen_ns[seen] = (

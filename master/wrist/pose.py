@@ -6,12 +6,13 @@ each finger; their covariance is that of the angles, carried along the arcs on w
 
 import numpy as np
 
-from common.arrays import Bool, Code, Float
+from common.arrays import Code, Float
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, WRIST
 from common.messages import HandPose, Source
 from master.ik.priors import Priors
 from master.volume import inside
+from master.wrist.belief import FingerAngles
 from master.wrist.palm_world import NO_WORLD
 from master.wrist.setup import WristSetup
 
@@ -32,10 +33,8 @@ class PoseMaker:
     def __call__(
         self,
         t_ns: int,
-        angles_rad: Float,
-        cov_rad2: Float,
+        found: FingerAngles,
         source: Code,
-        tracked: Bool,
         laser_m: Float,
         world: tuple[Float, Float] = NO_WORLD,
     ) -> HandPose:
@@ -43,19 +42,18 @@ class PoseMaker:
 
         Args:
             t_ns: Its instant [ns].
-            angles_rad: (5, 4), within the limits; NaN: nothing is known of that finger.
-            cov_rad2: (5, 4, 4).
+            found: The fingers, those that are held among them; NaN: nothing is known of that finger.
             source: (5,) of each finger; NONE: its joints are not valid, and NaN.
-            tracked: (5,) fingers that are observed now.
             laser_m: (5, 3) where the laser meets them [m].
             world: The palm in the IMU's world (4,), and how sure that is (2,), as of `PalmWorld.at`.
         """
         model, T = self._model, self._setup.T_camera_palm
+        angles_rad, tracked = found.angles_rad, found.told
         chains = model.chains(angles_rad)
         joints = model.joints(T, chains)
         R = T[:3, :3]
         cov = self._still_m2.copy()
-        cov[CHAINS[:, 1:]] += R @ self._moving_cov(angles_rad, cov_rad2) @ R.T
+        cov[CHAINS[:, 1:]] += R @ self._moving_cov(angles_rad, found.cov_rad2) @ R.T
         known = source != Source.NONE
         valid, seen, origin = np.zeros((3, 26), np.uint8)
         valid[CHAINS], seen[CHAINS], origin[CHAINS] = known[:, None], tracked[:, None], source[:, None]
@@ -81,6 +79,8 @@ class PoseMaker:
             laser_m=laser_m,
             palm_world_wxyz=world[0],
             palm_world_sigma_rad=world[1],
+            level=found.level,
+            ambiguous=found.ambiguous,
         )
 
     def _moving_cov(self, angles_rad: Float, cov_rad2: Float) -> Float:

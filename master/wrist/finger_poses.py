@@ -1,0 +1,92 @@
+"""What a wrist device would see of a finger in any of its poses: the forward function of the inverse model.
+
+A finger has three unknowns, each in its range: abduction, flexion of the MCP (0 ... 100 degrees in preset D), and PIP
+(0 ... 120); the DIP follows the PIP by the coupling (rows D16, D19). With the second angle counted from the first bone
+(I16) the chain is that of `common.hand_model`. A thumb has an axis of its own: CMC abduction, CMC flexion, and how far
+MCP and IP are closed together, in shares of their ranges as in `NaturalCurve`.
+
+What is seen are four numbers: where the laser meets the finger (2, on its plane), and its tip in the image (2).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.geometry import transform
+from common.hand_limits import ABDUCTION, FLEXION
+from master.wrist.fingertip import Fingertips
+from master.wrist.forward import ASIDE_RAD, BEYOND_RAD, DIP, PIP, NaturalCurve
+from master.wrist.laser_cut import LaserCut
+from master.wrist.setup import WristSetup
+from master.wrist.skin import Skin
+
+UNKNOWNS = 3
+SEEN = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Views:
+    """What is seen of fingers (...).
+
+    Attributes:
+        seen: (..., 4) laser point on its plane (across, along) [m], tip (x / z, y / z); NaN where the laser misses.
+        length_px: (...) of the laser line in the undistorted image.
+    """
+
+    seen: Float
+    length_px: Float
+
+
+class FingerPoses:
+    """Poses of the five fingers of one hand before one device. What it holds was prepared by the constructor.
+
+    Attributes:
+        low, high: (5, 3) range of the unknowns [rad]; that of the abduction goes beyond the limits of the hand, for
+            noise and skin.
+    """
+
+    def __init__(self, setup: WristSetup) -> None:
+        self._setup, self._curve = setup, NaturalCurve.of(setup.model)
+        self._cut, self._skin, self._tips = (
+            LaserCut(setup),
+            Skin.of(setup.model),
+            Fingertips.of(setup.model),
+        )
+        limits = setup.model.limits_rad
+        self.low, self.high = limits[:, :UNKNOWNS, 0].copy(), limits[:, :UNKNOWNS, 1].copy()
+        aside = np.maximum(np.abs(limits[:, ABDUCTION]).max(axis=1), ASIDE_RAD) + BEYOND_RAD
+        self.low[:, ABDUCTION], self.high[:, ABDUCTION] = -aside, aside
+        self._dip = self._curve.slope[:, DIP], self._curve.base_rad[:, DIP], limits[:, DIP].T
+
+    @property
+    def dip_per_pip(self) -> Float:
+        """(5,) how far the last joint bends with the one before."""
+        return self._dip[0]
+
+    @property
+    def habit(self) -> tuple[Float, Float]:
+        """Slope and base (5,) of natural flexion: flexion = base + slope * PIP."""
+        return self._curve.slope[:, FLEXION], self._curve.base_rad[:, FLEXION]
+
+    def angles(self, x: Float) -> Float:
+        """Angles (..., 5, 4) [rad] of unknowns (..., 5, 3)."""
+        slope, base, (low, high) = self._dip
+        out = np.empty((*x.shape[:-1], 4))
+        out[..., :UNKNOWNS] = x
+        out[..., DIP] = np.clip(base + slope * x[..., PIP], low, high)
+        return out
+
+    def views(self, x: Float, wanted: Bool, cut: LaserCut | None = None) -> Views:
+        """What is seen of some of the fingers with unknowns (N, 5, 3): the `wanted` (N, 5); NaN of the others."""
+        cut = cut or self._cut
+        chains = self._setup.model.chains(self.angles(x))
+        T = self._setup.T_camera_palm
+        tips = transform(T, self._tips.points(chains))
+        finger = np.nonzero(wanted)[1]
+        spheres = transform(T, self._skin.spheres(chains)[wanted])
+        line = cut.line(spheres, self._skin.radius_m[finger], finger == 0)
+        seen, length = np.full((*wanted.shape, SEEN), np.nan), np.full(wanted.shape, np.nan)
+        seen[wanted, :2], length[wanted] = line.point_m, line.length_px
+        seen[..., 2:] = tips[..., :2] / tips[..., 2:]
+        return Views(seen, length)

@@ -1,0 +1,164 @@
+"""The inverse model: poses of a finger that explain where the laser meets it and where its tip is (rows D16, D17, D19).
+
+A finger has three unknowns and four numbers are seen (`master.wrist.finger_poses`). The energy is
+
+    (y - f(x))' R^-1 (y - f(x))       within the range of x
+
+with R the covariance of what was seen; habits have no part in it. It can have several minima: a finger straight and
+low, or bent and high, may show its tip at the same place. All are looked for, the global one is among them:
+
+1. **table**: every node that explains better than its neighbours what was seen (`PoseTable.candidates`);
+2. **between nodes**: Gauss-Newton steps on the interpolated table, which merge and sort out most of these;
+3. **exactly**: the few that are left are refined with the laser's cut itself. Its derivatives are those of the table,
+   mended after every step by what the step did (Broyden 1965).
+
+An unknown at the end of its range stays there while the energy falls towards the outside (projected Newton, Bertsekas
+1982).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
+from master.wrist.pose_table import PoseTable
+from master.wrist.setup import WristSetup
+
+MINIMA = 3  # of one finger that are refined
+_CANDIDATES = 6
+_TABLE_STEPS, _EXACT_STEPS = 3, 8
+_FARTHEST_RAD = np.radians(12.0)  # of one step
+_ARRIVED_RAD = np.radians(0.02)
+_SAME_RAD = np.radians(4.0)  # nearer to each other than this, two candidates are on their way to one minimum
+_HOPELESS = 40.0  # worse than the best by this on the table, a candidate is none; a table is wrong by less
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Minima:
+    """Poses of the five fingers that explain what was seen, the best first; inf and NaN where there are not so many.
+
+    Attributes:
+        x_rad: (5, K, 3) abduction, flexion, PIP.
+        cov_rad2: (5, K, 3, 3).
+        misfit: (5, K) the energy, a chi-square of SEEN - UNKNOWNS degrees of freedom where nothing is at its limit.
+        length_px: (5, K) of the laser line there.
+    """
+
+    x_rad: Float
+    cov_rad2: Float
+    misfit: Float
+    length_px: Float
+
+
+class InverseModel:
+    """Finds them for one device and hand. What it holds was prepared by the constructor, in about a second."""
+
+    def __init__(self, setup: WristSetup) -> None:
+        self.poses = FingerPoses(setup)
+        self._table = PoseTable(setup, self.poses)
+        self._loose = 12.0 / (self.poses.high - self.poses.low) ** 2  # (5, 3): anywhere within the range
+
+    def __call__(self, seen: Float, cov: Float) -> Minima:
+        """The minima.
+
+        Args:
+            seen: (5, 4) laser point on its plane (across, along) [m] and tip (x / z, y / z); NaN: a finger of which
+                not both are known, and which is left out.
+            cov: (5, 4, 4) its covariance, finite.
+        """
+        told: Bool = np.isfinite(seen.sum(axis=1)) & self._table.met
+        places, energy = self._table.candidates(np.where(told[:, None], seen, 0.0), _CANDIDATES)
+        finger, _ = rows = np.nonzero(np.isfinite(energy) & told[:, None])
+        white = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
+        x, misfit = places[rows], np.zeros(len(finger))
+        seen = seen[finger]
+        for _ in range(_TABLE_STEPS):
+            y, J, _ = self._table.views(x, finger)
+            misfit, to = self._step(x, finger, white[finger], seen - y, J)
+            x = x + to
+        return self._exact(*self._left(x, finger, misfit, seen), white)
+
+    def _left(self, x: Float, finger: Int, misfit: Float, seen: Float) -> tuple[Float, Int, Float]:
+        """Of candidates (N) those that are worth refining, sorted by finger and misfit, with what was seen of each."""
+        order = np.lexsort((misfit, finger))
+        x, finger, misfit, seen = x[order], finger[order], misfit[order], seen[order]
+        rank = np.arange(len(x))
+        better = (finger[:, None] == finger) & (rank < rank[:, None])
+        close = (np.abs(x[:, None] - x)[..., 1:] < _SAME_RAD).all(axis=-1)
+        first = np.searchsorted(finger, finger)
+        keep = ~(better & close).any(axis=1) & (misfit < misfit[first] + _HOPELESS)
+        keep &= (better & keep).sum(axis=1) < MINIMA
+        return x[keep], finger[keep], seen[keep]
+
+    def _exact(self, x: Float, finger: Int, seen: Float, white: Float) -> Minima:
+        """The minima that poses (N, 3) of fingers (N,), sorted, are near to; `seen` (N, 4) of each."""
+        count, white = len(x), white[finger]
+        slot = np.arange(count) - np.searchsorted(finger, finger)
+        best_x, best, length = x.copy(), np.full(count, np.inf), np.full(count, np.nan)
+        _, J, _ = self._table.views(x, finger)
+        best_J, moving = J.copy(), np.ones(count, np.bool_)
+        y_before, x_before = np.full((count, SEEN), np.nan), x
+        for _ in range(_EXACT_STEPS if count else 0):
+            y, long = self._views(x, finger, slot, moving)
+            J = _mended(J, x - x_before, y - y_before)
+            misfit, to = self._step(x, finger, white, seen - y, J)
+            won = misfit < best
+            best_x[won], best[won], length[won], best_J[won] = x[won], misfit[won], long[won], J[won]
+            # Where the laser misses, or a step led uphill: half the way back to the best.
+            to = np.where(won[:, None], to, 0.5 * (best_x - x))
+            x_before, y_before, x = x, y, x + to
+            moving = (np.abs(to) > _ARRIVED_RAD).any(axis=1)
+            if not moving.any():
+                break
+        return self._sorted(best_x, best, length, best_J, white, finger, slot)
+
+    def _views(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float]:
+        """What is seen (N, 4) of poses (N, 3), exactly, and how long the line is (N,); NaN where not wanted."""
+        grid, which = np.zeros((MINIMA, 5, UNKNOWNS)), np.zeros((MINIMA, 5), np.bool_)
+        grid[slot, finger], which[slot, finger] = x, wanted
+        views = self.poses.views(grid, which)
+        return views.seen[slot, finger], views.length_px[slot, finger]
+
+    def _step(self, x: Float, finger: Int, white: Float, off: Float, J: Float) -> tuple[Float, Float]:
+        """Energy (N,) of poses (N, 3) with residuals `off` (N, 4), inf where that is NaN, and a step towards less."""
+        low, high = self.poses.low[finger], self.poses.high[finger]
+        off = (white @ off[..., None])[..., 0]
+        energy = np.nan_to_num(np.vecdot(off, off), nan=np.inf)
+        slope = white @ J
+        down = (np.swapaxes(slope, 1, 2) @ np.nan_to_num(off)[..., None])[..., 0]
+        H = np.swapaxes(slope, 1, 2) @ slope
+        stuck = ((x <= low) & (down < 0.0)) | ((x >= high) & (down > 0.0))
+        H = np.where(stuck[:, None] | stuck[..., None], 0.0, H)
+        np.einsum("nii->ni", H)[...] += np.where(stuck, 1.0, 1e-3 * self._loose[finger])
+        to = np.linalg.solve(H, np.where(stuck, 0.0, down)[..., None])[..., 0]
+        return energy, np.clip(x + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high) - x
+
+    def _sorted(
+        self, x: Float, misfit: Float, length: Float, J: Float, white: Float, finger: Int, slot: Int
+    ) -> Minima:
+        """Refined poses (N), with derivatives, as minima; the best of each finger first."""
+        slope = white @ J
+        information = np.swapaxes(slope, 1, 2) @ slope
+        np.einsum("nii->ni", information)[...] += self._loose[finger]
+        cov = np.asarray(np.linalg.inv(information), np.float64)
+        order = np.lexsort((misfit, finger))
+        out = Minima(
+            np.full((5, MINIMA, UNKNOWNS), np.nan),
+            np.full((5, MINIMA, UNKNOWNS, UNKNOWNS), np.nan),
+            np.full((5, MINIMA), np.inf),
+            np.full((5, MINIMA), np.nan),
+        )
+        at = finger, slot
+        out.x_rad[at], out.cov_rad2[at] = x[order], cov[order]
+        out.misfit[at], out.length_px[at] = misfit[order], length[order]
+        return out
+
+
+def _mended(J: Float, by: Float, did: Float) -> Float:
+    """Derivatives (N, 4, 3) that give what a step (N, 3) did (N, 4), else as they were."""
+    moved = np.vecdot(by, by)
+    known = np.isfinite(did).all(axis=1) & (moved > 1e-10)
+    short = did - (J @ by[..., None])[..., 0]
+    change = short[..., None] * by[:, None] / np.where(known, moved, 1.0)[:, None, None]
+    return J + np.where(known[:, None, None], change, 0.0)
