@@ -1,4 +1,9 @@
-"""Who wears the device: palm pose, knuckles and thickness of the fingers from one guided motion before it."""
+"""Who wears the device: palm pose, knuckles and fingers from one guided motion before it (row D18).
+
+The place of a knuckle is told by the laser where its finger is bent most: there the line lies beside it. One motion
+shows that, and the flat hand, from which everything is counted, and a fist, in which fingertips are seen. What is
+made of it is in `guided`, `wearer_model` and `wearer_fit`; here are what goes in, what comes out, and what is refused.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,15 +11,29 @@ from dataclasses import dataclass
 import numpy as np
 from msgspec.structs import replace
 
+from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
-from common.geometry import intersect_plane
-from common.hand_model import HandModel
+from common.errors import FitError
+from common.hand_model import CHAINS, FINGERS, HandModel
 from common.messages import WristDetections
-from common.wrist_device import laser_plane_of
 from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.wrist.curled import Curled
-from master.calibrate.wrist.palm_hand import palm_from_hand
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.guided import FLAT, MOTION, Guided, guided
+from master.calibrate.wrist.wearer_fit import Fit, Sightings, fit_wearer, prior_sigma
+from master.calibrate.wrist.wearer_model import MCP, Unknown, WearerModel, wearing
 from master.wrist.setup import WristSetup
+
+TOOL = "calibrate wearer"
+_NAMES = FINGERS[1:]
+_GUESS = np.radians(5.0), 5e-3  # of a drawing's pose of the palm, standard deviations
+_RULER = np.radians(1.0), 1.5e-3  # of a board's: how it lies on the palm, and what was measured with a ruler
+_LENGTH, _MEASURED = (
+    0.04,
+    0.012,
+)  # of fingers: bones are 6.5 % off their shares, each alone; measured ones 1 mm
+_BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
+_MISFIT = 1.5  # standard deviations: angles are free, so what is left is small
+_UNLIKELY = 3.0  # standard deviations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -23,13 +42,26 @@ class Wearer:
 
     Attributes:
         rig: The rig with its new `T_camera_palm`.
-        hand: The hand file with knuckles and `palmar_scale` as far as they were seen, under its old name.
+        hand: The hand file with new knuckles, lengths and `palmar_scale`, under its old name.
         report: Lines for a person.
+        chosen: Which triples were used.
+        seen: What was seen in them.
+        fit: What was fitted to it.
+        model: The forward function about the old rig and hand.
     """
 
     rig: RigCalibration
     hand: HandProfile
     report: tuple[str, ...]
+    chosen: Guided
+    seen: Sightings
+    fit: Fit
+    model: WearerModel
+
+    @property
+    def unknown(self) -> Unknown:
+        """What was fitted, as changes of the old rig and hand."""
+        return Unknown.of(self.fit.x)
 
 
 def calibrate_wearer(
@@ -37,26 +69,158 @@ def calibrate_wearer(
     rig: RigCalibration,
     camera: CameraCalibration,
     hand: HandProfile,
+    source: str = "a guided motion",
 ) -> Wearer:
-    """Fit the wearer of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, curl.
+    """Fit the wearer of a wrist device to one guided motion: open hand, straight fingers bent at the knuckles, fist.
 
     Args:
         triples: What the slave saw, in order.
         rig: The device: laser plane, and a palm pose that is right to a centimetre and ten degrees.
         camera: Its camera.
         hand: The hand as far as it is known, such as a hand of the user's length.
+        source: Name of the data, for the provenance.
 
     Raises:
-        FitError: What was seen does not determine it, or nothing explains it; the text says what to do.
+        FitError: The motion was not done, or not seen, or nothing likely explains it; the text says what to do.
         CalibrationError: The rig lacks its laser plane or palm pose.
     """
     setup = WristSetup.of(rig, camera, HandModel.of(hand))
-    normal, offset_m = laser_plane_of(rig, f"rig {rig.name!r}")
+    model = WearerModel(setup)
     laser = np.array([one.laser_uv for one in triples]).reshape(-1, 5, 2)
-    tips = np.array([one.tip_uv for one in triples]).reshape(-1, 5, 2)
-    points = intersect_plane(np.zeros(3), setup.optics.ray(laser), normal, offset_m)
-    fit = palm_from_hand(Curled(points, tips), setup)
-    said = (
-        f"palm from {fit.note}: ± {np.degrees(fit.turn_sigma_rad):.2f} deg, ± {1e3 * fit.shift_sigma_m:.2f} mm",
+    points = model.flat(setup.on_plane(laser))[:, 1:]
+    chosen = guided(points[..., 1])
+    tips = np.array([one.tip_uv for one in triples])[chosen.row, 1:]
+    doubt = np.array([one.tip_sigma_px for one in triples])[chosen.row, 1:]
+    seen = Sightings(points[chosen.row], tips, doubt, chosen.bend)
+    sigma = prior_sigma(_pose_sigma(rig), _length_sigma(hand))
+    fit = fit_wearer(model, seen, sigma)
+    _check(fit, seen)
+    unknown = Unknown.of(fit.x)
+    report = report_lines(setup, fit, len(triples))
+    new_rig, new_hand = _documented(rig, wearing(setup.model, unknown), fit, source)
+    new_rig = replace(new_rig, T_camera_palm=matrix_of(model.palm(unknown)))
+    return Wearer(new_rig, new_hand, report, chosen, seen, fit, model)
+
+
+def _pose_sigma(rig: RigCalibration) -> Float:
+    """(6,) how far the palm's pose in the rig file may be off [rad, m]."""
+    how = rig.provenance.get("T_camera_palm")
+    if how is None or how.tool != "calibrate palm":
+        return np.repeat(_GUESS, 3)
+    turn, shift = np.radians(how.residual.get("turn_sigma_deg", 0.0)), how.residual.get("shift_sigma_mm", 0.0)
+    return np.repeat([np.hypot(turn, _RULER[0]), np.hypot(1e-3 * shift, _RULER[1])], 3)
+
+
+def _length_sigma(hand: HandProfile) -> Float:
+    """(4,) how far the lengths of the fingers may be off, shares: less where markers measured them."""
+    how = [hand.provenance.get(name) for name in _NAMES]
+    return np.array(
+        [
+            _MEASURED if one and one.tool == "calibrate hand" and len(one.residual) > 1 else _LENGTH
+            for one in how
+        ]
     )
-    return Wearer(replace(rig, T_camera_palm=matrix_of(fit.T_camera_palm)), hand, said)
+
+
+def _check(fit: Fit, seen: Sightings) -> None:
+    """Refuse what does not reach the minimum, and what is not likely.
+
+    Raises:
+        FitError: With what to do.
+    """
+    knuckles = (seen.bend != FLAT) & ~fit.fist
+    if not knuckles.any() or not fit.fist.any():
+        missing = "closes to a fist" if knuckles.any() else "bends straight fingers at their knuckles"
+        raise FitError(f"the hand never {missing}, or its tips were not seen meanwhile: {MOTION}")
+    _check_likely(fit)
+    most = np.degrees(most_bent(fit, knuckles))
+    short = most < np.degrees(_BENT_RAD)
+    if short.sum() > 1:
+        told = ", ".join(f"{name} {angle:.0f}" for name, angle in zip(_NAMES, most, strict=True))
+        raise FitError(
+            f"straight fingers were bent at their knuckles to {told} deg, at least {np.degrees(_BENT_RAD):.0f} are"
+            " needed, where the laser lies beside the knuckle: bend them towards 90 deg, straight, before the camera"
+        )
+
+
+def _check_likely(fit: Fit) -> None:
+    pull = np.abs(fit.x) / fit.prior_sigma
+    worst = int(pull.argmax())
+    if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.unlike > _UNLIKELY:
+        raise FitError(
+            f"no likely wearer explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
+            f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
+            " deviations from the file; is the hand file that of this hand and side, the laser plane measured, and"
+            f" the palm's pose right to a centimetre and ten degrees? The motion is: {MOTION}"
+        )
+
+
+def most_bent(fit: Fit, knuckles: Bool) -> Float:
+    """(4,) how far straight fingers were bent at their knuckles [rad]."""
+    return fit.angles_rad[knuckles][..., MCP].max(axis=0)
+
+
+def _name(unknown: int) -> str:
+    """What number `unknown` of the vector is, for a person."""
+    if unknown < 6:
+        return f"the palm's {'turn about' if unknown < 3 else 'shift along'} {'xyz'[unknown % 3]}"
+    if unknown < 18:
+        return f"the {_NAMES[(unknown - 6) // 3]} knuckle"
+    return f"the {'thickness' if unknown < 22 else 'length'} of the {_NAMES[(unknown - 18) % 4]} finger"
+
+
+def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
+    """Before and after, for a person; knuckles across (to the thumb), up (to the back) and along the hand."""
+    new, sigma = Unknown.of(fit.x), Unknown.of(np.sqrt(np.diag(fit.covariance)))
+    turn, shift = np.degrees(np.linalg.norm(new.pose[:3])), 1e3 * np.linalg.norm(new.pose[3:])
+    knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
+    lines = [
+        f"wearer from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
+        f"what is left: laser points {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px",
+        f"palm turned by {turn:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
+        f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
+        f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",
+    ]
+    thumbwards = np.array([setup.model.side_sign, 1.0, 1.0])
+    before = setup.model.rest_position_m[CHAINS[1:, 0]] * thumbwards
+    moved = new.knuckle_m * thumbwards
+    most = np.degrees(most_bent(fit, knuckles)) if knuckles.any() else np.full(4, np.nan)
+    for f, name in enumerate(_NAMES):
+        lines.append(
+            f"{name:8} {most[f]:4.0f} {_three(1e3 * before[f]):>20} {_three(1e3 * (before + moved)[f]):>20}"
+            f" {_three(1e3 * sigma.knuckle_m[f]):>14} {np.exp(new.thick[f]):5.2f} ±{sigma.thick[f]:5.2f}"
+            f" {np.exp(new.long[f]):6.3f} ±{sigma.long[f]:6.3f}"
+        )
+    lines.append(
+        "± are standard deviations; what is as large as its belief (3 mm, 0.10, 0.04) was not seen and kept from it"
+    )
+    return tuple(lines)
+
+
+def _three(values: Float) -> str:
+    return " ".join(f"{value:.1f}" for value in values)
+
+
+def _documented(
+    rig: RigCalibration, hand: HandProfile, fit: Fit, source: str
+) -> tuple[RigCalibration, HandProfile]:
+    """Rig and hand with where they come from."""
+    sigma = Unknown.of(np.sqrt(np.diag(fit.covariance)))
+    left = {"laser_rms_mm": round(1e3 * fit.laser_m, 4), "tip_rms_px": round(fit.tip_px, 4)}
+    turn, shift = np.degrees(sigma.pose[:3].max()), 1e3 * sigma.pose[3:].max()
+    pose = left | {"turn_sigma_deg": round(float(turn), 4), "shift_sigma_mm": round(float(shift), 4)}
+    knuckles = {
+        f"{name}_sigma_mm": round(1e3 * float(np.linalg.norm(one)), 4)
+        for name, one in zip(_NAMES, sigma.knuckle_m, strict=True)
+    }
+    thick = {f"{name}_sigma": round(float(one), 4) for name, one in zip(_NAMES, sigma.thick, strict=True)}
+    note = "knuckles and palm are known together better than each alone"
+    told = {
+        key: provenance(TOOL, (source,), residual, note)
+        for key, residual in (("knuckles", left | knuckles), ("palmar_scale", left | thick))
+    }
+    how = provenance(TOOL, (source,), pose, f"hand {hand.name!r}; {note}")
+    return (
+        replace(rig, provenance=rig.provenance | {"T_camera_palm": how}),
+        replace(hand, provenance=hand.provenance | told),
+    )

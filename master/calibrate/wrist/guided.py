@@ -1,0 +1,105 @@
+"""The guided motion of a wearer, taken apart: flat hand, knuckles bent with straight fingers, flat hand, fist.
+
+How far the laser points lie tells how open the hand is, whatever else is still unknown: they are farthest on a flat
+hand and come nearer with every joint that bends. So a motion falls into its openings and what lies between them, and
+a few triples of each are all that a fit needs. Which of the bends are of the knuckles, and which are fists, is told
+later, by the tips.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import FitError
+
+MOTION = (
+    "open the hand flat; bend the straight fingers at their knuckles as far as they go, and back; open it flat;"
+    " close it to a fist, and open it again; each bend in three seconds or more"
+)
+FLAT = -1
+_OPEN, _BENT = 0.85, 0.5  # shares of a finger's way: 4 degrees of a straight finger are a tenth of it
+_MOVED_M = 0.015  # of the laser point of a finger that bent
+_FEWEST = 5  # triples of a bend
+_FINGERS = 3  # that must be seen
+_PER_BEND, _PER_FLAT = 16, 4
+_EDGE = 0.02  # share of strays beyond the ends of a way
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Guided:
+    """The triples that count (T), in order.
+
+    Attributes:
+        row: (T,) their numbers.
+        bend: (T,) number of the bend that each is of; FLAT: the hand is open.
+    """
+
+    row: Int
+    bend: Int
+
+
+def guided(along_m: Float) -> Guided:
+    """Choose triples by how far the laser points (T, 4) of index ... little lie [m]; NaN: not seen.
+
+    Raises:
+        FitError: Fewer than three fingers bent, or the hand bent fewer than two times between openings.
+    """
+    open_share = openness(along_m)
+    flat = open_share > _OPEN
+    bends = _bends(open_share, flat)
+    if len(bends) < 2 or not flat.any():
+        raise FitError(
+            f"the hand bent {len(bends)} times between being flat, at least twice is needed: {MOTION}"
+        )
+    chosen = [_evenly(np.flatnonzero(flat), open_share, _PER_FLAT)]
+    number = [np.full(len(chosen[0]), FLAT)]
+    for k, rows in enumerate(bends):
+        rows = _evenly(rows, open_share, max(_PER_BEND * 2 // len(bends), _FEWEST))
+        chosen.append(rows)
+        number.append(np.full(len(rows), k))
+    return Guided(np.concatenate(chosen), np.concatenate(number))
+
+
+def openness(along_m: Float) -> Float:
+    """Share (T,) of their ways that the fingers' laser points have gone from the nearest to the farthest.
+
+    Raises:
+        FitError: Fewer than three fingers are seen to bend.
+    """
+    low, high = np.full(4, np.nan), np.full(4, np.nan)
+    for f in range(4):
+        seen = along_m[np.isfinite(along_m[:, f]), f]
+        if len(seen) >= 2 * _FEWEST:
+            low[f], high[f] = np.quantile(seen, [_EDGE, 1.0 - _EDGE])
+    moved = high - low > _MOVED_M
+    if moved.sum() < _FINGERS:
+        raise FitError(
+            f"{moved.sum()} fingers bend before the laser, at least {_FINGERS} are needed: {MOTION}"
+        )
+    share = (along_m[:, moved] - low[moved]) / (high - low)[moved]
+    share[np.isfinite(share).sum(axis=1) < _FINGERS - 1] = np.nan
+    out = np.full(len(share), np.nan)
+    seen = np.isfinite(share).any(axis=1)
+    out[seen] = np.nanmedian(share[seen], axis=1)
+    return out
+
+
+def _bends(open_share: Float, flat: Bool) -> list[Int]:
+    """The triples of each bend: what lies between openings and goes at least half of the way."""
+    bends: list[Int] = []
+    known = np.flatnonzero(np.isfinite(open_share))
+    edges = np.flatnonzero(np.diff(np.r_[True, flat[known], True]))
+    for first, stop in edges.reshape(-1, 2):
+        rows = known[first:stop]
+        if len(rows) >= _FEWEST and open_share[rows].min() < _BENT:
+            bends.append(rows)
+    return bends
+
+
+def _evenly(rows: Int, open_share: Float, count: int) -> Int:
+    """At most `count` of the rows, spread evenly over how open the hand is."""
+    known = rows[np.isfinite(open_share[rows])]
+    share = open_share[known]
+    wanted: Float = np.linspace(float(share.min()), float(share.max()), count)
+    return known[np.unique(np.abs(share[:, None] - wanted).argmin(axis=0))]

@@ -1,0 +1,166 @@
+"""What a wrist device sees of a hand of which little is known: the forward function of a wearer, and its derivatives.
+
+Unknown of the wearer (26) are the palm's pose, and of each of the four fingers where its knuckle is, how thick it is
+and how long. Unknown in each triple are three angles of each finger; the DIP follows the PIP. What is seen are the
+laser point on its plane and the fingertip. Both are reckoned as the master does it (`master.wrist.laser_cut`,
+`master.wrist.fingertip`), so that what is fitted is what will be used.
+"""
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import Finger, HandProfile
+from common.geometry import rigid, rotation_vector_to_matrix, transform
+from common.hand_model import CHAINS, JOINTS, Chains, HandModel
+from master.wrist.fingertip import Fingertips
+from master.wrist.forward import DIP, NaturalCurve
+from master.wrist.laser_cut import LaserCut
+from master.wrist.laser_plane import PlaneAxes
+from master.wrist.setup import WristSetup
+from master.wrist.skin import Skin
+
+FINGERS = slice(1, 5)
+UNKNOWN, LOCAL = 26, 3
+ABDUCTION, MCP, PIP = range(LOCAL)
+_RAYS = 32
+_TURN_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central differences
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Unknown:
+    """What is unknown of a wearer, as changes of a setup.
+
+    Attributes:
+        pose: (6,) turn [rad] about the middle of the knuckles and shift [m] of the palm, camera axes.
+        knuckle_m: (4, 3) shift of each knuckle, palm frame.
+        thick, long: (4,) natural logarithms of the factors of thickness and length.
+    """
+
+    pose: Float
+    knuckle_m: Float
+    thick: Float
+    long: Float
+
+    @classmethod
+    def of(cls, x: Float) -> "Unknown":
+        """From a vector (26,): pose, knuckles, thickness, length."""
+        return cls(x[:6], x[6:18].reshape(4, 3), x[18:22], x[22:26])
+
+
+class WearerModel:
+    """Laser points and tips of one device and hand by unknowns. What it holds was prepared by the constructor."""
+
+    def __init__(self, setup: WristSetup) -> None:
+        self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
+        self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
+        self._root = setup.model.rest_position_m[CHAINS[:, 0]]
+        self._pivot = self._root[FINGERS].mean(axis=0)
+        curve = NaturalCurve.of(setup.model)
+        distance = np.linalg.norm(transform(setup.T_camera_palm, self._pivot))
+        self.px_per_m = float(setup.optics.matrix[0, 0] / distance)  # at the knuckles
+        self.mcp_per_pip, self.dip_per_pip = curve.slope[FINGERS, 1], curve.slope[FINGERS, DIP]
+
+    def flat(self, point_m: Float) -> Float:
+        """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""
+        return self._axes.flat(point_m)
+
+    def palm(self, unknown: Unknown) -> Float:
+        """T_camera_palm (4, 4)."""
+        guess = self._setup.T_camera_palm
+        pivot, turn = transform(guess, self._pivot), rotation_vector_to_matrix(unknown.pose[:3])
+        return rigid(turn @ guess[:3, :3], pivot + turn @ (guess[:3, 3] - pivot) + unknown.pose[3:])
+
+    def knuckles(self, unknown: Unknown) -> Float:
+        """(4, 3) of index ... little, camera frame [m]."""
+        return transform(self.palm(unknown), self._root[FINGERS] + unknown.knuckle_m)
+
+    def __call__(self, x: Float, angles: Float) -> Float:
+        """Laser point (across, along) [m] and tip [px] of every finger, (T, 4, 4), NaN where the laser misses.
+
+        Args:
+            x: (26,) as of `Unknown`.
+            angles: (T, 4, 3) abduction, MCP, PIP [rad].
+        """
+        return self._seen([self._skinned(Unknown.of(x), angles)])[0]
+
+    def derivatives(self, x: Float, angles: Float) -> tuple[Float, Float]:
+        """How that moves with what is unknown, (T, 4, 4, 26), and with the angles, (T, 4, 4, 3); 0 where not known."""
+        steps = np.r_[np.full(3, _TURN_STEP), np.full(3, _SHIFT_STEP), np.full(2, _SHARE_STEP)]
+        ways = np.zeros((8, UNKNOWN))
+        ways[:6, :6] = np.eye(6)
+        ways[6, 18:22] = ways[7, 22:26] = 1.0
+        skinned: list[tuple[Float, Float, Float]] = []
+        for way, step in zip(ways, steps, strict=True):
+            skinned += [self._skinned(Unknown.of(x + sign * step * way), angles) for sign in (1.0, -1.0)]
+        for k in range(LOCAL):
+            turn = _TURN_STEP * np.eye(LOCAL)[k]
+            skinned += [self._skinned(Unknown.of(x), angles + sign * turn) for sign in (1.0, -1.0)]
+        seen = self._seen(skinned)
+        half = np.r_[steps, np.full(LOCAL, _TURN_STEP)]
+        slope = np.nan_to_num((seen[0::2] - seen[1::2]) / (2.0 * half[:, None, None, None]))
+        out = np.zeros((*angles.shape[:2], 4, UNKNOWN))
+        out[..., :6] = np.moveaxis(slope[:6], 0, -1)
+        # A knuckle that moves in the palm moves its finger as a palm does that moves: only turned.
+        by_knuckle = np.moveaxis(slope[3:6], 0, -1) @ self.palm(Unknown.of(x))[:3, :3]
+        for f in range(4):
+            out[:, f, :, 6 + 3 * f : 9 + 3 * f] = by_knuckle[:, f]
+            out[:, f, :, 18 + f], out[:, f, :, 22 + f] = slope[6, :, f], slope[7, :, f]
+        return out, np.moveaxis(slope[8:], 0, -1)
+
+    def _skinned(self, unknown: Unknown, angles: Float) -> tuple[Float, Float, Float]:
+        """Spheres (T, 4, K, 3) [m], their radii (4, K), and the tips (T, 4, 3) [m], camera frame."""
+        whole = np.zeros((len(angles), 5, 4))
+        whole[:, FINGERS, :3] = angles
+        whole[:, FINGERS, DIP] = self.dip_per_pip * angles[..., 2]
+        chains = self._setup.model.chains(whole)
+        long, shift, thick = np.ones((5, 1, 1)), np.zeros((5, 1, 3)), np.ones((5, 1))
+        long[FINGERS, 0, 0], shift[FINGERS, 0], thick[FINGERS, 0] = (
+            np.exp(unknown.long),
+            unknown.knuckle_m,
+            np.exp(unknown.thick),
+        )
+        root = self._root[:, None]
+        chains = Chains(root + shift + long * (chains.position_m - root), chains.rotation)
+        skin = Skin(thick * self._skin.palmar_m, thick * self._skin.radius_m)
+        spheres = skin.spheres(chains)
+        tips, palm = self._tips.points(chains), self.palm(unknown)
+        return (
+            transform(palm, spheres[:, FINGERS]),
+            skin.radius_m[FINGERS],
+            transform(palm, tips[:, FINGERS]),
+        )
+
+    def _seen(self, skinned: list[tuple[Float, Float, Float]]) -> Float:
+        """(P, T, 4, 4) laser points and tips of P hands."""
+        spheres = np.stack([one[0] for one in skinned])
+        radius = np.stack([one[1] for one in skinned])[:, None]
+        line = self._cut.line(spheres, radius, np.bool_(False))
+        tips = self._setup.optics.project(np.stack([one[2] for one in skinned]))
+        return np.concatenate([line.point_m, tips], axis=-1)
+
+
+def wearing(model: HandModel, unknown: Unknown) -> HandProfile:
+    """The hand file with the knuckles, lengths and thickness of its wearer."""
+    place, thick = (
+        model.rest_position_m.copy(),
+        Skin.of(model).palmar_m[FINGERS] * np.exp(unknown.thick)[:, None],
+    )
+    for f, chain in enumerate(CHAINS[FINGERS]):
+        root = place[chain[0]].copy()
+        place[chain] = root + unknown.knuckle_m[f] + np.exp(unknown.long[f]) * (place[chain] - root)
+    joints = dict(model.profile.rest_joints)
+    for index in CHAINS[FINGERS].ravel():
+        x, y, z = (round(float(v), 9) for v in place[index])
+        joints[JOINTS[index]] = replace(joints[JOINTS[index]], position_m=(x, y, z))
+    plain = replace(model.profile, rest_joints=joints)
+    names: tuple[Finger, ...] = get_args(Finger)[FINGERS]
+    # Without radii the breadth of the knuckles tells the thickness, and they have moved.
+    without = {name: scale for name, scale in plain.palmar_scale.items() if name not in names}
+    usual = Skin.of(HandModel.of(replace(plain, palmar_scale=without))).palmar_m[FINGERS]
+    scale = (thick / usual).mean(axis=1)
+    told = {name: round(float(value), 4) for name, value in zip(names, scale, strict=True)}
+    return replace(plain, palmar_scale=without | told)
