@@ -16,7 +16,7 @@ from master.calibrate.wrist.wearer import calibrate_wearer
 from master.recorded import recorded_triples
 from master.study.line import Inputs, Level, claim, detect, solved, write_exact
 from master.study.participant import Known, Participant, participant
-from master.study.session import record_guided, record_trials
+from master.study.session import TRIAL_S, record_guided, record_trials
 from master.study.trials import Trial, trials_of
 from master.summary import read_summary, write_summary
 
@@ -48,6 +48,7 @@ class Task:
         out: Folder of the study.
         resume: Take rendered and detected recordings that are there from a study of the same settings.
         keep: Keep all frames, 140 MB for a participant of three blocks.
+        trial_s: How long each trial takes [s].
     """
 
     rig: RigCalibration
@@ -62,6 +63,7 @@ class Task:
     out: Path
     resume: bool
     keep: bool
+    trial_s: float = TRIAL_S
 
 
 class Calibrated(Struct, frozen=True, kw_only=True):
@@ -136,6 +138,7 @@ def _settings(task: Task) -> dict[str, object]:
     return {
         "seed": task.seed,
         "blocks": task.blocks,
+        "trial_s": task.trial_s,
         "step": task.step,
         "guided": task.guided,
         "rig": task.rig.name,
@@ -156,7 +159,7 @@ def _perform(task: Task, who: Participant, folder: Path) -> None:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
     if any(known == "calibrated" for known, _ in task.conditions):
         record_guided(folder / GUIDED, who, task.camera, task.guided, task.step)
-    record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step)
+    record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step, task.trial_s)
 
 
 def _knowledge(

@@ -2,11 +2,13 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 
 from common.errors import RecordingError
 from common.hand_model import FINGERS
@@ -19,6 +21,7 @@ from master.study.trials import LETTERS
 
 _COLOURS = ("#2b6cb0", "#2f855a", "#805ad5", "#b7791f", "#c2571a", "#718096")  # poses A ... F
 _GREY, _RED = "#8a8a8a", "#c53030"
+_NONE: dict[str, Any] = {"facecolor": "none", "edgecolor": "#cccccc", "hatch": "////", "linewidth": 0.0}
 _WIDTH = 0.13  # of a bar; a finger is 1 wide
 _TOP_DEG = 45.0  # taller bars are cut, and say so
 
@@ -47,64 +50,51 @@ def draw_study(path: Path, result: Result) -> None:
 
 def _bars(axes: Axes, cells: list[Cell]) -> None:
     poses = [pose for pose in POSES if any(cell.pose == pose for cell in cells)]
-    letters = {pose: letter for letter, pose in LETTERS.items()}
     highest = [cell.mean_deg + np.nan_to_num(cell.sd_deg) for cell in cells if cell.is_reached]
     top = min(_TOP_DEG, max([*highest, paper.MEAN_LIMIT_DEG]) * 1.12)
-    labelled: set[str] = set()
     for cell in cells:
-        k = poses.index(cell.pose)
-        x = FINGERS.index(cell.finger) + _WIDTH * (k - 0.5 * (len(poses) - 1))
-        colour = _COLOURS[list(POSES).index(cell.pose)]
-        if not cell.is_reached:
-            label = None if "none" in labelled else "not reached (tracked in fewer than half of the trials)"
-            labelled.add("none")
-            axes.bar(
-                x,
-                top,
-                _WIDTH * 0.92,
-                color="none",
-                edgecolor="#cccccc",
-                hatch="////",
-                linewidth=0.0,
-                label=label,
-            )
-            axes.text(
-                x,
-                0.02 * top,
-                f"{cell.reached}/{cell.trials}",
-                rotation=90,
-                ha="center",
-                va="bottom",
-                fontsize=7,
-                color=_GREY,
-            )
-            continue
-        label = None if cell.pose in labelled else f"{letters[cell.pose]}  {cell.pose.replace('_', ' ')}"
-        labelled.add(cell.pose)
-        spread = None if math.isnan(cell.sd_deg) else cell.sd_deg
-        axes.bar(
-            x,
-            cell.mean_deg,
-            _WIDTH * 0.92,
-            yerr=spread,
-            color=colour,
-            ecolor="#444444",
-            capsize=1.5,
-            error_kw={"linewidth": 0.8},
-            label=label,
-        )
-        if cell.mean_deg > top:
-            axes.text(x, top, f"{cell.mean_deg:.0f}", ha="center", va="bottom", fontsize=7, color=colour)
-    axes.axhline(
-        paper.MEAN_LIMIT_DEG, color=_RED, linewidth=1.0, linestyle="--", label="paper: every mean below 9°"
-    )
+        place = _WIDTH * (poses.index(cell.pose) - 0.5 * (len(poses) - 1))
+        _bar(axes, cell, FINGERS.index(cell.finger) + place, top)
+    limit = axes.axhline(paper.MEAN_LIMIT_DEG, color=_RED, linewidth=1.0, linestyle="--")
+    limit.set_label(f"paper: every mean below {paper.MEAN_LIMIT_DEG:g}°")
     for finger, (low, high) in paper.MEAN_RANGE_DEG.items():
         x = FINGERS.index(finger)
         axes.fill_between([x - 0.47, x + 0.47], low, high, color=_RED, alpha=0.15, linewidth=0.0)
     axes.set(xticks=range(len(FINGERS)), ylim=(0.0, top), xlim=(-0.5, len(FINGERS) - 0.5))
     axes.set_xticklabels(["thumb (MCP)", *FINGERS[1:]])
-    axes.set_ylabel("absolute error of the PIP [°], mean and sd; red bands: the paper's means")
-    axes.legend(fontsize=7.5, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.06), frameon=False)
+    axes.set_ylabel("absolute error of the PIP [°], mean ± sd")
+    letters = {pose: letter for letter, pose in LETTERS.items()}
+    shown = [Patch(color=_colour(pose), label=f"{letters[pose]}  {pose.replace('_', ' ')}") for pose in poses]
+    none = Patch(label="not reached: tracked in fewer than half of the trials", **_NONE)
+    band = Patch(color=_RED, alpha=0.15, label="paper: means over its poses")
+    axes.legend(
+        handles=[*shown, none, limit, band],
+        fontsize=7.5,
+        ncols=3,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.06),
+        frameon=False,
+    )
+
+
+def _bar(axes: Axes, cell: Cell, x: float, top: float) -> None:
+    """One cell at x; one that is not reached is hatched over the whole height."""
+    width = 0.92 * _WIDTH
+    if not cell.is_reached:
+        axes.bar(x, top, width, **_NONE)
+        text = f"{cell.reached}/{cell.trials}"
+        axes.text(x, 0.02 * top, text, rotation=90, ha="center", va="bottom", fontsize=7, color=_GREY)
+        return
+    colour = _colour(cell.pose)
+    axes.bar(x, cell.mean_deg, width, color=colour)
+    if not math.isnan(cell.sd_deg):
+        axes.errorbar(x, cell.mean_deg, cell.sd_deg, color="#444444", capsize=1.5, linewidth=0.8)
+    if cell.mean_deg > top:
+        axes.text(x, top, f"{cell.mean_deg:.0f}", ha="center", va="bottom", fontsize=7, color=colour)
+
+
+def _colour(pose: str) -> str:
+    return _COLOURS[list(POSES).index(pose)]
 
 
 def _icc(axes: Axes, again: list[Repeated]) -> None:

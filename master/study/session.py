@@ -24,8 +24,8 @@ from master.study.participant import Participant
 TRIALS = "trials.csv"
 COLUMNS = ("block", "pose", "from_ns", "to_ns")
 TRIAL_S = 0.7  # the way there and the hold
-MOVED_S = 0.5  # after which a pose is held
-_FIRST_S = TRIAL_S - 0.2  # of the recording: the hand rests, then begins
+_HELD = 0.72  # of a trial, after which its pose is held
+_REST_S = 0.2  # before the first trial
 _STREAM = 62
 
 
@@ -46,7 +46,14 @@ def orders(blocks: int, seed: int) -> tuple[tuple[str, ...], ...]:
     return tuple(tuple(str(name) for name in rng.permutation(names)) for _ in range(blocks))
 
 
-def record_trials(folder: Path, who: Participant, camera: CameraCalibration, blocks: int, step: int) -> None:
+def record_trials(
+    folder: Path,
+    who: Participant,
+    camera: CameraCalibration,
+    blocks: int,
+    step: int,
+    trial_s: float = TRIAL_S,
+) -> None:
     """Render all trials of a participant as a recording with its truth and trials.csv.
 
     Args:
@@ -55,6 +62,7 @@ def record_trials(folder: Path, who: Participant, camera: CameraCalibration, blo
         camera: That of the device.
         blocks: How often the six poses are made.
         step: Pixels between the rays that shade skin.
+        trial_s: How long each trial takes [s].
 
     Raises:
         RecordingError: The folder cannot be written.
@@ -64,12 +72,16 @@ def record_trials(folder: Path, who: Participant, camera: CameraCalibration, blo
     names = [(block + 1, pose) for block, poses in enumerate(order) for pose in poses]
     model = HandModel.of(who.hand)
     postures = (REST, *(POSES[pose] for _, pose in names))
-    motion = Stations(model, postures, who.seed, period_s=TRIAL_S * len(postures))
+    motion = Stations(model, postures, who.seed, period_s=trial_s * len(postures))
     scene = WristScene(who.rig, {camera.name: camera}, model, motion, "indoor", who.seed, who.reflectance)
-    seconds = TRIAL_S * len(postures) - _FIRST_S
-    record_wrist(folder, scene, seconds, start_s=_FIRST_S, step=step)
+    begin_s = max(trial_s - _REST_S, 0.0)
+    record_wrist(folder, scene, trial_s * len(postures) - begin_s, start_s=begin_s, step=step)
+
+    def stamp(scene_s: float) -> int:
+        return FIRST_NS + round(1e9 * (scene_s - begin_s))
+
     held = [
-        Held(block, pose, _stamp(TRIAL_S * (k + 1) + MOVED_S), _stamp(TRIAL_S * (k + 2)))
+        Held(block, pose, stamp(trial_s * (k + 1 + _HELD)), stamp(trial_s * (k + 2)))
         for k, (block, pose) in enumerate(names)
     ]
     write_trials(folder / TRIALS, held)
@@ -103,8 +115,3 @@ def write_trials(path: Path, held: list[Held]) -> None:
             rows.writerows((one.block, one.pose, one.from_ns, one.to_ns) for one in held)
     except OSError as error:
         raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
-
-
-def _stamp(scene_s: float) -> int:
-    """Stamp [ns] of a scene time in a recording of trials."""
-    return FIRST_NS + round(1e9 * (scene_s - _FIRST_S))

@@ -17,9 +17,8 @@ from master.study.session import COLUMNS, TRIALS, Held
 from master.wrist_score import WristTruth, at_rows, clear_line, load_wrist_truth, rows_at
 
 LETTERS = dict(zip("ABCDEF", POSES, strict=True))  # as the paper names the poses
-Five = tuple[float, float, float, float, float]
-Flags = tuple[bool, bool, bool, bool, bool]
-Counts = tuple[int, int, int, int, int]
+Five = tuple[float, ...]
+Flags = tuple[bool, ...]
 
 
 class Trial(Struct, frozen=True, kw_only=True):
@@ -43,7 +42,7 @@ class Trial(Struct, frozen=True, kw_only=True):
     pip_deg: Five
     truth_deg: Five
     tracked: Flags
-    level: Counts
+    level: tuple[int, ...]
     ambiguous: Flags
     laser_seen: Flags
     tip_seen: Flags
@@ -94,10 +93,10 @@ def trials_of(recording: FrameRecording, camera: str, name: str, poses: Poses) -
                 participant=name,
                 block=one.block,
                 pose=one.pose,
-                pip_deg=_five([round(angle, 3) for angle, _, _ in found]),
-                truth_deg=_five([round(true, 3) for _, true, _ in found]),
+                pip_deg=tuple(round(angle, 3) for angle, _, _ in found),
+                truth_deg=tuple(round(true, 3) for _, true, _ in found),
                 tracked=_most(sure),
-                level=_counts([rank for _, _, rank in found]),
+                level=tuple(rank for _, _, rank in found),
                 ambiguous=_most(ambiguous[own] & sure, sure),
                 laser_seen=_most(line[own]),
                 tip_seen=_most(truth.tip_visible[own]),
@@ -191,15 +190,4 @@ def _finger(angle: Float, true: Float, tracked: Bool, level: Float) -> tuple[flo
 def _most(flags: Bool, of: Bool | None = None) -> Flags:
     """Of each finger whether at least half of (n, 5) are set; `of` (n, 5): of those only."""
     total = np.full(5, len(flags)) if of is None else of.sum(axis=0)
-    a, b, c, d, e = ((flags.sum(axis=0) * 2 >= total) & (total > 0)).tolist()
-    return a, b, c, d, e
-
-
-def _five(values: list[float]) -> Five:
-    a, b, c, d, e = values
-    return a, b, c, d, e
-
-
-def _counts(values: list[int]) -> Counts:
-    a, b, c, d, e = values
-    return a, b, c, d, e
+    return tuple(((flags.sum(axis=0) * 2 >= total) & (total > 0)).tolist())
