@@ -10,15 +10,20 @@ from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
-from common.errors import CalibrationError, CameraError, ImuError, PhalanxError
+from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError
 from slave.arguments import CAMERAS, IMUS, parser
 from slave.cameras import real
 from slave.cameras.source import FrameSource
+from slave.lights.opening import SWITCHED, SYNTHETIC, choose, limits_for, open_guarded
+
+if TYPE_CHECKING:
+    from slave.cameras.synthetic import LitBy
 
 PROGRESS_EVERY = 500  # frames
 
@@ -60,7 +65,7 @@ def _run(options: argparse.Namespace) -> int:
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
     engine = engine_named(options.engine)
-    source = _source(options, rig, camera, clock, true_clock, stop)
+    source = _lit_source(options, rig, camera, clock, true_clock, stop)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
     def say(line: str) -> None:
@@ -117,6 +122,36 @@ def _paths(options: argparse.Namespace) -> tuple[Path, Path]:
     return folder / "cameras" / f"{options.name}.json", folder / "rigs" / f"{options.rig}.json"
 
 
+def _lit_source(
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    clock: Clock,
+    true_clock: Clock,
+    stop: threading.Event | None = None,
+) -> FrameSource:
+    """Open the camera as `_source` does, and the lights of a wrist device, which are dark before it is opened."""
+    lights = choose(options.lights, rig, str(options.camera))
+    if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
+        return _source(options, rig, camera, clock, true_clock, stop)
+    from slave.lights.controller import StrobeController
+    from slave.lights.simulated import SimulatedStrobe
+    from slave.lights.strobed import StrobedCamera, schedule_of
+
+    limits, schedule = limits_for(lights, rig), schedule_of(rig, camera)
+    if lights == SYNTHETIC:
+        strobe = SimulatedStrobe(schedule, limits)
+        source = _source(options, rig, camera, clock, true_clock, stop, strobe)
+        return StrobedCamera(source, camera, rig, strobe)
+    guard = open_guarded(lights, rig)
+    try:
+        source = _source(options, rig, camera, clock, true_clock, stop)
+    except PhalanxError:
+        guard.close()
+        raise
+    return StrobedCamera(source, camera, rig, StrobeController(schedule, guard, clock))
+
+
 def _source(
     options: argparse.Namespace,
     rig: RigCalibration,
@@ -124,6 +159,7 @@ def _source(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None = None,
+    lights: "LitBy | None" = None,
 ) -> FrameSource:
     """Open the camera; with `stop`, a real one that is lost later is opened again until that is set."""
     wrist = rig.kind == "wrist"
@@ -141,8 +177,30 @@ def _source(
         scene = scene_of(options.calibration, rig, options.scene, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
-        return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock)
+        return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock, lights=lights)
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
+
+
+def _lights(options: argparse.Namespace) -> int:
+    from slave.lights.report import blink, budget
+
+    rig = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
+    camera = load(options.calibration / "cameras" / f"{rig.cameras[0]}.json", CameraCalibration)
+    if not (options.blink or options.off):
+        print(budget(rig, camera))
+        return 0
+    if options.lights is None:
+        raise LightsError(f"--blink and --off need the lights: --lights {SWITCHED}")
+    with _stop_by_signal() as stop:
+        guard = open_guarded(options.lights, rig)  # dark from here on
+        try:
+            if options.blink:
+                print(budget(rig, camera), flush=True)
+                blink(guard, rig, camera, stop, options.blink)
+        finally:
+            guard.close()
+    print(", ".join(f"{event} {count}" for event, count in guard.events().items()))
+    return 0
 
 
 def _record(options: argparse.Namespace) -> int:
@@ -172,7 +230,7 @@ def _record(options: argparse.Namespace) -> int:
     scene = (options.calibration, rig, options.scene, options.seed)
     imu = imu_of(str(options.camera), *scene) if options.imu else None
     display = ProgressDisplay(options.name, sys.stderr)
-    source = _source(options, rig, camera, clock, true_clock)
+    source = _lit_source(options, rig, camera, clock, true_clock)
     try:
         recorder = Recorder(
             options.output,
@@ -280,6 +338,7 @@ def _colours(options: argparse.Namespace) -> int:
 COMMANDS = {
     "run": _run,
     "imu": _imu,
+    "lights": _lights,
     "record": _record,
     "join": _join,
     "detect": _detect,

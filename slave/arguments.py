@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slave.cameras import real
+from slave.lights.opening import CHOICES, SWITCHED
 
 ABOUT = (
     "The slave stands beside a camera: it finds the painted markers, or the fingers before a wrist device, and sends\n"
@@ -35,6 +36,17 @@ HELP = {
   phalanx-slave imu --name imu --rig wrist --imu synthetic --bind 127.0.0.1 --key-file rig.key
         waits for the master's start, then sends one sealed datagram per sample: that of the simulated hand; with
         cameras in other processes, all with the same --scene, --seed and --scene-epoch-ns
+""",
+    ),
+    "lights": (
+        "budget and test of laser and LEDs",
+        """\
+  phalanx-slave lights --rig wrist
+        what the strobe of a rig may do, and what share of every limit for eyes and supply that is
+  phalanx-slave lights --rig wrist --lights gpio:0:17,27 --blink 3
+        three seconds of laser and LEDs in turn, as before a camera, within the limits; gpio:0:17/low,27 where low is on
+  phalanx-slave lights --rig wrist --lights i2c:1:0x63 --off
+        dark, whatever was before: for a service that ends the slave by force
 """,
     ),
     "record": (
@@ -88,6 +100,7 @@ def parser() -> argparse.ArgumentParser:
     fill = {
         "run": _run,
         "imu": _imu,
+        "lights": _lights,
         "record": _record,
         "join": _join,
         "detect": _detect,
@@ -133,6 +146,19 @@ def _imu(imu: argparse.ArgumentParser) -> None:
     )
     _link(imu)
     _simulated(imu.add_argument_group("synthetic IMU").add_argument)
+
+
+def _lights(lights: argparse.ArgumentParser) -> None:
+    lights.add_argument(
+        "--rig", default="wrist", help="rig, a file in DIR/rigs, with the key strobe (default: %(default)s)"
+    )
+    lights.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+    lights.add_argument("--lights", metavar="DRIVER", help=SWITCHED)
+    act = lights.add_mutually_exclusive_group()
+    act.add_argument(
+        "--blink", type=_positive, metavar="S", help="laser and LEDs in turn, for so many seconds"
+    )
+    act.add_argument("--off", action="store_true", help="switch both off")
 
 
 def _record(record: argparse.ArgumentParser) -> None:
@@ -216,6 +242,12 @@ def _camera(command: argparse.ArgumentParser) -> None:
     """All that opening a camera asks for."""
     _place(command, "camera of this slave, a member of the rig")
     command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    command.add_argument(
+        "--lights",
+        metavar="DRIVER",
+        help=f"who switches laser and LEDs of a wrist device: {CHOICES} (docs/safety.md); the last two: the camera's "
+        "own strobe output, or another controller. Before a synthetic camera synthetic (default) or camera",
+    )
     real.add_options(command)
     sim = command.add_argument_group("synthetic camera")
     _simulated(sim.add_argument)

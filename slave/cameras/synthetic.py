@@ -5,7 +5,8 @@ Frame k is exposed when the camera's own oscillator, which is the slave's (perha
 picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame rate loses
 frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
 
-The camera of a wrist device is lit in turn: frame k by what k modulo 3 says. There a slow process loses whole cycles,
+The camera of a wrist device takes what its lights had on while it exposed (`slave.lights.simulated`). Without lights
+it is a camera that switches them itself, frame k by what k modulo 3 says. Either way a slow process loses whole cycles,
 for of a strobe whose single frames are lost no triple would ever be whole.
 
 The lamp of the simulated room is such that the settings of the camera file at the start expose it well. Exposure and
@@ -31,8 +32,10 @@ from common.sim.scenes import renderer_of
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from slave.cameras.source import Frame
+from slave.lights.schedule import CYCLE as STROBE
+from slave.lights.synthetic import Lit
 
-STROBE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)  # of a wrist device, frame by frame
+WHOLE = 0.999  # of an exposure; what lit that much lit all of it
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
 
 
@@ -43,6 +46,14 @@ class _Skewed(Protocol):
     def to_true(self, t_ns: int) -> int: ...
 
     def from_true(self, t_ns: int) -> int: ...
+
+
+class LitBy(Protocol):
+    """What lights the scene; a `SimulatedStrobe`."""
+
+    def during(self, start_ns: int, stop_ns: int) -> Lit:
+        """How much of an exposure [ns] each light was on; exposures are asked for one after another."""
+        ...
 
 
 class SyntheticCamera:
@@ -57,6 +68,7 @@ class SyntheticCamera:
         start_offset_ns: int,
         true_clock: Clock,
         sleep: Callable[[float], None] = time.sleep,
+        lights: LitBy | None = None,
     ) -> None:
         """Prepare the renderer. The camera may join at any time: `seq` counts from the epoch.
 
@@ -68,6 +80,7 @@ class SyntheticCamera:
             start_offset_ns: How much later than the epoch frame 0 is taken [ns].
             true_clock: The clock of the scene.
             sleep: Waits so many seconds.
+            lights: What lights a wrist device, on `clock`; None: this camera switches its lights itself.
 
         Raises:
             CalibrationError: The scene has no such camera, or a marker without paint.
@@ -76,7 +89,7 @@ class SyntheticCamera:
         camera = scene.cameras[camera_name]
         self._lit_for, self._camera = camera, camera
         self._clock, self._true, self._sleep = clock, true_clock, sleep
-        self._epoch_ns = epoch_ns
+        self._epoch_ns, self._lights = epoch_ns, lights
         self._first_ns = self._own(epoch_ns + start_offset_ns)
         self._rate_hz = camera.frame_rate_hz
         self._rows_ns = camera.height_px * camera.row_time_us * 1e3
@@ -93,7 +106,7 @@ class SyntheticCamera:
             return None
         seq = self._due_next()
         t_ns = self._exposed_ns(seq)
-        image, lit = self._draw(seq, (self._true_ns(t_ns) - self._epoch_ns) * 1e-9)
+        image, lit = self._draw(seq, t_ns)
         self._next = seq + 1
         due = self._true_ns(t_ns + self._readout_ns)
         while (left_s := (due - self._true.now_ns()) * 1e-9) > 0.0:
@@ -126,15 +139,34 @@ class SyntheticCamera:
         """`camera.skipped`: frames that this process was too slow to draw; they count as dropped, too."""
         return {"camera.skipped": self.skipped}
 
-    def _draw(self, seq: int, t_s: float) -> tuple[Image, Illumination]:
-        """Frame `seq` at scene time `t_s` [s], and what lit it."""
+    def _draw(self, seq: int, t_ns: int) -> tuple[Image, Illumination]:
+        """Frame `seq`, mid-exposure at `t_ns` on its own clock, and what lit it."""
+        t_s = (self._true_ns(t_ns) - self._epoch_ns) * 1e-9
         if isinstance(self._renderer, WristRenderer):
+            if self._lights is not None:
+                return self._draw_lit(self._renderer, t_s, t_ns, self._lights)
             lit = STROBE[seq % len(STROBE)]
             return self._renderer.render(t_s, lit), lit
         image = self._renderer.render(t_s)
         if self._grey:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
         return image, Illumination.AMBIENT
+
+    def _draw_lit(
+        self, renderer: WristRenderer, t_s: float, t_ns: int, lights: LitBy
+    ) -> tuple[Image, Illumination]:
+        """What the lights had on during the exposure; a light that was on for a part of it adds that part."""
+        half_ns = round(self._camera.exposure_us * 500.0)
+        lit = lights.during(t_ns - half_ns, t_ns + half_ns)
+        shares = {Illumination.LASER: lit.laser, Illumination.LED: lit.led}
+        if all(share <= 0.0 or share >= WHOLE for share in shares.values()) and lit.laser * lit.led == 0.0:
+            return renderer.render(t_s, lit.mostly), lit.mostly
+        ambient = renderer.render(t_s, Illumination.AMBIENT).astype(np.float32)
+        image = ambient.copy()
+        for light, share in shares.items():
+            if share > 0.0:
+                image += np.float32(share) * (renderer.render(t_s, light) - ambient)
+        return np.clip(np.rint(image), 0, 255).astype(np.uint8), lit.mostly
 
     @property
     def _readout_ns(self) -> int:

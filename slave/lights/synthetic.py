@@ -3,6 +3,7 @@
 import threading
 from collections import deque
 from dataclasses import dataclass
+from itertools import pairwise
 
 from common.clock import Clock
 from common.frame_recording import Illumination
@@ -43,8 +44,7 @@ class Timeline:
         with self._lock:
             switched = list(self._switched)
         on_ns = {Illumination.LASER: 0, Illumination.LED: 0}
-        ends = [t_ns for t_ns, _ in switched[1:]] + [max(stop_ns, start_ns)]
-        for (t_ns, lit), end_ns in zip(switched, ends, strict=True):
+        for (t_ns, lit), (end_ns, _) in pairwise([*switched, (stop_ns, Illumination.AMBIENT)]):
             if lit in on_ns:
                 on_ns[lit] += max(min(end_ns, stop_ns) - max(t_ns, start_ns), 0)
         whole_ns = stop_ns - start_ns

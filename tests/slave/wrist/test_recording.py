@@ -136,7 +136,8 @@ def test_frames_recorded_by_the_command_are_read_back_as_they_were(
 ) -> None:
     out = tmp_path / "rec"
     command = ["record", "--name", "wrist", "--rig", "wrist", "--calibration", str(TREE), "--frames", "12"]
-    assert main([*command, "--camera", "synthetic", "--scene", "curl", "-o", str(out)]) == 0
+    sensor = ["--camera", "synthetic", "--scene", "curl", "--lights", "camera"]
+    assert main([*command, *sensor, "-o", str(out)]) == 0
     recorded = open_recording(out)
     assert recorded.manifest.kind == "wrist"
     assert recorded.manifest.wrist_rig() == RIG

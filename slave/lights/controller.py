@@ -1,0 +1,174 @@
+"""Switches ambient -> laser -> LED in step with a camera: the push machine, and the thread that lives by it.
+
+`Strober.step` does what is due and says when to come again; it never waits. The thread does nothing but wait and step.
+A light goes on a lead before its exposure and off right after it. Whoever comes too late for the beginning of an
+exposure leaves that pulse out (`skipped`): a frame without its light is no triple, a light that smears into the next
+frame might become a wrong one. A light that came on only after the exposure had begun goes off at once (`late`).
+"""
+
+import logging
+import threading
+from collections import Counter
+
+from common.clock import Clock
+from common.errors import LightsError
+from slave.lights.guard import Guard
+from slave.lights.schedule import Pulse, StrobeSchedule
+
+FAILED_NS = 500_000_000  # after a driver has failed, no light for so long; then it is tried again
+IDLE_S = 0.5  # without frames
+LOG_EVERY_NS = 10_000_000_000
+EVENTS = ("skipped", "late")
+_LOG = logging.getLogger(__name__)
+
+
+class Strober:
+    """Makes the light of each frame. Holds the pulse that is on, and the last frame that was seen to.
+
+    Attributes:
+        counts: Event -> how often.
+            skipped: pulses left out, as it was too late for them.
+            late: pulses ended at once, as the driver took too long.
+    """
+
+    def __init__(self, schedule: StrobeSchedule, guard: Guard, clock: Clock) -> None:
+        """Begin dark.
+
+        Args:
+            schedule: Knows the exposures.
+            guard: The lights.
+            clock: That of the frames' stamps.
+        """
+        self._schedule, self._guard, self._clock = schedule, guard, clock
+        self._on: Pulse | None = None
+        self._number = -1
+        self._rest_until_ns: int | None = None
+        self._said_ns: int | None = None
+        self.counts: Counter[str] = Counter(dict.fromkeys(EVENTS, 0))
+
+    def step(self) -> int | None:
+        """Do what is due; when to come again [ns], None: when there is another frame."""
+        now_ns = self._clock.now_ns()
+        if self._rest_until_ns is not None and now_ns < self._rest_until_ns:
+            return self._rest_until_ns
+        try:
+            return self._step(now_ns)
+        except LightsError as error:
+            self._rest_until_ns = now_ns + FAILED_NS
+            self._on = None
+            self._say(now_ns, error)
+            return self._rest_until_ns
+
+    def dark(self) -> None:
+        """End what is on, now: the camera has stopped, or all ends."""
+        self._on = None
+        try:
+            self._guard.end()
+        except LightsError as error:
+            self._say(self._clock.now_ns(), error)
+
+    def _step(self, now_ns: int) -> int | None:
+        if self._on is not None:
+            if now_ns < self._on.off_ns:
+                return self._on.off_ns
+            self._guard.end()
+            self._on = None
+        if self._number < 0:
+            self._number = self._schedule.before(now_ns)
+        pulse = self._schedule.after(self._number)
+        while pulse is not None and now_ns > pulse.latest_ns:
+            self.counts["skipped"] += 1
+            self._number = pulse.number
+            pulse = self._schedule.after(self._number)
+        if pulse is None or now_ns < pulse.on_ns:
+            return None if pulse is None else pulse.on_ns
+        self._number = pulse.number
+        if not self._guard.begin(pulse.lit, pulse.off_ns - now_ns):
+            return pulse.off_ns
+        if self._clock.now_ns() > pulse.latest_ns:
+            self.counts["late"] += 1
+            self._guard.end()
+        else:
+            self._on = pulse
+        return pulse.off_ns
+
+    def renumber(self) -> None:
+        """The frames are counted anew."""
+        self._number = -1
+
+    def _say(self, now_ns: int, error: LightsError) -> None:
+        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
+            self._said_ns = now_ns
+            _LOG.warning("lights: %s", error)
+
+
+def told(guard: Guard, strober: Strober, schedule: StrobeSchedule) -> dict[str, int]:
+    """`lights.<event>` -> how often, of all three."""
+    own = {**guard.events(), **strober.counts, "restarts": schedule.restarts}
+    return {f"lights.{event}": count for event, count in own.items()}
+
+
+class StrobeController:
+    """Keeps a camera lit, on a thread of its own. Holds the strober and its schedule under one lock."""
+
+    def __init__(self, schedule: StrobeSchedule, guard: Guard, clock: Clock) -> None:
+        """Start the thread.
+
+        Args:
+            schedule: Fed by `push`.
+            guard: The lights; closed by `close`.
+            clock: That of the frames' stamps.
+        """
+        self._schedule, self._guard, self._clock = schedule, guard, clock
+        self._strober = Strober(schedule, guard, clock)
+        self._news = threading.Condition()
+        self._closed = False
+        self._thread = threading.Thread(target=self._work, name="strobe", daemon=True)
+        self._thread.start()
+
+    def push(self, seq: int, t_ns: int) -> None:
+        """A frame came; its mid-exposure [ns]."""
+        with self._news:
+            if self._schedule.push(seq, t_ns):
+                self._strober.renumber()
+            self._news.notify_all()
+
+    def expose(self, exposure_us: float) -> None:
+        """The camera exposes for so long from now on [us]."""
+        with self._news:
+            self._schedule.expose(exposure_us)
+
+    def stalled(self) -> None:
+        """There are no frames any more: go dark, and know nothing."""
+        with self._news:
+            self._schedule.forget()
+            self._strober.renumber()
+            self._strober.dark()
+            self._news.notify_all()
+
+    def counts(self) -> dict[str, int]:
+        """`lights.<event>` -> how often."""
+        return told(self._guard, self._strober, self._schedule)
+
+    def close(self) -> None:
+        """Go dark, end the thread, give the lights back. Safe to call twice.
+
+        Raises:
+            LightsError: The lights could not be darkened.
+        """
+        with self._news:
+            self._closed = True
+            self._strober.dark()
+            self._news.notify_all()
+        self._thread.join()
+        self._guard.close()
+
+    def _work(self) -> None:
+        with self._news:
+            while not self._closed:
+                again_ns = self._strober.step()
+                if again_ns is None:
+                    self._news.wait(IDLE_S)
+                elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
+                    self._news.wait(left_s)
+            self._strober.dark()

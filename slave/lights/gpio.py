@@ -1,0 +1,191 @@
+"""Laser and LEDs behind two GPIO lines, by libgpiod 2 (Linux's character device); the only file that knows it.
+
+`gpio:CHIP:LASER,LED`: the chip as a path, a name or a number, the lines as numbers of the chip or by name; `/low`
+after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a change
+seen, and read back.
+
+When the process ends, however it ends, the kernel gives the lines back. What the pin does then is the matter of the
+chip's driver: it may become an input, or keep its level (libgpiod says nothing of it). So a line alone does not darken
+a light whose process was killed during a pulse: a pull-down resistor and a monostable in series do (docs/safety.md).
+"""
+
+import errno
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from common.errors import LightsError
+from common.frame_recording import Illumination
+
+if TYPE_CHECKING:
+    from gpiod import LineRequest
+
+CONSUMER = "phalanx strobe"
+INSTALL = (
+    "--lights gpio needs the library gpiod 2: pip install 'phalanx-hand[wrist]', or on Raspberry Pi OS"
+    " `sudo apt install python3-libgpiod` and a virtual environment made with --system-site-packages"
+)
+FORM = "write gpio:CHIP:LASER,LED, for example gpio:0:17,27; gpio:0:17,27/low where low lights the LEDs"
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line: its number on the chip or its name, and whether low is on."""
+
+    place: int | str
+    active_low: bool
+
+    @classmethod
+    def of(cls, text: str) -> "Line":
+        """`17`, `GPIO17`, either with `/low`.
+
+        Raises:
+            LightsError: Neither.
+        """
+        place, slash, level = text.partition("/")
+        if not place or (slash and level != "low"):
+            raise LightsError(f"--lights gpio: line {text!r}: {FORM}")
+        return cls(int(place) if place.isdecimal() else place, bool(slash))
+
+
+class GpioLights:
+    """`Lights` behind two lines. Holds the request of the lines; None while the chip is away."""
+
+    def __init__(self, place: str) -> None:
+        """Request the lines, dark.
+
+        Args:
+            place: CHIP:LASER,LED.
+
+        Raises:
+            LightsError: No such chip or line, not allowed, in use by somebody else, or the library is missing.
+        """
+        chip, colon, lines = place.rpartition(":")
+        names = lines.split(",")
+        if not colon or not chip or len(names) != 2:
+            raise LightsError(f"--lights gpio:{place}: {FORM}")
+        self._chip = _path_of(chip)
+        self._laser, self._led = Line.of(names[0]), Line.of(names[1])
+        if self._laser.place == self._led.place:
+            raise LightsError(f"--lights gpio:{place}: laser and LEDs on one line; {FORM}")
+        self._gpiod = _library()
+        self._closed = False
+        self._request: LineRequest | None = self._requested()
+        self._reopened = 0
+
+    def switch(self, lit: Illumination) -> None:
+        """Set both lines; lines that were lost are requested again first.
+
+        Raises:
+            LightsError: The chip is gone, or a line does not follow.
+        """
+        if self._closed:
+            return
+        if self._request is None:
+            self._request = self._requested()
+            self._reopened += 1
+        value = self._gpiod.line.Value
+        lights = (Illumination.LASER, Illumination.LED)
+        wanted = [value.ACTIVE if lit is light else value.INACTIVE for light in lights]
+        places = [self._laser.place, self._led.place]
+        try:
+            self._request.set_values(dict(zip(places, wanted, strict=True)))
+            got = self._request.get_values(places)
+        except OSError as error:
+            self._lose()
+            raise LightsError(f"{self._chip}: lost: {error.strerror or error}") from error
+        if got != wanted:
+            raise LightsError(
+                f"{self._chip}: lines {places[0]} and {places[1]} were set to {_levels(wanted)} and read"
+                f" {_levels(got)}: something else drives them, or they are shorted"
+            )
+
+    def off(self) -> None:
+        """Set both lines dark."""
+        self.switch(Illumination.AMBIENT)
+
+    def close(self) -> None:
+        """Dark, and the lines given back."""
+        try:
+            if self._request is not None:
+                self.off()
+        finally:
+            self._closed = True
+            self._lose()
+
+    def counts(self) -> dict[str, int]:
+        """`reopened`: how often the chip was lost and came back."""
+        return {"reopened": self._reopened}
+
+    def _lose(self) -> None:
+        request, self._request = self._request, None
+        if request is not None:
+            request.release()
+
+    def _requested(self) -> "LineRequest":
+        settings, line = self._gpiod.LineSettings, self._gpiod.line
+        config = {
+            one.place: settings(
+                direction=line.Direction.OUTPUT,
+                drive=line.Drive.PUSH_PULL,
+                active_low=one.active_low,
+                output_value=line.Value.INACTIVE,
+            )
+            for one in (self._laser, self._led)
+        }
+        try:
+            return self._gpiod.request_lines(self._chip, config=config, consumer=CONSUMER)
+        except (OSError, ValueError) as error:
+            raise LightsError(self._why(error)) from error
+
+    def _why(self, error: OSError | ValueError) -> str:
+        """What a user can do about a request that failed."""
+        lines = f"{self._laser.place}, {self._led.place}"
+        code = error.errno if isinstance(error, OSError) else None
+        if code == errno.ENOENT and "line" not in str(error).lower():
+            return f"{self._chip}: no such GPIO chip; `gpiodetect` lists them"
+        if code in (errno.EACCES, errno.EPERM):
+            return (
+                f"{self._chip}: not allowed; add the user to the group that owns it (gpio on Raspberry Pi OS)"
+            )
+        if code == errno.EBUSY:
+            return f"{self._chip}: line {lines}: in use by {self._users()}; `gpioinfo` shows by whom"
+        if code in (errno.ENODEV, errno.ENOTTY):
+            return f"{self._chip}: is no GPIO chip; `gpiodetect` lists them"
+        return f"{self._chip}: line {lines}: cannot be requested ({error}); `gpioinfo` lists the lines"
+
+    def _users(self) -> str:
+        """Who has the lines."""
+        try:
+            with self._gpiod.Chip(self._chip) as chip:
+                infos = [chip.get_line_info(one.place) for one in (self._laser, self._led)]
+        except OSError:
+            return "somebody"
+        found = [f"{info.consumer or 'the kernel'} ({info.offset})" for info in infos if info.used]
+        return ", ".join(found) or "somebody"
+
+
+def _path_of(chip: str) -> str:
+    if chip.isdecimal():
+        return f"/dev/gpiochip{chip}"
+    return chip if "/" in chip else f"/dev/{chip}"
+
+
+def _levels(values: Sequence[object]) -> str:
+    return " ".join(str(getattr(value, "name", value)).lower() for value in values)
+
+
+def _library() -> ModuleType:
+    """The library, in version 2.
+
+    Raises:
+        LightsError: It is missing, or version 1.
+    """
+    try:
+        import gpiod
+    except ImportError as error:
+        raise LightsError(INSTALL) from error
+    if not hasattr(gpiod, "request_lines"):
+        raise LightsError(f"gpiod {gpiod.__version__} is too old; {INSTALL}")
+    return gpiod

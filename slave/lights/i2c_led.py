@@ -1,0 +1,199 @@
+"""Laser and LEDs behind one LM3644 flash driver on I2C: LED1 drives the laser, LED2 the LEDs.
+
+Texas Instruments, LM3644, SNVSA52E (September 2016); sections of that data sheet below. Its flash mode is begun by
+one write and ended by another, or by the chip itself: after the time-out, 10 ms at the least, it clears the mode bits
+(8.3.1, 8.4.5.2). So a pulse ends though the slave was killed, the bus is cut or the kernel has died: the chip needs
+nobody. It also regulates the currents, and stops for shorts and heat. The LM3644TT, whose shortest time-out is 40 ms,
+is refused.
+
+A fault takes the chip to standby until both flag registers are read, which clears them (8.4.5.1): they are read after
+every pulse, and counted by name. After an unplug all registers have their defaults: everything is written and read back
+again before the next pulse. Registers are written at 400 kHz in 70 us, at 100 kHz in 0.3 ms: well within the lead.
+
+Torch and IR mode, in which no time-out ends the light, are never written.
+"""
+
+from collections import Counter
+
+from smbus2 import SMBus
+
+from common.errors import LightsError
+from common.frame_recording import Illumination
+from common.strobe_calibration import StrobeCalibration
+
+ADDRESS = 0x63  # 8.5.2.4
+# 8.6.1 to 8.6.12
+ENABLE, LED1_FLASH, LED2_FLASH, TIMING, FLAGS1, FLAGS2, DEVICE_ID = 0x01, 0x03, 0x04, 0x08, 0x0A, 0x0B, 0x0C
+STANDBY = 0x00  # 8.6.1: mode 00, no LED, and neither TX, strobe nor torch pin has a say
+FLASH = {Illumination.LASER: 0x0D, Illumination.LED: 0x0E}  # 8.6.1: mode 11 (flash) with LED1, with LED2
+IS_ON = 0x0F  # 8.6.1: mode and LED bits
+TIMEOUT_10_MS = 0x10  # 8.6.8: bits 3-0 0000: 10 ms; bits 6-4, the torch's ramp, as after a reset
+ID_MASK, LM3644, LM3644TT = 0x3F, 0x02, 0x04  # 8.6.12
+LEAST_A, STEP_A, MOST_CODE = 0.0109, 0.011725, 0x7F  # 8.6.3, 8.6.4: I = code x 11.725 mA + 10.9 mA
+# 8.6.10, 8.6.11, from bit 0 on
+FAULTS1 = (
+    "timeout",
+    "undervoltage",
+    "overheated",
+    "current_limit",
+    "led_short",
+    "laser_short",
+    "out_short",
+    "tx",
+)
+FAULTS2 = ("led_hot", "overvoltage", "input_low", "ntc_open", "ntc_short")
+
+
+class FlashDriverLights:
+    """`Lights` behind the chip. Holds the open bus, and whether the chip is known to be set up; counts its faults."""
+
+    def __init__(self, place: str, strobe: StrobeCalibration) -> None:
+        """Open the bus, and set the chip up, dark.
+
+        Args:
+            place: BUS[:ADDRESS], numbers; the address in C's notation.
+            strobe: With the currents of laser and LEDs.
+
+        Raises:
+            LightsError: No such bus, not allowed, no chip there or another one; a current is missing or out of range.
+        """
+        bus, colon, address = place.partition(":")
+        try:
+            self._number, self._address = int(bus), int(address, 0) if colon else ADDRESS
+        except ValueError as error:
+            raise LightsError(
+                f"--lights i2c:{place}: write i2c:BUS, or i2c:BUS:ADDRESS, for example i2c:1:0x63"
+            ) from error
+        self._where = f"I2C bus {self._number}, address 0x{self._address:02x}"
+        self._codes = (
+            current_code(strobe.laser.current_a, "laser"),
+            current_code(strobe.led.current_a, "led"),
+        )
+        self._bus: SMBus | None = None
+        self._ready = self._closed = False
+        self._counts: Counter[str] = Counter({"reopened": 0})
+        self._set_up()
+
+    def switch(self, lit: Illumination) -> None:
+        """Begin a flash, or end it; a chip that was away is set up again first.
+
+        Raises:
+            LightsError: The chip does not answer, or did not go dark.
+        """
+        if lit not in FLASH:
+            self.off()
+            return
+        if self._closed:
+            return
+        if not self._ready:
+            self._set_up()
+            self._counts["reopened"] += 1
+        self._write(ENABLE, FLASH[lit])
+
+    def off(self) -> None:
+        """Standby, read back; then the flags."""
+        if self._closed:
+            return
+        self._write(ENABLE, STANDBY)
+        if (got := self._read(ENABLE)) & IS_ON:
+            raise LightsError(f"{self._where}: was sent to standby, and says 0x{got:02x}: it may be lit")
+        self._count_faults()
+
+    def close(self) -> None:
+        """Standby, and the bus given back."""
+        if self._closed:
+            return
+        try:
+            self.off()
+        finally:
+            self._closed = True
+            self._drop()
+
+    def counts(self) -> dict[str, int]:
+        """`fault.<name>`: what the chip's flags said; `reopened`: how often it was lost and came back."""
+        return dict(self._counts)
+
+    def _set_up(self) -> None:
+        """Check which chip it is, and write and read back what it needs."""
+        if self._bus is None:
+            self._bus = self._opened()
+        self._write(ENABLE, STANDBY)
+        kind = self._read(DEVICE_ID) & ID_MASK
+        if kind != LM3644:
+            what = "an LM3644TT, whose shortest time-out is 40 ms" if kind == LM3644TT else f"id 0x{kind:02x}"
+            raise LightsError(f"{self._where}: is {what}; an LM3644 (id 0x{LM3644:02x}) is needed")
+        laser, led = self._codes  # bit 7 of LED1's register clear: LED2 has a current of its own (8.6.3)
+        wanted = {LED1_FLASH: laser, LED2_FLASH: led, TIMING: TIMEOUT_10_MS, ENABLE: STANDBY}
+        for register, value in wanted.items():
+            self._write(register, value)
+        for register, value in wanted.items():
+            if (got := self._read(register)) != value:
+                raise LightsError(
+                    f"{self._where}: register 0x{register:02x} was set to 0x{value:02x} and reads 0x{got:02x}"
+                )
+        self._count_faults()
+        self._ready = True
+
+    def _count_faults(self) -> None:
+        for register, names in ((FLAGS1, FAULTS1), (FLAGS2, FAULTS2)):
+            flags = self._read(register)
+            self._counts.update(f"fault.{name}" for bit, name in enumerate(names) if flags >> bit & 1)
+
+    def _write(self, register: int, value: int) -> None:
+        try:
+            self._opened_bus().write_byte_data(self._address, register, value)
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def _read(self, register: int) -> int:
+        try:
+            return int(self._opened_bus().read_byte_data(self._address, register))
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def _opened_bus(self) -> SMBus:
+        if self._bus is None:
+            self._bus = self._opened()
+        return self._bus
+
+    def _lost(self, error: OSError) -> LightsError:
+        """The bus is opened anew next time: it may have been an adapter that was unplugged."""
+        self._drop()
+        return LightsError(
+            f"{self._where}: no answer ({error.strerror or error}); `i2cdetect -y {self._number}` shows who answers"
+        )
+
+    def _drop(self) -> None:
+        bus, self._bus, self._ready = self._bus, None, False
+        if bus is not None:
+            bus.close()
+
+    def _opened(self) -> SMBus:
+        try:
+            return SMBus(self._number)
+        except FileNotFoundError as error:
+            raise LightsError(
+                f"I2C bus {self._number}: no /dev/i2c-{self._number}; on a Pi: sudo raspi-config nonint do_i2c 0"
+            ) from error
+        except PermissionError as error:
+            raise LightsError(
+                f"I2C bus {self._number}: not allowed; add the user to the group i2c"
+            ) from error
+        except OSError as error:
+            raise LightsError(f"I2C bus {self._number}: cannot be opened: {error.strerror}") from error
+
+
+def current_code(current_a: float | None, light: str) -> int:
+    """Code of the largest current that is not above `current_a` [A] (8.6.3).
+
+    Raises:
+        LightsError: There is none, or it is out of range.
+    """
+    most_a = LEAST_A + MOST_CODE * STEP_A
+    if current_a is None or not LEAST_A <= current_a <= most_a:
+        has = "missing" if current_a is None else f"{current_a:g}"
+        raise LightsError(
+            f"--lights i2c: strobe.{light}.current_a of the rig file: {has}; the chip has {LEAST_A:g} to"
+            f" {most_a:.2f} A"
+        )
+    return int((current_a - LEAST_A) / STEP_A + 1e-9)

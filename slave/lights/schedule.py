@@ -1,0 +1,158 @@
+"""When the next exposures of a camera are, and what is to light each: from the stamps of the frames so far (row D2).
+
+The stamps of a camera that runs freely lie on a line: mid-exposure = first + number x period. A line is fitted to the
+last ones by least squares, numbers counted by time alone (so that lost frames and drivers that number only what they
+deliver do no harm), and read where the next frames will be. There is no schedule until the stamps lie on a line well
+enough that an exposure is known to a part of the lead, and none beyond `AHEAD` periods after the last frame: a camera
+that stalls is not lit.
+
+Frame number k of the strobe's cycle is ambient, laser, LED as k modulo 3 is 0, 1, 2. Which frame is number 0 is agreed
+with nobody: what a frame is, its content says (`slave.wrist.strobe`).
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.frame_recording import Illumination
+
+CYCLE = (Illumination.AMBIENT, Illumination.LASER, Illumination.LED)
+KEPT = 45  # stamps: half a second at 90 Hz, over which no oscillator drifts by a microsecond
+LEAST = 9  # stamps before anything is predicted
+AHEAD = 9  # periods after the last stamp: a frame is handed over late, and some may be lost
+OFF_LINE = 0.25  # periods; a stamp farther from the line belongs to another one
+FORGOTTEN = 90  # periods without a frame, after which a new line is begun
+SIGMAS = 3.0  # of the prediction that must fit into `GUARD_NS`
+GUARD_NS = 200_000  # a light is on from so long before an exposure to so long after it at least
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """One light for one exposure; times on the clock of the stamps [ns].
+
+    Attributes:
+        number: Frame number in the cycle's count.
+        lit: The light.
+        on_ns: When to switch it on.
+        latest_ns: Later than this it must not go on any more: the exposure would begin without it.
+        off_ns: When to switch it off.
+    """
+
+    number: int
+    lit: Illumination
+    on_ns: int
+    latest_ns: int
+    off_ns: int
+
+
+class StrobeSchedule:
+    """Predicts. Holds the last stamps with their numbers, and the line through them.
+
+    Attributes:
+        restarts: How often the stamps left the line, or were away too long, and a new one was begun.
+    """
+
+    def __init__(
+        self, frame_rate_hz: float, exposure_us: float, lead_us: float, offset_us: float = 0.0
+    ) -> None:
+        """Know of no frame yet.
+
+        Args:
+            frame_rate_hz: Of the camera file: single frames.
+            exposure_us: Exposure and, of a rolling shutter, the reading of all rows [us].
+            lead_us: How much before an exposure a light goes on [us].
+            offset_us: How much later exposures are than their stamps say [us].
+        """
+        self._nominal_ns = 1e9 / frame_rate_hz
+        self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)
+        self.expose(exposure_us)
+        self._stamps: deque[tuple[int, int]] = deque(maxlen=KEPT)
+        self._line: tuple[int, float, float] | None = None
+        self.restarts = 0
+
+    def expose(self, exposure_us: float) -> None:
+        """Take another exposure time [us], from the next pulse on."""
+        self._half_ns = round(exposure_us * 500.0)
+
+    @property
+    def length_ns(self) -> int:
+        """Of a pulse as planned [ns]."""
+        return self._lead_ns + 2 * self._half_ns + GUARD_NS
+
+    @property
+    def ready(self) -> bool:
+        """Whether exposures are known well enough."""
+        return self._line is not None
+
+    def push(self, seq: int, t_ns: int) -> bool:
+        """Take the stamp of a frame: mid-exposure [ns]; whether a new line is begun, whose numbers begin anew.
+
+        The number `seq` matters for the first frame of a line only.
+        """
+        if not self._stamps:
+            self._stamps.append((seq, t_ns))
+            return True
+        number, last_ns = self._stamps[-1]
+        at, period_ns = (last_ns, self._nominal_ns) if self._line is None else self._at(number)
+        periods = (t_ns - at) / period_ns
+        step = round(periods)
+        if abs(periods - step) > OFF_LINE or not 0 <= step <= FORGOTTEN:
+            self.restarts += 1
+            self._stamps.clear()
+            self._stamps.append((seq, t_ns))
+            self._line = None
+            return True
+        if step > 0:  # else it is the last one again
+            self._stamps.append((number + step, t_ns))
+            self._line = self._fitted()
+        return False
+
+    def forget(self) -> None:
+        """The camera has stopped: predict nothing until its frames are known anew."""
+        self._stamps.clear()
+        self._line = None
+
+    def before(self, now_ns: int) -> int:
+        """Number of the last frame whose exposure has begun; -1: not known."""
+        if self._line is None:
+            return -1
+        number, period_ns = self._stamps[-1][0], self._line[2]
+        begun_ns = self._at(number)[0] + self._offset_ns - self._half_ns
+        return number + int((now_ns - begun_ns) // period_ns)
+
+    def after(self, number: int) -> Pulse | None:
+        """The first pulse of a frame after frame `number`; None: not known, or too far ahead."""
+        if self._line is None:
+            return None
+        for k in range(number + 1, self._stamps[-1][0] + AHEAD + 1):
+            lit = CYCLE[k % len(CYCLE)]
+            if lit is not Illumination.AMBIENT:
+                middle_ns = round(self._at(k)[0]) + self._offset_ns
+                start_ns, stop_ns = middle_ns - self._half_ns, middle_ns + self._half_ns
+                return Pulse(k, lit, start_ns - self._lead_ns, start_ns - GUARD_NS // 2, stop_ns + GUARD_NS)
+        return None
+
+    def _at(self, number: int) -> tuple[float, float]:
+        """Stamp of a frame by the line, and its slope [ns]."""
+        assert self._line is not None
+        first, at_first, period_ns = self._line
+        return first + at_first + (number - self._stamps[0][0]) * period_ns, period_ns
+
+    def _fitted(self) -> tuple[int, float, float] | None:
+        """First stamp, the line's value there less that, and its slope [ns]; None: not known well enough."""
+        if len(self._stamps) < LEAST:
+            return None
+        first_number, first_ns = self._stamps[0]
+        k = np.array([number - first_number for number, _ in self._stamps], np.float64)
+        t = np.array([t_ns - first_ns for _, t_ns in self._stamps], np.float64)
+        middle, mean = k.mean(), t.mean()
+        spread = float(((k - middle) ** 2).sum())
+        slope = float(((k - middle) * (t - mean)).sum()) / spread
+        at_first = float(mean - slope * middle)
+        rms = float(np.sqrt(((t - at_first - slope * k) ** 2).sum() / (len(k) - 2)))
+        farthest = k[-1] + AHEAD - middle
+        sigma = rms * float(np.sqrt(1.0 / len(k) + farthest**2 / spread))
+        if SIGMAS * sigma > GUARD_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
+            return None
+        return first_ns, at_first, slope
