@@ -47,61 +47,73 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
     reach = reach_of(view)
     runs = line_runs(laser, reach.first_row)
+    if not len(runs.row):
+        return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
-    if len(points):
-        finger[~in_lines(runs)] = NONE
-        finger = _at_creases(finger, runs)
-        finger[~reach.holds(finger, points)] = NONE
-    share = np.ones(len(points))
-    thumb = finger == 0
-    share[thumb] = reach.of_thumb(points[thumb])
+    finger[~in_lines(runs)] = NONE
+    finger = _at_creases(finger, runs)
+    finger[~reach.holds(finger, points)] = NONE
+    share = None
+    if len(thumb := np.flatnonzero(finger == 0)):
+        share = np.ones(len(points))
+        share[thumb] = reach.of_thumb(points[thumb])
     return _centroids(points, runs, finger, share, view, shown=fingers.shown)
 
 
 def _centroids(
-    points: Float, runs: Runs, finger: Int, share: Float, view: WristView, *, shown: bool
+    points: Float, runs: Runs, finger: Int, share: Float | None, view: WristView, *, shown: bool
 ) -> LaserLines:
-    """Centroids by length of the pieces of line, each with its share of the finger."""
+    """Centroids by length of the pieces of line, each with its share (N,) of the finger; None: wholly the finger's."""
     on = finger != NONE
-    here = np.arange(len(points))
-    linked = on & (runs.following != here) & (finger[runs.following] == finger)
-    linked_back = on & (runs.preceding != here) & (finger[runs.preceding] == finger)
-    right, left = here[on & ~linked], here[on & ~linked_back]
-    last = np.concatenate([right, left])
-    # Runs to the left and to the right in one row, so that both kinds of ends are gone back from alike.
-    back = np.concatenate([runs.preceding, runs.following + len(here)])
-    end, inner = _ends(points, finger, last, len(right), back)
-    # The links beyond where a line is drawn straight are replaced by the piece to its end.
-    bent = right[inner[: len(right)] != right]
-    linked[runs.preceding[bent]] = linked[runs.preceding[runs.preceding[bent]]] = False
-    bent = left[inner[len(right) :] != left]
-    linked[bent] = linked[runs.following[bent]] = False
-    a = here[linked]
-    b = runs.following[a]
-    start = np.concatenate([points[a], points[inner]])
-    stop = np.concatenate([points[b], end])
-    sure = np.concatenate([(share[a] + share[b]) / 2.0, share[last]])
-    of: Bool = np.concatenate([finger[a], finger[last]]) == _FIVE
-    middle, piece = (start + stop) / 2.0, np.hypot(*(stop - start).T)
+    goes_on = finger[1:] == finger[:-1]
+    goes_on &= on[1:]
+    goes_on[runs.first[1:] - 1] = False
+    linked = np.zeros(len(on) + 1, dtype=np.bool_)  # whether a run goes on from the one before
+    linked[1:-1] = goes_on
+    left, right = np.flatnonzero(on & ~linked[:-1]), np.flatnonzero(on & ~linked[1:])
+    outer, inner = _ends(points, left, right)
+    # Pieces from run to run, of which those beyond `inner` are none: from there a line is drawn straight to its end.
+    u, v = runs.column.astype(np.float64), runs.row
+    down = v[1:] - v[:-1]
+    piece = np.sqrt(down * down + 1.0) * goes_on
+    bent = np.flatnonzero(inner[: len(left)] != left)
+    for k in (left[bent], left[bent] + 1, right[bent] - 1, right[bent] - 2):
+        piece[k] = 0.0
+    last = np.concatenate([left, right])
+    to_end = outer - points[inner]
+    piece = np.concatenate([piece, np.hypot(to_end[:, 0], to_end[:, 1])])
+    middle_u = np.concatenate([u[:-1] + 0.5, (outer[:, 0] + u[inner]) / 2.0])
+    middle_v = np.concatenate([(v[1:] + v[:-1]) / 2.0, (outer[:, 1] + v[inner]) / 2.0])
+    of = np.concatenate([finger[:-1], finger[last]]) + 1
+    line, doubt = _of_fingers(of, piece), np.zeros(5)
+    sure = (
+        np.ones(len(of)) if share is None else np.concatenate([(share[1:] + share[:-1]) / 2.0, share[last]])
+    )
     weight = piece * sure
-    line, length, u, v = (of @ np.stack([piece, weight, weight * middle[:, 0], weight * middle[:, 1]], -1)).T
+    length = _of_fingers(of, weight)
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack([u, v], axis=-1) / length[:, None]
+        uv = np.stack([_of_fingers(of, weight * m) / length for m in (middle_u, middle_v)], axis=-1)
+    if share is not None:  # of the thumb alone
+        away = np.abs(middle_u - uv[0, 0]) * (weight * (1.0 - sure)) * (of == 1)
+        doubt[0] = away.sum() / max(length[0], 1e-9)
     seen = line * reach_of(view).metres_per_px(uv) >= _LEAST_M
-    away = of * np.abs(middle[:, 0] - uv[:, :1])
-    away[:, weight == 0.0] = 0.0
-    doubt = away @ (weight * (1.0 - sure)) / np.maximum(length, 1e-9)
-    apart = _apart(points, finger, left, linked_back, runs.following)
-    column = points[:, 0]
-    cut = finger[(column < 1.0) | (column > view.optics.width_px - 2.0)] == _FIVE
-    brightest = ((finger == _FIVE) * runs.peak).max(axis=1, initial=0.0)
-    sigma = _sigma_px(doubt, apart, cut.any(axis=1), brightest < _FAINT, shown=shown)
+    cut = np.zeros(5, dtype=np.bool_)
+    cut[finger[on & ((u < 1.0) | (u > view.optics.width_px - 2.0))]] = True
+    brightest = np.zeros(6)
+    np.maximum.at(brightest, finger, runs.peak)  # those of no finger come last
+    apart = _apart(points, finger, left, right)
+    sigma = _sigma_px(doubt, apart, cut, brightest[:5] < _FAINT, shown=shown)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan
     return LaserLines(uv, sigma, length)
 
 
-def _apart(points: Float, finger: Int, left: Int, goes_on: Bool, following: Int) -> Float:
+def _of_fingers(of: Int, weight: Float) -> Float:
+    """Sums (5,) of weights (M,) by finger, which `of` (M,) counts from 1; 0: no finger."""
+    return np.asarray(np.bincount(of, weight, 6)[1:], np.float64)
+
+
+def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
     """Half of how far (5,) [px] the middle of a finger's line in parts lies from that of its longest part alone.
 
     NaN where the line is whole.
@@ -109,25 +121,19 @@ def _apart(points: Float, finger: Int, left: Int, goes_on: Bool, following: Int)
     Args:
         points: (N, 2) of runs.
         finger: (N,) of runs.
-        left: The runs at left ends.
-        goes_on: (N,) whether a run continues another of its finger.
-        following: (N,) of runs.
+        left: (P,) the first run of each part.
+        right: (P,) the last one.
     """
     out = np.full(5, np.nan)
-    for of in range(5):
-        starts = left[finger[left] == of].tolist()
-        if len(starts) < 2:
-            continue
-        middles: list[Float] = []
-        columns: list[int] = []
-        for k in starts:
-            part = [k]
-            while (after := int(following[part[-1]])) != part[-1] and goes_on[after] and finger[after] == of:
-                part.append(after)
-            middles.append(points[part].mean(axis=0))
-            columns.append(len(part))
-        whole = np.average(middles, axis=0, weights=columns)
-        out[of] = 0.5 * float(np.hypot(*(whole - middles[int(np.argmax(columns))])))
+    part = finger[left]
+    for of in np.flatnonzero(np.bincount(part, minlength=5) > 1).tolist():
+        parts = np.flatnonzero(part == of)
+        middles = np.array(
+            [points[a : b + 1].mean(axis=0) for a, b in zip(left[parts], right[parts], strict=True)]
+        )
+        columns = right[parts] - left[parts] + 1
+        whole = columns @ middles / columns.sum()
+        out[of] = 0.5 * float(np.hypot(*(whole - middles[int(columns.argmax())])))
     return out
 
 
@@ -142,33 +148,22 @@ def _sigma_px(doubt: Float, apart: Float, cut: Bool, faint: Bool, *, shown: bool
     return np.sqrt(_LINE_PX**2 + in_parts**2 + (_BALL_OF_THUMB * doubt) ** 2 + unshown**2)
 
 
-def _ends(points: Float, finger: Int, last: Int, rights: int, back: Int) -> tuple[Float, Int]:
-    """Where lines end (E, 2) beyond their last runs (E,), and from which run (E,) on the line is drawn straight there.
+def _ends(points: Float, left: Int, right: Int) -> tuple[Float, Int]:
+    """Where lines end (2 P, 2) beyond their first and last runs (P,), and from which runs (2 P,) on straight; left
+    ends first.
 
     A line goes round a finger until it is seen no more: near its end it falls away as the root of the distance to the
-    end does, most of it in less than a column, and dark. So it is continued from a few columns within.
-
-    Args:
-        points: (N, 2) of runs.
-        finger: (N,) of runs.
-        last: The runs, those at right ends first.
-        rights: How many they are.
-        back: (2 N,) run before each one, then N more than the run after each one.
+    end does, most of it in less than a column, and dark. So a long one is continued from a few columns within.
     """
-    count = len(points)
-    k = last.copy()
-    k[rights:] += count
-    inner = back[back[k]]
-    deep = back[back[back[inner]]] % count
-    inner %= count
-    smooth = (np.abs(points[last, 0] - points[deep, 0]) == 5.0) & (finger[deep] == finger[last])
-    smooth &= (points[inner, 0] != points[last, 0]) & (finger[inner] == finger[last])
+    long = np.where(right - left >= 5, 1, 0)
+    inner = np.concatenate([left + 2 * long, right - 2 * long])
+    deep = np.concatenate([left + 5 * long, right - 5 * long])
+    outer = points[np.concatenate([left, right])]
+    outer[: len(left), 0] -= 0.5
+    outer[len(left) :, 0] += 0.5
     bend = np.clip((points[deep, 1] - points[inner, 1]) / (np.sqrt(5.5) - np.sqrt(2.5)), 0.0, _STEEPEST)
-    end = points[last]
-    end[:rights, 0] += 0.5
-    end[rights:, 0] -= 0.5
-    end[:, 1] = np.where(smooth, points[inner, 1] - bend * np.sqrt(2.5), end[:, 1])
-    return end, np.where(smooth, inner, last)
+    outer[:, 1] = points[inner, 1] - bend * np.sqrt(2.5)
+    return outer, inner
 
 
 def _at_creases(finger: Int, runs: Runs) -> Int:
@@ -178,25 +173,28 @@ def _at_creases(finger: Int, runs: Runs) -> Int:
     uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
     """
     out = finger.copy()
-    following = runs.following
-    changes = np.flatnonzero((finger != finger[following]) & (finger >= 0) & (finger[following] >= 0))
-    for i in changes.tolist():
-        back = _climb(i, runs.preceding, runs.row, out == out[i])
-        ahead = _climb(int(following[i]), following, runs.row, finger == finger[following[i]])
-        line = back[::-1] + ahead
-        top = int(runs.row[line].argmin())
-        if len(line) - top < SHORT:
-            top = len(line)
-        elif top < SHORT:
-            top = 0
-        out[line[:top]], out[line[top:]] = out[i], finger[ahead[0]]
+    change = finger[1:] != finger[:-1]
+    change &= (finger[1:] >= 0) & (finger[:-1] >= 0)
+    change[runs.first[1:] - 1] = False
+    for i in np.flatnonzero(change).tolist():
+        of_line = int(np.searchsorted(runs.first, i, side="right"))
+        end = int(runs.first[of_line]) if of_line < len(runs.first) else len(finger)
+        begin = _climb(i, range(i - 1, int(runs.first[of_line - 1]) - 1, -1), runs.row, out == out[i])
+        stop = _climb(i + 1, range(i + 2, end), runs.row, finger == finger[i + 1]) + 1
+        top = begin + int(runs.row[begin:stop].argmin())
+        if stop - top < SHORT:
+            top = stop
+        elif top - begin < SHORT:
+            top = begin
+        out[begin:top], out[top:stop] = out[i], finger[i + 1]
     return out
 
 
-def _climb(start: int, step: Int, row: Float, same: Bool) -> list[int]:
-    """Runs from one on along a line, of the same finger: some columns, and farther while it rises in the image."""
-    out, k = [start], int(step[start])
-    while k != out[-1] and same[k] and (len(out) < _CREASE_PX or row[k] < row[out[-1]]):
-        out.append(k)
-        k = int(step[k])
-    return out
+def _climb(start: int, along: range, row: Float, same: Bool) -> int:
+    """The last run from one on along a line, of the same finger: some columns, and farther while it rises."""
+    last = start
+    for count, k in enumerate(along, 1):
+        if not (same[k] and (count < _CREASE_PX or row[k] < row[last])):
+            break
+        last = k
+    return last
