@@ -42,6 +42,7 @@ class Runs:
         start, end: (N,) first row, and the one after the last.
         peak: (N,) grey levels.
         first: (L,) the first run of each line.
+        joins: (L,) the line that each line runs into at its right end, or that one does, and so on; or the line itself.
     """
 
     column: Int
@@ -50,10 +51,11 @@ class Runs:
     end: Int
     peak: Float
     first: Int
+    joins: Int
 
 
 _NONE_INT: Int = np.empty(0, dtype=np.int64)
-_NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT)
+_NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT)
 
 
 def line_runs(laser: Image, first_row: int) -> Runs:
@@ -109,30 +111,32 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
 
 def in_lines(runs: Runs) -> Bool:
     """Which runs belong to a line: long enough, and not much darker than what is near, as a glow is."""
-    peak = runs.peak
-    columns = np.concatenate([runs.first[1:], [len(peak)]]) - runs.first
-    brightest = np.maximum.reduceat(peak, runs.first)
+    peak, joins = runs.peak, runs.joins
+    columns = np.diff(np.append(runs.first, len(peak)))
+    brightest = np.zeros(len(joins))
+    np.maximum.at(brightest, joins, np.maximum.reduceat(peak, runs.first))
     row, column = runs.start // _NEAR_PX, runs.column // _NEAR_PX
     across = int(column.max()) + 1
     cell = row * across + column
     around = np.zeros((int(row.max()) + 1) * across)
     np.maximum.at(around, cell, peak)
     near = np.asarray(cv2.dilate(around.reshape(-1, across), _NEAR), np.float64).ravel()[cell]
-    beside = np.maximum.reduceat(near, runs.first)
+    beside = np.zeros(len(joins))
+    np.maximum.at(beside, joins, np.maximum.reduceat(near, runs.first))
     of_column = np.zeros(int(runs.column.max()) + 1)
     np.maximum.at(of_column, runs.column, peak)
-    share = np.where(columns < SHORT, _GLOW_OF_SHORT, _GLOW)
-    line = (brightest >= share * beside) & (columns >= _FEWEST)
-    least = np.maximum(
-        np.repeat(np.where(line, _FADED * brightest, np.inf), columns), _SECOND * of_column[runs.column]
-    )
+    joined = np.bincount(joins, columns, len(joins))
+    share = np.where(joined < SHORT, _GLOW_OF_SHORT, _GLOW)
+    line = (brightest >= share * beside) & (joined >= _FEWEST)
+    least = np.repeat(np.where(line, _FADED * brightest, np.inf)[joins], columns)
+    np.maximum(least, _SECOND * of_column[runs.column], out=least)
     return peak >= least
 
 
 def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
     """Runs (N,), given by column and then by row, each with the nearest of those of the next column that it overlaps.
 
-    Where two meet in one, the line goes on from the nearer one.
+    Where two meet in one, the line goes on from the nearer one, and the other joins it.
     """
     there = (column + 1) * _COLUMN + row  # the same row of the next column
     after = np.searchsorted(there - _COLUMN, there)
@@ -144,15 +148,22 @@ def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
         (off < _JUMP_PX) & (start[near % len(near)] <= end) & (end[near % len(near)] >= start)
     )
     to = near[here]  # rising, as lines do not cross
+    lost: list[tuple[Int, Int]] = []
     while (twice := to[1:] == to[:-1]).any():
         k = np.flatnonzero(twice)
-        farther = k + (off[here[k + 1]] >= off[here[k]])
+        farther = np.unique(k + (off[here[k + 1]] >= off[here[k]]))
+        lost.append((here[farther], to[farther]))
         here, to = np.delete(here, farther), np.delete(to, farther)
     line = np.arange(len(column))
     line[here] = to
     for _ in range(int(column[-1] - column[0]).bit_length()):  # twice as far each time
         line = line[line]
     order = np.argsort(line, kind="stable")
-    line = line[order]
-    first = np.concatenate([[0], np.flatnonzero(line[1:] != line[:-1]) + 1])
-    return Runs(column[order], row[order], start[order], end[order], peak[order], first)
+    ends = line[order]
+    first = np.concatenate([[0], np.flatnonzero(ends[1:] != ends[:-1]) + 1])
+    joins = np.arange(len(first))
+    for source, target in lost:
+        joins[np.searchsorted(ends[first], line[source])] = np.searchsorted(ends[first], line[target])
+    for _ in lost:
+        joins = joins[joins]
+    return Runs(column[order], row[order], start[order], end[order], peak[order], first, joins)
