@@ -143,8 +143,15 @@ def _settings(task: Task) -> dict[str, object]:
         "guided": task.guided,
         "rig": task.rig.name,
         "hand": task.hand.name,
-        "conditions": [name_of(one) for one in task.conditions],
+        "frames_of": sorted(
+            {known for known, inputs in task.conditions if inputs == "detected"} | _calibrates(task)
+        ),
     }
+
+
+def _calibrates(task: Task) -> set[Known]:
+    """Whether the guided motion is needed."""
+    return {known for known, _ in task.conditions if known == "calibrated"}
 
 
 def _perform(task: Task, who: Participant, folder: Path) -> None:
@@ -157,7 +164,7 @@ def _perform(task: Task, who: Participant, folder: Path) -> None:
         folder.mkdir(parents=True)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
-    if any(known == "calibrated" for known, _ in task.conditions):
+    if _calibrates(task):
         record_guided(folder / GUIDED, who, task.camera, task.guided, task.step)
     record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step, task.trial_s)
 

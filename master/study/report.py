@@ -8,6 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import FINGERS
 from common.messages import Level
@@ -198,17 +199,33 @@ def _cause_lines(result: Result) -> list[str]:
 
 
 def _level_lines(result: Result) -> list[str]:
-    """From what the tracked fingers were solved."""
-    trials = result.trials[result.judged]
-    ranks = [rank for one in trials for rank, own in zip(one.level, one.tracked, strict=True) if own]
-    sure = [flag for one in trials for flag, own in zip(one.ambiguous, one.tracked, strict=True) if own]
-    parts = [f"{sum(rank == level for rank in ranks)} {level.name.lower()}" for level in Level]
-    return [f"Tracked fingers by level: {', '.join(parts)}; ambiguous: {sum(sure)}."]
+    """Mean error of the tracked fingers by what they were solved from, and whether that left a choice."""
+    kinds = (("laser alone (fk)", Level.FK, False), ("laser and tip (ik)", Level.IK, False))
+    lines = [
+        "By level, of the same condition: mean absolute error in degrees (trials).",
+        "",
+        "| solved from | " + " | ".join(FINGERS) + " |",
+        "|---|" + "--:|" * len(FINGERS),
+    ]
+    for name, level, ambiguous in (*kinds, ("laser and tip, ambiguous", Level.IK, True)):
+        texts: list[str] = []
+        for f in range(len(FINGERS)):
+            error = [
+                abs(one.pip_deg[f] - one.truth_deg[f])
+                for one in result.trials[result.judged]
+                if one.tracked[f] and one.level[f] == level and one.ambiguous[f] is ambiguous
+            ]
+            texts.append(f"{np.mean(error):.1f} ({len(error)})" if error else "none")
+        lines.append(f"| {name} | " + " | ".join(texts) + " |")
+    return lines
 
 
 def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
+    turns = np.array([(one.nominal_turn_deg, one.turn_deg) for one in calibrated.values()])
+    shifts = np.array([(one.nominal_shift_mm, one.shift_mm) for one in calibrated.values()])
+    before, after = (f"{_rms(turns[:, k]):.1f}° and {_rms(shifts[:, k]):.1f} mm" for k in (0, 1))
     lines = [
-        "How far the palm's pose is off, of the rig file and after the guided motion (at the knuckles):",
+        f"How far the palm's pose is off (shift at the knuckles): rms {before} in the rig file, {after} calibrated.",
         "",
         "| participant | file | calibrated | |",
         "|---|--:|--:|---|",
@@ -222,6 +239,10 @@ def _calibration_lines(calibrated: Mapping[str, Calibrated]) -> list[str]:
     return lines
 
 
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def _verdict(cells: list[Cell], again: list[Repeated]) -> list[str]:
     reached = [cell for cell in cells if cell.is_reached]
     above = [cell for cell in reached if cell.mean_deg >= paper.MEAN_LIMIT_DEG]
@@ -230,7 +251,9 @@ def _verdict(cells: list[Cell], again: list[Repeated]) -> list[str]:
         f"{cell.finger} {cell.pose} {cell.mean_deg:.1f}"
         for cell in sorted(above, key=lambda cell: -cell.mean_deg)
     )
-    below = ", ".join(f"{one.finger} {one.icc:.2f}" for one in low)
+    below = ", ".join(
+        f"{one.finger} {one.icc:.2f}" if math.isfinite(one.icc) else f"{one.finger} (none)" for one in low
+    )
     reach = f"Reached: {len(reached)} of {len(cells)} cells."
     limits = f"Not below {paper.MEAN_LIMIT_DEG:g}°: {worst or 'none'}. ICC below {paper.ICC_GOAL}: {below or 'none'}."
     return [f"{reach} {limits}"]
