@@ -195,3 +195,21 @@ def test_black_white_and_random_pictures_are_ordinary_input() -> None:
 def test_after_a_long_pause_the_cycle_is_not_held_against_the_stream() -> None:
     frames = clean() + [frame_of(one, 10_001 + place) for place, one in enumerate(shown())]
     assert len(pushed(frames)[0]) == 24
+
+
+@pytest.mark.parametrize("slower", [-0.003, 0.003])
+@pytest.mark.parametrize("ambient", ["dark", "indoor", "bright"])
+def test_a_real_sensor_of_10_bits_whose_clock_and_black_level_are_not_as_stated(
+    ambient: str, slower: float
+) -> None:
+    """Its clock 0.3 % off and a jitter of 50 us; black 64 of 1023, held from frame to frame within 8 (2 of 255)."""
+    rng = np.random.default_rng(11)
+    frames: list[Frame] = []
+    for k, one in enumerate(shown(ambient)):
+        level = 4.0 * one.image + 64.0 - 8.0 + rng.integers(-8, 9) + rng.uniform(0.0, 4.0, one.image.shape)
+        image = (np.minimum(level, 1023.0).astype(np.int64) >> 2).astype(np.uint8)
+        t_ns = 10**15 + round(k * PERIOD_NS * (1.0 + slower) + rng.normal(0.0, 50e3))
+        frames.append(Frame(k, t_ns, t_ns, image, Illumination.NONE))
+    assert seqs(pushed(frames)[0]) == seqs(pushed(clean(ambient))[0])
+    gap = pushed([*frames[:9], *frames[21:]])[0]  # four triples lost
+    assert [one.led.seq for one in gap] == [2, 5, 8, *range(23, 36, 3)]
