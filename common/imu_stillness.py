@@ -2,8 +2,8 @@
 
 What is constant cannot be told from a bias: whoever turns evenly about the vertical, slower than a gyroscope may be
 off, is taken to lie still. A person's slow motion is rarely so even. Time and the limits of single samples are those of
-VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by one degree, seen by
-gravity, or half a degree per second more or less is a motion.
+VQF (Laidig, Seel 2023); those of short means are narrower, for noise does not last: a tilt by half a degree,
+seen by gravity, or half a degree per second more or less is a motion.
 """
 
 from math import radians
@@ -12,7 +12,7 @@ from common.arrays import Float
 
 _FOR_S = 1.5
 _SAMPLE_RAD_S, _SAMPLE_M_S2 = radians(2.0), 0.5
-_SHORT_S, _SHORT_RAD_S, _SHORT_M_S2 = 0.3, radians(0.5), 0.15
+_SHORT_S, _SHORT_RAD_S, _SHORT_M_S2 = 0.3, radians(0.5), 0.1
 _LONG_S = 4.0
 _BIAS_RAD_S = radians(
     5.0
