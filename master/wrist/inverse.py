@@ -7,8 +7,9 @@ A finger has three unknowns and four numbers are seen (`master.wrist.finger_pose
 with R the covariance of what was seen; habits have no part in it. It can have several minima: a finger straight and
 low, or bent and high, may show its tip at the same place. All are looked for, the global one is among them:
 
-1. **table**: every node that explains better than its neighbours what was seen (`PoseTable.candidates`);
-2. **between nodes**: Gauss-Newton steps on the interpolated table, which merge and sort out most of these;
+1. **table**: for every PIP of a grid the node that explains best what was seen (`PoseTable.candidates`), brought by
+   Gauss-Newton steps on the interpolated table to the least energy at that PIP;
+2. **dips** of this energy over the PIP: from there the PIP moves too, and those that meet are one;
 3. **exactly**: the few that are left are refined with the laser's cut itself. Its derivatives are those of the table,
    mended after every step by what the step did (Broyden 1965).
 
@@ -22,14 +23,14 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
+from master.wrist.forward import PIP
 from master.wrist.pose_table import PoseTable
 from master.wrist.setup import WristSetup
 
 MINIMA = 3  # of one finger that are refined
-_CANDIDATES = 6
-_TABLE_STEPS, _EXACT_STEPS = 3, 8
+_PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 8
 _FARTHEST_RAD = np.radians(12.0)  # of one step
-_ARRIVED_RAD = np.radians(0.02)
+_ARRIVED_RAD = np.radians(0.1)  # a step no longer than this leads to within a few hundredths of a degree
 _SAME_RAD = np.radians(4.0)  # nearer to each other than this, two candidates are on their way to one minimum
 _HOPELESS = 40.0  # worse than the best by this on the table, a candidate is none; a table is wrong by less
 
@@ -43,12 +44,14 @@ class Minima:
         cov_rad2: (5, K, 3, 3).
         misfit: (5, K) the energy, a chi-square of SEEN - UNKNOWNS degrees of freedom where nothing is at its limit.
         length_px: (5, K) of the laser line there.
+        midway: (5, K) misfit half way from the best to each: little more than of these, and there is one wide valley.
     """
 
     x_rad: Float
     cov_rad2: Float
     misfit: Float
     length_px: Float
+    midway: Float
 
 
 class InverseModel:
@@ -68,16 +71,29 @@ class InverseModel:
             cov: (5, 4, 4) its covariance, finite.
         """
         told: Bool = np.isfinite(seen.sum(axis=1)) & self._table.met
-        places, energy = self._table.candidates(np.where(told[:, None], seen, 0.0), _CANDIDATES)
-        finger, _ = rows = np.nonzero(np.isfinite(energy) & told[:, None])
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
-        x, misfit = places[rows], np.zeros(len(finger))
-        seen = seen[finger]
+        x, finger = self._dips(np.where(told[:, None], seen, 0.0), told, white)
+        misfit, seen = np.zeros(len(x)), seen[finger]
         for _ in range(_TABLE_STEPS):
             y, J, _ = self._table.views(x, finger)
             misfit, to = self._step(x, finger, white[finger], seen - y, J)
             x = x + to
         return self._exact(*self._left(x, finger, misfit, seen), white)
+
+    def _dips(self, seen: Float, told: Bool, white: Float) -> tuple[Float, Int]:
+        """Where the least energy for each PIP has its minima over the PIP: poses (N, 3) and their fingers (N,)."""
+        places, energy = self._table.candidates(seen)
+        finger, _ = rows = np.nonzero(np.isfinite(energy) & told[:, None])
+        x, profile = places[rows], np.full(energy.shape, np.inf)
+        for _ in range(_PROFILE_STEPS):
+            y, J, _ = self._table.views(x, finger)
+            profile[rows], to = self._step(x, finger, white[finger], seen[finger] - y, J, bend=False)
+            x = x + to
+        places[rows] = x
+        dip = np.isfinite(profile)
+        dip[:, 1:] &= profile[:, 1:] <= profile[:, :-1]
+        dip[:, :-1] &= profile[:, :-1] <= profile[:, 1:]
+        return places[dip], np.nonzero(dip)[0]
 
     def _left(self, x: Float, finger: Int, misfit: Float, seen: Float) -> tuple[Float, Int, Float]:
         """Of candidates (N) those that are worth refining, sorted by finger and misfit, with what was seen of each."""
@@ -108,10 +124,21 @@ class InverseModel:
             # Where the laser misses, or a step led uphill: half the way back to the best.
             to = np.where(won[:, None], to, 0.5 * (best_x - x))
             x_before, y_before, x = x, y, x + to
-            moving = (np.abs(to) > _ARRIVED_RAD).any(axis=1)
+            moving &= (np.abs(to) > _ARRIVED_RAD).any(axis=1)
+            arrived = won & ~moving
+            best_x[arrived] = x[arrived]
+            moving &= best < best[np.searchsorted(finger, finger)] + _HOPELESS
             if not moving.any():
                 break
-        return self._sorted(best_x, best, length, best_J, white, finger, slot)
+        order = np.lexsort((best, finger))
+        best_x, best = best_x[order], best[order]
+        middle = 0.5 * (best_x + best_x[np.searchsorted(finger, finger)])
+        y, J, _ = self._table.views(middle, finger)
+        midway, _ = self._step(middle, finger, white, seen - y, J)
+        cov = self._cov(best_J[order], white, finger)
+        return _minima(
+            finger, slot, x_rad=best_x, cov_rad2=cov, misfit=best, length_px=length[order], midway=midway
+        )
 
     def _views(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float]:
         """What is seen (N, 4) of poses (N, 3), exactly, and how long the line is (N,); NaN where not wanted."""
@@ -120,8 +147,13 @@ class InverseModel:
         views = self.poses.views(grid, which)
         return views.seen[slot, finger], views.length_px[slot, finger]
 
-    def _step(self, x: Float, finger: Int, white: Float, off: Float, J: Float) -> tuple[Float, Float]:
-        """Energy (N,) of poses (N, 3) with residuals `off` (N, 4), inf where that is NaN, and a step towards less."""
+    def _step(
+        self, x: Float, finger: Int, white: Float, off: Float, J: Float, bend: bool = True
+    ) -> tuple[Float, Float]:
+        """Energy (N,) of poses (N, 3) with residuals `off` (N, 4), inf where that is NaN, and a step towards less.
+
+        Without `bend` the PIP is left as it is.
+        """
         low, high = self.poses.low[finger], self.poses.high[finger]
         off = (white @ off[..., None])[..., 0]
         energy = np.nan_to_num(np.vecdot(off, off), nan=np.inf)
@@ -129,30 +161,28 @@ class InverseModel:
         down = (np.swapaxes(slope, 1, 2) @ np.nan_to_num(off)[..., None])[..., 0]
         H = np.swapaxes(slope, 1, 2) @ slope
         stuck = ((x <= low) & (down < 0.0)) | ((x >= high) & (down > 0.0))
+        stuck[:, PIP] |= not bend
         H = np.where(stuck[:, None] | stuck[..., None], 0.0, H)
         np.einsum("nii->ni", H)[...] += np.where(stuck, 1.0, 1e-3 * self._loose[finger])
         to = np.linalg.solve(H, np.where(stuck, 0.0, down)[..., None])[..., 0]
         return energy, np.clip(x + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high) - x
 
-    def _sorted(
-        self, x: Float, misfit: Float, length: Float, J: Float, white: Float, finger: Int, slot: Int
-    ) -> Minima:
-        """Refined poses (N), with derivatives, as minima; the best of each finger first."""
+    def _cov(self, J: Float, white: Float, finger: Int) -> Float:
+        """Covariances (N, 3, 3) of unknowns at derivatives (N, 4, 3)."""
         slope = white @ J
         information = np.swapaxes(slope, 1, 2) @ slope
         np.einsum("nii->ni", information)[...] += self._loose[finger]
-        cov = np.asarray(np.linalg.inv(information), np.float64)
-        order = np.lexsort((misfit, finger))
-        out = Minima(
-            np.full((5, MINIMA, UNKNOWNS), np.nan),
-            np.full((5, MINIMA, UNKNOWNS, UNKNOWNS), np.nan),
-            np.full((5, MINIMA), np.inf),
-            np.full((5, MINIMA), np.nan),
-        )
-        at = finger, slot
-        out.x_rad[at], out.cov_rad2[at] = x[order], cov[order]
-        out.misfit[at], out.length_px[at] = misfit[order], length[order]
-        return out
+        return np.asarray(np.linalg.inv(information), np.float64)
+
+
+def _minima(finger: Int, slot: Int, **values: Float) -> Minima:
+    """Values (N, ...) of minima, as many of each finger."""
+    empty = {"misfit": np.inf, "midway": np.inf}
+    table: dict[str, Float] = {}
+    for name, value in values.items():
+        table[name] = np.full((5, MINIMA, *value.shape[1:]), empty.get(name, np.nan))
+        table[name][finger, slot] = value
+    return Minima(**table)
 
 
 def _mended(J: Float, by: Float, did: Float) -> Float:

@@ -10,7 +10,10 @@ is left, the misfit, is chi-square with one degree of freedom, and more than thr
 
 **Ambiguous** is a finger of which two clearly different poses misfit by amounts that do not differ significantly
 (chi-square of one degree of freedom, 95 %). Of these the one nearest to the finger's last angles is taken, if these are
-fresh, else the most natural one; the covariance is widened to hold all of them.
+fresh, else the most natural one; a pose that is so unnatural that this outweighs what it explains better is none of
+them. The covariance is widened to hold all. Where a fingertip turns back in the image, at the nearest place of its way
+to the camera, both sides of that turn explain it: if the misfit between them is no more than noise they are one wide
+valley, and its mean is taken.
 """
 
 from dataclasses import dataclass, replace
@@ -20,7 +23,7 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.hand_limits import FLEXION
 from common.messages import Level
-from master.ik.priors import Priors
+from master.ik.priors import FreeHand, Priors
 from master.wrist.belief import FingerAngles
 from master.wrist.finger_poses import SEEN, UNKNOWNS
 from master.wrist.forward import DIP, PIP
@@ -30,6 +33,7 @@ from master.wrist.sight import HARDLY, SightNoise
 
 _REFUSED = 9.0
 _AS_GOOD = 3.84
+_FLAT = 1.0  # two minima with no more than one standard deviation between them are one
 _APART_RAD = np.radians(10.0)  # in flexion or PIP: clearly another pose
 _RATIOS = 0.5 * (
     0.84 - 2.0 / 3.0
@@ -64,7 +68,9 @@ class Levels:
     def __init__(self, setup: WristSetup, model: InverseModel, priors: Priors | None = None) -> None:
         self._model, self._hand, self._sight = model, setup.model, SightNoise(setup)
         self._alone = setup.level == "ik"
-        self._natural_rad = (priors or Priors()).natural_flexion
+        habits = priors or Priors()
+        natural = habits.natural_share
+        self._hands = (natural, habits.natural_flexion), (1.0 - natural, (habits.free or FreeHand()).pip)
 
     def __call__(self, natural: FingerAngles, sight: Sighting, last_rad: Float) -> tuple[FingerAngles, Bool]:
         """Angles of fingers, and whose tip was refused (5,).
@@ -107,20 +113,39 @@ class Levels:
     def _angles(self, minima: Minima, solved: Bool, last_rad: Float) -> FingerAngles:
         """Of the minima of each finger the one that is believed."""
         rows, x = np.arange(5), minima.x_rad
-        as_good = solved[:, None] & (minima.misfit <= minima.misfit[:, :1] + _AS_GOOD)
-        away = np.where(as_good[..., None], x - x[:, :1], 0.0)
-        ambiguous = (np.abs(away[..., 1:]) > _APART_RAD).any(axis=(1, 2))
-        fresh = np.isfinite(last_rad[:, 0])
+        unnatural = self._unnatural(x)
+        cost = minima.misfit + unnatural
         walked = (np.abs(x - last_rad[:, None, :UNKNOWNS]) ** 2).sum(axis=-1)
+        rank = np.where(np.isfinite(last_rad[:, :1]), walked, unnatural)
+        likely = cost <= cost.min(axis=1, keepdims=True) + _AS_GOOD
+        best = np.where(likely, np.nan_to_num(rank, nan=np.inf), np.inf).argmin(axis=1)
+        chosen = x[rows, best]
+        as_good = solved[:, None] & (minima.misfit <= minima.misfit[rows, best][:, None] + _AS_GOOD)
+        away = np.where(as_good[..., None], x - chosen[:, None], 0.0)
+        ambiguous = (np.abs(away[..., 1:]) > _APART_RAD).any(axis=(1, 2))
+        weight = as_good / np.maximum(as_good.sum(axis=1, keepdims=True), 1)
+        cov = minima.cov_rad2[rows, best] + np.swapaxes(away, 1, 2) @ (weight[..., None] * away)
+        # Of one wide valley the mean is believed.
+        valley = as_good & (minima.midway < minima.misfit[:, :1] + _FLAT)
+        worse = np.nan_to_num(cost, posinf=1e9) - np.nan_to_num(cost[rows, best], posinf=1e9)[:, None]
+        part = np.where(valley, np.exp(-0.5 * np.clip(worse, -50.0, 50.0)), 0.0)
+        part[rows, best] = np.maximum(part[rows, best], 1e-9)
+        wide = (valley.sum(axis=1) > 1) & valley[rows, best]
+        mean = chosen + (part[..., None] * away).sum(axis=1) / part.sum(axis=1)[:, None]
+        return self._whole(np.where(wide[:, None], mean, chosen), cov, solved, ambiguous)
+
+    def _unnatural(self, x: Float) -> Float:
+        """What poses (5, K, 3) cost by being unnatural, as chi-square: -2 ln of how rare that is; inf where NaN.
+
+        Some hands bend by habit and some are free (`master.ik.priors`), so it is no more than some units.
+        """
         slope, base = self._model.poses.habit
-        strayed = (x[..., FLEXION] - base[:, None] - slope[:, None] * x[..., PIP]) ** 2
-        rank = np.where(fresh[:, None], walked, strayed)
-        best = np.where(ambiguous, np.where(as_good, rank, np.inf).argmin(axis=1), 0)
-        chosen, cov = x[rows, best], minima.cov_rad2[rows, best]
-        apart = np.where(as_good[..., None], x - chosen[:, None], 0.0)
-        count = np.maximum(as_good.sum(axis=1), 1)
-        cov = cov + (np.swapaxes(apart, 1, 2) @ apart) / count[:, None, None]
-        return self._whole(chosen, cov, solved, ambiguous)
+        strayed = x[..., FLEXION] - base[:, None] - slope[:, None] * x[..., PIP]
+        share, rare = 0.0, 0.0
+        for part, sigma in self._hands:
+            share = share + part / sigma * np.exp(-0.5 * (strayed / sigma) ** 2)
+            rare += part / sigma
+        return -2.0 * np.log(np.nan_to_num(share / rare, nan=0.0) + 1e-300)
 
     def _whole(self, x: Float, cov: Float, solved: Bool, ambiguous: Bool) -> FingerAngles:
         """Four angles of three unknowns (5, 3)."""

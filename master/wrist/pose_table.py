@@ -61,27 +61,23 @@ class PoseTable:
         self._strides: Int = np.array([SHAPE[1] * SHAPE[2], SHAPE[2], 1])
         self._offset = _CORNERS @ self._strides
 
-    def candidates(self, seen: Float, most: int) -> tuple[Float, Float]:
-        """Places (5, most, 3) [rad] of the nodes that are better than those around them, the best ones first.
+    def candidates(self, seen: Float) -> tuple[Float, Float]:
+        """For each PIP of the grid the node that explains best what was seen.
 
         Args:
             seen: (5, 4) what was seen of each finger, finite.
-            most: How many.
 
         Returns:
-            The places, and their energies (5, most), inf where there is none that is plausible.
+            The places of these nodes (5, P, 3) [rad], and their energies (5, P), inf where that is not plausible.
         """
         told = np.concatenate([seen * seen, seen], axis=1).astype(np.float32)
-        energy = (self._constant + (self._linear @ told[..., None])[..., 0]).reshape(5, *SHAPE)
-        around = energy
-        for axis in (1, 2, 3):
-            around = _least_beside(around, axis)
-        flat = np.where((energy <= around) & (energy < _PLAUSIBLE), energy, np.inf).reshape(5, -1)
-        best = np.argpartition(flat, most, axis=1)[:, :most]
-        value = np.take_along_axis(flat, best, axis=1)
-        order = value.argsort(axis=1)
-        node = np.stack(np.unravel_index(np.take_along_axis(best, order, axis=1), SHAPE), axis=-1)
-        return self.first[:, None] + node * self.step[:, None], np.take_along_axis(value, order, axis=1)
+        energy = (self._constant + (self._linear @ told[..., None])[..., 0]).reshape(5, -1, SHAPE[2])
+        best = energy.argmin(axis=1)
+        value = np.take_along_axis(energy, best[:, None], axis=1)[:, 0]
+        node = np.empty((*best.shape, UNKNOWNS))
+        node[..., 0], node[..., 1] = np.divmod(best, SHAPE[1])
+        node[..., 2] = np.arange(SHAPE[2])
+        return self.first[:, None] + node * self.step[:, None], np.where(value < _PLAUSIBLE, value, np.inf)
 
     def views(self, x: Float, finger: Int) -> tuple[Float, Float, Float]:
         """What is seen of poses (N, 3) [rad] of fingers (N,), interpolated between nodes.
@@ -131,13 +127,3 @@ def _difference(values: Float, axis: int) -> Float:
     before, after = edge.copy(), edge.copy()
     before[axis], after[axis] = (1, 0), (0, 1)
     return np.maximum(np.pad(step, before), np.pad(step, after))
-
-
-def _least_beside(values: npt.NDArray[np.float32], axis: int) -> npt.NDArray[np.float32]:
-    """The least of each node and its two neighbours along an axis."""
-    out = values.copy()
-    to, back = [slice(None)] * values.ndim, [slice(None)] * values.ndim
-    to[axis], back[axis] = slice(1, None), slice(None, -1)
-    np.minimum(out[tuple(to)], values[tuple(back)], out=out[tuple(to)])
-    np.minimum(out[tuple(back)], values[tuple(to)], out=out[tuple(back)])
-    return out
