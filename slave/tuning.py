@@ -197,6 +197,11 @@ def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
             f"rig {new.rig.name!r}: hand: {old.rig.hand} cannot become {new.rig.hand} while it runs: restart all "
             "processes of the rig"
         )
+    if old.rig.strobe != new.rig.strobe:
+        raise CalibrationError(
+            f"rig {new.rig.name!r}: strobe: the limits of laser and LEDs cannot change while they are switched: restart"
+            " the slave"
+        )
     if old.rig.markers != new.rig.markers:
         raise CalibrationError(
             f"rig {new.rig.name!r}: markers: {', '.join(old.rig.markers)} cannot become "

@@ -128,7 +128,7 @@ def check_pulses(rig: RigCalibration, camera: CameraCalibration) -> StrobeCalibr
     strobe, where = rig.strobe, f"camera {camera.name!r}: exposure_us {camera.exposure_us:g}"
     period_us = 1e6 / camera.frame_rate_hz
     pulse_us = strobe.lead_us + _exposed_us(camera) + GUARD_NS * 1e-3
-    if pulse_us + _exposed_us(camera) > period_us:
+    if pulse_us > period_us:
         raise CalibrationError(
             f"{where} and row_time_us {camera.row_time_us:g} ({_rows_us(camera):.0f} us for all rows): with"
             f" strobe.lead_us {strobe.lead_us:g} its light would reach into the next frame, {period_us:.0f} us later"

@@ -140,7 +140,7 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
     ("option", "says"),
     [
         (
-            ["--camera", "v4l2:/dev/there-is-none"],
+            ["--camera", "v4l2:/dev/there-is-none", "--lights", "camera"],
             "camera 'wrist' (v4l2:/dev/there-is-none): cannot be opened",
         ),
         (["--camera", "synthetic", "--luma"], "--luma is an option of --camera picamera2 and v4l2"),

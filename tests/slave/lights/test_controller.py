@@ -1,0 +1,186 @@
+"""The strober lights every frame by its kind and no other; late wake-ups, stalls, failing drivers leave frames dark."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from common.clock import SystemClock
+from common.frame_recording import Illumination
+from slave.lights.controller import FAILED_NS, StrobeController, Strober
+from slave.lights.guard import WINDOW_NS, Guard
+from slave.lights.schedule import CYCLE, LEAST, StrobeSchedule
+from tests.slave.lights.stage import (
+    AMBIENT,
+    LASER,
+    LED,
+    MS,
+    PERIOD_NS,
+    STROBE,
+    Lateness,
+    NotedLights,
+    SetClock,
+    covers,
+    exposures,
+    overlaps,
+    stamp,
+)
+
+HANDED_OVER_NS = 15 * MS  # after its stamp a frame arrives
+
+
+class Stage:
+    """Strober, schedule, guard and driver on a clock of their own, and a camera whose frames arrive late."""
+
+    def __init__(self, takes_ns: int = 0, late: Lateness = lambda: 0) -> None:
+        self.clock = SetClock(stamp(0))
+        self.lights = NotedLights(self.clock, takes_ns)
+        self.guard = Guard(self.lights, STROBE, self.clock, watch=False)
+        self.schedule = StrobeSchedule(90.0, 2000.0, 1000.0)
+        self.strober = Strober(self.schedule, self.guard, self.clock)
+        self.late = late
+
+    def run(self, frames: range, jitter_ns: float = 0.0, seed: int = 0, lost: float = 0.0) -> None:
+        """Let these frames be taken; each is pushed when it arrives, and the strober stepped when it asked for it."""
+        rng = np.random.default_rng(seed)
+        again = self.strober.step()
+        for k in frames:
+            again = self._until(stamp(k) + HANDED_OVER_NS, again)
+            if rng.random() >= lost:
+                if self.schedule.push(k, stamp(k, jitter_ns, rng)):
+                    self.strober.renumber()
+                again = self.strober.step()
+        self._until(stamp(frames[-1]) + HANDED_OVER_NS, again)
+
+    def _until(self, end_ns: int, again: int | None) -> int | None:
+        while again is not None and again + (late := self.late()) <= end_ns:
+            self.clock.t_ns = max(again + late, self.clock.t_ns)
+            again = self.strober.step()
+        self.clock.t_ns = max(end_ns, self.clock.t_ns)
+        return again
+
+    def kind(self, number: int) -> Illumination | None:
+        """What lit a frame wholly; None: a part of it, or two lights."""
+        pulses = [pulse for pulse in self.lights.pulses() if overlaps(pulse, number)]
+        if not pulses:
+            return AMBIENT
+        return pulses[0][0] if len(pulses) == 1 and covers(pulses[0], number) else None
+
+
+def test_every_frame_is_lit_as_the_cycle_says() -> None:
+    stage = Stage()
+    stage.run(range(60))
+    assert [stage.kind(k) for k in range(20, 58)] == [CYCLE[k % 3] for k in range(20, 58)]
+    assert stage.strober.counts == {"skipped": 0, "late": 0}
+    assert stage.guard.counts["refused"] == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_jitter_and_lost_frames_change_nothing(seed: int) -> None:
+    stage = Stage(takes_ns=300_000)
+    stage.run(range(300), jitter_ns=50_000.0, seed=seed, lost=0.2)
+    assert [stage.kind(k) for k in range(60, 298)] == [CYCLE[k % 3] for k in range(60, 298)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_who_wakes_up_late_leaves_frames_dark_and_lights_no_other(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    stage = Stage(late=lambda: int(rng.exponential(0.8) * MS))
+    stage.run(range(300))
+    kinds = [stage.kind(k) for k in range(20, 298)]
+    wanted = [CYCLE[k % 3] for k in range(20, 298)]
+    assert all(kind in (AMBIENT, right) for kind, right in zip(kinds, wanted, strict=True))
+    dark = sum(kind is not right for kind, right in zip(kinds, wanted, strict=True))
+    assert 10 < dark < 150
+    assert (
+        abs(stage.strober.counts["skipped"] - dark) <= 6
+    )  # the first frames after the start, and the last ones
+    longest = max(stop - start for _, start, stop in stage.lights.pulses())
+    assert longest < PERIOD_NS  # even without the watchdog
+
+
+def test_a_driver_that_takes_too_long_is_darkened_before_the_frame_is_over() -> None:
+    stage = Stage(takes_ns=round(1.2 * MS))
+    stage.run(range(40))
+    assert stage.strober.counts["late"] > 10
+    assert all(stop - start <= 1.3 * MS for _, start, stop in stage.lights.pulses())
+
+
+def test_a_stall_goes_dark_and_the_return_is_lit_again() -> None:
+    stage = Stage()
+    stage.run(range(30))
+    stage.run(range(45, 46), lost=1.0)  # nothing comes meanwhile
+    stage.clock.t_ns = stamp(60)
+    last = max(stop for _, _, stop in stage.lights.pulses())
+    assert last < stamp(30 + LEAST)
+    assert stage.lights.lit is AMBIENT
+    stage.run(range(60, 90))
+    assert [stage.kind(k) for k in range(64, 88)] == [CYCLE[k % 3] for k in range(64, 88)]
+    stage.run(range(400, 430))  # after a stall so long that all is forgotten
+    assert [stage.kind(k) for k in range(415, 428)] == [CYCLE[k % 3] for k in range(415, 428)]
+
+
+def test_dark_ends_a_pulse_at_once() -> None:
+    stage = Stage()
+    stage.run(range(25))
+    while stage.lights.lit is AMBIENT:
+        again = stage.strober.step()
+        assert again is not None
+        stage.clock.t_ns = again
+    stage.strober.dark()
+    assert stage.lights.lit is AMBIENT
+
+
+def test_a_driver_that_is_unplugged_is_tried_again_and_comes_back() -> None:
+    stage = Stage()
+    stage.run(range(30))
+    stage.lights.fails = True
+    stage.run(range(30, 60))
+    assert 1 <= stage.guard.counts["failed"] <= 4  # not at every frame
+    stage.lights.fails = False
+    stage.guard.look()
+    # A light that could not be darkened counts as on, so its duty is used up for a second.
+    rest = round((FAILED_NS + WINDOW_NS) / PERIOD_NS) + 3
+    stage.run(range(60, 60 + rest + 30))
+    assert stage.kind(60 + rest + 10) is CYCLE[(60 + rest + 10) % 3]
+
+
+def test_the_thread_lights_what_it_is_told_of_and_ends_dark() -> None:
+    clock = SystemClock()
+    begun = threading.Event()
+
+    class Real(NotedLights):
+        def switch(self, lit: Illumination) -> None:
+            self.switched.append((clock.now_ns(), lit))
+            if lit is not AMBIENT:
+                begun.set()
+
+    lights = Real(SetClock())
+    guard = Guard(lights, STROBE)
+    controller = StrobeController(StrobeSchedule(90.0, 2000.0, 1000.0), guard, clock)
+    first_ns = clock.now_ns()
+    for k in range(-20, 0):  # a camera that has run for a while
+        controller.push(k + 21, first_ns + round(k * PERIOD_NS))
+    deadline = time.monotonic() + 60.0
+    k = 0
+    while not begun.is_set() and time.monotonic() < deadline:
+        controller.push(k + 21, first_ns + round(k * PERIOD_NS))
+        k += 1
+        time.sleep(max((first_ns + k * PERIOD_NS - clock.now_ns()) * 1e-9, 0.0))
+    assert begun.is_set()
+    controller.stalled()
+    assert lights.lit is AMBIENT
+    seen = len(lights.switched)
+    controller.close()
+    controller.close()
+    assert lights.closed
+    assert all(lit is AMBIENT for _, lit in lights.switched[seen:])
+    counts = controller.counts()
+    assert counts["lights.pulses"] >= 1
+    assert {"lights.skipped", "lights.late", "lights.refused", "lights.off_by_watchdog"} <= set(counts)
+
+
+def test_exposures_do_not_touch() -> None:
+    assert exposures(1)[1] < exposures(2)[0]
+    assert (LASER, LED) == CYCLE[1:]

@@ -1,0 +1,236 @@
+"""Two GPIO lines: libgpiod is replaced at its seam, `request_lines` and `Chip`; gpio-sim where the kernel has it."""
+
+import errno
+import inspect
+import os
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gpiod
+import pytest
+
+from common.errors import LightsError
+from slave.lights.gpio import CONSUMER, GpioLights
+from tests.slave.lights.stage import AMBIENT, LASER, LED
+
+VALUE = gpiod.line.Value
+CONFIGFS = Path("/sys/kernel/config/gpio-sim")
+
+
+class FakeGpio:
+    """The kernel's side of one chip, /dev/gpiochip0: electrical levels of 32 lines, and who holds them.
+
+    Signatures and errors follow libgpiod 2.3 (gpiod/__init__.py, chip.py, line_request.py).
+    """
+
+    def __init__(self) -> None:
+        self.level = dict.fromkeys(range(32), 0)
+        self.names = {"LASER": 17, "LEDS": 27}
+        self.users: dict[int, str] = {}
+        self.fails: int | None = None  # errno of the next request
+        self.gone = False
+        self.stuck: set[int] = set()
+        self.requests: list[FakeRequest] = []
+
+    def request_lines(
+        self, path: str, config: Mapping[Any, Any], consumer: str | None = None, **_: Any
+    ) -> "FakeRequest":
+        if path != "/dev/gpiochip0":
+            raise FileNotFoundError(errno.ENOENT, "No such file or directory")
+        if self.gone:
+            raise OSError(errno.ENODEV, "No such device")
+        if self.fails is not None:
+            raise OSError(self.fails, os.strerror(self.fails))
+        lines = {place: self.offset(place) for place in config}
+        if any(offset in self.users for offset in lines.values()):
+            raise OSError(errno.EBUSY, "Device or resource busy")
+        self.users |= dict.fromkeys(lines.values(), consumer or "")
+        request = FakeRequest(self, lines, config)
+        self.requests.append(request)
+        return request
+
+    def offset(self, place: int | str) -> int:
+        if isinstance(place, str):
+            if place not in self.names:
+                raise OSError(errno.ENOENT, f"Unknown line: {place}")
+            return self.names[place]
+        if place not in self.level:
+            raise ValueError("line offset of out range")
+        return place
+
+
+class FakeRequest:
+    """Lines as outputs; a value is logical, the level behind it electrical."""
+
+    def __init__(self, kernel: FakeGpio, lines: dict[Any, int], config: Mapping[Any, Any]) -> None:
+        self.kernel, self.lines, self.config = kernel, lines, dict(config)
+        self.released = False
+        self.set_values({place: settings.output_value for place, settings in config.items()})
+
+    def set_values(self, values: Mapping[Any, Any]) -> None:
+        self._alive()
+        for place, value in values.items():
+            offset = self.lines[place]
+            if offset not in self.kernel.stuck:
+                self.kernel.level[offset] = int(bool(value)) ^ self.config[place].active_low
+
+    def get_values(self, places: list[Any]) -> list[Any]:
+        self._alive()
+        levels = [self.kernel.level[self.lines[p]] ^ self.config[p].active_low for p in places]
+        return [VALUE.ACTIVE if level else VALUE.INACTIVE for level in levels]
+
+    def release(self) -> None:
+        self.released = True
+        for offset in self.lines.values():
+            self.kernel.users.pop(offset, None)
+
+    def _alive(self) -> None:
+        assert not self.released
+        if self.kernel.gone:
+            raise OSError(errno.ENODEV, "No such device")
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> FakeGpio:
+    fake = FakeGpio()
+
+    class Chip:
+        def __init__(self, path: str) -> None:
+            assert path == "/dev/gpiochip0"
+
+        def __enter__(self) -> "Chip":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            return None
+
+        def get_line_info(self, place: int | str) -> SimpleNamespace:
+            offset = fake.offset(place)
+            return SimpleNamespace(
+                offset=offset, used=offset in fake.users, consumer=fake.users.get(offset, "")
+            )
+
+    monkeypatch.setattr(gpiod, "request_lines", fake.request_lines)
+    monkeypatch.setattr(gpiod, "Chip", Chip)
+    return fake
+
+
+def test_the_stand_in_takes_what_the_library_takes() -> None:
+    real = inspect.signature(gpiod.request_lines).parameters
+    assert set(inspect.signature(FakeGpio.request_lines).parameters) - {"self", "_"} <= set(real)
+    methods = vars(gpiod.LineRequest)
+    assert {"set_values", "get_values", "release"} <= set(methods)
+
+
+@pytest.mark.parametrize("chip", ["0", "gpiochip0", "/dev/gpiochip0"])
+@pytest.mark.parametrize(
+    ("lines", "low"),
+    [("17,27", (0, 0)), ("LASER,LEDS", (0, 0)), ("17,27/low", (0, 1)), ("17/low,27", (1, 0))],
+)
+def test_one_light_at_a_time_and_dark_at_both_ends(
+    kernel: FakeGpio, chip: str, lines: str, low: tuple[int, int]
+) -> None:
+    lights = GpioLights(f"{chip}:{lines}")
+
+    def lit() -> tuple[bool, bool]:
+        return bool(kernel.level[17] ^ low[0]), bool(kernel.level[27] ^ low[1])
+
+    assert lit() == (False, False)
+    assert set(kernel.users.values()) == {CONSUMER}
+    for kind, seen in (
+        (LASER, (True, False)),
+        (LED, (False, True)),
+        (AMBIENT, (False, False)),
+        (LED, (False, True)),
+    ):
+        lights.switch(kind)
+        assert lit() == seen
+    lights.close()
+    lights.close()
+    assert lit() == (False, False)
+    assert kernel.users == {}
+    lights.switch(LASER)
+    assert lit() == (False, False)
+
+
+def test_a_chip_that_is_unplugged_comes_back(kernel: FakeGpio) -> None:
+    lights = GpioLights("0:17,27")
+    lights.switch(LASER)
+    kernel.gone = True
+    for _ in range(2):
+        with pytest.raises(LightsError, match="/dev/gpiochip0"):
+            lights.switch(LED)
+    assert kernel.requests[0].released
+    kernel.gone = False
+    lights.switch(LED)
+    assert (kernel.level[17], kernel.level[27]) == (0, 1)
+    assert lights.counts() == {"reopened": 1}
+
+
+def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
+    lights = GpioLights("0:17,27")
+    kernel.stuck = {17}
+    with pytest.raises(LightsError, match="17 and 27 were set to active inactive and read inactive inactive"):
+        lights.switch(LASER)
+
+
+@pytest.mark.parametrize(
+    ("place", "fails", "says"),
+    [
+        ("7:17,27", None, "/dev/gpiochip7: no such GPIO chip; `gpiodetect`"),
+        ("0:17,27", errno.EACCES, "not allowed; add the user to the group"),
+        ("0:17,27", errno.ENOTTY, "is no GPIO chip"),
+        ("0:17,99", None, "line 17, 99: cannot be requested"),
+        ("0:17,NONE", None, "Unknown line: NONE"),
+        ("0:17", None, "write gpio:CHIP:LASER,LED"),
+        ("17,27", None, "write gpio:CHIP:LASER,LED"),
+        ("0:17,27/up", None, "line '27/up'"),
+        ("0:17,17/low", None, "laser and LEDs on one line"),
+        ("0:,27", None, "line ''"),
+    ],
+)
+def test_what_cannot_be_opened_says_why(kernel: FakeGpio, place: str, fails: int | None, says: str) -> None:
+    kernel.fails = fails
+    with pytest.raises(LightsError, match=says):
+        GpioLights(place)
+
+
+def test_a_busy_line_names_its_user(kernel: FakeGpio) -> None:
+    kernel.users[27] = "w1-gpio"
+    with pytest.raises(LightsError, match=r"in use by w1-gpio \(27\)"):
+        GpioLights("0:17,27")
+
+
+def test_without_the_library_it_is_said_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gpiod", None)
+    with pytest.raises(LightsError, match=r"phalanx-hand\[wrist\].*python3-libgpiod"):
+        GpioLights("0:17,27")
+    monkeypatch.setitem(sys.modules, "gpiod", SimpleNamespace(__version__="1.6.3"))
+    with pytest.raises(LightsError, match=r"gpiod 1.6.3 is too old"):
+        GpioLights("0:17,27")
+
+
+@pytest.mark.skipif(
+    not os.access(CONFIGFS, os.W_OK), reason="this kernel has no gpio-sim, or only root may use it"
+)
+def test_the_kernels_own_simulated_lines_follow() -> None:
+    device = CONFIGFS / f"phalanx{os.getpid()}"
+    bank = device / "bank0"
+    bank.mkdir(parents=True)
+    try:
+        (bank / "num_lines").write_text("8")
+        (device / "live").write_text("1")
+        chip = (bank / "chip_name").read_text().strip()
+        levels = Path("/sys/devices/platform") / (device / "dev_name").read_text().strip() / chip
+        lights = GpioLights(f"{chip}:2,5/low")
+        for kind, seen in ((AMBIENT, "01"), (LASER, "11"), (LED, "00")):
+            lights.switch(kind)
+            assert "".join((levels / f"sim_gpio{line}/value").read_text().strip() for line in (2, 5)) == seen
+        lights.close()
+    finally:
+        (device / "live").write_text("0")
+        bank.rmdir()
+        device.rmdir()

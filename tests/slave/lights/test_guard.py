@@ -1,0 +1,166 @@
+"""No pulse too long, no duty too high, dark if nobody darkens it; and a guard without these rules fails here."""
+
+import threading
+
+import msgspec
+import pytest
+
+from common.errors import LightsError
+from common.frame_recording import Illumination
+from slave.lights.guard import WINDOW_NS, Guard
+from tests.slave.lights.stage import AMBIENT, LASER, LED, MS, STROBE, NotedLights, SetClock
+
+LIMITS = msgspec.structs.replace(STROBE, max_pulse_us=5000.0, max_duty=0.1)
+
+
+def staged(kind: type[Guard] = Guard, watch: bool = False) -> tuple[Guard, NotedLights, SetClock]:
+    clock = SetClock()
+    lights = NotedLights(clock)
+    return kind(lights, LIMITS, clock, watch), lights, clock
+
+
+def misuse(kind: type[Guard]) -> list[str]:
+    """What a guard lets happen that it must not; empty: it bites."""
+    wrong: list[str] = []
+    guard, lights, clock = staged(kind)
+    if guard.begin(LASER, 5 * MS + 1) or lights.lit is not AMBIENT:
+        wrong.append("too long a pulse")
+    guard, lights, clock = staged(kind)
+    guard.begin(LASER, 5 * MS)
+    if guard.begin(LED, MS) or lights.lit is LED:
+        wrong.append("both at once")
+    guard, lights, clock = staged(kind)
+    on_ns, start_ns = 0, clock.t_ns
+    while clock.t_ns < start_ns + WINDOW_NS:
+        if guard.begin(LASER, 4 * MS):
+            clock.t_ns += 4 * MS
+            on_ns += 4 * MS
+            guard.end()
+        clock.t_ns += MS
+    if on_ns > 0.1 * WINDOW_NS:
+        wrong.append("too much duty")
+    guard, lights, clock = staged(kind)
+    guard.begin(LED, 4 * MS)
+    clock.t_ns += 5 * MS
+    guard.look()
+    if lights.lit is LED:
+        wrong.append("nobody ended it")
+    return wrong
+
+
+class NoLimits(Guard):
+    """A planted violation: everything is allowed."""
+
+    def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
+        return 10 * WINDOW_NS
+
+
+class NoDuty(Guard):
+    """A planted violation: only the length of a pulse is limited."""
+
+    def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
+        return self._longest_ns
+
+
+class NoWatchdog(Guard):
+    """A planted violation: nobody looks."""
+
+    def look(self) -> float | None:
+        return None
+
+
+def test_the_guard_lets_nothing_happen_that_it_must_not() -> None:
+    assert misuse(Guard) == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "lets"),
+    [
+        (NoLimits, ["too long a pulse", "too much duty", "nobody ended it"]),
+        (NoDuty, ["too much duty"]),
+        (NoWatchdog, ["nobody ended it"]),
+    ],
+)
+def test_a_guard_without_a_rule_is_found_out(kind: type[Guard], lets: list[str]) -> None:
+    assert misuse(kind) == lets
+
+
+def test_what_is_refused_and_what_the_watchdog_ends_is_counted() -> None:
+    guard, lights, clock = staged()
+    assert not guard.begin(LASER, 6 * MS)
+    assert not guard.begin(LASER, 0)
+    assert not guard.begin(AMBIENT, MS)
+    assert guard.begin(LASER, 4 * MS)
+    assert guard.look() == pytest.approx(0.005)
+    clock.t_ns += 5 * MS
+    assert guard.look() is None
+    assert lights.pulses() == [(LASER, clock.t_ns - 5 * MS, clock.t_ns)]
+    assert guard.events() == {"pulses": 1, "refused": 3, "off_by_watchdog": 1, "failed": 0}
+
+
+def test_duty_is_free_again_when_its_second_is_over() -> None:
+    guard, _, clock = staged()
+    for _ in range(20):
+        assert guard.begin(LED, 5 * MS)
+        clock.t_ns += 5 * MS
+        guard.end()
+        clock.t_ns += MS
+    assert not guard.begin(LED, MS)
+    assert guard.begin(LASER, MS)  # each light has its own
+    guard.end()
+    clock.t_ns += WINDOW_NS - 110 * MS
+    assert guard.begin(LED, 5 * MS)
+
+
+def test_a_pulse_that_is_not_ended_uses_up_no_more_than_its_duty() -> None:
+    guard, lights, clock = staged()
+    for _ in range(24):
+        assert guard.begin(LED, 4 * MS)
+        clock.t_ns += 4 * MS
+        guard.end()
+        clock.t_ns += MS
+    assert guard.begin(LED, 3 * MS)  # 4 ms are left
+    assert guard.look() == pytest.approx(0.004)
+    clock.t_ns += 4 * MS
+    guard.look()
+    assert lights.lit is AMBIENT
+
+
+def test_a_driver_that_fails_is_darkened_as_soon_as_it_answers() -> None:
+    guard, lights, clock = staged()
+    lights.fails = True
+    with pytest.raises(LightsError, match="unplugged"):
+        guard.begin(LASER, MS)
+    again_s = guard.look()
+    assert again_s is not None
+    assert again_s < 0.1
+    lights.fails = False
+    assert guard.look() is None
+    assert lights.switched == [(clock.t_ns, AMBIENT)]
+    assert guard.begin(LASER, MS)
+    lights.fails = True
+    with pytest.raises(LightsError):
+        guard.end()
+    assert guard.look() is not None
+    lights.fails = False
+    assert guard.look() is None
+    assert lights.lit is AMBIENT
+    assert guard.counts["off_by_watchdog"] == 0  # the driver failed, nobody overslept
+
+
+def test_the_watchdog_ends_a_pulse_by_itself() -> None:
+    dark = threading.Event()
+
+    class Told(NotedLights):
+        def off(self) -> None:
+            super().off()
+            dark.set()
+
+    lights = Told(SetClock())
+    guard = Guard(lights, LIMITS)  # on the clock of this machine
+    assert guard.begin(LASER, MS)
+    assert dark.wait(30.0)
+    guard.close()
+    assert guard.counts["off_by_watchdog"] == 1
+    assert lights.closed
+    assert not guard.begin(LASER, MS)

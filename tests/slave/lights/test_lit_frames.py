@@ -1,0 +1,152 @@
+"""The simulated wrist device is lit by its strobe; faults of the strobe cost triples and never make a wrong one."""
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.errors import CameraError
+from common.frame_recording import Illumination
+from common.sim.wrist.scene import WristScene
+from slave.__main__ import main
+from slave.cameras.source import Frame
+from slave.cameras.synthetic import SyntheticCamera
+from slave.lights.simulated import SimulatedStrobe
+from slave.lights.strobed import StrobedCamera, schedule_of
+from slave.lights.synthetic import SyntheticLights, Timeline
+from slave.simulated import scene_of
+from slave.wrist.strobe import Strobe
+from tests.slave.lights.stage import (
+    AMBIENT,
+    CAMERA,
+    FIRST_NS,
+    LASER,
+    LED,
+    MS,
+    RIG,
+    ROOT,
+    STROBE,
+    Lateness,
+    SetClock,
+)
+
+
+class StageClock(SetClock):
+    """A clock that moves when somebody sleeps."""
+
+    def sleep(self, seconds: float) -> None:
+        self.t_ns += max(round(seconds * 1e9), 1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> WristScene:
+    found = scene_of(ROOT / "calib_json", RIG, "curl", 7)
+    assert isinstance(found, WristScene)
+    return found
+
+
+def device(scene: WristScene, clock: StageClock, late: Lateness = lambda: 0) -> StrobedCamera:
+    strobe = SimulatedStrobe(schedule_of(RIG, CAMERA), STROBE, late)
+    source = SyntheticCamera(scene, "wrist", FIRST_NS, clock, 0, clock, clock.sleep, strobe)
+    return StrobedCamera(source, CAMERA, RIG, strobe)
+
+
+def taken(camera: StrobedCamera, count: int) -> list[Frame]:
+    frames = [camera.read() for _ in range(count)]
+    assert all(frame is not None for frame in frames)
+    return [frame for frame in frames if frame is not None]
+
+
+def test_frames_are_dark_until_the_camera_is_understood_and_then_lit_in_turn(scene: WristScene) -> None:
+    camera = device(scene, StageClock())
+    frames = taken(camera, 24)
+    cycle = (AMBIENT, LASER, LED)
+    kinds = [frame.illumination for frame in frames]
+    assert kinds[:9] == [AMBIENT] * 9
+    assert kinds[12:] == [cycle[frame.seq % 3] for frame in frames[12:]]
+    counts = camera.counts()
+    assert counts["lights.pulses"] in (8, 9, 10)
+    assert counts["lights.skipped"] == counts["lights.refused"] == 0
+    camera.close()
+    assert camera.read() is None
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_late_and_skipped_pulses_cost_triples_and_make_no_wrong_one(scene: WristScene, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+
+    def late() -> int:
+        return int(rng.choice([0, 2, 7, 13], p=[0.9, 0.05, 0.03, 0.02])) * MS
+
+    camera, strobe = device(scene, StageClock(), late), Strobe(CAMERA.frame_rate_hz)
+    triples = [triple for frame in taken(camera, 150) if (triple := strobe.push(frame)) is not None]
+    kinds = {(t.ambient.illumination, t.laser.illumination, t.led.illumination) for t in triples}
+    assert kinds == {(AMBIENT, LASER, LED)}
+    assert 10 <= len(triples) < 45
+    assert camera.counts()["lights.skipped"] > 3
+
+
+def test_a_light_that_smears_into_the_next_frame_is_seen_there(scene: WristScene) -> None:
+    # What the strober never does: the timeline and the camera show it all the same.
+    class Smeared:
+        def __init__(self) -> None:
+            self.timeline = Timeline()
+
+        def during(self, start_ns: int, stop_ns: int) -> object:
+            return self.timeline.during(start_ns, stop_ns)
+
+    clock, lights = StageClock(), Smeared()
+    lights.timeline.add(FIRST_NS - 2 * MS, LASER)
+    lights.timeline.add(FIRST_NS + 11 * MS, AMBIENT)  # frame 1 is exposed from 10.1 to 12.1 ms
+    source = SyntheticCamera(scene, "wrist", FIRST_NS, clock, 0, clock, clock.sleep, lights)  # type: ignore[arg-type]
+    first, second, third = (source.read() for _ in range(3))
+    assert first is not None
+    assert second is not None
+    assert third is not None
+    assert (first.illumination, second.illumination, third.illumination) == (LASER, LASER, AMBIENT)
+    line = first.image.astype(int) - third.image
+    smear = second.image.astype(int) - third.image
+    assert line.max() > 100
+    assert 0.3 < smear[line > 100].mean() / line[line > 100].mean() < 0.9
+
+
+def test_the_timeline_tells_shares_of_an_exposure() -> None:
+    clock, timeline = SetClock(1000), Timeline()
+    lights = SyntheticLights(timeline, clock)
+    assert timeline.during(0, 100).mostly is AMBIENT
+    for t_ns, lit in ((1000, LASER), (1300, AMBIENT), (1400, LED), (1900, LASER)):
+        clock.t_ns = t_ns
+        lights.switch(lit)
+    seen = timeline.during(1200, 2200)
+    assert (seen.laser, seen.led) == (pytest.approx(0.4), pytest.approx(0.5))
+    assert seen.mostly is LED
+    clock.t_ns = 2000
+    lights.close()
+    clock.t_ns = 3000
+    lights.switch(LED)
+    assert timeline.during(2500, 4000) == type(seen)(0.0, 0.0)
+
+
+def test_the_lights_follow_the_exposure_and_refuse_one_that_is_too_long(scene: WristScene) -> None:
+    camera = device(scene, StageClock())
+    taken(camera, 15)
+    camera.tune(msgspec.structs.replace(CAMERA, exposure_us=2500.0))
+    assert camera.figures()["exposure_us"] == 2500.0
+    kinds = [frame.illumination for frame in taken(camera, 6)]
+    assert kinds == [(AMBIENT, LASER, LED)[seq % 3] for seq in range(15, 21)]
+    with pytest.raises(CameraError, match=r"exposure_us 4000: needs light for 5200 us, strobe.max_pulse_us"):
+        camera.tune(msgspec.structs.replace(CAMERA, exposure_us=4000.0))
+    assert camera.figures()["exposure_us"] == 2500.0
+
+
+def test_recorded_frames_say_what_lit_them(tmp_path: Path) -> None:
+    from common.frame_recording import open_recording
+
+    command = ["record", "--name", "wrist", "--rig", "wrist", "--calibration", str(ROOT / "calib_json")]
+    sensor = ["--camera", "synthetic", "--scene", "curl", "--frames", "30", "-o", str(tmp_path / "rec")]
+    assert main([*command, *sensor]) == 0
+    rows = open_recording(tmp_path / "rec").frames_of("wrist")
+    lit: tuple[Illumination, ...] = (AMBIENT, LASER, LED)
+    assert all(row.illumination in (AMBIENT, lit[row.seq % 3]) for row in rows)
+    assert {row.illumination for row in rows} == set(lit)
