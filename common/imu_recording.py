@@ -74,14 +74,18 @@ def write_imu(folder: Path, samples: Iterable[ImuSample]) -> None:
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")
     table.writerow(HEADERS[-1])
-    for one in samples:
-        values = np.concatenate([one.gyro_rad_s, one.accel_m_s2, one.mag_ut, one.orientation_wxyz])
-        table.writerow([one.t_ns, *values.tolist()])
+    table.writerows(row(one) for one in samples)
     try:
         with replacing(folder / IMU) as file:
             file.write(text.getvalue().encode())
     except OSError as error:
         raise RecordingError(f"{folder / IMU}: cannot write: {error.strerror}") from error
+
+
+def row(sample: ImuSample) -> list[int | float]:
+    """One row of a table with all columns, those of the last of `HEADERS`."""
+    values = [sample.gyro_rad_s, sample.accel_m_s2, sample.mag_ut, sample.orientation_wxyz]
+    return [sample.t_ns, *np.concatenate(values).tolist()]
 
 
 def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequence[str]) -> ImuSample:

@@ -16,14 +16,16 @@ import cv2
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
-from common.errors import CalibrationError, CameraError, ImuError, LightsError, PhalanxError
-from slave.arguments import CAMERAS, IMUS, parser
+from common.errors import CalibrationError, CameraError, LightsError, PhalanxError
+from slave.arguments import CAMERAS, parser
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 from slave.lights.opening import SWITCHED, SYNTHETIC, choose, limits_for, open_guarded
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
+    from slave.imu.recording import ImuRecorder
+    from slave.imu.source import ImuSource
 
 PROGRESS_EVERY = 500  # frames
 
@@ -46,25 +48,23 @@ def _run(options: argparse.Namespace) -> int:
     # Imported here: `detect` and `colours` need neither sockets nor zenoh, and start twice as fast.
     from common.keys import rig_key
     from slave.live import run_live
-    from slave.markers.engine import engine_named
+    from slave.markers import engine as marker_engine
     from slave.tuning import CameraFiles
     from slave.uplink import Uplink
+    from slave.wrist import engine as wrist_engine
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     rig, camera = _calibration(options)
     files = CameraFiles(*_paths(options), camera, rig)
-    if rig.kind == "wrist":
-        if options.engine != "numpy":
-            raise CameraError(f"--engine {options.engine}: finds markers; rig {rig.name!r} is a wrist device")
-        if options.colours != "none":  # then nothing is detected, and fingers need not be known
-            hand_path = options.calibration / "hands" / f"{rig.hand}.json"
-            files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
+    if rig.kind == "wrist" and options.colours != "none":  # then nothing is detected, and fingers need not be known
+        hand_path = options.calibration / "hands" / f"{rig.hand}.json"
+        files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
-    engine = engine_named(options.engine)
+    engine = (wrist_engine if rig.kind == "wrist" else marker_engine).engine_named(options.engine)
     source = _lit_source(options, rig, camera, clock, true_clock, stop)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
@@ -78,6 +78,7 @@ def _run(options: argparse.Namespace) -> int:
 def _imu(options: argparse.Namespace) -> int:
     from common.keys import rig_key
     from slave.imu.live import run_live
+    from slave.imu.opening import open_real, orientation_of
     from slave.imu.synthetic import SyntheticImu
     from slave.simulated import imu_of
     from slave.uplink import Uplink
@@ -86,23 +87,23 @@ def _imu(options: argparse.Namespace) -> int:
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
-    if options.imu != "synthetic":
-        raise ImuError(
-            f"--imu {options.imu}: no such driver; there is {IMUS}, and none that reads an IMU on a serial port or "
-            "on I2C yet"
-        )
+    orientation = orientation_of(rig.imu, options.imu, options.orientation)
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
-    epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
-    imu = imu_of(options.imu, options.calibration, rig, options.scene, options.seed)
 
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
     with _stop_by_signal() as stop:
+        if options.imu == "synthetic":
+            epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
+            imu = imu_of(options.imu, options.calibration, rig, options.scene, options.seed)
+            source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
+        else:
+            source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop)
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, SyntheticImu(imu, epoch_ns, clock, stop), uplink, clock, stop, say)
+        run_live(options.name, source, orientation, uplink, clock, stop, say)
     return 0
 
 
@@ -228,37 +229,67 @@ def _record(options: argparse.Namespace) -> int:
     if options.scene_epoch_ns is None:
         options.scene_epoch_ns = true_clock.now_ns()
     scene = (options.calibration, rig, options.scene, options.seed)
-    imu = imu_of(str(options.camera), *scene) if options.imu else None
+    imu = imu_of(str(options.camera), *scene) if options.imu == "synthetic" else None
     display = ProgressDisplay(options.name, sys.stderr)
-    source = _lit_source(options, rig, camera, clock, true_clock)
-    try:
-        recorder = Recorder(
-            options.output,
-            manifest,
-            options.name,
-            Length(options.seconds, options.frames),
-            display.show,
-            round(options.reserve_mb * 1e6),
-            round(options.queue_mb * 1e6),
-        )
+    with _imu_beside(options, rig, clock) as beside:
+        source = _lit_source(options, rig, camera, clock, true_clock)
         try:
-            with _stop_by_signal() as stop:
-                feed(source, recorder, stop)
+            recorder = Recorder(
+                options.output,
+                manifest,
+                options.name,
+                Length(options.seconds, options.frames),
+                display.show,
+                round(options.reserve_mb * 1e6),
+                round(options.queue_mb * 1e6),
+            )
+            try:
+                if beside is not None:
+                    beside.start(options.output)
+                with _stop_by_signal() as stop:
+                    feed(source, recorder, stop)
+            finally:
+                recorder.close()
+                done = recorder.progress()
+                display.end(done)
         finally:
-            recorder.close()
-            done = recorder.progress()
-            display.end(done)
-    finally:
-        source.close()
+            source.close()
+        if beside is not None and done.frames:
+            beside.keep()
     if imu is not None and done.frames:
         add_imu(options.output, imu, options.scene_epoch_ns, clock)
     os.sync()  # what was said to be recorded is there, also when the power goes now
-    if recorder.failure is not None:
-        raise recorder.failure
+    failure = recorder.failure or (None if beside is None else beside.failure)
+    if failure is not None:
+        raise failure
     if not done.frames:
         raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
     print(f"{options.name}: recorded in {options.output}", flush=True)
     return 0
+
+
+@contextmanager
+def _imu_beside(
+    options: argparse.Namespace, rig: RigCalibration, clock: Clock
+) -> "Generator[ImuRecorder | None, None, None]":
+    """A real IMU of the rig that is recorded with a camera, if one is asked for."""
+    if options.imu is None or options.imu == "synthetic":
+        yield None
+        return
+    from slave.imu.opening import open_real, orientation_of
+    from slave.imu.recording import ImuRecorder
+
+    if rig.imu is None:
+        raise CalibrationError(f"rig {rig.name!r}: imu: missing; there is none to record")
+    orientation, stop = orientation_of(rig.imu, options.imu, "fused"), threading.Event()
+    beside = ImuRecorder(
+        open_real(rig.imu.name, options.imu, rig.imu.rate_hz, clock, stop), orientation, stop
+    )
+    try:
+        yield beside
+    finally:
+        counts = beside.close()
+        print(", ".join(f"{event} {count}" for event, count in counts.items()), file=sys.stderr)
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slave.cameras import real
+from slave.imu import opening
 from slave.lights.opening import CHOICES, SWITCHED
 
 ABOUT = (
@@ -36,6 +37,12 @@ HELP = {
   phalanx-slave imu --name imu --rig wrist --imu synthetic --bind 127.0.0.1 --key-file rig.key
         waits for the master's start, then sends one sealed datagram per sample: that of the simulated hand; with
         cameras in other processes, all with the same --scene, --seed and --scene-epoch-ns
+  phalanx-slave imu --list
+        says which serial ports and I2C buses there are, then ends
+  phalanx-slave imu --name imu --rig wrist --imu ximu3:/dev/serial/by-id/PORT --key-file rig.key
+        an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
+  phalanx-slave imu --name imu --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
+        an LSM6DSOX on I2C bus 1 of a Pi
 """,
     ),
     "lights": (
@@ -54,6 +61,8 @@ HELP = {
         """\
   phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
         without master or network; one folder per camera
+  phalanx-slave record --name wrist --rig wrist --camera synthetic --imu ximu3:/dev/ttyACM0 --seconds 10 -o out
+        the rig's IMU beside the camera, as imu.csv on the clock of the frames
 """,
     ),
     "join": (
@@ -84,7 +93,6 @@ HELP = {
     ),
 }
 CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
-IMUS = "synthetic"
 BEACON_PORT = 47800
 
 
@@ -132,18 +140,14 @@ def _run(run: argparse.ArgumentParser) -> None:
         "--engine",
         choices=("numpy", "numba"),
         default="numpy",
-        help="what detects markers: numba is several times faster, needs the extra `fast` (default: %(default)s)",
+        help="what detects markers, or fingers before a wrist device: numba is several times faster, needs the extra "
+        "`fast` (default: %(default)s)",
     )
 
 
 def _imu(imu: argparse.ArgumentParser) -> None:
     _place(imu, "IMU of this slave, that of the rig")
-    imu.add_argument(
-        "--imu",
-        required=True,
-        metavar="DRIVER",
-        help=f"{IMUS}: that of a simulated hand; none of a real IMU yet",
-    )
+    opening.add_options(imu)
     _link(imu)
     _simulated(imu.add_argument_group("synthetic IMU").add_argument)
 
@@ -169,7 +173,11 @@ def _record(record: argparse.ArgumentParser) -> None:
     record.add_argument("--seconds", type=_positive, metavar="S", help="default: until Ctrl-C")
     record.add_argument("--frames", type=_count, metavar="N", help="end after so many recorded frames")
     record.add_argument(
-        "--imu", action="store_true", help="with a synthetic camera: what the rig's IMU says, too, as imu.csv"
+        "--imu",
+        nargs="?",
+        const="synthetic",
+        metavar="DRIVER",
+        help=f"what the rig's IMU says, too, as imu.csv: {opening.REAL}; without a driver, that of a synthetic camera",
     )
     record.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
     record.add_argument(

@@ -8,41 +8,52 @@ from msgspec.structs import replace
 
 from common.clock import Clock
 from common.zenoh_bus import ZenohBus
-from slave.app import Sender, wait_for_start
+from slave.app import Barrier, Sender
 from slave.imu.source import ImuSource
+from slave.imu.tally import Orientation, SampleTally
 from slave.report import Reporter
-from slave.tally import Tally
 from slave.uplink import Uplink
 
-
-class SampleTally:
-    """Counts samples, and those left out, for `Health`. Holds the counters, one sample like one frame."""
-
-    def __init__(self) -> None:
-        """Count from nothing."""
-        self._tally = Tally(())
-
-    def sample(self, seq: int) -> None:
-        """Count one sample; a gap in their numbers counts as left out."""
-        self._tally.part(seq)
-
-    def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: samples, skipped."""
-        counts = self._tally.counts()
-        return {"samples": counts["frames"], "skipped": counts["dropped"]}
-
-    def gauges(self) -> dict[str, float]:
-        """rate_hz since the last call."""
-        return {"rate_hz": self._tally.gauges()["rate_hz"]}
+LOOK_S = 0.5e-3  # between two samples it is looked whether the master has started
 
 
-def run(source: ImuSource, sender: Sender, tally: SampleTally, stop: threading.Event) -> None:
+def wait_for_start(
+    source: ImuSource, barrier: Barrier, stop: threading.Event, orientation: Orientation | None = None
+) -> bool:
+    """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
+
+    Samples are read meanwhile, and forgotten: none grows old in a buffer, and the filter knows its bias when it starts.
+
+    Raises:
+        ImuError: The IMU is gone.
+    """
+    while not stop.is_set():
+        if barrier.wait_for_start(LOOK_S):
+            return True
+        if (sample := source.read()) is None:
+            return False
+        if orientation is not None:
+            orientation.push(sample)
+    return False
+
+
+def run(
+    source: ImuSource,
+    sender: Sender,
+    tally: SampleTally,
+    stop: threading.Event,
+    orientation: Orientation | None = None,
+) -> None:
     """Send every sample until the source ends or `stop` is set.
+
+    Its orientation is that of the filter, without one the sensor's own; rates and forces stay as they were measured.
 
     Raises:
         ImuError: The IMU is gone.
     """
     while not stop.is_set() and (sample := source.read()) is not None:
+        if orientation is not None:
+            sample = orientation.push(sample)
         sender.send(replace(sample, session=sender.session))
         tally.sample(sample.seq)
 
@@ -50,6 +61,7 @@ def run(source: ImuSource, sender: Sender, tally: SampleTally, stop: threading.E
 def run_live(
     name: str,
     source: ImuSource,
+    orientation: Orientation | None,
     uplink: Uplink,
     clock: Clock,
     stop: threading.Event,
@@ -60,6 +72,7 @@ def run_live(
     Args:
         name: The rig's IMU.
         source: The open IMU.
+        orientation: Makes the orientation of the samples; None: the sensor's own is sent.
         uplink: Where samples go.
         clock: The slave's clock.
         stop: Set by a signal handler, or by the command "stop" on the bus.
@@ -68,14 +81,14 @@ def run_live(
     Raises:
         ImuError: The IMU is gone.
     """
-    tally = SampleTally()
+    tally = SampleTally(source, orientation)
     reporter = Reporter(name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set)
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
-        if wait_for_start(uplink, stop):
-            run(source, uplink, tally, stop)
+        if wait_for_start(source, uplink, stop, orientation):
+            run(source, uplink, tally, stop, orientation)
     finally:
         reporter.close()
         uplink.close()

@@ -10,11 +10,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.keys import new_key
-from common.messages import Command, ImuSample
+from common.messages import Command, Health, ImuSample
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
 from common.zenoh_bus import ZenohBus
@@ -22,6 +23,7 @@ from master.ingest import Ingest
 from slave.simulated import scene_of
 from slave.uplink import Uplink
 from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.slave.imu.fake_ximu3 import FakeXimu3
 
 ROOT = Path(__file__).resolve().parents[2]
 APART_NS = 20_000_000  # of clocks that are seconds apart: what a busy machine makes of an echo
@@ -46,9 +48,11 @@ def simulated(files: Path, rig: RigCalibration, seed: int) -> SimulatedImu:
 
 
 @contextmanager
-def process(files: Path, log: Path, key: str, port: int, *more: str) -> Generator[subprocess.Popen[bytes]]:
+def process(
+    files: Path, log: Path, key: str, port: int, *more: str, imu: str = "synthetic"
+) -> Generator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "slave", "imu", "--name", "palm-imu", "--rig", "desk-imu"]
-    command += ["--imu", "synthetic", "--calibration", str(files), "--seed", "5", "--bind", "127.0.0.1"]
+    command += ["--imu", imu, "--calibration", str(files), "--seed", "5", "--bind", "127.0.0.1"]
     with log.open("w") as out:
         slave = subprocess.Popen(
             [*command, "--beacon-port", str(port), *more],
@@ -64,6 +68,27 @@ def process(files: Path, log: Path, key: str, port: int, *more: str) -> Generato
         slave.wait(20)
 
 
+def master(
+    stack: ExitStack, key: bytes, beacon: tuple[str, int], here: tuple[str, int], endpoint: str
+) -> tuple[ZenohBus, Ingest]:
+    """The master's ends of bus and link, and the two cameras that its start waits for."""
+    bus, clock = ZenohBus(endpoint, None), SystemClock()
+    stack.callback(bus.close)
+    ingest = Ingest(("left", "right"), key, clock, beacon, here, endpoint, imus=("palm-imu",))
+    stack.callback(ingest.close)
+    for name in ("left", "right"):
+        stack.callback(Uplink(name, key, clock, beacon[1], "127.0.0.1").close)
+    return bus, ingest
+
+
+def take(ingest: Ingest, got: list[ImuSample]) -> int:
+    """Take one more sample, if there is one; how many there are."""
+    message = ingest.get(0.1)
+    assert message is None or isinstance(message, ImuSample)
+    got.extend([] if message is None else [message])
+    return len(got)
+
+
 def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path) -> None:
     files, log = calibration(tmp_path), tmp_path / "imu.log"
     key, port, endpoint, clock = new_key(), free_udp_port(), free_endpoint(), SystemClock()
@@ -71,22 +96,10 @@ def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path)
     epoch_ns = clock.now_ns() - 10_000_000_000  # it joins a scene that has run for a while
     skew = ["--scene-epoch-ns", str(epoch_ns), "--clock-offset-ms", "4000", "--clock-ppm", "80"]
     with ExitStack() as stack:
-        bus = ZenohBus(endpoint, None)
-        stack.callback(bus.close)
-        ingest = Ingest(("left", "right"), raw, clock, beacon, here, endpoint, imus=("palm-imu",))
-        stack.callback(ingest.close)
-        for name in ("left", "right"):  # the start waits for the cameras
-            stack.callback(Uplink(name, raw, clock, port, "127.0.0.1").close)
-        slave = stack.enter_context(process(files, log, key, port, *skew))
+        bus, ingest = master(stack, raw, beacon, here, endpoint)
+        slave = stack.enter_context(process(files, log, key, port, "--orientation", "own", *skew))
         got: list[ImuSample] = []
-
-        def enough() -> bool:
-            message = ingest.get(0.1)
-            assert message is None or isinstance(message, ImuSample)
-            got.extend([] if message is None else [message])
-            return len(got) >= 60
-
-        assert until(enough, 60.0), log.read_text()
+        assert until(lambda: take(ingest, got) >= 60, 60.0), log.read_text()
         assert until(lambda: "palm-imu" in bus.alive(), 20.0), log.read_text()
         health = bus.ask(Command("palm-imu", "report", ""), 10.0)
         assert health.counts["sent"] >= 60
@@ -107,6 +120,51 @@ def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path)
         assert abs(one.t_ns - epoch_ns - t_s * 1e9) < APART_NS
         assert abs(one.orientation_wxyz @ ours.sample(one.seq, t_s, 0).orientation_wxyz) > 0.9999
         assert abs(one.orientation_wxyz @ other.sample(one.seq, t_s, 0).orientation_wxyz) < 0.999
+
+
+def test_an_ximu3_is_read_lost_and_back(tmp_path: Path) -> None:
+    files, log, link = calibration(tmp_path), tmp_path / "imu.log", tmp_path / "ttyACM0"
+    key, port, endpoint = new_key(), free_udp_port(), free_endpoint()
+    device = FakeXimu3(link, streams=True)
+    with ExitStack() as stack:
+        bus, ingest = master(stack, bytes.fromhex(key), ("127.255.255.255", port), ("127.0.0.1", 0), endpoint)
+        slave = stack.enter_context(process(files, log, key, port, imu=f"ximu3:{link}"))
+        got: list[ImuSample] = []
+        assert until(lambda: take(ingest, got) >= 150, 60.0), log.read_text()
+        assert until(lambda: "palm-imu" in bus.alive(), 20.0), log.read_text()
+        device.unplug()
+        assert until(lambda: health(bus).counts["lost"] == 1, 20.0), log.read_text()
+        assert health(bus).counts["back"] == 0
+        while ingest.get(0.0) is not None:  # what was on its way
+            pass
+        before = got[-1]
+        device = FakeXimu3(link, streams=True, begins_us=0)  # it has begun anew
+        stack.callback(device.unplug)
+        again: list[ImuSample] = []
+        assert until(lambda: take(ingest, again) >= 30, 60.0), log.read_text()
+        counts = health(bus).counts
+        assert (counts["lost"], counts["back"], counts["broken"]) == (1, 1, 0)
+        gauges = health(bus).gauges
+        assert gauges["away_s"] == 0.0
+        assert {"rate_hz", "bias_x_rad_s", "heading_sigma_rad", "at_rest"} <= set(gauges)
+        slave.send_signal(signal.SIGINT)
+        assert slave.wait(20) == 0, log.read_text()
+    for run in (got, again):
+        seq, t_ns = np.array([one.seq for one in run]), np.array([one.t_ns for one in run])
+        assert np.median(np.diff(t_ns) / np.diff(seq)) == pytest.approx(7.5e6, rel=0.01)
+        np.testing.assert_allclose(run[0].gyro_rad_s, np.radians([5.0, 0.0, -3.0]), rtol=1e-6)
+        np.testing.assert_allclose(run[0].accel_m_s2, [0.0, 0.0, 9.80665], rtol=1e-6)
+        assert np.isnan(run[0].mag_ut).all()
+    absent_ns = again[0].t_ns - before.t_ns
+    assert absent_ns > 0
+    assert again[0].seq - before.seq > 1
+    assert abs((again[0].seq - before.seq) * 7.5e6 - absent_ns) < 50e6, "the gap is the absence"
+    assert np.isfinite(got[-1].orientation_wxyz).all(), "a filter knows its tilt after a second"
+    assert again[-1].t_ns < SystemClock().now_ns()
+
+
+def health(bus: ZenohBus) -> Health:
+    return bus.ask(Command("palm-imu", "report", ""), 10.0)
 
 
 def test_it_waits_for_a_master_and_a_signal_ends_it(tmp_path: Path) -> None:

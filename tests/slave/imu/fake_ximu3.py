@@ -90,11 +90,12 @@ class FakeXimu3:
             for line in lines:
                 self._obey(line)
             if self._behaviour.get("streams") and self.applied:
-                due = (began_us + time.monotonic_ns() // 1000 - self.now_us) // self.period_us
+                now_us = began_us + time.monotonic_ns() // 1000
                 try:
-                    self.inertial(max(0, due), gyro=(5.0, 0.0, -3.0))
-                except BlockingIOError:  # nobody reads
-                    self.now_us += due * self.period_us
+                    while self.now_us + self.period_us <= now_us:
+                        self.inertial(gyro=(5.0, 0.0, -3.0))
+                except BlockingIOError:  # nobody reads: what it measures meanwhile is gone
+                    continue
 
     def _obey(self, line: bytes) -> None:
         if self._behaviour.get("mute"):

@@ -13,7 +13,8 @@ from common.clock import SystemClock
 from common.errors import ImuError
 from common.messages import Command, ImuSample, Message
 from slave.__main__ import main
-from slave.imu.live import SampleTally, run
+from slave.imu.live import run, wait_for_start
+from slave.imu.tally import SampleTally
 from slave.report import Reporter
 from tests.network_helpers import until
 
@@ -79,6 +80,71 @@ def test_the_loop_ends_when_told_and_when_the_device_is_gone() -> None:
     assert len(wire.sent) == 1
 
 
+class Filter:
+    """Stands for the filter of the orientation."""
+
+    at_rest, bias_rad_s, heading_sigma_rad = True, np.array([0.01, 0.0, np.nan]), 0.25
+
+    def __init__(self) -> None:
+        self.counts = {"fusion.gap": 2}
+        self.pushed = 0
+
+    def push(self, sample: ImuSample, /) -> ImuSample:
+        self.pushed += 1
+        return msgspec.structs.replace(sample, orientation_wxyz=np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+class Telling(Source):
+    """An IMU that has more to tell."""
+
+    def counts(self) -> dict[str, int]:
+        return {"lost": 1, "back": 1, "broken": 0}
+
+    def gauges(self) -> dict[str, float]:
+        return {"temperature_c": 30.5, "away_s": 0.0, "battery_percent": np.inf}
+
+
+def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() -> None:
+    wire, source, orientation = Wire(), Telling([sample(0), sample(1)]), Filter()
+    tally = SampleTally(source, orientation)
+    run(source, wire, tally, threading.Event(), orientation)
+    assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2
+    assert tally.counts() == {"samples": 2, "skipped": 0, "lost": 1, "back": 1, "broken": 0, "fusion.gap": 2}
+    gauges = tally.gauges()
+    assert gauges.pop("rate_hz") > 0.0
+    assert gauges == {
+        "temperature_c": 30.5,
+        "away_s": 0.0,
+        "bias_x_rad_s": 0.01,
+        "bias_y_rad_s": 0.0,
+        "heading_sigma_rad": 0.25,
+        "at_rest": 1.0,
+    }, "only what is a number"
+
+
+class Barrier:
+    """A master that starts after some looks."""
+
+    def __init__(self, looks: int) -> None:
+        self.looks = looks
+
+    def wait_for_start(self, timeout_s: float) -> bool:
+        assert timeout_s < 0.01
+        self.looks -= 1
+        return self.looks < 0
+
+
+def test_samples_before_the_start_are_read_and_forgotten() -> None:
+    source, orientation = Source([sample(k) for k in range(5)]), Filter()
+    assert wait_for_start(source, Barrier(3), threading.Event(), orientation)
+    assert len(source.samples) == 2
+    assert orientation.pushed == 3, "but the filter has seen them"
+    assert not wait_for_start(source, Barrier(9), threading.Event()), "the source has ended"
+    told = threading.Event()
+    told.set()
+    assert not wait_for_start(Source([sample(0)]), Barrier(9), told)
+
+
 def test_it_reports_and_stops_on_the_bus() -> None:
     bus, stop, tally = LoopbackBus(), threading.Event(), SampleTally()
     for seq in (1, 2, 4):
@@ -103,11 +169,25 @@ def test_it_reports_and_stops_on_the_bus() -> None:
         (["--name", "imu", "--rig", "unplaced"], "rig 'unplaced': imu: q_palm_imu and q_rig_world: missing"),
         (
             ["--name", "imu", "--imu", "serial:/dev/ttyUSB0"],
-            "no such driver; there is synthetic, and none that",
+            "no such driver; there are ximu3:PORT[@BAUD] | lsm6dsox:BUS[:ADDRESS] | synthetic",
         ),
         (["--name", "imu", "--imu", "synthetic:2"], "no such driver"),
         (["--name", "imu", "--scene", "board"], "only a hand before a synthetic camera has one"),
         (["--name", "imu", "--scene", "lights"], "for a wrist rig there are standard"),
+        (
+            ["--name", "imu", "--imu", "ximu3:/dev/nowhere"],
+            "/dev/nowhere cannot be opened: there is no such port",
+        ),
+        (["--name", "imu", "--imu", "ximu3:/dev/ttyACM0@fast"], "write ximu3:PORT or ximu3:PORT@BAUD"),
+        (["--name", "imu", "--imu", "ximu3"], "no such driver"),
+        (["--name", "imu", "--imu", "lsm6dsox:99"], "I2C bus 99, address 0x6a: there is no /dev/i2c-99"),
+        (["--name", "imu", "--imu", "lsm6dsox:1:zwei"], "write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS"),
+        (["--name", "imu", "--imu", "lsm6dsox:1:0x99"], "write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS"),
+        (
+            ["--name", "imu", "--imu", "lsm6dsox:1", "--orientation", "own"],
+            "without an orientation of its own",
+        ),
+        (["--name", "imu", "--rig", "trusting"], "imu.heading_sigma_rad: 0.1, but an orientation from rates"),
     ],
 )
 def test_what_it_cannot_be_is_said_at_the_start(
@@ -119,13 +199,12 @@ def test_what_it_cannot_be_is_said_at_the_start(
 ) -> None:
     monkeypatch.setenv("PHALANX_RIG_KEY", "00" * 32)
     files = ROOT / "calib_json"
-    if "unplaced" in option:
+    if (name := option[-1]) in ("unplaced", "trusting"):
         files = tmp_path / "calib"
         (files / "rigs").mkdir(parents=True)
         rig = load(ROOT / "calib_json/rigs/wrist.json", RigCalibration)
-        save(
-            files / "rigs/unplaced.json", msgspec.structs.replace(rig, name="unplaced", imu=ImuCalibration())
-        )
+        imu = ImuCalibration(heading_sigma_rad=0.1 if name == "trusting" else None)
+        save(files / f"rigs/{name}.json", msgspec.structs.replace(rig, name=name, imu=imu))
         for kept in ("hands", "cameras"):
             (files / kept).symlink_to(ROOT / "calib_json" / kept)
     command = ["imu", "--rig", "wrist", "--imu", "synthetic", "--calibration", str(files)]

@@ -1,0 +1,245 @@
+"""The ST LSM6DSOX (or LSM6DSO) on an I2C bus, by its FIFO: every sample whole and with its own time stamp.
+
+Opened, it is asked who it is, reset, given its settings, and every register is read back and compared. It measures at
+the lowest of its rates that is not below the rig's, 16 g and 2000 deg/s, and puts each measurement with a stamp into
+its FIFO; whatever is there is fetched some hundred times a second. A process that is late loses nothing for 0.8 s at
+208 Hz (512 words). It has no magnetometer. Its stamps become times by `DeviceClock`.
+"""
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable, Generator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from errno import EACCES, EIO, ENOENT, ENXIO, EREMOTEIO, ETIMEDOUT
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from smbus2 import SMBus, i2c_msg
+
+from common.clock import Clock
+from common.errors import ImuError
+from common.messages import ImuSample
+from slave.imu import lsm6dsox_fifo as chip
+from slave.imu.device_clock import ClockSteppedError, DeviceClock
+from slave.imu.lsm6dsox_fifo import Rate, Register
+
+ADDRESS = 0x6A  # its pin SA0 to ground; 0x6B: to the supply
+POLL_S = 0.004
+SILENT_POLLS = 250  # without a word: it measures no more
+MOST_WORDS = 90  # of one read: half a kilobyte
+SETTLE_S = 0.1  # a gyroscope starts within 70 ms
+RESET_POLLS = 20
+TEMPERATURE_NS = 1_000_000_000
+CLOCK_ERROR = 0.02  # of its oscillator, once its fine frequency is taken into account: what temperature does
+_NONE = (np.full(3, np.nan), np.full(4, np.nan))
+_SILENT = (EIO, ENXIO, EREMOTEIO, ETIMEDOUT)
+
+
+class Bus(Protocol):
+    """What is used of `smbus2.SMBus`."""
+
+    def write_byte_data(self, i2c_addr: int, register: int, value: int, /) -> None:
+        """Write one register."""
+        ...
+
+    def i2c_rdwr(self, *i2c_msgs: i2c_msg) -> None:
+        """Transfer messages as one."""
+        ...
+
+    def close(self) -> None:
+        """Give the bus back."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class I2cPlace:
+    """Where it is connected: /dev/i2c-BUS, and the address of the part there."""
+
+    bus: int
+    address: int = ADDRESS
+
+    def __str__(self) -> str:
+        """For people."""
+        return f"I2C bus {self.bus}, address {self.address:#04x}"
+
+
+def rate_of(rate_hz: float) -> Rate:
+    """The lowest of its rates that is no less than `rate_hz`.
+
+    Raises:
+        ImuError: It has none.
+    """
+    for rate in chip.RATES:
+        if rate.rate_hz >= rate_hz:
+            return rate
+    most = chip.RATES[-1].rate_hz
+    raise ImuError(f"imu.rate_hz: {rate_hz:g} Hz: an LSM6DSOX on I2C gives at most {most:.0f} Hz")
+
+
+def buses(where: Path = Path("/dev")) -> list[str]:
+    """The I2C buses of this machine."""
+    return [path.name.removeprefix("i2c-") for path in sorted(where.glob("i2c-*"))]
+
+
+class Lsm6dsoxImu:
+    """An `ImuSource`. Holds the bus, what came and is not handed over yet, and the number of the last sample."""
+
+    def __init__(
+        self,
+        name: str,
+        place: I2cPlace,
+        rate_hz: float,
+        clock: Clock,
+        stop: threading.Event,
+        opener: Callable[[int], Bus] = SMBus,
+    ) -> None:
+        """Open the bus, ask who is there, write and compare the settings, start.
+
+        Args:
+            name: The rig's IMU.
+            place: Where it is.
+            rate_hz: Samples per second that are needed.
+            clock: The slave's clock.
+            stop: Ends the stream, also while a sample is waited for.
+            opener: Opens the bus.
+
+        Raises:
+            ImuError: There is no such bus, nobody answers, it is another part, or a setting did not stick.
+        """
+        self._name, self._place, self._clock, self._stop = name, place, clock, stop
+        rate = rate_of(rate_hz)
+        self._slots = chip.Slots()
+        self._came: deque[ImuSample] = deque()
+        self._counts: Counter[str] = Counter()
+        self._temperature_c = float("nan")
+        self._heated_ns: int | None = None
+        self._seq, self._stamp_ns = -1, 0
+        self._silent = 0
+        self._closed = False
+        self._device_clock = DeviceClock(CLOCK_ERROR)
+        with self._errors():
+            self._bus = opener(place.bus)
+        try:
+            fine = self._begin(rate)
+        except ImuError:
+            self.close()
+            raise
+        self._tick_ns = 25_000.0 / fine
+        self._period_ns = 1e9 / (rate.rate_hz * fine)
+
+    def read(self) -> ImuSample | None:
+        """Next sample; None once closed or stopped."""
+        while not (self._closed or self._stop.is_set()):
+            if self._came:
+                return self._came.popleft()
+            self._fetch()
+        return None
+
+    def close(self) -> None:
+        """Give the bus back. It goes on measuring."""
+        self._closed = True
+        self._bus.close()
+
+    def counts(self) -> Mapping[str, int]:
+        """`broken` in all and by reason, `imu.overrun` of its FIFO, `clipped` axes."""
+        counts = {**self._slots.counts, **self._counts}
+        return {"broken": sum(v for k, v in counts.items() if k.startswith("broken.")), **counts}
+
+    def gauges(self) -> Mapping[str, float]:
+        """`temperature_c` of the part."""
+        return {"temperature_c": self._temperature_c}
+
+    def _begin(self, rate: Rate) -> float:
+        """Set it up; how much faster than nominal its clock runs."""
+        identity = self._get(Register.WHO_AM_I)[0]
+        if identity != chip.IDENTITY:
+            other = chip.OTHERS.get(identity, "another part")
+            raise ImuError(
+                f"{self._place}: WHO_AM_I is {identity:#04x}, {other}; an LSM6DSOX says {chip.IDENTITY:#04x}"
+            )
+        self._put(Register.CTRL3_C, chip.SW_RESET)
+        for _ in range(RESET_POLLS):
+            if not self._get(Register.CTRL3_C)[0] & chip.SW_RESET:
+                break
+            self._stop.wait(POLL_S)
+        for register, value in chip.settings(rate).items():
+            self._set(register, value)
+        fine = int.from_bytes(self._get(Register.INTERNAL_FREQ_FINE), signed=True)
+        self._stop.wait(SETTLE_S)
+        self._set(Register.FIFO_CTRL4, chip.FIFO_CONTINUOUS)
+        return 1.0 + chip.FREQ_FINE_STEP * fine
+
+    def _fetch(self) -> None:
+        """Take from the FIFO what is there, or wait a little."""
+        low, high = self._get(Register.FIFO_STATUS1, 2)
+        arrival_ns = self._clock.now_ns()
+        words = min((high & 3) << 8 | low, MOST_WORDS)
+        self._counts["imu.overrun"] += bool(high & chip.OVERRUN)
+        if self._heated_ns is None or arrival_ns - self._heated_ns >= TEMPERATURE_NS:
+            self._heated_ns = arrival_ns
+            self._temperature_c = chip.temperature_c(self._get(Register.OUT_TEMP_L, 2))
+        if not words:
+            self._silent += 1
+            if self._silent > SILENT_POLLS:
+                raise ImuError(f"{self._place}: the LSM6DSOX measures no more")
+            self._stop.wait(POLL_S)
+            return
+        self._silent = 0
+        fresh = self._slots.push(self._get(Register.FIFO_DATA_OUT_TAG, words * chip.WORD))
+        dated = [(stamp, one) for one in fresh if (stamp := self._stamp(one.ticks, arrival_ns)) is not None]
+        self._came.extend(self._sample(stamp, one) for stamp, one in dated)
+
+    def _stamp(self, ticks: int, arrival_ns: int) -> int | None:
+        """When it was measured, by the part's clock [ns]; None: it cannot be."""
+        stamp_ns = round(ticks * self._tick_ns)
+        try:
+            possible = self._device_clock.observe(stamp_ns, arrival_ns)
+        except ClockSteppedError:
+            raise ImuError(f"{self._place}: the LSM6DSOX began anew") from None
+        self._counts["broken.time"] += not possible
+        return stamp_ns if possible else None
+
+    def _sample(self, stamp_ns: int, one: chip.Measured) -> ImuSample:
+        passed = max(1, round((stamp_ns - self._stamp_ns) / self._period_ns)) if self._seq >= 0 else 1
+        self._seq, self._stamp_ns = self._seq + passed, stamp_ns
+        t_ns = self._device_clock.at(stamp_ns)
+        return ImuSample(self._name, 0, self._seq, t_ns, one.gyro_rad_s, one.accel_m_s2, *_NONE)
+
+    def _set(self, register: Register, value: int) -> None:
+        self._put(register, value)
+        if (has := self._get(register)[0]) != value:
+            raise ImuError(
+                f"{self._place}: register {register.name} has {has:#04x}, {value:#04x} was written: are the wires "
+                "long or loose, is the bus too fast?"
+            )
+
+    def _put(self, register: Register, value: int) -> None:
+        with self._errors():
+            self._bus.write_byte_data(self._place.address, register, value)
+
+    def _get(self, register: Register, count: int = 1) -> bytes:
+        """Read registers, or the FIFO, in one transfer."""
+        answer = i2c_msg.read(self._place.address, count)
+        with self._errors():
+            self._bus.i2c_rdwr(i2c_msg.write(self._place.address, [register]), answer)
+        return bytes(answer)
+
+    @contextmanager
+    def _errors(self) -> Generator[None]:
+        """Errors of the bus, in words that say what to do."""
+        try:
+            yield
+        except OSError as error:
+            raise ImuError(f"{self._place}: {_why(self._place, error)}") from error
+
+
+def _why(place: I2cPlace, error: OSError) -> str:
+    if error.errno == ENOENT:
+        return f"there is no /dev/i2c-{place.bus}: is I2C on? (`raspi-config`, or dtparam=i2c_arm=on)"
+    if error.errno == EACCES:
+        return "permission denied: `sudo usermod -aG i2c $USER`, then log in again"
+    if error.errno in _SILENT:
+        return f"nobody answers: look at the wires and the address, `i2cdetect -y {place.bus}`"
+    return str(error)
