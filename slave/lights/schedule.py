@@ -46,6 +46,20 @@ class Pulse:
     off_ns: int
 
 
+@dataclass(frozen=True, slots=True)
+class _Line:
+    """Stamp of frame k: t_ns + off_ns + (k - number) x period_ns."""
+
+    number: int
+    t_ns: int
+    off_ns: float
+    period_ns: float
+
+    def at(self, number: int) -> float:
+        """Stamp of a frame [ns]."""
+        return self.t_ns + (self.off_ns + (number - self.number) * self.period_ns)
+
+
 class StrobeSchedule:
     """Predicts. Holds the last stamps with their numbers, and the line through them.
 
@@ -68,7 +82,7 @@ class StrobeSchedule:
         self._lead_ns, self._offset_ns = round(lead_us * 1e3), round(offset_us * 1e3)
         self.expose(exposure_us)
         self._stamps: deque[tuple[int, int]] = deque(maxlen=KEPT)
-        self._line: tuple[int, float, float] | None = None
+        self._line: _Line | None = None
         self.restarts = 0
 
     def expose(self, exposure_us: float) -> None:
@@ -94,8 +108,8 @@ class StrobeSchedule:
             self._stamps.append((seq, t_ns))
             return True
         number, last_ns = self._stamps[-1]
-        at, period_ns = (last_ns, self._nominal_ns) if self._line is None else self._at(number)
-        periods = (t_ns - at) / period_ns
+        line = self._line or _Line(number, last_ns, 0.0, self._nominal_ns)
+        periods = (t_ns - line.at(number)) / line.period_ns
         step = round(periods)
         if abs(periods - step) > OFF_LINE or not 0 <= step <= FORGOTTEN:
             self.restarts += 1
@@ -105,7 +119,8 @@ class StrobeSchedule:
             return True
         if step > 0:  # else it is the last one again
             self._stamps.append((number + step, t_ns))
-            self._line = self._fitted()
+            if self._line is None or (number + step) % len(CYCLE) == 0:  # once a cycle is often enough
+                self._line = self._fitted()
         return False
 
     def forget(self) -> None:
@@ -117,9 +132,9 @@ class StrobeSchedule:
         """Number of the last frame whose exposure has begun; -1: not known."""
         if self._line is None:
             return -1
-        number, period_ns = self._stamps[-1][0], self._line[2]
-        begun_ns = self._at(number)[0] + self._offset_ns - self._half_ns
-        return number + int((now_ns - begun_ns) // period_ns)
+        number = self._stamps[-1][0]
+        begun_ns = self._line.at(number) + self._offset_ns - self._half_ns
+        return number + int((now_ns - begun_ns) // self._line.period_ns)
 
     def after(self, number: int) -> Pulse | None:
         """The first pulse of a frame after frame `number`; None: not known, or too far ahead."""
@@ -128,19 +143,13 @@ class StrobeSchedule:
         for k in range(number + 1, self._stamps[-1][0] + AHEAD + 1):
             lit = CYCLE[k % len(CYCLE)]
             if lit is not Illumination.AMBIENT:
-                middle_ns = round(self._at(k)[0]) + self._offset_ns
+                middle_ns = round(self._line.at(k)) + self._offset_ns
                 start_ns, stop_ns = middle_ns - self._half_ns, middle_ns + self._half_ns
                 return Pulse(k, lit, start_ns - self._lead_ns, start_ns - GUARD_NS // 2, stop_ns + GUARD_NS)
         return None
 
-    def _at(self, number: int) -> tuple[float, float]:
-        """Stamp of a frame by the line, and its slope [ns]."""
-        assert self._line is not None
-        first, at_first, period_ns = self._line
-        return first + at_first + (number - self._stamps[0][0]) * period_ns, period_ns
-
-    def _fitted(self) -> tuple[int, float, float] | None:
-        """First stamp, the line's value there less that, and its slope [ns]; None: not known well enough."""
+    def _fitted(self) -> _Line | None:
+        """The line through the stamps; None: not known well enough."""
         if len(self._stamps) < LEAST:
             return None
         first_number, first_ns = self._stamps[0]
@@ -155,4 +164,4 @@ class StrobeSchedule:
         sigma = rms * float(np.sqrt(1.0 / len(k) + farthest**2 / spread))
         if SIGMAS * sigma > GUARD_NS or abs(slope / self._nominal_ns - 1.0) > OFF_LINE / AHEAD:
             return None
-        return first_ns, at_first, slope
+        return _Line(first_number, first_ns, at_first, slope)

@@ -3,6 +3,7 @@
 import errno
 import inspect
 import os
+import re
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,8 +14,9 @@ import gpiod
 import pytest
 
 from common.errors import LightsError
+from slave.__main__ import main
 from slave.lights.gpio import CONSUMER, GpioLights
-from tests.slave.lights.stage import AMBIENT, LASER, LED
+from tests.slave.lights.stage import AMBIENT, LASER, LED, ROOT
 
 VALUE = gpiod.line.Value
 CONFIGFS = Path("/sys/kernel/config/gpio-sim")
@@ -68,12 +70,14 @@ class FakeRequest:
     def __init__(self, kernel: FakeGpio, lines: dict[Any, int], config: Mapping[Any, Any]) -> None:
         self.kernel, self.lines, self.config = kernel, lines, dict(config)
         self.released = False
+        self.lit: set[int] = set()
         self.set_values({place: settings.output_value for place, settings in config.items()})
 
     def set_values(self, values: Mapping[Any, Any]) -> None:
         self._alive()
         for place, value in values.items():
             offset = self.lines[place]
+            self.lit |= {offset} if value else set()
             if offset not in self.kernel.stuck:
                 self.kernel.level[offset] = int(bool(value)) ^ self.config[place].active_low
 
@@ -196,6 +200,23 @@ def test_what_cannot_be_opened_says_why(kernel: FakeGpio, place: str, fails: int
     kernel.fails = fails
     with pytest.raises(LightsError, match=says):
         GpioLights(place)
+
+
+def test_the_command_blinks_within_the_limits_and_ends_dark(
+    kernel: FakeGpio, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["lights", "--calibration", str(ROOT / "calib_json"), "--lights", "gpio:0:17,27"]
+    kernel.level[17] = 1
+    assert main([*command, "--off"]) == 0
+    assert (kernel.level[17], kernel.level[27]) == (0, 0)
+    assert capsys.readouterr().out == "dark\n"
+    assert main([*command, "--blink", "0.2"]) == 0
+    said = capsys.readouterr().out
+    pulses = re.search(r"^pulses (\d+), refused", said, re.MULTILINE)
+    assert pulses is not None
+    assert 1 <= int(pulses[1]) <= 14  # 18 frames, 12 of them lit; fewer on a busy machine
+    assert (kernel.level[17], kernel.level[27]) == (0, 0)
+    assert {line for request in kernel.requests for line in request.lit} == {17, 27}
 
 
 def test_a_busy_line_names_its_user(kernel: FakeGpio) -> None:

@@ -1,5 +1,7 @@
 """No pulse too long, no duty too high, dark if nobody darkens it; and a guard without these rules fails here."""
 
+import subprocess
+import sys
 import threading
 
 import msgspec
@@ -8,7 +10,7 @@ import pytest
 from common.errors import LightsError
 from common.frame_recording import Illumination
 from slave.lights.guard import WINDOW_NS, Guard
-from tests.slave.lights.stage import AMBIENT, LASER, LED, MS, STROBE, NotedLights, SetClock
+from tests.slave.lights.stage import AMBIENT, LASER, LED, MS, ROOT, STROBE, NotedLights, SetClock
 
 LIMITS = msgspec.structs.replace(STROBE, max_pulse_us=5000.0, max_duty=0.1)
 
@@ -164,3 +166,26 @@ def test_the_watchdog_ends_a_pulse_by_itself() -> None:
     assert guard.counts["off_by_watchdog"] == 1
     assert lights.closed
     assert not guard.begin(LASER, MS)
+
+
+DYING = """
+from tests.slave.lights.stage import LASER, STROBE, NotedLights, SetClock
+from slave.lights.guard import Guard
+
+class Spoken(NotedLights):
+    def switch(self, lit):
+        super().switch(lit)
+        print(lit, flush=True)
+
+guard = Guard(Spoken(SetClock()), STROBE, SetClock())
+guard.begin(LASER, 1_000_000)
+raise RuntimeError("nobody closes the guard")
+"""
+
+
+def test_a_process_that_ends_by_an_exception_ends_dark() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", DYING], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert "RuntimeError: nobody closes the guard" in done.stderr
+    assert done.stdout.split() == ["laser", "ambient"]
