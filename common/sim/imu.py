@@ -1,36 +1,56 @@
-"""An IMU on the back of a simulated hand: exact rates and forces, and the orientation that fusion would make of them.
+"""An IMU on a simulated hand or forearm: what a common part says of the motion, raw; its orientation it does not know.
 
-The error of such an orientation is not white: the tilt is off by what the accelerometer's bias makes of gravity and the
-heading by what summed-up rates have become, both the same for a whole recording; little of it is new in every sample.
-Where the rig's file says that the heading is not known, it begins anywhere.
+The motion's exact rates and forces, and on top of them the errors of a part, an LSM6DSO if none is named. The
+accelerometer's zero is off by as much as the rig's file says that the tilt may be: gravity then points elsewhere, and
+no filter can know better. Zeros and scale are the same for a whole recording; the gyroscope's zero wanders a little, as
+in a part that warms up.
 """
 
 from collections.abc import Iterator
-from math import ceil, floor
+from dataclasses import dataclass
+from math import ceil, floor, pi, radians, sqrt
 
 import numpy as np
 
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
-from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix, unskew
+from common.geometry import quaternion_to_matrix, unskew
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
 from common.sim.scene import Scene
 from common.sim.wrist.scene import WristScene
 
-_NEW_SHARE = 0.25  # of the standard deviation, new in every sample
+GRAVITY_M_S2 = 9.81
+_WANDER_RAD_S, _WANDER_S = radians(0.03), 200.0
 _HALF_STEP_S = 1e-3  # for rates and accelerations
-_GRAVITY_M_S2 = 9.81
-_MORE_S = 0.1
-_NOTHING = np.full(3, np.nan)
+_BEFORE_S, _AFTER_S = 2.0, 0.1  # a filter has to settle before the first frame
+_NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
 _UNPLACED = "imu: q_palm_imu and q_rig_world: missing; an IMU is simulated as it is mounted"
+
+
+@dataclass(frozen=True, slots=True)
+class InertialPart:
+    """Errors of a kind of sensor, one sigma: noise per root hertz; zero and scale of its gyroscope."""
+
+    gyro_noise: float
+    accel_noise: float
+    zero_rad_s: float
+    scale: float
+
+
+LSM6DSO = InertialPart(radians(3.8e-3), 70e-6 * GRAVITY_M_S2, radians(1.0), 0.01)  # ST, DS12140, table 2
+ICM20948 = InertialPart(
+    radians(0.015), 230e-6 * GRAVITY_M_S2, radians(2.5), 0.015
+)  # TDK, DS-000189, tables 1, 2
 
 
 class SimulatedImu:
     """What the IMU of a rig would say of a motion. Pure in time: holds the errors of this recording."""
 
-    def __init__(self, motion: HandMotion, imu: ImuCalibration, seed: int) -> None:
+    def __init__(
+        self, motion: HandMotion, imu: ImuCalibration, seed: int, part: InertialPart = LSM6DSO
+    ) -> None:
         """Draw the errors of one recording.
 
         Raises:
@@ -38,26 +58,19 @@ class SimulatedImu:
         """
         if imu.q_palm_imu is None or imu.q_rig_world is None:
             raise CalibrationError(_UNPLACED)
-        self._motion, self._imu, self._seed = motion, imu, seed
+        self._motion, self._imu, self._seed, self._part = motion, imu, seed, part
         self._palm_imu = quaternion_to_matrix(np.array(imu.q_palm_imu))
-        self._rig_world = quaternion_to_matrix(np.array(imu.q_rig_world))
+        self._up = quaternion_to_matrix(np.array(imu.q_rig_world))[:, 2]
         rng = np.random.default_rng([seed, 0])
-        lasting = np.sqrt(1.0 - _NEW_SHARE**2) * imu.orientation_sigma_rad
-        self._tilt = lasting * rng.normal(size=3)
-        drift_sign = rng.choice([-1.0, 1.0])
-        self._drift_rad_s = float(drift_sign * imu.heading_drift_rad_s)
-        known = imu.heading_sigma_rad
-        self._heading_rad = float(rng.uniform(-np.pi, np.pi) if known is None else known * rng.normal())
-        self._tilt -= self._up * (self._up @ self._tilt)
+        self._zero = part.zero_rad_s * rng.normal(size=3)
+        self._phase = rng.uniform(0.0, 2.0 * pi, 3)
+        self._scale = np.eye(3) + part.scale * rng.normal(size=(3, 3))
+        self._zero_g = imu.orientation_sigma_rad * GRAVITY_M_S2 * rng.normal(size=3)
 
     @property
     def rate_hz(self) -> float:
         """Samples per second, by the IMU's own clock."""
         return self._imu.rate_hz
-
-    @property
-    def _up(self) -> Float:
-        return self._rig_world[:, 2]
 
     @classmethod
     def of(cls, scene: Scene | WristScene) -> "SimulatedImu":
@@ -73,31 +86,36 @@ class SimulatedImu:
         return cls(scene.motion, scene.rig.imu, scene.seed)
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
-        """All samples of a span of scene time [s] and a little more; `t_ns` counts from scene time 0 at `zero_ns`."""
+        """All samples of a span of scene time [s], and before it as long as a filter takes to settle.
+
+        `t_ns` counts from scene time 0 at `zero_ns`; there is none before that.
+        """
         rate = self._imu.rate_hz
-        for seq in range(max(ceil((start_s - _MORE_S) * rate), 0), floor((stop_s + _MORE_S) * rate) + 1):
+        for seq in range(max(ceil((start_s - _BEFORE_S) * rate), 0), floor((stop_s + _AFTER_S) * rate) + 1):
             t_s = seq / rate
             yield self.sample(seq, t_s, zero_ns + round(t_s * 1e9))
+
+    def bias_rad_s(self, t_s: float) -> Float:
+        """What its gyroscope would say at rest (3,) [rad/s]."""
+        return self._zero + _WANDER_RAD_S * np.sin(2.0 * pi * t_s / _WANDER_S + self._phase)
 
     def sample(self, seq: int, t_s: float, t_ns: int) -> ImuSample:
         """Sample `seq`, at scene time `t_s` [s], stamped `t_ns`."""
         before, now, after = (self._motion.at(t_s + h).T_rig_palm for h in (-_HALF_STEP_S, 0.0, _HALF_STEP_S))
         rig_imu = now[:3, :3] @ self._palm_imu
-        turned = unskew(
-            before[:3, :3].T @ after[:3, :3]
-        )  # palm axes; the sine of so small an angle is the angle
+        turned = unskew(before[:3, :3].T @ after[:3, :3])  # palm axes; the sine of so small an angle is it
         moved = (after[:3, 3] - 2.0 * now[:3, 3] + before[:3, 3]) / _HALF_STEP_S**2
-        new = np.random.default_rng([self._seed, 1, seq]).normal(size=3)
-        error = self._tilt + _NEW_SHARE * self._imu.orientation_sigma_rad * new
-        heading = (self._heading_rad + self._drift_rad_s * max(t_s, 0.0)) * self._up
-        wrong = rotation_vector_to_matrix(heading) @ rotation_vector_to_matrix(error)
+        new = sqrt(0.5 * self._imu.rate_hz) * np.random.default_rng([self._seed, 1, seq]).normal(size=(2, 3))
+        rate = self._palm_imu.T @ turned / (2.0 * _HALF_STEP_S)
         return ImuSample(
             source=self._imu.name,
             session=0,
             seq=seq,
             t_ns=t_ns,
-            gyro_rad_s=self._palm_imu.T @ turned / (2.0 * _HALF_STEP_S),
-            accel_m_s2=rig_imu.T @ (moved + _GRAVITY_M_S2 * self._up),
+            gyro_rad_s=self._scale @ rate + self.bias_rad_s(t_s) + self._part.gyro_noise * new[0],
+            accel_m_s2=rig_imu.T @ (moved + GRAVITY_M_S2 * self._up)
+            + self._zero_g
+            + self._part.accel_noise * new[1],
             mag_ut=_NOTHING,
-            orientation_wxyz=matrix_to_quaternion(self._rig_world.T @ wrong @ rig_imu),
+            orientation_wxyz=_NO_TURN,
         )

@@ -1,6 +1,6 @@
-"""A recording with an IMU through the offline line: the palm is turned better, and an unknown heading spoils nothing.
+"""A recording with a raw IMU through the offline line: the palm is turned better, and its heading spoils nothing.
 
-The simulated IMU errs by 2 degrees of tilt for the whole recording, and its heading begins anywhere.
+The simulated accelerometer sees gravity 2 degrees off for the whole recording; the heading begins anywhere.
 """
 
 import logging
@@ -19,6 +19,8 @@ from common.errors import RecordingError
 from common.frame_recording import open_recording
 from common.geometry import quaternion_to_matrix
 from common.hand_model import WRIST
+from common.imu_fusion import OrientationFilter
+from common.imu_recording import read_imu, write_imu
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.outputs.files import load_poses
@@ -79,6 +81,14 @@ def recorded(root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Recor
     return made
 
 
+def fused(one: Recorded, folder: Path) -> Path:
+    """The recording as of a sensor that tells its own orientation; its heading is as little known."""
+    copytree(one.folder, folder)
+    fusion = OrientationFilter(IMU.rate_hz)
+    write_imu(folder, [fusion.push(sample) for sample in read_imu(one.folder, IMU.name)])
+    return folder
+
+
 def mean_deg(errors: list[Float]) -> float:
     return float(np.mean([np.linalg.norm(e, axis=1).mean() for e in errors]))
 
@@ -93,10 +103,29 @@ def test_the_palm_is_turned_better_with_it_and_an_unknown_heading_spoils_nothing
     assert max(tilt) < 4.0  # two degrees per axis, and what the markers add
     heading_without, heading_used = (np.mean([np.abs(e @ UP).mean() for e in x]) for x in (without, used))
     assert heading_used < heading_without + 0.3
-    # The same samples believed in their heading, which is anywhere: the check above would see it.
+    # The same orientations believed in their heading, which is anywhere: the check above would see it.
     trusting = msgspec.structs.replace(IMU, heading_sigma_rad=0.05)
-    trusted = [one.solved(tmp_path / f"trusted{k}", trusting) for k, one in enumerate(recorded)]
+    trusted = [
+        one.solved(tmp_path / f"trusted{k}", trusting, fused(one, tmp_path / f"fused{k}"))
+        for k, one in enumerate(recorded)
+    ]
     assert np.mean([np.abs(e @ UP).mean() for e in trusted]) > heading_without + 3.0
+
+
+def test_a_heading_is_not_believed_of_a_sensor_that_measured_none(
+    recorded: list[Recorded], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    used = recorded[0].solved(tmp_path / "used", IMU)
+    with caplog.at_level(logging.WARNING):
+        told = recorded[0].solved(tmp_path / "told", msgspec.structs.replace(IMU, heading_sigma_rad=0.05))
+    assert "imu.csv: no quaternions: imu.heading_sigma_rad not used" in caplog.text
+    np.testing.assert_array_equal(told, used)
+
+
+def test_quaternions_of_the_recording_are_used_as_they_are(recorded: list[Recorded], tmp_path: Path) -> None:
+    raw = recorded[0].solved(tmp_path / "raw", IMU)
+    sensors = recorded[0].solved(tmp_path / "sensors", IMU, fused(recorded[0], tmp_path / "fused"))
+    np.testing.assert_array_equal(sensors, raw)
 
 
 def test_replay_by_command_uses_the_imu_of_the_recording(
@@ -135,10 +164,10 @@ def test_one_of_which_nothing_is_known_is_not_used_and_that_is_told(
 def test_samples_without_orientation_or_out_of_time_are_counted(
     recorded: list[Recorded], tmp_path: Path
 ) -> None:
-    folder = tmp_path / "recording"
-    copytree(recorded[0].folder, folder)
+    folder = fused(recorded[0], tmp_path / "recording")
     header, *lines = (folder / "imu.csv").read_text().splitlines()
-    gone = [",".join([*line.split(",")[:-4], "nan,nan,nan,nan"]) for line in lines[: len(lines) // 2]]
+    half = len(lines) - round(0.6 * IMU.rate_hz)  # the last 0.1 s is after the frames
+    gone = [",".join([*line.split(",")[:-4], "nan,nan,nan,nan"]) for line in lines[:half]]
     (folder / "imu.csv").write_text("\n".join([header, *gone, *lines[len(gone) :]]) + "\n")
     recorded[0].solved(tmp_path / "half", IMU, folder)
     counts = msgspec.convert(read_summary(tmp_path / "half" / "summary.json")["counts"], dict[str, int])
