@@ -58,9 +58,7 @@ def _run(options: argparse.Namespace) -> int:
         signal.signal(number, lambda _number, _frame: stop.set())
     rig, camera = _calibration(options)
     files = CameraFiles(*_paths(options), camera, rig)
-    if (
-        rig.kind == "wrist" and options.colours != "none"
-    ):  # then nothing is detected, and fingers need not be known
+    if rig.kind == "wrist" and options.colours != "none":  # with none, fingers need not be known
         hand_path = options.calibration / "hands" / f"{rig.hand}.json"
         files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
     true_clock = SystemClock()
@@ -202,9 +200,8 @@ def _lights(options: argparse.Namespace) -> int:
                 blink(guard, rig, camera, stop, options.blink)
         finally:
             guard.close()
-    print(
-        ", ".join(f"{event} {count}" for event, count in guard.events().items()) if options.blink else "dark"
-    )
+    events = ", ".join(f"{event} {count}" for event, count in guard.events().items())
+    print(events if options.blink else "dark")
     return 0
 
 

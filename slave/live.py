@@ -28,6 +28,7 @@ from slave.uplink import Uplink
 from slave.wrist.blind import BlindWrist
 from slave.wrist.changing import view_of, wrist_changes
 from slave.wrist.detector import WristDetector
+from slave.wrist.engine import Engine as WristEngine
 
 Colours = Literal["follow", "fixed", "none"]
 NO_REFERENCE = (
@@ -44,7 +45,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     colours: Colours,
-    engine: Engine,
+    engine: Engine | WristEngine,
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> None:
@@ -57,7 +58,7 @@ def run_live(
         uplink: Where detections go.
         clock: The slave's clock.
         colours: Whether those of markers follow the light, stay fixed, or nothing is detected at all.
-        engine: What scans and measures for markers.
+        engine: What scans and measures for markers, or what does the inner loops before a wrist device.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
 
@@ -67,8 +68,8 @@ def run_live(
     """
     previews = Previews(name, clock)
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
-    if files.rig.kind == "wrist":
-        line = _wrist_line(name, files, source, uplink, colours, stop, previews.offer)
+    if isinstance(engine, WristEngine):
+        line = _wrist_line(name, files, source, uplink, colours, engine, stop, previews.offer)
     else:
         line = _marker_line(name, files, source, uplink, colours, engine, stop, previews.offer, workers)
     tuning = CameraTuning(files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0)
@@ -149,13 +150,14 @@ def _wrist_line(
     source: FrameSource,
     uplink: Uplink,
     colours: Colours,
+    engine: WristEngine,
     stop: threading.Event,
     show: Callable[[Frame], None],
 ) -> _Line:
     if colours == "none":
         tally = Tally(())
         return _Line(lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, show), tally, None)
-    detector = WristDetector(view_of(files), files.camera.frame_rate_hz)
+    detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
     names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
     tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
     return _Line(

@@ -12,6 +12,7 @@ from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
+from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
@@ -63,16 +64,20 @@ class WristDetector:
     Of a pose nothing is kept: two triples have nothing to do with each other.
     """
 
-    def __init__(self, view: WristView, frame_rate_hz: float, led_shift_px: Float = _NONE) -> None:
+    def __init__(
+        self, view: WristView, frame_rate_hz: float, led_shift_px: Float = _NONE, engine: Engine = NUMPY
+    ) -> None:
         """Begin with no frame; it takes a second or two to prepare the view.
 
         Args:
             view: What the device knows of itself and of the hand.
             frame_rate_hz: Of the camera file: single frames per second, three per triple.
             led_shift_px: (2,) how far the LED frames of a recording lie beside its laser frames.
+            engine: What does the inner loops.
         """
         self._strobe, self._led_shift = Strobe(frame_rate_hz), led_shift_px
-        self._view = prepared(view)
+        self._engine = engine
+        self._view = prepared(view, engine)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -82,27 +87,27 @@ class WristDetector:
     def push(self, frame: Frame) -> WristFound | None:
         """Take the next frame of the camera; what was found, where it completes a triple."""
         triple = self._strobe.push(frame)
-        return None if triple is None else find(triple, self._view, self._led_shift)
+        return None if triple is None else find(triple, self._view, self._led_shift, self._engine)
 
     def replace(self, view: WristView) -> None:
         """See with another view, a prepared one, from the next triple on. From any thread."""
         self._view = view
 
 
-def prepared(view: WristView) -> WristView:
+def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
     """The same view, once all that hangs on it alone (corridors, templates) has been made and is kept.
 
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
-    find(Triple(dark, dark, dark), view)
+    find(Triple(dark, dark, dark), view, engine=engine)
     return view
 
 
-def find(triple: Triple, view: WristView, led_shift_px: Float = _NONE) -> WristFound:
+def find(triple: Triple, view: WristView, led_shift_px: Float = _NONE, engine: Engine = NUMPY) -> WristFound:
     """What one triple shows of the five fingers; its LED frame lies `led_shift_px` (2,) beside its laser frame."""
     ambient = triple.ambient.image
     led = shifted(lit(triple.led.image, ambient), -led_shift_px)
-    fingers = separate(led, view)
-    laser = laser_lines(lit(triple.laser.image, ambient), fingers, view)
+    fingers = separate(led, view, engine)
+    laser = laser_lines(lit(triple.laser.image, ambient), fingers, view, engine)
     return WristFound(triple, laser, fingertips(led, fingers, view))

@@ -16,30 +16,17 @@ import cv2
 import numpy as np
 
 from common.arrays import Float, Image, Int
-from slave.wrist.corridors import LATERAL, MARGIN, STATION_PX, Corridors, Float32, corridors_of
-from slave.wrist.paths import FENCE, least_paths
+from slave.wrist.corridors import STATION_PX, Corridors, Float32, corridors_of
+from slave.wrist.engine import NUMPY, Engine
+from slave.wrist.valleys import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
 
 NONE = -1  # no finger
-_DARK = 6.0  # grey levels: what the noise of a difference of two frames leaves
 _SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
-_SKIN = 20.0  # energy of a bright, even surface: no seam crosses a finger
-_OPEN = 1.0  # energy in the dark beside one finger only
-_BEYOND_THUMB = 0.2  # energy in the dark beyond the thumb's tip
-_ASIDE = 3.0  # energy at the edge of a corridor
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
 _ONE_VALLEY = 0.35  # of the distance of two corridors, and of the rows of the hand
 _VALLEY = 3.0  # samples of the thumb's corridor: half the breadth of such a valley
-_ACROSS = 0.3  # energy where the thumb would lie across all fingers
-_WIDTHS = tuple(n + 2 * MARGIN for n in LATERAL)
-_STARTS = np.cumsum([0, *_WIDTHS[:-1]]).tolist()
-_PRIOR = np.concatenate(
-    [np.pad(_ASIDE * np.linspace(-1.0, 1.0, n) ** 2, MARGIN, constant_values=FENCE) for n in LATERAL[:3]]
-    + [np.pad(_ACROSS * np.linspace(1.0, 0.0, LATERAL[3]), MARGIN, constant_values=FENCE)]
-).astype(np.float32)
-_AROUND = np.ones((1, 7), dtype=np.uint8)
 _CREASE = np.ones((5, 5), dtype=np.uint8)
-_BESIDE = np.ones((1, MARGIN), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +62,7 @@ class Fingers:
         return [self.corridors.pixels(seam, self.seams[seam]) for seam in range(4)]
 
 
-def separate(led: Image, view: WristView) -> Fingers:
+def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     """Find the seams in the difference of LED and ambient frame."""
     corridors = corridors_of(view)
     dark = cv2.erode(led, _CREASE)
@@ -85,10 +72,9 @@ def separate(led: Image, view: WristView) -> Fingers:
         Image,
         cv2.remap(dark, corridors.map_x, corridors.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
     )
-    energy = _energy(strips, corridors.thumb_crosses)
-    energy += _PRIOR
-    paths = least_paths(energy, _WIDTHS)
-    _part(paths[:3], strips, energy, corridors)
+    energy = engine.energy(strips, corridors.thumb_crosses)
+    paths = engine.least_paths(energy, WIDTHS)
+    _part(paths[:3], strips, energy, corridors, engine)
     seams = corridors.across(slice(0, 4), paths)
     # Towards the little finger, each seam stays on its own side of the one before it.
     order = corridors.thumb_side
@@ -96,18 +82,18 @@ def separate(led: Image, view: WristView) -> Fingers:
     seams[:3] *= order
     taken = _in_thumbs(corridors, seams[:3])
     if (np.abs(paths[3] - taken) < _VALLEY).any():  # else it would pay nothing for what is taken
-        thumb = energy[:, _STARTS[3] :]
-        thumb += _TAKEN * (np.abs(np.arange(_WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
-        seams[3:] = corridors.across(slice(3, 4), least_paths(thumb, _WIDTHS[3:]))
+        thumb = energy[:, STARTS[3] :]
+        thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
+        seams[3:] = corridors.across(slice(3, 4), engine.least_paths(thumb, WIDTHS[3:]))
     return Fingers(corridors, seams, shown)
 
 
-def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors) -> None:
+def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors, engine: Engine) -> None:
     """Where a seam and the next one lie in one valley, send the one that is farther out of its corridor to another.
 
     `paths` (3, S) and `energy` are changed.
     """
-    lit = strips[:, : _STARTS[3]].max(axis=1) > _DARK
+    lit = strips[:, : STARTS[3]].max(axis=1) > DARK
     near = _ONE_VALLEY * np.abs(np.diff(corridors.middle[:3], axis=0))
     most = _ONE_VALLEY * np.count_nonzero(lit)
     for seam in range(2):
@@ -117,14 +103,14 @@ def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors) -> N
             return
         if np.count_nonzero(same[seam]) < most:
             continue
-        off = np.abs(paths[seam : seam + 2] - (_WIDTHS[seam] - 1) / 2.0)[:, lit].sum(axis=1)
+        off = np.abs(paths[seam : seam + 2] - (WIDTHS[seam] - 1) / 2.0)[:, lit].sum(axis=1)
         loser = seam + int(off[1] > off[0])
         winner = 2 * seam + 1 - loser
-        start = _STARTS[loser]
-        strip = energy[:, start : start + _WIDTHS[loser]]
+        start = STARTS[loser]
+        strip = energy[:, start : start + WIDTHS[loser]]
         at = corridors.sample(loser, across[winner])
-        strip += _TAKEN * (np.abs(np.arange(_WIDTHS[loser]) - at[:, None]) < _VALLEY)
-        paths[loser] = least_paths(strip, _WIDTHS[loser : loser + 1])[0]
+        strip += _TAKEN * (np.abs(np.arange(WIDTHS[loser]) - at[:, None]) < _VALLEY)
+        paths[loser] = engine.least_paths(strip, WIDTHS[loser : loser + 1])[0]
 
 
 def _in_thumbs(corridors: Corridors, seams: Float) -> Float:
@@ -137,27 +123,3 @@ def _in_thumbs(corridors: Corridors, seams: Float) -> Float:
     circles = corridors.radius + steps
     on_circles: list[Float] = [np.interp(circles, r, a) for r, a in zip(*upward, strict=True)]
     return corridors.sample(3, np.array(on_circles))
-
-
-def _energy(strips: Image, crossed: int) -> Float32:
-    """Energy of the straightened corridors (S, K), from 0 in a black valley to `_SKIN` on a finger.
-
-    A pixel is as much of a valley as it lies below the darker of its two sides, and below what is brightest right
-    beside it. The thumb's seam has the thumb on one side, and on the other perhaps nothing near: only the thumb's side
-    counts. Where nothing is lit beside a pixel it is open, except for the thumb's seam on the first `crossed` circles:
-    no thumb at all beyond it would mean that the seam lies outside of the thumb.
-    """
-    before = cv2.dilate(strips, _BESIDE, anchor=(MARGIN - 1, 0))
-    behind = cv2.dilate(strips, _BESIDE, anchor=(0, 0))
-    thumb = _STARTS[3]
-    side = cv2.min(before, behind)
-    side[:, thumb:] = behind[:, thumb:]
-    level = np.divide(strips, cv2.dilate(strips, _AROUND) + np.float32(_DARK), dtype=np.float32)
-    above = 1.0 - cv2.subtract(side, strips) / (side + np.float32(_DARK))
-    energy = np.maximum(above, level)
-    energy *= energy * energy
-    energy *= _SKIN * energy  # the sixth power
-    bare = side <= _DARK
-    np.putmask(energy[:, :thumb], bare[:, :thumb], _OPEN)
-    np.putmask(energy[crossed:, thumb:], bare[crossed:, thumb:], _BEYOND_THUMB)
-    return energy

@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Image, Int
+from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import NONE, Fingers
 from slave.wrist.reach import reach_of
-from slave.wrist.runs import FLOOR, SHORT, Runs, in_lines, line_runs
+from slave.wrist.runs import FLOOR, SHORT, Runs
 from slave.wrist.view import WristView
 
 _FIVE = np.arange(5)[:, None]
@@ -43,15 +44,15 @@ class LaserLines:
     length_px: Float
 
 
-def laser_lines(laser: Image, fingers: Fingers, view: WristView) -> LaserLines:
+def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
     reach = reach_of(view)
-    runs = line_runs(laser, reach.first_row)
+    runs, on_line = engine.lines(laser, reach.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
     finger = fingers.finger_of(points)
-    finger[~in_lines(runs)] = NONE
+    finger[~on_line] = NONE
     finger = _at_creases(finger, runs)
     finger[~reach.holds(finger, points)] = NONE
     share = None

@@ -24,11 +24,11 @@ _SECOND = 0.65  # of the brightest run of the same column
 _FADED = 0.5  # of the brightest of the line: its edge, through the blur of the camera
 _GLOW = 0.4  # of the brightest near by: a darker line is glow
 SHORT, _GLOW_OF_SHORT = 8, 0.7  # of so few columns it must be brighter
-_TOP, _FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
-_OF_PEAK, _OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
+TOP, FLAT_PX = 0.93, 4  # so many pixels as bright as this share of the peak: a flat, saturated top
+OF_PEAK, OF_FLAT = 0.5, 0.85  # of its peak: what of a run is weighed
 _COLUMN = 1024.0  # rows of a column when all are counted through: more than an image has
-_JUMP_PX = 6.0  # between columns: another surface
-_THICKEST_PX = 64  # the line on a thumb right before the camera; what is thicker is no line
+JUMP_PX = 6.0  # between columns: another surface
+THICKEST_PX = 64  # the line on a thumb right before the camera; what is thicker is no line
 _FEWEST = 3  # columns of a line
 
 
@@ -55,38 +55,57 @@ class Runs:
 
 
 _NONE_INT: Int = np.empty(0, dtype=np.int64)
-_NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT)
+NO_RUNS = Runs(_NONE_INT, np.empty(0), _NONE_INT, _NONE_INT, np.empty(0), _NONE_INT, _NONE_INT)
 
 
-def line_runs(laser: Image, first_row: int) -> Runs:
-    """The runs of the rows from `first_row` on."""
+def lines(laser: Image, first_row: int) -> tuple[Runs, Bool]:
+    """The runs of the rows from `first_row` on, and which of them (N,) belong to a line."""
+    runs = line_runs(laser, first_row)
+    return runs, in_lines(runs)
+
+
+def bright(laser: Image, first_row: int) -> tuple[Image, Image, tuple[int, int]]:
+    """What may be a line: the part (w, h) of a laser image, column by column, and the levels (w, h) it must exceed.
+
+    And at which column and row of the image it begins.
+    """
     band = laser[first_row:]
     mean, deviation = cv2.meanStdDev(laser[:first_row] if first_row >= _ENOUGH_ROWS else laser)
     noise = float(mean[0, 0]) + _NOISE * float(deviation[0, 0])
     threshold = min(max(FLOOR, noise, _OF_BRIGHTEST * cv2.minMaxLoc(band)[1]), 255.0)
     band = cv2.threshold(band, np.ceil(threshold) - 1.0, 0.0, cv2.THRESH_TOZERO)[1]
     left, top, width, height = cv2.boundingRect(band)
+    corner = (left, top + first_row)
     band = band[top : top + height, left : left + width]
     if not band.size:
-        return _NO_RUNS
+        return np.empty((0, 0), np.uint8), np.empty((0, 0), np.uint8), corner
+    # Above a half less 3/4: half or more, and not 0.
     least = cv2.convertScaleAbs(cv2.dilate(band, _NEIGHBOURHOOD), alpha=_OF_NEIGHBOURHOOD, beta=-0.75)
-    # Column by column from here on; above a half less 3/4: half or more, and not 0.
-    bright = np.zeros((width, height + 2), np.uint8)
-    bright[:, 1:-1] = cv2.transpose(cv2.compare(band, least, cv2.CMP_GT))
-    levels = np.asarray(cv2.transpose(band), np.uint8)[bright[:, 1:-1].view(np.bool_)]
-    flat = bright.ravel()
+    return np.asarray(cv2.transpose(band), np.uint8), np.asarray(cv2.transpose(least), np.uint8), corner
+
+
+def line_runs(laser: Image, first_row: int) -> Runs:
+    """The runs of the rows from `first_row` on."""
+    band, least, (left, top) = bright(laser, first_row)
+    if not band.size:
+        return NO_RUNS
+    width, height = band.shape
+    over = np.zeros((width, height + 2), np.uint8)
+    over[:, 1:-1] = cv2.compare(band, least, cv2.CMP_GT)
+    levels = band[over[:, 1:-1].view(np.bool_)]
+    flat = over.ravel()
     edges = np.flatnonzero(flat[1:] != flat[:-1])
     column, begin = np.divmod(edges[::2], height + 2)
     size = edges[1::2] - edges[::2]
-    good = size <= _THICKEST_PX
+    good = size <= THICKEST_PX
     if not good.all():
         levels = levels[np.repeat(good, size)]
         column, begin, size = column[good], begin[good], size[good]
     if not len(size):
-        return _NO_RUNS
+        return NO_RUNS
     centre, peak = _across(levels, size)
     column += left
-    begin += top + first_row
+    begin += top
     return _linked(column, begin + centre, begin, begin + size, peak)
 
 
@@ -101,8 +120,8 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
     first -= size
     peak = np.maximum.reduceat(levels, first).astype(np.float32)
     level = levels.astype(np.float32)
-    flat = np.add.reduceat(level > np.repeat(_TOP * peak, size), first, dtype=np.int64) >= _FLAT_PX
-    level -= np.repeat(np.where(flat, _OF_FLAT, _OF_PEAK) * peak, size)
+    flat = np.add.reduceat(level > np.repeat(TOP * peak, size), first, dtype=np.int64) >= FLAT_PX
+    level -= np.repeat(np.where(flat, OF_FLAT, OF_PEAK) * peak, size)
     np.maximum(level, 0.0, out=level)
     whole = np.add.reduceat(level, first)
     level *= np.arange(len(levels)) - np.repeat(first, size)
@@ -112,6 +131,8 @@ def _across(levels: Image, size: Int) -> tuple[Float, Float]:
 def in_lines(runs: Runs) -> Bool:
     """Which runs belong to a line: long enough, and not much darker than what is near, as a glow is."""
     peak, joins = runs.peak, runs.joins
+    if not len(peak):
+        return np.empty(0, dtype=np.bool_)
     columns = np.diff(np.append(runs.first, len(peak)))
     brightest = np.zeros(len(joins))
     np.maximum.at(brightest, joins, np.maximum.reduceat(peak, runs.first))
@@ -145,7 +166,7 @@ def _linked(column: Int, row: Float, start: Int, end: Int, peak: Float) -> Runs:
     off = np.minimum(off_above, off_below)
     near = after - (off_above <= off_below)
     here = np.flatnonzero(
-        (off < _JUMP_PX) & (start[near % len(near)] <= end) & (end[near % len(near)] >= start)
+        (off < JUMP_PX) & (start[near % len(near)] <= end) & (end[near % len(near)] >= start)
     )
     to = near[here]  # rising, as lines do not cross
     lost: list[tuple[Int, Int]] = []

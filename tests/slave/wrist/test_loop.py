@@ -144,7 +144,6 @@ def test_real_frames_go_through_the_loop_into_messages() -> None:
             "camera 'wrist' (v4l2:/dev/there-is-none): cannot be opened",
         ),
         (["--camera", "synthetic", "--luma"], "--luma is an option of --camera picamera2 and v4l2"),
-        (["--camera", "synthetic", "--engine", "numba"], "finds markers; rig 'wrist' is a wrist device"),
         (["--camera", "synthetic", "--scene", "lights"], "for a wrist rig there are standard"),
     ],
 )

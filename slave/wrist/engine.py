@@ -1,0 +1,49 @@
+"""Which code does the inner loops before a wrist device: OpenCV and numpy, or machine code. Chosen by name alone."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from common.arrays import Bool, Image, Int
+from slave.wrist.corridors import Float32
+from slave.wrist.paths import least_paths
+from slave.wrist.runs import Runs, lines
+from slave.wrist.valleys import energy
+
+Energy: TypeAlias = Callable[[Image, int], Float32]
+LeastPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
+Lines: TypeAlias = Callable[[Image, int], tuple[Runs, Bool]]
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """The steps in which much is done with few numbers.
+
+    Attributes:
+        energy: Straightened corridors, and how many circles the thumb crosses -> energy (`valleys.energy`).
+        least_paths: As `paths.least_paths`.
+        lines: As `runs.lines`.
+    """
+
+    energy: Energy
+    least_paths: LeastPaths
+    lines: Lines
+
+
+NUMPY = Engine(energy, least_paths, lines)
+
+
+def engine_named(name: str) -> Engine:
+    """The engine of a name, "numpy" or "numba".
+
+    Raises:
+        PhalanxError: numba is asked for and not installed; the text says how to install it.
+        ValueError: No such name.
+    """
+    if name == "numpy":
+        return NUMPY
+    if name == "numba":
+        from slave.wrist.fast import NUMBA  # an optional package: only who asks for it loads it
+
+        return NUMBA
+    raise ValueError(f"engine {name!r}, not numpy or numba")
