@@ -143,20 +143,23 @@ def _settings(task: Task) -> dict[str, object]:
         "guided": task.guided,
         "rig": task.rig.name,
         "hand": task.hand.name,
-        "frames_of": sorted(
-            {known for known, inputs in task.conditions if inputs == "detected"} | _calibrates(task)
-        ),
     }
 
 
-def _calibrates(task: Task) -> set[Known]:
-    """Whether the guided motion is needed."""
-    return {known for known, _ in task.conditions if known == "calibrated"}
+def _may_go_on(task: Task, folder: Path) -> bool:
+    """Whether all that needs frames is there from before: exact inputs need none, the guided motion does."""
+    if not task.resume or not (folder / DONE).exists() or read_summary(folder / DONE) != _settings(task):
+        return False
+    return all(
+        (folder / known).exists() and (inputs == "exact" or (folder / f"{known}-{inputs}").exists())
+        for known, inputs in task.conditions
+        if known == "calibrated" or inputs == "detected"
+    )
 
 
 def _perform(task: Task, who: Participant, folder: Path) -> None:
     """Render what this participant does, unless it was already and may be taken."""
-    if task.resume and (folder / DONE).exists() and read_summary(folder / DONE) == _settings(task):
+    if _may_go_on(task, folder):
         return
     try:
         if folder.exists():
@@ -164,7 +167,7 @@ def _perform(task: Task, who: Participant, folder: Path) -> None:
         folder.mkdir(parents=True)
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
-    if _calibrates(task):
+    if any(known == "calibrated" for known, _ in task.conditions):
         record_guided(folder / GUIDED, who, task.camera, task.guided, task.step)
     record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step, task.trial_s)
 

@@ -40,7 +40,7 @@ def task(out: Path) -> Task:
         out=out,
         resume=True,
         keep=True,
-        trial_s=0.25,
+        trial_s=0.2,
     )
 
 
@@ -71,7 +71,7 @@ def test_every_trial_went_through_the_line(told: dict[str, Any]) -> None:
     for who in ("participant-01", "participant-02"):
         assert {one["pose"] for one in trials if one["participant"] == who} == set(POSES)
     for one in trials:
-        assert one["triples"] in (2, 3)
+        assert one["triples"] in (1, 2)
         if one["pose"] == "open_palm":
             assert all(one["tracked"][1:])
             off = np.abs(np.array(one["pip_deg"]) - one["truth_deg"])[1:]
@@ -111,12 +111,12 @@ def test_calibration_is_ours_and_what_it_refuses_is_said(told: dict[str, Any]) -
 def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told: dict[str, Any]) -> None:
     detections = out / "participant-01/calibrated-detected/detections_wrist.npz"
     before = detections.stat().st_mtime_ns
-    found = run_participant(replace(task(out), level="auto", keep=False, conditions=(JUDGED, EXACT)), 1)
+    found = run_participant(replace(task(out), level="auto", keep=False, conditions=(EXACT,)), 1)
     assert detections.stat().st_mtime_ns == before
-    assert [len(trials) for trials in found.trials.values()] == [6, 6]
+    assert [len(trials) for trials in found.trials.values()] == [6]
     (palm,) = (one for one in found.trials["all, exact"] if one.pose == "open_palm")
     assert all(palm.tracked[1:])
-    # Three triples after a quick motion: the filter is still on its way.
+    # Two triples after a quick motion: the filter is still on its way.
     assert np.abs(np.array(palm.pip_deg) - palm.truth_deg)[1:].max() < 15.0
     assert (out / "participant-02/trials/wrist").is_dir()
     assert not (out / "participant-01/trials/wrist").exists()  # not kept
