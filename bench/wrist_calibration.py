@@ -1,7 +1,7 @@
 """What the calibration of a wrist device is worth: laser plane, flat field and palm against the truth they are of.
 
 Boards are rendered before the wrist camera by `common.sim.wrist_board`, each seed another laser and other places of the
-board; curls are those of the wrist scene, each seed another hand's skin, detected exactly but for noise.
+board. Wearers are those of `bench.wrist_wearers`, each seed another person.
 """
 
 from collections.abc import Iterator
@@ -11,34 +11,31 @@ import numpy as np
 from msgspec.structs import replace
 
 from bench.row import Row
+from bench.wrist_wearers import Person
 from common.arrays import Float
-from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration import CameraCalibration, RigCalibration, load
 from common.camera_model import CameraModel
 from common.errors import FitError
 from common.flat_field import field_at
 from common.frame_recording import Illumination
 from common.geometry import (
-    intersect_plane,
     matrix_to_rotation_vector,
-    rigid,
     rotation_vector_to_matrix,
     transform,
 )
 from common.hand_model import HandModel
-from common.sim.wrist.scene import WristScene
 from common.sim.wrist_board import LED_LOBE, LENS_POWER, WristBoardRenderer, WristBoardScene, board_poses
 from common.wrist_calibration import LaserPlane
 from master.calibrate.cameras.boards import Checkerboard, board_corners
-from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.wrist.curled import Curled
 from master.calibrate.wrist.flat_command import white_of
 from master.calibrate.wrist.flat_field import fit_flat_field
 from master.calibrate.wrist.laser_command import LinesSeen, lines_of
 from master.calibrate.wrist.lit_views import LitView
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board
-from master.calibrate.wrist.palm_hand import palm_from_hand
 from master.calibrate.wrist.placed import place_corners
 from master.calibrate.wrist.plane import PlaneFit, ViewLine, fit_plane
+from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
+from master.wrist.pipeline import WristPipeline
 from master.wrist.setup import WristSetup
 
 CALIB = Path("calib_json")
@@ -46,7 +43,7 @@ SEEDS = range(100, 120)
 LASERS = SEEDS[:12]  # rendered views take a third of a second each
 VIEWS = (3, 4, 6, 10)
 FLAT_SEEDS, FLAT_VIEWS = range(200, 202), 40
-CURL_SEEDS = range(300, 305)
+CURLED = 6  # people whose curl is solved, with three tables each
 BOARD = Checkerboard(9, 6, 0.015)
 PALM_BOARD, MOUNTING = Checkerboard(7, 4, 0.010), Mounting(0.085, 0.0, 0.022, 1.0)
 LENS_SIGMA_PX = (0.35, 0.5)  # focal length, centre: what a calibration from a dozen board views leaves
@@ -60,6 +57,7 @@ def rows() -> Iterator[Row]:
     yield from _planes(camera, rig)
     yield from _fields(camera, rig)
     yield from _palms(camera, rig)
+    yield from _wearers()
 
 
 def _planes(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
@@ -133,20 +131,65 @@ def _palms(camera: CameraCalibration, rig: RigCalibration) -> Iterator[Row]:
     yield from _palm_rows(
         "palm by a board, corners 0.1 px", by_board, "one view; the ruler's error comes on top"
     )
-    by_hand: list[tuple[float, float]] = []
-    sigma: list[float] = []
+
+
+def _wearers() -> Iterator[Row]:
+    """Mounting and knuckles before and after a guided motion, and the PIP of a natural curl with the files of each."""
+    turn: list[tuple[Float, Float]] = []
+    knuckle: list[tuple[Float, Float]] = []
+    unlikely: list[Float] = []
     refused = 0
-    for seed in CURL_SEEDS:
+    people: list[tuple[Person, Wearer]] = []
+    for person in map(Person.of, SEEDS):
         try:
-            fit = palm_from_hand(*_curl(camera, rig, seed))
+            found = calibrate_wearer(person.detected("wearer")[0], person.rig, person.camera, person.hand)
         except FitError:
             refused += 1
             continue
-        sigma.append(float(np.degrees(fit.turn_sigma_rad)))
-        by_hand.append(_palm_error(fit.T_camera_palm, true))
-    if by_hand:
-        note = f"begun up to 6 deg and 6 mm off; stated sigma {np.median(sigma):.1f} deg; {refused} refused"
-        yield from _palm_rows("palm by a curl", by_hand, note)
+        before, after = person.errors(person.rig, person.hand), person.errors(found.rig, found.hand)
+        turn.append((before[0], after[0]))
+        knuckle.append((before[1], after[1]))
+        unlikely.append(1e-3 * after[1] / found.knuckle_sigma_m)
+        people.append((person, found))
+    note = f"{len(people)} people, {refused} refused; palm 3 deg, 2 mm, knuckles 5 mm off per axis"
+    for k, axis in enumerate(("x, the pitch of the hand", "y", "z")):
+        was, now = (_rms(np.array([one[side][k] for one in turn])) for side in (0, 1))
+        yield Row(f"wearer: palm's turn about {axis}, rms", now, "deg", f"before {was:.2f}; {note}")
+    for k, axis in enumerate(("across", "away from the lens, down", "away from the lens, ahead")):
+        was, now = (_rms(np.array([one[side][:, k] for one in knuckle])) for side in (0, 1))
+        yield Row(f"wearer: knuckles {axis}, rms", now, "mm", f"before {was:.2f}")
+    yield Row(
+        "wearer: knuckles by stated sigma, rms",
+        _rms(np.array(unlikely)),
+        "sigma",
+        "1 is honest, less is careful",
+    )
+    errors = [_pip_errors(person, found) for person, found in people[:CURLED]]
+    for k, name in enumerate(("files as they were", "calibrated", "true files")):
+        value = _rms(np.concatenate([one[k] for one in errors]))
+        yield Row(
+            f"wearer: PIP of a natural curl, {name}, rms", value, "deg", f"{len(errors)} people, to 90 deg"
+        )
+
+
+def _pip_errors(person: Person, found: Wearer) -> list[Float]:
+    """Errors [deg] with the old, the new and the true files."""
+    triples, true = person.detected("curl", np.linspace(0.3, 3.6, 24))
+    out: list[Float] = []
+    for rig, hand in (
+        (person.rig, person.hand),
+        (found.rig, found.hand),
+        (person.true_rig, person.true_hand),
+    ):
+        line = WristPipeline(WristSetup.of(rig, person.camera, HandModel.of(hand)), continuous=False)
+        angles = np.array([line.push(triple)[0].pose.angles_rad for triple in triples])
+        error = np.degrees(angles[:, 1:, 2] - true[:, 1:, 2])
+        out.append(error[np.isfinite(error)])
+    return out
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _palm_rows(name: str, found: list[tuple[float, float]], note: str) -> Iterator[Row]:
@@ -196,25 +239,6 @@ def _wrong_lens(camera: CameraCalibration, seed: int) -> CameraModel:
         lens, fx_px=lens.fx_px + focal, fy_px=lens.fy_px + focal, cx_px=lens.cx_px + u, cy_px=lens.cy_px + v
     )
     return CameraModel.of(replace(camera, intrinsics=off), np.eye(4))
-
-
-def _curl(camera: CameraCalibration, rig: RigCalibration, seed: int) -> tuple[Curled, WristSetup]:
-    """What a slave sees of a guided curl, and the device with a palm as wrong as a drawing."""
-    hand = load(CALIB / "hands" / f"{rig.hand}.json", HandProfile)
-    scene = WristScene.by_name("curl@indoor", rig, {camera.name: camera}, hand, seed)
-    rng = np.random.default_rng(seed)
-    truths = [scene.truth(t) for t in np.linspace(0.0, 0.5 * scene.period_s, 30)]
-    uv = np.array([truth.laser_uv[1:6] for truth in truths]) + rng.normal(0.0, 0.3, (30, 5, 2))
-    tip = np.array([np.where(truth.tip_visible[:, None], truth.tip_uv, np.nan) for truth in truths])
-    tip = tip + rng.normal(0.0, 2.0, tip.shape)
-    plane = rig.laser_plane
-    assert plane is not None
-    points = intersect_plane(np.zeros(3), scene.optics.ray(uv), np.array(plane.normal), plane.offset_m)
-    true = scene.T_camera_palm
-    turn = rotation_vector_to_matrix(np.radians(rng.uniform(-6.0, 6.0, 3)))
-    rough = rigid(turn @ true[:3, :3], true[:3, 3] + rng.uniform(-0.006, 0.006, 3))
-    setup = WristSetup.of(replace(rig, T_camera_palm=matrix_of(rough)), camera, HandModel.of(hand))
-    return Curled(points, tip), setup
 
 
 def _palm_error(T: Float, true: Float) -> tuple[float, float]:

@@ -22,7 +22,7 @@ _OPEN, _BENT = 0.85, 0.5  # shares of a finger's way: 4 degrees of a straight fi
 _MOVED_M = 0.015  # of the laser point of a finger that bent
 _FEWEST = 5  # triples of a bend
 _FINGERS = 3  # that must be seen
-_PER_BEND, _PER_FLAT = 16, 4
+_PER_BEND, _PER_FLAT = 16, 6
 _EDGE = 0.02  # share of strays beyond the ends of a way
 
 
@@ -52,7 +52,7 @@ def guided(along_m: Float) -> Guided:
         raise FitError(
             f"the hand bent {len(bends)} times between being flat, at least twice is needed: {MOTION}"
         )
-    chosen = [_evenly(np.flatnonzero(flat), open_share, _PER_FLAT)]
+    chosen = [_flattest(np.flatnonzero(flat), open_share)]
     number = [np.full(len(chosen[0]), FLAT)]
     for k, rows in enumerate(bends):
         rows = _evenly(rows, open_share, max(_PER_BEND * 2 // len(bends), _FEWEST))
@@ -95,6 +95,12 @@ def _bends(open_share: Float, flat: Bool) -> list[Int]:
         if len(rows) >= _FEWEST and open_share[rows].min() < _BENT:
             bends.append(rows)
     return bends
+
+
+def _flattest(rows: Int, open_share: Float) -> Int:
+    """Some of the more open half of the rows: a hand stays flat for longer than it passes by."""
+    half = rows[np.argsort(open_share[rows])][len(rows) // 2 :]
+    return np.unique(half[np.linspace(0.0, len(half) - 1.0, _PER_FLAT).astype(np.int64)])
 
 
 def _evenly(rows: Int, open_share: Float, count: int) -> Int:

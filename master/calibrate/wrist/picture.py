@@ -16,8 +16,8 @@ from master.calibrate.wrist.curl import FingerCurl
 from master.calibrate.wrist.flat_field import FlatFit, WhiteSamples
 from master.calibrate.wrist.plane import PlaneFit, ViewLine
 
-_FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
-_BLUE, _ORANGE, _GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
+FINGER_COLOURS = ("#c2571a", "#2b6cb0", "#2f855a", "#805ad5", "#b7791f")
+BLUE, ORANGE, GREY = "#2b6cb0", "#c2571a", "#8a8a8a"
 
 
 def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: CameraModel) -> None:
@@ -26,27 +26,27 @@ def draw_plane(path: Path, fit: PlaneFit, lines: Sequence[ViewLine], optics: Cam
     Raises:
         RecordingError: The file cannot be written.
     """
-    figure = _figure((15.0, 4.6))
+    figure = figure_of((15.0, 4.6))
     figure.suptitle(
         f"laser plane: normal ± {np.degrees(fit.normal_sigma_rad):.3f} deg,"
         f" offset {1e3 * fit.plane.offset_m:.2f} ± {1e3 * fit.offset_sigma_m:.3f} mm, rms {1e3 * fit.rms_m:.3f} mm"
     )
     image, above, bars = figure.subplots(1, 3)
-    _frame(image, optics, "lines in the image")
+    framed(image, optics, "lines in the image")
     normal = np.array(fit.plane.normal)
     for line, own in zip(lines, fit.used, strict=True):
-        colour = _BLUE if own else _ORANGE
+        colour = BLUE if own else ORANGE
         uv = optics.project(line.points_m)
         image.plot(uv[:, 0], uv[:, 1], ".", markersize=2, color=colour)
         above.plot(1e3 * line.points_m[:, 0], 1e3 * line.points_m[:, 2], ".", markersize=2, color=colour)
     above.set(title="lines from above [mm]; camera at 0, 0", xlabel="x", ylabel="z", aspect="equal")
-    above.plot([0.0], [0.0], "^", color=_GREY)
+    above.plot([0.0], [0.0], "^", color=GREY)
     off = [1e3 * float(np.mean(line.points_m @ normal - fit.plane.offset_m)) for line in lines]
-    bars.bar(range(len(lines)), off, color=[_BLUE if own else _ORANGE for own in fit.used])
-    bars.axhline(0.0, color=_GREY, linewidth=0.8)
+    bars.bar(range(len(lines)), off, color=[BLUE if own else ORANGE for own in fit.used])
+    bars.axhline(0.0, color=GREY, linewidth=0.8)
     bars.set(title="views off the plane [mm]; orange: left out", xlabel="view")
     bars.set_xticks(range(len(lines)), [line.name for line in lines], rotation=90, fontsize=7)
-    _save(figure, path)
+    saved(figure, path)
 
 
 def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: CameraModel) -> None:
@@ -55,7 +55,7 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     Raises:
         RecordingError: The file cannot be written.
     """
-    figure = _figure((15.0, 4.2))
+    figure = figure_of((15.0, 4.2))
     figure.suptitle(
         f"flat field: residual {100 * fit.rms:.2f} %, of views left out of the fit {100 * fit.foretold_rms:.2f} %"
     )
@@ -63,11 +63,11 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
     u, v = np.meshgrid(np.arange(0, optics.width_px, 8.0), np.arange(0, optics.height_px, 8.0))
     xy = optics.undistort(np.stack([u, v], axis=-1)).reshape(-1, 2)
     values = field_at(fit.field, xy).reshape(u.shape)
-    _frame(field, optics, "flat field, 1 on the axis; dots: samples")
+    framed(field, optics, "flat field, 1 on the axis; dots: samples")
     drawn = field.contourf(u, v, values, levels=20, cmap="viridis")
     field.plot(samples.uv[:, 0], samples.uv[:, 1], ".", markersize=1, color="white", alpha=0.5)
     figure.colorbar(drawn, ax=field)
-    _frame(left, optics, "residual [%]")
+    framed(left, optics, "residual [%]")
     limit = max(300.0 * fit.rms, 1.0)
     dots = left.scatter(
         samples.uv[:, 0],
@@ -79,12 +79,12 @@ def draw_flat_field(path: Path, fit: FlatFit, samples: WhiteSamples, optics: Cam
         vmax=limit,
     )
     figure.colorbar(dots, ax=left)
-    law.plot(np.linalg.norm(samples.xy, axis=1), 100 * fit.residual, ".", markersize=2, color=_BLUE)
-    law.axhline(0.0, color=_GREY, linewidth=0.8)
+    law.plot(np.linalg.norm(samples.xy, axis=1), 100 * fit.residual, ".", markersize=2, color=BLUE)
+    law.axhline(0.0, color=GREY, linewidth=0.8)
     law.set(
         title="residual [%] by distance from the axis", xlabel="tangent of the angle", ylim=(-limit, limit)
     )
-    _save(figure, path)
+    saved(figure, path)
 
 
 def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
@@ -93,9 +93,9 @@ def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
     Raises:
         RecordingError: The file cannot be written.
     """
-    figure = _figure((8.0, 6.5))
+    figure = figure_of((8.0, 6.5))
     axes = figure.subplots()
-    for found, colour in zip(curls, _FINGER_COLOURS, strict=True):
+    for found, colour in zip(curls, FINGER_COLOURS, strict=True):
         axes.plot(
             1e3 * found.points_m[:, 0], 1e3 * found.points_m[:, 2], ".", markersize=3, color=colour, alpha=0.5
         )
@@ -111,20 +111,27 @@ def draw_curls(path: Path, curls: Sequence[FingerCurl]) -> None:
         axes.plot(ends[1:, 0], ends[1:, 2], "x", color=colour)
     axes.set(title="laser points from above [mm]: o straight, x bent", xlabel="x", ylabel="z", aspect="equal")
     figure.legend(fontsize=8, loc="outside lower center", ncols=3)  # not on the fingers
-    _save(figure, path)
+    saved(figure, path)
 
 
-def _figure(size: tuple[float, float]) -> Figure:
+def figure_of(size: tuple[float, float]) -> Figure:
+    """An empty figure of a size [inches]."""
     figure = Figure(figsize=size, dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def _frame(axes: Axes, optics: CameraModel, title: str) -> None:
+def framed(axes: Axes, optics: CameraModel, title: str) -> None:
+    """Give axes the frame of the camera's image."""
     axes.set(xlim=(0, optics.width_px), ylim=(optics.height_px, 0), aspect="equal", title=title)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def saved(figure: Figure, path: Path) -> None:
+    """Write a figure.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
     try:
         with replacing(path) as file:
             figure.savefig(file, format="png")

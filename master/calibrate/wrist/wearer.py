@@ -34,6 +34,7 @@ _LENGTH, _MEASURED = (
 _BENT_RAD = np.radians(60.0)  # at its knuckle: from here on the line hardly moves any more
 _MISFIT = 1.5  # standard deviations: angles are free, so what is left is small
 _UNLIKELY = 3.0  # standard deviations
+_SURPRISE = 1.5  # rms of standard deviations: one in a hundred wearers, of 14 numbers that a motion tells
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,6 +63,12 @@ class Wearer:
     def unknown(self) -> Unknown:
         """What was fitted, as changes of the old rig and hand."""
         return Unknown.of(self.fit.x)
+
+    @property
+    def knuckle_sigma_m(self) -> Float:
+        """(4, 3) of the knuckles in the camera's frame [m]: of palm and hand file together."""
+        by_x = self.model.knuckle_derivatives(self.fit.x)
+        return np.sqrt(np.einsum("fki,ij,fkj->fk", by_x, self.fit.covariance, by_x))
 
 
 def calibrate_wearer(
@@ -144,9 +151,14 @@ def _check(fit: Fit, seen: Sightings) -> None:
 
 
 def _check_likely(fit: Fit) -> None:
+    """Refuse what neither skin nor belief explains.
+
+    Raises:
+        FitError: With what is most unlikely.
+    """
     pull = np.abs(fit.x) / fit.prior_sigma
     worst = int(pull.argmax())
-    if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.unlike > _UNLIKELY:
+    if fit.rms > _MISFIT or pull[worst] > _UNLIKELY or fit.surprise > _SURPRISE or fit.unlike > _UNLIKELY:
         raise FitError(
             f"no likely wearer explains what was seen: it is {fit.rms:.1f} times farther off than skin explains,"
             f" fingers {fit.unlike:.1f} times from their habits, and {_name(worst)} {pull[worst]:.1f} standard"
@@ -176,7 +188,7 @@ def report_lines(setup: WristSetup, fit: Fit, count: int) -> tuple[str, ...]:
     knuckles = ~fit.fist & (fit.angles_rad[..., MCP].max(axis=1) > _BENT_RAD)
     lines = [
         f"wearer from {len(fit.fist)} of {count} triples and {np.isfinite(fit.off[..., 2]).sum()} fingertips in them",
-        f"what is left: laser points {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px",
+        f"left: laser {1e3 * fit.laser_m:.2f} mm, tips {fit.tip_px:.1f} px; changed by {fit.surprise:.1f} of belief",
         f"palm turned by {turn:.1f} deg, about x, y, z ± {_three(np.degrees(sigma.pose[:3]))}",
         f"palm shifted by {shift:.1f} mm, along x, y, z ± {_three(1e3 * sigma.pose[3:])}",
         f"{'':8} {'bent':>4} {'knuckle before':>20} {'after, mm':>20} {'±':>14} {'thick':>11} {'long':>13}",

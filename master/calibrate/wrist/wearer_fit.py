@@ -36,7 +36,8 @@ _ROUGH = np.array([4e-3, 25.0])  # of a guess: laser point along the plane [m], 
 _ROUGHEST = 3.0
 _GRID_RAD = np.radians(np.arange(0.0, 97.0, 4.0))
 _PAST_RAD = np.radians(84.0)  # PIP beyond which the last phalanx may fold into the light
-_ROUNDS, _TRIALS, _SETTLED = 15, 6, 0.02  # steps, and the gain that is none
+_ROUNDS = (4, 4, 12)  # steps, from one guess of angles to the next
+_TRIALS, _SETTLED = 6, 0.02  # of a step; the gain that is none
 _KNUCKLES, _FIST = 0, 1
 
 
@@ -85,6 +86,12 @@ class Fit:
     laser_m: float
     tip_px: float
 
+    @property
+    def surprise(self) -> float:
+        """Rms change in standard deviations of what was believed, by as many numbers as the motion told."""
+        told = (1.0 - np.diag(self.covariance) / self.prior_sigma**2).sum()
+        return float(np.sqrt(((self.x / self.prior_sigma) ** 2).sum() / told))
+
 
 def prior_sigma(pose: Float, length: Float) -> Float:
     """What is believed of a wearer (26,), with the palm's pose (6,) [rad, m] and the lengths of fingers (4,)."""
@@ -100,12 +107,9 @@ def fit_wearer(model: WearerModel, seen: Sightings, sigma: Float) -> Fit:
         sigma: (26,) how far the first guess may be off, as of `prior_sigma`.
     """
     problem = _Problem(model, seen, sigma)
-    x, covariance = np.zeros(UNKNOWN), np.empty(0)
-    guess = problem.guessed(x)
-    for _ in range(2):  # what a rough pose takes for a stray may be none
-        x, guess, covariance = problem.solved(x, guess)
-        guess = problem.guessed(x)
-    x, guess, covariance = problem.solved(x, guess)
+    x, guess, covariance = np.zeros(UNKNOWN), problem.guessed(np.zeros(UNKNOWN)), np.empty(0)
+    for rounds in _ROUNDS:  # what a rough pose takes for a stray may be none
+        x, guess, covariance = problem.solved(x, problem.guessed(x), rounds)
     return problem.told(x, guess, covariance)
 
 
@@ -154,11 +158,11 @@ class _Problem:
         angles[flat], used[flat] = 0.0, True
         return _Guess(angles, fist, used)
 
-    def solved(self, x: Float, guess: _Guess) -> tuple[Float, _Guess, Float]:
+    def solved(self, x: Float, guess: _Guess, rounds: int) -> tuple[Float, _Guess, Float]:
         """Unknowns (26,), angles and covariance (26, 26), from a guess."""
         damping, covariance = 1e-2, np.diag(self.prior_sigma**2)
         cost = self._cost(x, guess)
-        for _ in range(_ROUNDS):
+        for _ in range(rounds):
             normal = self._normal(x, guess)
             covariance = np.asarray(np.linalg.inv(normal.reduced(0.0)[0]), np.float64)
             for _ in range(_TRIALS):

@@ -26,7 +26,7 @@ from master.wrist.skin import Skin
 FINGERS = slice(1, 5)
 UNKNOWN, LOCAL = 26, 3
 ABDUCTION, MCP, PIP = range(LOCAL)
-_RAYS = 32
+_RAYS, _NUDGE = 32, 1e-5
 _TURN_STEP, _SHIFT_STEP, _SHARE_STEP = np.radians(0.5), 5e-4, 0.02  # of central differences
 
 
@@ -64,6 +64,11 @@ class WearerModel:
         self.px_per_m = float(setup.optics.matrix[0, 0] / distance)  # at the knuckles
         self.mcp_per_pip, self.dip_per_pip = curve.slope[FINGERS, 1], curve.slope[FINGERS, DIP]
 
+    @property
+    def none(self) -> Unknown:
+        """No change."""
+        return Unknown.of(np.zeros(UNKNOWN))
+
     def flat(self, point_m: Float) -> Float:
         """Points (..., 3) [m] on the laser plane as (across, along) (..., 2)."""
         return self._axes.flat(point_m)
@@ -77,6 +82,14 @@ class WearerModel:
     def knuckles(self, unknown: Unknown) -> Float:
         """(4, 3) of index ... little, camera frame [m]."""
         return transform(self.palm(unknown), self._root[FINGERS] + unknown.knuckle_m)
+
+    def knuckle_derivatives(self, x: Float) -> Float:
+        """How the knuckles move with what is unknown, (4, 3, 26)."""
+        out = np.empty((4, 3, UNKNOWN))
+        for k, step in enumerate(_NUDGE * np.eye(UNKNOWN)):
+            ahead, behind = (self.knuckles(Unknown.of(x + sign * step)) for sign in (1.0, -1.0))
+            out[..., k] = (ahead - behind) / (2.0 * _NUDGE)
+        return out
 
     def __call__(self, x: Float, angles: Float) -> Float:
         """Laser point (across, along) [m] and tip [px] of every finger, (T, 4, 4), NaN where the laser misses.

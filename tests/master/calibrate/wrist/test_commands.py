@@ -249,8 +249,11 @@ def test_broken_recordings_say_what_is_wrong(
             CalibrationError,
             "expected a rig of kind 'wrist'",
         ),
-        (("palm", "nowhere", *PALM_BOARD[:4], "--rig", "wrist"), CalibrationError, "--wrist-mm: missing"),
-        (("palm", "nowhere", "--rig", "wrist"), CalibrationError, "needs --board .* or --detections DIR"),
+        (
+            ("wearer", "nowhere", "--detections", "x", "--rig", "wrist"),
+            RecordingError,
+            "phalanx-slave detect",
+        ),
         (("curl", "nowhere", "--detections", "x", "--rig", "wrist"), RecordingError, "phalanx-slave detect"),
     ],
 )

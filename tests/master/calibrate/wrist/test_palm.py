@@ -1,30 +1,19 @@
-"""The palm's pose: from a board whose mounting is known by hand calculation, and from a curl of a simulated hand."""
+"""The palm's pose from a board whose mounting is known by hand calculation."""
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
 from common.arrays import Float
-from common.calibration import HandProfile, RigCalibration, load
 from common.errors import FitError
 from common.geometry import (
-    intersect_plane,
     matrix_to_rotation_vector,
     rigid,
-    rotation_vector_to_matrix,
     transform,
 )
-from common.hand_model import HandModel
-from common.sim.wrist.scene import WristScene
 from master.calibrate.cameras.boards import Checkerboard, board_corners
-from master.calibrate.cameras.lens_files import matrix_of
-from master.calibrate.wrist.curled import Curled
 from master.calibrate.wrist.palm_board import Mounting, palm_from_board
-from master.calibrate.wrist.palm_hand import palm_from_hand
 from master.calibrate.wrist.placed import PlacedBoard, place_corners
-from master.wrist.setup import WristSetup
-from tests.conftest import ROOT
-from tests.master.calibrate.wrist.devices import CAMERA, OPTICS, RIG
+from tests.master.calibrate.wrist.devices import OPTICS, RIG
 
 BOARD = Checkerboard(7, 4, 0.010)
 MOUNTING = Mounting(0.085, 0.004, 0.022, 1.0)
@@ -92,55 +81,3 @@ def test_a_board_too_small_to_tell_its_tilt_is_refused() -> None:
     placed = place_corners(uv + 0.1 * rng.standard_normal(uv.shape), tiny, OPTICS)
     with pytest.raises(FitError, match="take a larger board"):
         palm_from_board([placed], tiny, MOUNTING)
-
-
-def curl(seed: int, *, tips: bool = True) -> Curled:
-    """What a slave sees of a guided curl: true centroids and tips with noise."""
-    hand = load(ROOT / "calib_json/hands/default-right.json", HandProfile)
-    scene = WristScene.by_name("curl@indoor", RIG, {"wrist": CAMERA}, hand, seed)
-    rng = np.random.default_rng(seed)
-    truths = [scene.truth(t) for t in np.linspace(0.0, 0.5 * scene.period_s, 16)]
-    uv = np.array([truth.laser_uv[1:6] for truth in truths]) + rng.normal(0.0, 0.3, (16, 5, 2))
-    tip = np.array([np.where(truth.tip_visible[:, None], truth.tip_uv, np.nan) for truth in truths])
-    tip = tip + rng.normal(0.0, 2.0, tip.shape)
-    assert RIG.laser_plane is not None
-    plane = RIG.laser_plane
-    points = intersect_plane(np.zeros(3), OPTICS.ray(uv), np.array(plane.normal), plane.offset_m)
-    return Curled(points, tip if tips else np.full_like(tip, np.nan))
-
-
-def guessed(turn_deg: tuple[float, float, float], shift_m: tuple[float, float, float]) -> WristSetup:
-    """The device with a palm as wrong as a drawing."""
-    rough = rigid(rotation_vector_to_matrix(np.radians(turn_deg)) @ TRUE[:3, :3], TRUE[:3, 3] + shift_m)
-    rig: RigCalibration = replace(RIG, T_camera_palm=matrix_of(rough))
-    return WristSetup.of(
-        rig, CAMERA, HandModel.of(load(ROOT / "calib_json/hands/default-right.json", HandProfile))
-    )
-
-
-def test_a_curl_brings_a_rough_palm_near_the_true_one() -> None:
-    setup = guessed((5.0, -4.0, 3.0), (0.006, -0.005, 0.004))
-    before = errors(setup.T_camera_palm)
-    fit = palm_from_hand(curl(2), setup)
-    turn, shift = errors(fit.T_camera_palm)
-    assert (
-        turn < 4.0 < before[0]
-    )  # skin of the simulation is not that of the table; stated is a sigma of 1 to 2 deg
-    assert shift < 4.0 < before[1]
-    assert turn < 3.5 * np.degrees(fit.turn_sigma_rad)
-    assert fit.residual["laser_rms_mm"] < 1.2
-
-
-def test_fingers_that_do_not_curl_tell_no_palm() -> None:
-    seen = curl(2)
-    still = Curled(np.repeat(seen.laser_m[:1], 16, axis=0), seen.tip_uv)
-    with pytest.raises(FitError, match="0 fingers curl before the laser"):
-        palm_from_hand(still, guessed((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-
-
-def test_a_curl_elsewhere_is_explained_by_no_palm() -> None:
-    seen = curl(2, tips=False)
-    mixed = seen.laser_m.copy()
-    mixed[:, [1, 2, 3, 4]] = seen.laser_m[:, [4, 3, 2, 1]]  # the fingers of the other hand
-    with pytest.raises(FitError, match=r"no pose of the palm explains|is known to"):
-        palm_from_hand(Curled(mixed, seen.tip_uv), guessed((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))

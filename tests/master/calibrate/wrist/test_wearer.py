@@ -1,0 +1,180 @@
+"""Who wears a device: knuckles and palm of simulated people are found again, and motions that tell nothing refused."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from bench.wrist_wearers import CALIB, Person, knuckles
+from common.arrays import Float
+from common.calibration import HandProfile, load, parse
+from common.errors import CalibrationError, FitError
+from common.geometry import rotation_vector_to_matrix, transform
+from common.hand_model import CHAINS, HandModel
+from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.tree_files import provenance
+from master.calibrate.wrist.guided import FLAT, guided
+from master.calibrate.wrist.wearer import calibrate_wearer
+from master.calibrate.wrist.wearer_model import UNKNOWN, Unknown, WearerModel, wearing
+from master.wrist.setup import WristSetup
+from master.wrist.skin import Skin
+
+ANGLES = np.radians(
+    [[[2.0, 0.0, 0.0]] * 4, [[0.0, 50.0, 4.0]] * 4, [[-3.0, 85.0, 0.0]] * 4, [[1.0, 30.0, 60.0]] * 4]
+)
+
+
+def setup_of(person: Person) -> WristSetup:
+    return WristSetup.of(person.rig, person.camera, HandModel.of(person.hand))
+
+
+@pytest.fixture(scope="module")
+def people() -> dict[int, Person]:
+    """A right and a left hand, whose files are wrong in palm and knuckles."""
+    return {seed: Person.of(seed) for seed in (40, 41)}
+
+
+@pytest.mark.parametrize("seed", [40, 41])
+def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
+    people: dict[int, Person], seed: int
+) -> None:
+    person = people[seed]
+    found = calibrate_wearer(person.detected("wearer")[0], person.rig, person.camera, person.hand)
+    turn_before, before = person.errors(person.rig, person.hand)
+    turn, after = person.errors(found.rig, found.hand)
+    assert np.sqrt(np.mean(after**2)) < 0.75 * np.sqrt(np.mean(before**2))
+    assert np.abs(after[:, 0]).max() < 2.5  # across is what the laser tells best [mm]
+    by_sigma = 1e-3 * after / found.knuckle_sigma_m
+    assert np.sqrt(np.mean(by_sigma**2)) < 1.5
+    assert np.abs(by_sigma).max() < 3.0
+    # About y and z the palm is told by where fingers go aside, about x by the flat hand alone.
+    assert np.linalg.norm(turn[1:]) < max(2.5, np.linalg.norm(turn_before[1:]))
+    assert abs(turn[0]) < 3.0 * np.degrees(np.sqrt(found.fit.covariance[0, 0]))
+    assert found.rig.provenance["T_camera_palm"].tool == "calibrate wearer"
+    assert {"knuckles", "palmar_scale"} <= found.hand.provenance.keys()
+    # What is written is what was fitted.
+    written = transform(np.array(found.rig.T_camera_palm), knuckles(found.hand))
+    np.testing.assert_allclose(written, found.model.knuckles(found.unknown), atol=1e-7)
+
+
+def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(people: dict[int, Person]) -> None:
+    person = people[40]
+    triples = person.detected("wearer")[0]
+    found = calibrate_wearer(triples, person.rig, person.camera, person.hand)
+    told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
+    assert told.knuckle_m[:, 0].max() < 0.6  # across
+    assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
+    # With a palm that a board has placed, knuckles are known better.
+    rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
+    placed = calibrate_wearer(triples, rig, person.camera, person.hand)
+    surer = Unknown.of(np.sqrt(np.diag(placed.fit.covariance)) / placed.fit.prior_sigma)
+    assert (surer.knuckle_m[:, :2] < told.knuckle_m[:, :2]).all()  # across and up
+    assert np.sqrt(np.mean(person.errors(placed.rig, placed.hand)[1] ** 2)) < 3.0
+
+
+def test_derivatives_are_those_of_the_function(people: dict[int, Person]) -> None:
+    model, rng = WearerModel(setup_of(people[41])), np.random.default_rng(0)
+    x = 1e-3 * rng.standard_normal(UNKNOWN)
+    by_x, by_angles = model.derivatives(x, ANGLES)
+    way, turn = 3e-4 * rng.standard_normal(UNKNOWN), 3e-3 * rng.standard_normal(ANGLES.shape)
+    ahead, behind = model(x + way, ANGLES + turn), model(x - way, ANGLES - turn)
+    change = 2.0 * (by_x @ way + (by_angles @ turn[..., None])[..., 0])
+    scale = np.array([1e-4, 1e-4, 0.2, 0.2])  # m and px
+    np.testing.assert_array_less(np.abs((ahead - behind - change) / scale), 1.0)
+
+
+def test_the_files_written_show_what_was_fitted(people: dict[int, Person]) -> None:
+    person, rng = people[40], np.random.default_rng(1)
+    for hand in (person.hand, replace(person.hand, radius_m=None)):
+        setup = WristSetup.of(person.rig, person.camera, HandModel.of(hand))
+        model = WearerModel(setup)
+        x = rng.standard_normal(UNKNOWN) * np.r_[np.full(18, 1e-3), np.full(8, 0.02)]
+        unknown = Unknown.of(x)
+        new = HandModel.of(wearing(setup.model, unknown))
+        rig = replace(person.rig, T_camera_palm=matrix_of(model.palm(unknown)))
+        again = WearerModel(WristSetup.of(rig, person.camera, new))
+        fitted, shown = model(x, ANGLES), again(np.zeros(UNKNOWN), ANGLES)
+        np.testing.assert_allclose(shown[..., :2], fitted[..., :2], atol=3e-4)
+        np.testing.assert_allclose(shown[..., 2:], fitted[..., 2:], atol=2.0)
+        assert (new.rest_position_m[CHAINS[0]] == setup.model.rest_position_m[CHAINS[0]]).all()
+
+
+def along(*bends: float, flat: float = 0.17) -> Float:
+    """Laser points (T, 4) of a hand that is flat, bends until they are so near [m], and is flat again."""
+    parts = [np.full(6, flat)]
+    for near in bends:
+        way = flat + (near - flat) * (0.5 - 0.5 * np.cos(np.linspace(0.0, 2.0 * np.pi, 30)))
+        parts += [way, np.full(6, flat)]
+    return np.repeat(np.concatenate(parts)[:, None], 4, axis=1)
+
+
+def test_a_motion_falls_into_its_bends() -> None:
+    found = guided(along(0.09, 0.11))
+    assert set(found.bend.tolist()) == {FLAT, 0, 1}
+    assert (found.row[found.bend == 0].max() < found.row[found.bend == 1].min()).all()
+    gaps = along(0.09, 0.11)
+    gaps[::3, 1] = np.nan
+    gaps[7] = np.nan
+    assert set(guided(gaps).bend.tolist()) == {FLAT, 0, 1}
+
+
+@pytest.mark.parametrize(
+    ("seen", "match"),
+    [
+        (along(0.09), "the hand bent 1 times .* open the hand flat"),
+        (along(0.165, 0.165), "0 fingers bend before the laser"),
+        (np.full((40, 4), np.nan), "0 fingers bend before the laser"),
+        (np.empty((0, 4)), "0 fingers bend before the laser"),
+        (along(0.09, 0.11) * [1.0, np.nan, np.nan, 1.0], "2 fingers bend before the laser, at least 3"),
+    ],
+)
+def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
+    with pytest.raises(FitError, match=match):
+        guided(seen)
+
+
+@pytest.mark.parametrize(
+    ("what", "match"),
+    [
+        ("half", "bent at their knuckles to index .* bend them towards 90 deg|never bends straight fingers"),
+        ("fists", "never bends straight fingers at their knuckles"),
+        ("hand", "no likely wearer.*hand file that of this hand and side"),
+        ("plane", "no likely wearer.*laser plane measured|never|bent at their knuckles"),
+    ],
+)
+def test_what_tells_nothing_or_a_lie_is_refused(people: dict[int, Person], what: str, match: str) -> None:
+    person = people[40]
+    rig, hand = person.rig, person.hand
+    triples = person.detected("wearer")[0]
+    if what == "half":  # back from where the knuckles are bent by 40 degrees
+        triples = triples[:10] + triples[10:13] + triples[27:]
+    elif what == "fists":
+        triples = triples[40:] + triples[40:]
+    elif what == "hand":
+        hand = load(CALIB / "hands" / "default-left.json", HandProfile)
+    else:
+        assert rig.laser_plane is not None
+        turned = rotation_vector_to_matrix(np.array([0.1, 0.0, 0.0])) @ np.array(rig.laser_plane.normal)
+        x, y, z = turned.tolist()
+        rig = replace(rig, laser_plane=replace(rig.laser_plane, normal=(x, y, z)))
+    with pytest.raises(FitError, match=match):
+        calibrate_wearer(triples, rig, person.camera, hand)
+
+
+def test_a_hand_file_says_how_thick_its_fingers_are(people: dict[int, Person]) -> None:
+    hand = people[40].hand
+    for plain in (hand, replace(hand, radius_m=None)):
+        usual, thick = (
+            Skin.of(HandModel.of(one)) for one in (plain, replace(plain, palmar_scale={"ring": 1.2}))
+        )
+        ratio = thick.palmar_m / usual.palmar_m
+        np.testing.assert_allclose(ratio[3], 1.2)
+        np.testing.assert_allclose(np.delete(ratio, 3, axis=0), 1.0)
+        np.testing.assert_allclose(thick.radius_m / usual.radius_m, ratio)
+
+
+@pytest.mark.parametrize(("key", "value"), [("ringfinger", "1.1"), ("ring", "0.1"), ("ring", '"thick"')])
+def test_a_thickness_that_is_none_is_refused_with_its_key(key: str, value: str) -> None:
+    raw = (CALIB / "hands" / "default-right.json").read_text()
+    wrong = raw.replace('"version": 1,', f'"version": 1, "palmar_scale": {{"{key}": {value}}},', 1)
+    with pytest.raises(CalibrationError, match=r"me\.json.*palmar_scale"):
+        parse(wrong.encode(), HandProfile, "me.json")
