@@ -19,10 +19,11 @@ from master.wrist.fingertip import Fingertips
 from master.wrist.forward import ASIDE_RAD, BEYOND_RAD, DIP, PIP, NaturalCurve
 from master.wrist.laser_cut import LaserCut
 from master.wrist.setup import WristSetup
-from master.wrist.skin import Skin
+from master.wrist.skin import Skin, first_hits
 
 UNKNOWNS = 3
 SEEN = 4
+BEHIND_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -90,3 +91,16 @@ class FingerPoses:
         seen[wanted, :2], length[wanted] = line.point_m, line.length_px
         seen[..., 2:] = tips[..., :2] / tips[..., 2:]
         return Views(seen, length)
+
+    def tips_shown(self, x: Float) -> Bool:
+        """Whether the camera sees the tips (N, 5) of unknowns (N, 5, 3), or these lie just behind a finger's edge."""
+        chains, T = self._setup.model.chains(self.angles(x)), self._setup.T_camera_palm
+        tips = transform(T, self._tips.points(chains))
+        spheres = transform(T, self._skin.spheres(chains))
+        away = np.linalg.norm(tips, axis=-1)
+        out = np.empty(away.shape, np.bool_)
+        for f in range(5):
+            rays = (tips[:, f] / away[:, f, None])[:, None]
+            first = first_hits(np.zeros(3), rays, spheres[:, f], self._skin.radius_m[f])
+            out[:, f] = first.min(axis=(1, 2)) > away[:, f] - BEHIND_M
+        return out

@@ -30,7 +30,7 @@ from master.wrist.setup import WristSetup
 MINIMA = 3  # of one finger that are refined
 _PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 8
 _FARTHEST_RAD = np.radians(12.0)  # of one step
-_ARRIVED_RAD = np.radians(0.1)  # a step no longer than this leads to within a few hundredths of a degree
+_ARRIVED_RAD = np.radians(0.05)  # what is left after so short a step is a part of it
 _SAME_RAD = np.radians(4.0)  # nearer to each other than this, two candidates are on their way to one minimum
 _HOPELESS = 40.0  # worse than the best by this on the table, a candidate is none; a table is wrong by less
 

@@ -119,6 +119,8 @@ class Levels:
         rank = np.where(np.isfinite(last_rad[:, :1]), walked, unnatural)
         likely = cost <= cost.min(axis=1, keepdims=True) + _AS_GOOD
         best = np.where(likely, np.nan_to_num(rank, nan=np.inf), np.inf).argmin(axis=1)
+        near = (np.abs(x[rows, best] - x[:, 0])[:, 1:] <= _APART_RAD).all(axis=1)
+        best = np.where(near, 0, best)
         chosen = x[rows, best]
         as_good = solved[:, None] & (minima.misfit <= minima.misfit[rows, best][:, None] + _AS_GOOD)
         away = np.where(as_good[..., None], x - chosen[:, None], 0.0)
@@ -130,7 +132,7 @@ class Levels:
         worse = np.nan_to_num(cost, posinf=1e9) - np.nan_to_num(cost[rows, best], posinf=1e9)[:, None]
         part = np.where(valley, np.exp(-0.5 * np.clip(worse, -50.0, 50.0)), 0.0)
         part[rows, best] = np.maximum(part[rows, best], 1e-9)
-        wide = (valley.sum(axis=1) > 1) & valley[rows, best]
+        wide = (valley.sum(axis=1) > 1) & valley[rows, best] & ambiguous
         mean = chosen + (part[..., None] * away).sum(axis=1) / part.sum(axis=1)[:, None]
         return self._whole(np.where(wide[:, None], mean, chosen), cov, solved, ambiguous)
 
