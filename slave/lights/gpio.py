@@ -4,14 +4,18 @@
 after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a change
 seen, and read back.
 
-When the process ends, however it ends, the kernel gives the lines back. What the pin does then is the matter of the
-chip's driver: it may become an input, or keep its level (libgpiod says nothing of it). So a line alone does not darken
-a light whose process was killed during a pulse: a pull-down resistor and a monostable in series do (docs/safety.md).
+A slave that is killed during a pulse darkens nothing, and what a pin does whose process is gone is the matter of the
+chip's driver: it may become an input, or keep its level. So a second process inherits the request and sets the lines
+dark when the first one is gone (`gpio_heir`). Against a kernel that is dead, or a kill of both, only wires help: a
+pull-down resistor, and a monostable in series (docs/safety.md).
 """
 
 import errno
+import subprocess
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
@@ -22,6 +26,8 @@ if TYPE_CHECKING:
     from gpiod import LineRequest
 
 CONSUMER = "phalanx strobe"
+HEIR = Path(__file__).with_name("gpio_heir.py")
+HEIR_S = 5.0  # it has one call to make
 INSTALL = (
     "--lights gpio needs the library gpiod 2: pip install 'phalanx-hand[wrist]', or on Raspberry Pi OS"
     " `sudo apt install python3-libgpiod` and a virtual environment made with --system-site-packages"
@@ -50,7 +56,7 @@ class Line:
 
 
 class GpioLights:
-    """`Lights` behind two lines. Holds the request of the lines; None while the chip is away."""
+    """`Lights` behind two lines. Holds the request of the lines and its heir; None while the chip is away."""
 
     def __init__(self, place: str) -> None:
         """Request the lines, dark.
@@ -71,6 +77,7 @@ class GpioLights:
             raise LightsError(f"--lights gpio:{place}: laser and LEDs on one line; {FORM}")
         self._gpiod = _library()
         self._closed = False
+        self._heir: subprocess.Popen[bytes] | None = None
         self._request: LineRequest | None = self._requested()
         self._reopened = 0
 
@@ -122,6 +129,13 @@ class GpioLights:
         request, self._request = self._request, None
         if request is not None:
             request.release()
+        heir, self._heir = self._heir, None
+        if heir is not None:
+            try:
+                heir.communicate(timeout=HEIR_S)  # ends its input, and waits: then the lines are free
+            except subprocess.TimeoutExpired:
+                heir.kill()
+                heir.wait()
 
     def _requested(self) -> "LineRequest":
         settings, line = self._gpiod.LineSettings, self._gpiod.line
@@ -135,9 +149,16 @@ class GpioLights:
             for one in (self._laser, self._led)
         }
         try:
-            return self._gpiod.request_lines(self._chip, config=config, consumer=CONSUMER)
+            request: LineRequest = self._gpiod.request_lines(self._chip, config=config, consumer=CONSUMER)
         except (OSError, ValueError) as error:
             raise LightsError(self._why(error)) from error
+        self._heir = subprocess.Popen(
+            [sys.executable, "-I", str(HEIR), str(request.fd)],
+            stdin=subprocess.PIPE,
+            pass_fds=(request.fd,),
+            start_new_session=True,
+        )
+        return request
 
     def _why(self, error: OSError | ValueError) -> str:
         """What a user can do about a request that failed."""

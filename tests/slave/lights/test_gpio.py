@@ -4,7 +4,11 @@ import errno
 import inspect
 import os
 import re
+import signal
+import struct
+import subprocess
 import sys
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +19,8 @@ import pytest
 
 from common.errors import LightsError
 from slave.__main__ import main
-from slave.lights.gpio import CONSUMER, GpioLights
+from slave.lights.gpio import CONSUMER, HEIR, GpioLights
+from slave.lights.gpio_heir import SET_VALUES
 from tests.slave.lights.stage import AMBIENT, LASER, LED, ROOT
 
 VALUE = gpiod.line.Value
@@ -71,6 +76,7 @@ class FakeRequest:
         self.kernel, self.lines, self.config = kernel, lines, dict(config)
         self.released = False
         self.lit: set[int] = set()
+        self.fd = os.open(os.devnull, os.O_RDONLY)
         self.set_values({place: settings.output_value for place, settings in config.items()})
 
     def set_values(self, values: Mapping[Any, Any]) -> None:
@@ -87,6 +93,8 @@ class FakeRequest:
         return [VALUE.ACTIVE if level else VALUE.INACTIVE for level in levels]
 
     def release(self) -> None:
+        if not self.released:
+            os.close(self.fd)
         self.released = True
         for offset in self.lines.values():
             self.kernel.users.pop(offset, None)
@@ -152,8 +160,12 @@ def test_one_light_at_a_time_and_dark_at_both_ends(
     ):
         lights.switch(kind)
         assert lit() == seen
+    heir = lights._heir
+    assert heir is not None
+    assert heir.poll() is None
     lights.close()
     lights.close()
+    assert heir.returncode == 1  # the stand-in's lines are no lines of a kernel
     assert lit() == (False, False)
     assert kernel.users == {}
     lights.switch(LASER)
@@ -232,6 +244,45 @@ def test_without_the_library_it_is_said_how_to_install_it(monkeypatch: pytest.Mo
     monkeypatch.setitem(sys.modules, "gpiod", SimpleNamespace(__version__="1.6.3"))
     with pytest.raises(LightsError, match=r"gpiod 1.6.3 is too old"):
         GpioLights("0:17,27")
+
+
+# A slave with an heir, whose call of the kernel is printed.
+SLAVE = """
+import subprocess, sys, time
+run = "import fcntl, runpy, sys; fcntl.ioctl = lambda *call: print(*call, flush=True); "
+run += f"sys.argv = [{sys.argv[1]!r}, '9']; runpy.run_path(sys.argv[0], run_name='__main__')"
+heir = subprocess.Popen([sys.executable, "-I", "-c", run], stdin=subprocess.PIPE, start_new_session=True)
+print(heir.pid, flush=True)
+time.sleep(600)
+"""
+
+
+def test_the_heir_of_a_killed_slave_darkens_both_lines() -> None:
+    slave = subprocess.Popen([sys.executable, "-c", SLAVE, str(HEIR)], stdout=subprocess.PIPE, text=True)
+    assert slave.stdout is not None
+    heir = int(slave.stdout.readline())
+    assert ignores_stops(heir)
+    os.kill(heir, signal.SIGTERM)  # a service's stop reaches both: the slave is to end first
+    slave.kill()
+    said = slave.stdout.read()  # ends when the heir has ended, too
+    slave.wait()
+    slave.stdout.close()
+    assert said == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
+
+
+def ignores_stops(pid: int) -> bool:
+    """Whether a process ignores SIGTERM; waits until it does."""
+    for _ in range(1200):
+        ignored = re.search(r"SigIgn:\s*([0-9a-f]+)", Path(f"/proc/{pid}/status").read_text())
+        if ignored is not None and int(ignored[1], 16) >> (signal.SIGTERM - 1) & 1:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+def test_the_call_of_the_heir_is_that_of_the_kernels_header() -> None:
+    # _IOWR(type, number, size) of asm-generic/ioctl.h: direction 3, size of struct gpio_v2_line_values, 0xB4, 0x0F.
+    assert SET_VALUES == 3 << 30 | struct.calcsize("=QQ") << 16 | 0xB4 << 8 | 0x0F
 
 
 @pytest.mark.skipif(
