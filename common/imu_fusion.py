@@ -14,7 +14,8 @@ own:
   library's rejection of accelerations stays off: it judges single samples, and to leave out those of one side of a
   mean that is zero moves the mean.
 - **Bias** is taken where `Stillness` sees rest, also above the library's 3 deg/s, at once where it is quite unknown; in
-  motion gravity tells of those axes that are level.
+  motion gravity tells that of the axes that are level. The latter is noisy: it is kept apart and level, so that it
+  never turns the heading.
 
 Magnetometers are not used: steel in a desk turns them by more than a gyroscope drifts in minutes.
 """
@@ -33,17 +34,12 @@ from common.messages import ImuSample
 
 _G_M_S2 = 9.80665
 _SETTLED_RAD = radians(4.0)  # reached two thirds of a second after the first sample
-_BRIDGED_S, _BRIDGED_SAMPLES = (
-    0.1,
-    3.0,
-)  # a longer silence may hide a turn that the rates at its ends do not tell
+_BRIDGED_S, _BRIDGED_SAMPLES = 0.1, 3.0  # a longer silence may hide a turn that no rate tells
 _CLOCK_S = 1.0  # a sample so much older than the last is not late: a clock was set back
 _RATE_RAD_S, _FORCE_M_S2 = 100.0, 2000.0  # beyond any range there is (4000 deg/s, 200 g)
 _FALLING_M_S2 = 1.0  # shorter forces have no direction
-_BIAS_RAD_S = radians(5.0)
-_SURPRISE_RAD_S = radians(
-    0.1
-)  # more than three of it beyond what is believed is rather a slow turn than a bias
+_BIAS_RAD_S = radians(7.5)  # three sigma of what `Doubt` begins with
+_SURPRISE_RAD_S = radians(0.1)  # three of it beyond what is believed: rather a slow turn
 _DAMPED = 4.0  # gain times the memory of gravity's mean is a quarter: critical damping
 _NONE, _ZERO, _UP = np.full(4, np.nan), np.zeros(3), np.array([0.0, 0.0, _G_M_S2])
 
@@ -62,7 +58,7 @@ class OrientationFilter:
         self._bridged_s = max(_BRIDGED_S, _BRIDGED_SAMPLES / rate_hz)
         self._ahrs: imufusion.Ahrs | None = None
         self._doubt, self._stillness = Doubt(), Stillness()
-        self._bias, self._gravity = _ZERO, _UP
+        self._bias, self._lean, self._gravity = _ZERO, _ZERO, _UP
         self._last_ns, self._rate = 0, _ZERO
 
     @property
@@ -73,7 +69,7 @@ class OrientationFilter:
     @property
     def bias_rad_s(self) -> Float:
         """What the gyroscope says at rest (3,) [rad/s], sensor axes."""
-        return self._bias.copy()
+        return self._bias + self._lean
 
     @property
     def tilt_sigma_rad(self) -> float:
@@ -104,7 +100,7 @@ class OrientationFilter:
             self.counts["fusion.late"] += 1
             return replace(sample, orientation_wxyz=_NONE)
         if 0.0 < step_s <= self._bridged_s:
-            self._turn(self._ahrs, step_s, 0.5 * (self._rate + rate) - self._bias)
+            self._turn(self._ahrs, step_s, 0.5 * (self._rate + rate) - self.bias_rad_s)
             if not falls:
                 self._level(self._ahrs, step_s, force)
                 self._rest(step_s, rate, force)
@@ -133,14 +129,17 @@ class OrientationFilter:
         ahrs.update_no_magnetometer(_ZERO, world_sensor.T @ self._gravity / _G_M_S2)
         x, y, z = (self._gravity / sqrt(self._gravity @ self._gravity)).tolist()
         off = world_sensor.T @ np.array([y, -x, 0.0]) / (1.0 if z > 0.0 else hypot(x, y) or 1.0)
-        self._bias = np.clip(self._bias - bias * off, -_BIAS_RAD_S, _BIAS_RAD_S)
+        level = self._lean - bias * off
+        self._lean = np.clip(level - (level @ world_sensor[2]) * world_sensor[2], -_BIAS_RAD_S, _BIAS_RAD_S)
 
     def _rest(self, step_s: float, rate: Float, force: Float) -> None:
         """Learn the bias where the sensor lies still."""
         self._stillness.push(step_s, rate, force)
         if self._stillness.still:
             most = 3.0 * hypot(self._doubt.bias_rad_s, _SURPRISE_RAD_S)
-            self._bias = self._bias + self._doubt.rest(step_s) * np.clip(rate - self._bias, -most, most)
+            share = self._doubt.rest(step_s)
+            self._bias = self._bias + share * np.clip(rate - self._bias, -most, most)
+            self._lean = (1.0 - share) * self._lean
 
 
 def _settings(gain: float, step_s: float) -> imufusion.AhrsSettings:

@@ -8,15 +8,15 @@ seen by gravity, or half a degree per second more or less is a motion.
 
 from math import radians
 
+import numpy as np
+
 from common.arrays import Float
 
 _FOR_S = 1.5
 _SAMPLE_RAD_S, _SAMPLE_M_S2 = radians(2.0), 0.5
 _SHORT_S, _SHORT_RAD_S, _SHORT_M_S2 = 0.3, radians(0.5), 0.1
 _LONG_S = 4.0
-_BIAS_RAD_S = radians(
-    5.0
-)  # a faster mean is a turn: +-5 deg/s is the zero of an ICM-20948 (DS-000189, table 1)
+_BIAS_RAD_S = radians(7.5)  # a faster mean is a turn: three sigma of a bias (`Doubt`)
 
 
 class Stillness:
@@ -46,7 +46,7 @@ class Stillness:
         if (
             self._rate.left(self._since_s, step_s, gyro_rad_s, _SAMPLE_RAD_S, _SHORT_RAD_S)
             or self._force.left(self._since_s, step_s, accel_m_s2, _SAMPLE_M_S2, _SHORT_M_S2)
-            or self._rate.long @ self._rate.long > _BIAS_RAD_S**2
+            or np.abs(self._rate.long).max() > _BIAS_RAD_S
         ):
             self.moved()
 

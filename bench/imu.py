@@ -1,0 +1,284 @@
+"""Orientation by rates and forces alone, beside peers fed the same samples in the same run; and its heading's drift.
+
+Recorded: two recordings of BROAD (D. Laidig et al. 2021, CC BY 4.0) with optical truth, of which only what moves is
+scored. Inclination is the angle between true and found vertical. The heading of such a filter begins anywhere: its
+error is that against its first moment of the motion, its drift the slope of a line through it.
+
+Simulated: a forearm that gestures, with parts of two data sheets, at rest for three seconds before it moves or never at
+rest; the drift there is held against what `heading_sigma_rad` says of it.
+"""
+
+import importlib
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter_ns
+from typing import Any
+
+import imufusion
+import numpy as np
+
+from bench.row import Row
+from common.arrays import Bool, Float
+from common.calibration import ImuCalibration
+from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix, rigid
+from common.imu_fusion import OrientationFilter
+from common.messages import ImuSample
+from common.sim.imu import ICM20948, LSM6DSO, InertialPart, SimulatedImu
+from common.sim.motion import HandState
+
+_DATASETS = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parents[2] / "shared/datasets")).resolve()
+_G_M_S2 = 9.81
+_NOTHING, _NO_TURN = np.full(3, np.nan), np.full(4, np.nan)
+_PARTS: dict[str, InertialPart] = {"LSM6DSO": LSM6DSO, "ICM-20948": ICM20948}
+_SEEDS = range(8)
+_LEVEL = ImuCalibration(
+    q_palm_imu=(1.0, 0.0, 0.0, 0.0), q_rig_world=(1.0, 0.0, 0.0, 0.0), orientation_sigma_rad=1e-9
+)
+Push = Callable[[ImuSample], Float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """Samples of an IMU, how it truly lay (T, 4) wxyz, NaN where that is not known, and what of it is scored (T,)."""
+
+    samples: list[ImuSample]
+    rate_hz: float
+    truth_wxyz: Float
+    moving: Bool
+
+    @classmethod
+    def of(cls, path: Path, every: int = 1) -> "Recording":
+        """A file of BROAD, of which only every so-manieth sample is heard."""
+        with np.load(path) as data:
+            gyro, accel = (data[name][::every].astype(np.float64) for name in ("gyr_rads", "acc_ms2"))
+            rate_hz = float(data["fs"]) / every
+            truth, moving = (
+                data["opt_quat_wxyz"][::every].astype(np.float64),
+                data["movement"][::every].astype(np.bool_),
+            )
+        samples = [
+            ImuSample("broad", 0, k, round(k * 1e9 / rate_hz), gyro[k], accel[k], _NOTHING, _NO_TURN)
+            for k in range(len(gyro))
+        ]
+        return cls(samples, rate_hz, truth, moving & np.isfinite(truth).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Errors:
+    """Of what moved: inclination [deg] (T,), heading [deg] (T,) against its first moment, and time [s] (T,)."""
+
+    inclination_deg: Float
+    heading_deg: Float
+    t_s: Float
+
+    @classmethod
+    def of(cls, found_wxyz: Float, recording: Recording) -> "Errors":
+        """Of orientations (T, 4); NaN, one not known, is not scored."""
+        rows = np.flatnonzero(recording.moving & np.isfinite(found_wxyz).all(axis=1))
+        found, truth = (quaternion_to_matrix(q[rows]) for q in (found_wxyz, recording.truth_wxyz))
+        off = found @ np.swapaxes(truth, 1, 2)
+        heading = np.unwrap(np.arctan2(off[:, 1, 0] - off[:, 0, 1], off[:, 0, 0] + off[:, 1, 1]))
+        t_s = np.array([recording.samples[row].t_ns for row in rows]) * 1e-9
+        return cls(
+            np.degrees(np.arccos(np.clip(off[:, 2, 2], -1.0, 1.0))), np.degrees(heading - heading[0]), t_s
+        )
+
+    @property
+    def inclination_rms_deg(self) -> float:
+        """Root mean square."""
+        return _rms(self.inclination_deg)
+
+    @property
+    def drift_deg_per_min(self) -> float:
+        """Slope of the heading's error."""
+        t = self.t_s - self.t_s.mean()
+        return 60.0 * float(t @ self.heading_deg / (t @ t))
+
+
+def recordings(folder: Path, every: int = 1) -> dict[str, Recording]:
+    """Those of BROAD in a folder, by name."""
+    return {path.stem: Recording.of(path, every) for path in sorted(folder.glob("*.npz"))}
+
+
+def played(push: Push, recording: Recording) -> Float:
+    """What a filter says of every sample (T, 4)."""
+    return np.array([push(sample) for sample in recording.samples])
+
+
+def rows() -> Iterator[Row]:
+    """Measure; one row per figure."""
+    found = recordings(_DATASETS / "broad")
+    if not found:
+        yield Row(
+            "recorded: skipped", 0.0, "", f"no recordings at {_DATASETS / 'broad'}: set PHALANX_DATASETS"
+        )
+    for name, recording in found.items():
+        for peer, make in _PEERS.items():
+            push = make(recording.rate_hz)
+            if push is None:
+                yield Row(f"{name[:24]}, {peer}", float("nan"), "", "not installed")
+                continue
+            errors = Errors.of(played(push, recording), recording)
+            note = "goal 1" if peer == "this filter" else ""
+            yield Row(f"{name[:24]}, {peer}: inclination", errors.inclination_rms_deg, "deg rms", note)
+            note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
+            yield Row(f"{name[:24]}, {peer}: heading", errors.drift_deg_per_min, "deg/min", note)
+    for part in _PARTS:
+        for rest_s in (3.0, 0.0):
+            yield from _simulated(part, rest_s)
+    yield from _cost()
+
+
+def ours(rate_hz: float) -> Push:
+    """The filter of every slave and recording."""
+    fusion = OrientationFilter(rate_hz)
+    return lambda sample: fusion.push(sample).orientation_wxyz
+
+
+def library(rate_hz: float) -> Push:
+    """imufusion as it comes: its own bias, its usual gain."""
+    settings = imufusion.AhrsSettings(sample_rate=rate_hz, convention=imufusion.CONVENTION_ENU)
+    ahrs, bias = imufusion.Ahrs(), imufusion.Bias()
+    ahrs.set_settings(settings)
+    bias.set_settings(imufusion.BiasSettings(sample_rate=rate_hz))
+
+    def push(sample: ImuSample) -> Float:
+        rate = bias.update(np.degrees(sample.gyro_rad_s))
+        ahrs.update_no_magnetometer(rate, sample.accel_m_s2 / _G_M_S2)
+        return np.asarray(ahrs.get_quaternion(), np.float64)
+
+    return push
+
+
+def summed_up(rate_hz: float) -> Push:
+    """Rates alone, from the first upright: no gravity, no bias."""
+    ahrs = imufusion.Ahrs()
+    ahrs.set_settings(
+        imufusion.AhrsSettings(sample_rate=rate_hz, convention=imufusion.CONVENTION_ENU, gain=0.0)
+    )
+    ahrs.skip_startup()
+    begun = False
+
+    def push(sample: ImuSample) -> Float:
+        nonlocal begun
+        if not begun:
+            ahrs.set_quaternion(_level(sample.accel_m_s2))
+            begun = True
+        ahrs.update_no_magnetometer(np.degrees(sample.gyro_rad_s), np.zeros(3))
+        return np.asarray(ahrs.get_quaternion(), np.float64)
+
+    return push
+
+
+def forces_alone(rate_hz: float) -> Push:
+    """Where the force of every sample points is up; no heading at all."""
+    return lambda sample: _level(sample.accel_m_s2)
+
+
+def vqf(rate_hz: float) -> Push | None:
+    """VQF (Laidig, Seel 2023), if it is installed: a filter of the same kind by others, six axes."""
+    try:
+        other: Any = importlib.import_module("vqf").VQF(1.0 / rate_hz)
+    except ImportError:
+        return None
+
+    def push(sample: ImuSample) -> Float:
+        other.update(sample.gyro_rad_s.copy(), sample.accel_m_s2.copy())
+        return other.getQuat6D()
+
+    return push
+
+
+_PEERS: dict[str, Callable[[float], Push | None]] = {
+    "this filter": ours,
+    "imufusion as it comes": library,
+    "rates summed up": summed_up,
+    "forces alone": forces_alone,
+    "VQF": vqf,
+}
+
+
+class Gestures:
+    """A forearm that turns and moves about all axes, at 1 m/s^2, from `rest_s` [s] on."""
+
+    period_s = 1e9
+
+    def __init__(self, seed: int, rest_s: float) -> None:
+        rng = np.random.default_rng([seed, 5])
+        self.rest_s = rest_s
+        self._amplitude = rng.uniform(0.2, 0.5, 6)
+        self._rate, self._phase = rng.uniform(1.5, 6.0, 6), rng.uniform(0.0, 6.3, 6)
+
+    def at(self, t_s: float) -> HandState:
+        """Its pose; the fingers do not matter."""
+        t = max(t_s - self.rest_s, 0.0)
+        swing = self._grown(t) * self._amplitude * np.sin(self._rate * t + self._phase)
+        turn = axis_rotation(2, 2.0 * swing[0]) @ axis_rotation(1, swing[1]) @ axis_rotation(0, swing[2])
+        return HandState(rigid(turn, 0.15 * swing[3:]), np.zeros((5, 4)))
+
+    @staticmethod
+    def _grown(t: float) -> float:
+        """It begins gently: 0...1, without a jerk."""
+        u = min(t, 1.0)
+        return u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+
+
+def _simulated(part: str, rest_s: float) -> Iterator[Row]:
+    """A minute of gestures of every seed."""
+    tilt: list[float] = []
+    drift: list[float] = []
+    surprise: list[float] = []
+    for seed in _SEEDS:
+        motion, fusion = Gestures(seed, rest_s), OrientationFilter(_LEVEL.rate_hz)
+        sensor = SimulatedImu(motion, _LEVEL, seed, _PARTS[part])
+        said: list[tuple[Float, float]] = []
+        samples: list[ImuSample] = []
+        for sample in sensor.around(0.0, rest_s + 62.0):
+            samples.append(sample)
+            said.append((fusion.push(sample).orientation_wxyz, fusion.heading_sigma_rad))
+        truth = np.array([_lies(motion, sample.seq / _LEVEL.rate_hz) for sample in samples])
+        moving = np.array([sample.t_ns for sample in samples]) > (rest_s + 2.0) * 1e9
+        errors = Errors.of(np.array([q for q, _ in said]), Recording(samples, _LEVEL.rate_hz, truth, moving))
+        begun = said[int(np.argmax(moving))][1]
+        tilt.append(errors.inclination_rms_deg)
+        drift.append(errors.drift_deg_per_min)
+        surprise.append(errors.heading_deg[-1] / np.degrees(np.sqrt(max(said[-1][1] ** 2 - begun**2, 1e-12))))
+    name = f"simulated {part}, {'rested' if rest_s else 'never at rest'}"
+    yield Row(f"{name}: inclination", _rms(np.array(tilt)), "deg rms", f"{len(_SEEDS)} arms, a minute each")
+    note = f"{_rms(np.array(surprise)):.1f} of what heading_sigma_rad says (rms)"
+    yield Row(f"{name}: heading", _rms(np.array(drift)), "deg/min", note)
+
+
+def _lies(motion: Gestures, t_s: float) -> Float:
+    """Quaternion (4,) of the sensor in its world."""
+    return matrix_to_quaternion(motion.at(t_s).T_rig_palm[:3, :3])
+
+
+def _cost() -> Iterator[Row]:
+    """Microseconds per sample, this filter and the library's in turns."""
+    sensor = SimulatedImu(Gestures(1, 0.0), _LEVEL, 1)
+    samples = list(sensor.around(2.0, 10.0))
+    pushes = {name: make(_LEVEL.rate_hz) for name, make in (("this filter", ours), ("library", library))}
+    spent: dict[str, list[float]] = {name: [] for name in pushes}
+    for sample in samples:
+        for name, push in pushes.items():
+            start = perf_counter_ns()
+            push(sample)
+            spent[name].append((perf_counter_ns() - start) * 1e-3)
+    other = float(np.median(spent["library"]))
+    mine = float(np.median(spent["this filter"]))
+    note = f"imufusion as it comes: {other:.1f}; {100 * mine * 120e-6:.1f} % of a core at 120 Hz"
+    yield Row("cost of a sample", mine, "us", note)
+
+
+def _level(force: Float) -> Float:
+    """The quaternion (4,) of the shortest turn that brings a force (3,) up."""
+    x, y, z = (force / np.linalg.norm(force)).tolist()
+    q = np.array([1.0 + z, y, -x, 0.0])
+    return q / np.linalg.norm(q)
+
+
+def _rms(values: Float) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
