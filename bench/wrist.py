@@ -8,6 +8,7 @@ blob; neither fingers are separated nor tips found there.
 
 import os
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from itertools import cycle
 from pathlib import Path
 from typing import TypeVar
@@ -18,7 +19,7 @@ from msgspec.structs import replace
 
 from bench.markers import Step, interleaved
 from bench.row import Row
-from common.arrays import Float
+from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.frame_recording import open_recording
 from common.messages import WristDetections, encode
@@ -32,7 +33,8 @@ from slave.cameras.source import Frame
 from slave.cameras.synthetic import STROBE
 from slave.wrist.background import lit
 from slave.wrist.detector import WristFound, find
-from slave.wrist.fingers import separate
+from slave.wrist.engine import NUMPY, Engine, engine_named
+from slave.wrist.fingers import Fingers, separate
 from slave.wrist.fingertips import fingertips
 from slave.wrist.laser import laser_lines
 from slave.wrist.strobe import Strobe, Triple
@@ -106,7 +108,7 @@ def slave_steps(
     with_fingers = list(zip(lights, fingers, strict=True))
     return {
         "baseline": baseline(camera, triples),
-        "slave": _slave(camera, view, frames),
+        "slave": _slave(camera, view, frames, NUMPY),
         "of it strobe": _strobe(camera, frames),
         "of it background": _each(
             triples,
@@ -116,6 +118,26 @@ def slave_steps(
         "of it laser": _each(with_fingers, lambda all_: laser_lines(all_[0][0], all_[1], view)),
         "of it fingertips": _each(with_fingers, lambda all_: fingertips(all_[0][1], all_[1], view)),
         "of it message": _each(found, lambda one: encode(one.message(camera.name, 1))),
+    } | _with_numba(camera, view, frames, lights, with_fingers)
+
+
+def _with_numba(
+    camera: CameraCalibration,
+    view: WristView,
+    frames: list[Frame],
+    lights: list[tuple[Image, Image]],
+    with_fingers: list[tuple[tuple[Image, Image], Fingers]],
+) -> dict[str, Step]:
+    """The slave, and those of its stages that the other engine does, where numba is installed."""
+    if find_spec("numba") is None:
+        return {}
+    engine = engine_named("numba")
+    return {
+        "slave --engine numba": _slave(camera, view, frames, engine),
+        "of it fingers, numba": _each(lights, lambda pair: separate(pair[1], view, engine)),
+        "of it laser, numba": _each(
+            with_fingers, lambda all_: laser_lines(all_[0][0], all_[1], view, engine)
+        ),
     }
 
 
@@ -163,7 +185,7 @@ def baseline(camera: CameraCalibration, triples: list[Triple]) -> Step:
     return _each(triples, usual)
 
 
-def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame]) -> Step:
+def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame], engine: Engine) -> Step:
     """Three frames into the strobe, what they make together, and its bytes."""
     strobe, endless = Strobe(camera.frame_rate_hz), _endless(camera, frames)
 
@@ -171,7 +193,7 @@ def _slave(camera: CameraCalibration, view: WristView, frames: list[Frame]) -> S
         out = None
         for _ in range(3):
             triple = strobe.push(next(endless))
-            out = out if triple is None else encode(find(triple, view).message(camera.name, 1))
+            out = out if triple is None else encode(find(triple, view, engine=engine).message(camera.name, 1))
         return out
 
     return step

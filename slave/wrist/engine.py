@@ -4,15 +4,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from common.arrays import Bool, Image, Int
+from common.arrays import Bool, Float, Image, Int
 from slave.wrist.corridors import Float32
 from slave.wrist.paths import least_paths
+from slave.wrist.pieces import Pieces, measure
 from slave.wrist.runs import Runs, lines
 from slave.wrist.valleys import energy
 
 Energy: TypeAlias = Callable[[Image, int], Float32]
 LeastPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
 Lines: TypeAlias = Callable[[Image, int], tuple[Runs, Bool]]
+Measure: TypeAlias = Callable[[Runs, Int, Float | None, int], Pieces]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,14 +25,16 @@ class Engine:
         energy: Straightened corridors, and how many circles the thumb crosses -> energy (`valleys.energy`).
         least_paths: As `paths.least_paths`.
         lines: As `runs.lines`.
+        measure: As `pieces.measure`.
     """
 
     energy: Energy
     least_paths: LeastPaths
     lines: Lines
+    measure: Measure
 
 
-NUMPY = Engine(energy, least_paths, lines)
+NUMPY = Engine(energy, least_paths, lines, measure)
 
 
 def engine_named(name: str) -> Engine:

@@ -18,10 +18,10 @@ import numpy as np
 from common.arrays import Float, Image, Int
 from slave.wrist.corridors import STATION_PX, Corridors, Float32, corridors_of
 from slave.wrist.engine import NUMPY, Engine
+from slave.wrist.pieces import NONE
 from slave.wrist.valleys import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
 
-NONE = -1  # no finger
 _SHOWN = 24  # grey levels that the palm of a lit hand exceeds, or what hides it; the sun leaves less
 _TAKEN = 10.0  # energy for the thumb's seam where another seam runs
 _ONE_VALLEY = 0.35  # of the distance of two corridors, and of the rows of the hand

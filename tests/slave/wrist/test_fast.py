@@ -83,6 +83,20 @@ def test_runs_and_lines_are_the_same(fast: Engine, seed: int) -> None:
     np.testing.assert_array_equal(on, on_expected)
 
 
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("doubted", [False, True])
+def test_pieces_measure_the_same(fast: Engine, seed: int, doubted: bool) -> None:
+    runs, on = NUMPY.lines(drawn(seed), 200)
+    rng = np.random.default_rng(seed)
+    finger = np.where(on, runs.column // 128, -1)
+    finger[rng.random(len(finger)) < 0.02] = -1
+    share = np.where(finger == 0, rng.choice([0.005, 0.4, 1.0], len(finger)), 1.0) if doubted else None
+    found, expected = (engine.measure(runs, finger, share, 640) for engine in (fast, NUMPY))
+    for name, value in expected._asdict().items():
+        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-9, atol=1e-9, err_msg=name)
+    assert np.isfinite(expected.uv).any()
+
+
 @pytest.mark.parametrize("image", [np.zeros((480, 640), np.uint8), np.full((480, 640), 255, np.uint8)])
 def test_without_a_line_there_are_no_runs(fast: Engine, image: Image) -> None:
     found, on = fast.lines(image, 200)
@@ -100,6 +114,7 @@ def test_a_hand_is_seen_alike(fast: Engine) -> None:
             for seam, engine in zip(seams, (NUMPY, fast), strict=True)
         )
         np.testing.assert_allclose(there.uv, here.uv, atol=0.2)
+        np.testing.assert_allclose(there.length_px, here.length_px, atol=0.5)
         np.testing.assert_allclose(there.sigma_px, here.sigma_px, rtol=0.1)
 
 
