@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -15,7 +16,6 @@ from master.study.one import CAUSES, Condition, Task
 from master.study.paper import BLOCKS, PARTICIPANTS
 from master.study.participant import Known
 
-_MOST_BLOCKS = 50
 Recordings = Annotated[
     list[Path] | None,
     typer.Argument(
@@ -24,6 +24,47 @@ Recordings = Annotated[
         show_default=False,
     ),
 ]
+Out = Annotated[Path, typer.Option(help="Folder for study.json, study.md, study.png and all files.")]
+Participants = Annotated[int, typer.Option(min=1, max=99, help="Simulated people.")]
+Blocks = Annotated[int, typer.Option(min=1, max=50, help="How often each makes the six poses.")]
+Seed = Annotated[int, typer.Option(min=0, help="Same seed, same people, same poses.")]
+KnownOf = Annotated[
+    Known,
+    typer.Option(
+        help="Of the participants: bones and mounting as our own calibration finds them (calibrated), exactly (all), or"
+        " the rig's usual hand and its file's mounting (nothing)."
+    ),
+]
+Causes = Annotated[
+    bool,
+    typer.Option(
+        help="Judge all trials also with everything known, with nothing known, and with exact laser points and tips:"
+        " where does the error come from?"
+    ),
+]
+LevelOf = Annotated[
+    Level | None,
+    typer.Option(
+        help="Fingers from the laser alone, from laser and fingertip, or from what there is; default: the rig's."
+    ),
+]
+Rig = Annotated[str, typer.Option(help="Wrist rig: a file of CALIBRATION/rigs, without .json.")]
+Hand = Annotated[
+    Path | None,
+    typer.Option(help="Of recordings: the hand file; default: what their rig names, in CALIBRATION/hands."),
+]
+Jobs = Annotated[
+    int, typer.Option(min=0, max=64, help="Participants at a time; 0: as many as there are cores.")
+]
+Step = Annotated[int, typer.Option(min=1, max=8, help="Rendering: px between the rays that shade skin.")]
+Guided = Annotated[int, typer.Option(min=16, max=480, help="Triples of the guided motion before the trials.")]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        help="Take what an earlier study of the same settings rendered, calibrated and detected in --out; solve anew."
+    ),
+]
+Keep = Annotated[bool, typer.Option(help="Keep all frames to look at: 140 MB for each participant.")]
 
 
 def evaluate_app() -> typer.Typer:
@@ -35,60 +76,21 @@ def evaluate_app() -> typer.Typer:
 
 def study(
     recordings: Recordings = None,
-    out: Annotated[
-        Path, typer.Option(help="Folder for study.json, study.md, study.png and all files.")
-    ] = Path("out/study"),
-    participants: Annotated[int, typer.Option(min=1, max=99, help="Simulated people.")] = PARTICIPANTS,
-    blocks: Annotated[
-        int, typer.Option(min=1, max=_MOST_BLOCKS, help="How often each makes the six poses.")
-    ] = BLOCKS,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same people, same poses.")] = 1,
-    known: Annotated[
-        Known,
-        typer.Option(
-            help="Of the participants: bones and mounting as our own calibration finds them (calibrated), exactly"
-            " (all), or the rig's usual hand and its file's mounting (nothing)."
-        ),
-    ] = "calibrated",
-    causes: Annotated[
-        bool,
-        typer.Option(
-            help="Judge all trials also with everything known, with nothing known, and with exact laser points and"
-            " tips: where does the error come from?"
-        ),
-    ] = False,
-    level: Annotated[
-        Level | None,
-        typer.Option(
-            help="Fingers from the laser alone, from laser and fingertip, or from what there is; default: the rig's."
-        ),
-    ] = None,
-    rig: Annotated[str, typer.Option(help="Wrist rig: a file of CALIBRATION/rigs, without .json.")] = "wrist",
-    hand: Annotated[
-        Path | None,
-        typer.Option(
-            help="Of recordings: the hand file; default: what their rig names, in CALIBRATION/hands."
-        ),
-    ] = None,
+    out: Out = Path("out/study"),
+    participants: Participants = PARTICIPANTS,
+    blocks: Blocks = BLOCKS,
+    seed: Seed = 1,
+    known: KnownOf = "calibrated",
+    causes: Causes = False,
+    level: LevelOf = None,
+    rig: Rig = "wrist",
+    hand: Hand = None,
     calibration: Calibration = CALIB_JSON,
-    jobs: Annotated[
-        int, typer.Option(min=0, max=64, help="Participants at a time; 0: as many as there are cores.")
-    ] = 0,
-    step: Annotated[
-        int, typer.Option(min=1, max=8, help="Rendering: px between the rays that shade skin.")
-    ] = 2,
-    guided: Annotated[
-        int, typer.Option(min=16, max=480, help="Triples of the guided motion before the trials.")
-    ] = 96,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            help="Take what an earlier study of the same settings rendered and detected in --out; solve anew."
-        ),
-    ] = False,
-    keep: Annotated[
-        bool, typer.Option(help="Keep all frames to look at: 140 MB for each participant.")
-    ] = False,
+    jobs: Jobs = 0,
+    step: Step = 2,
+    guided: Guided = 96,
+    resume: Resume = False,
+    keep: Keep = False,
 ) -> None:
     """Repeat the paper's study: people of different hands, six poses, several blocks, errors and repeatability.
 
@@ -103,7 +105,7 @@ def study(
 
       phalanx-master evaluate study --out out/study
 
-      phalanx-master evaluate study --causes --jobs 2 --out out/study          where errors come from; 6 min on 2 cores
+      phalanx-master evaluate study --causes --out out/study                   where errors come from
 
       phalanx-master evaluate study --level fk --resume --out out/study        solve again, without rendering
 
@@ -113,62 +115,53 @@ def study(
     """
     from master.study.run import Study, finish, recorded, simulate
 
-    begun = time.monotonic()
-
-    def progress(done: int, total: int, what: str) -> None:
-        spent = time.monotonic() - begun
-        left = f", about {_spell(spent * (total - done) / done)} left" if done < total else ""
-        typer.echo(f"study: {what} done, {done} of {total} after {_spell(spent)}{left}", err=True)
-
     if recordings:
-
-        def hand_of(name: str) -> tuple[Path, HandProfile]:
-            file = hand or calibration / "hands" / f"{name}.json"
-            if not file.exists():
-                raise CalibrationError(f"{file}: no such hand profile: give --hand FILE")
-            return file, load(file, HandProfile)
-
-        result = recorded(recordings, hand_of, level, out, progress)
+        result = recorded(recordings, lambda name: _hand(hand, calibration, name), level, out, _progress())
     else:
         if hand is not None:
             raise CalibrationError("--hand: is for recordings; simulated people have hands of their own")
         judged: Condition = (known, "detected")
         conditions = tuple(dict.fromkeys((judged, *CAUSES))) if causes else (judged,)
-        task = _task(rig, calibration, seed, blocks, conditions, level, step, guided, out, resume, keep)
+        device = _device(rig, calibration)
+        task = Task(*device, seed, blocks, conditions, level, step, guided, out, resume, keep)
         workers = jobs or min(os.cpu_count() or 1, participants)
-        typer.echo(
-            f"study: {participants} participants x {blocks} blocks x 6 poses, {workers} at a time, into {out}",
-            err=True,
-        )
-        result = simulate(Study(task, participants, workers, judged), progress)
+        people = f"{participants} participants x {blocks} blocks x 6 poses"
+        typer.echo(f"study: {people}, {workers} at a time, into {out}", err=True)
+        result = simulate(Study(task, participants, workers, judged), _progress())
     for line in finish(result, out):
         typer.echo(line)
     typer.echo(f"\nwrote {out / 'study.json'}, {out / 'study.md'}, {out / 'study.png'}")
 
 
-def _task(
-    rig_name: str,
-    calibration: Path,
-    seed: int,
-    blocks: int,
-    conditions: tuple[Condition, ...],
-    level: Level | None,
-    step: int,
-    guided: int,
-    out: Path,
-    resume: bool,
-    keep: bool,
-) -> Task:
-    rig = load(calibration / "rigs" / f"{rig_name}.json", RigCalibration)
+def _hand(file: Path | None, calibration: Path, name: str) -> tuple[Path, HandProfile]:
+    """File and content of the hand of a recording."""
+    found = file or calibration / "hands" / f"{name}.json"
+    if not found.exists():
+        raise CalibrationError(f"{found}: no such hand profile: give --hand FILE")
+    return found, load(found, HandProfile)
+
+
+def _device(name: str, calibration: Path) -> tuple[RigCalibration, CameraCalibration, HandProfile]:
+    """Rig, camera and usual hand."""
+    rig = load(calibration / "rigs" / f"{name}.json", RigCalibration)
     if rig.kind != "wrist":
-        raise CalibrationError(f"--rig {rig_name}: kind is {rig.kind!r}; the study is of a wrist device")
+        raise CalibrationError(f"--rig {name}: kind is {rig.kind!r}; the study is of a wrist device")
     if rig.T_camera_palm is None:
-        raise CalibrationError(
-            f"--rig {rig_name}: T_camera_palm is missing: people wear the device about there"
-        )
+        raise CalibrationError(f"--rig {name}: T_camera_palm is missing: people wear the device about there")
     camera = load(calibration / "cameras" / f"{rig.cameras[0]}.json", CameraCalibration)
-    hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
-    return Task(rig, camera, hand, seed, blocks, conditions, level, step, guided, out, resume, keep)
+    return rig, camera, load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
+
+
+def _progress() -> Callable[[int, int, str], None]:
+    """Says who is done and about how long the rest takes, from now on."""
+    begun = time.monotonic()
+
+    def tell(done: int, total: int, what: str) -> None:
+        spent = time.monotonic() - begun
+        left = f", about {_spell(spent * (total - done) / done)} left" if done < total else ""
+        typer.echo(f"study: {what} done, {done} of {total} after {_spell(spent)}{left}", err=True)
+
+    return tell
 
 
 def _spell(seconds: float) -> str:
