@@ -38,6 +38,7 @@ _LABELS = {
     "joint_mm": ("joint error, all fingers", "mm"),
     "pip_deg_visible": ("PIP error, visible fingers", "deg"),
     "pip_deg": ("PIP error, all fingers", "deg"),
+    "forearm_tilt_deg": ("forearm against the vertical, RMS", "deg"),
 }
 
 

@@ -20,7 +20,7 @@ from master.outputs.truth import PosesTruth
 from master.rig import RigSetup
 from master.score import Truth, score
 from master.solve import fingers_of
-from master.wrist_report import lit_view, wrist_images, wrist_truth_of
+from master.wrist_report import forearm_tilt, lit_view, wrist_images, wrist_truth_of
 from master.wrist_score import score_wrist
 
 _IMAGES_HZ = 2.0
@@ -99,7 +99,7 @@ def _of_wrist(
         renderer = WristRenderer(scene, scene.rig.cameras[0])
         frame = lit_view(renderer, (int(poses.t_ns[row]) - epoch_ns) * 1e-9)
     return _Judged(
-        score_wrist(poses, truth),
+        score_wrist(poses, truth) | forearm_tilt(poses, scene, epoch_ns),
         PosesTruth.of_webxr(truth.joints_m, poses.markers_m, truth.laser_m[:, 1:6]),
         wrist_images(poses, scene, epoch_ns, tell),
         WristPicture.of(setup, frame),

@@ -7,6 +7,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.frame_recording import Illumination
+from common.geometry import quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.scene import WristTruth as WristInstant
@@ -33,6 +34,21 @@ def wrist_truth_of(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progres
         joints_m=np.array([one.joints.position_m[1:] for one in now]),
         pip_rad=np.array([one.angles_rad[:, 2] for one in now]),
     )
+
+
+def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, float]:
+    """How far the forearm's vertical is off, rms [deg]: `forearm_tilt_deg`; nothing where no pose tells how it lies."""
+    imu = scene.rig.imu
+    rows = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
+    if imu is None or imu.q_rig_world is None or not len(rows):
+        return {}
+    up = quaternion_to_matrix(np.array(imu.q_rig_world))[:, 2]
+    true_up = np.empty((len(rows), 3))
+    for row, t_ns in enumerate(poses.t_ns[rows].tolist()):
+        true_up[row] = up @ scene.motion.at((t_ns - epoch_ns) * 1e-9).T_rig_palm[:3, :3]
+    said_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
+    off_rad = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
+    return {"forearm_tilt_deg": float(np.degrees(np.sqrt(np.mean(off_rad**2))))}
 
 
 def lit_view(renderer: WristRenderer, t_s: float) -> Image:

@@ -53,6 +53,7 @@ _FIGURES = (
     ("joint_mm_visible", "mm joints, visible", "{:.1f}"),
     ("pip_deg_visible", "deg PIP, visible", "{:.1f}"),
     ("pip_rms_deg", "deg PIP, rms", "{:.1f}"),
+    ("forearm_tilt_deg", "deg forearm tilt", "{:.1f}"),
 )
 
 

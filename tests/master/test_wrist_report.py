@@ -1,17 +1,19 @@
 """The report of a simulated run of a wrist device: scores against its scene, a picture, a file for the viewer."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from common.frame_recording import Illumination
+from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import save_poses
 from master.report import report_scene
 from master.rig import RigSetup
-from master.wrist_report import lit_view
+from master.wrist_report import forearm_tilt, lit_view
 from tests.master.test_outputs_rerun import rows_of
 from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
 
@@ -26,6 +28,24 @@ def setup(root: Path) -> RigSetup:
 @pytest.fixture(scope="module")
 def scene(setup: RigSetup) -> WristScene:
     return wrist_scene(setup, "curl")
+
+
+def test_the_forearm_is_scored_against_the_vertical_whatever_its_heading(
+    setup: RigSetup, scene: WristScene
+) -> None:
+    imu = setup.rig.imu
+    assert imu is not None
+    assert imu.q_rig_world is not None
+    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9) for k in range(N)])
+    assert forearm_tilt(poses, scene, START_NS) == {}
+    rig_world = quaternion_to_matrix(np.array(imu.q_rig_world))
+    times = (poses.t_ns - START_NS) * 1e-9
+    lies = np.array([rig_world.T @ scene.motion.at(float(t)).T_rig_palm[:3, :3] for t in times])
+    for tilt_deg in (0.0, 5.0):
+        turned = axis_rotation(2, 1.0) @ axis_rotation(0, np.radians(tilt_deg)) @ lies
+        told = replace(poses, palm_world_wxyz=matrix_to_quaternion(turned))
+        told.palm_world_wxyz[:3] = np.nan
+        assert forearm_tilt(told, scene, START_NS)["forearm_tilt_deg"] == pytest.approx(tilt_deg, abs=1e-4)
 
 
 @pytest.mark.parametrize("late_ms", [0, 30])
