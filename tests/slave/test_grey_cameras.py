@@ -313,7 +313,8 @@ def test_a_real_wrist_camera_is_recorded_grey(tmp_path: Path, monkeypatch: pytes
         "--frames",
         "6",
     ]
-    assert main([*command, "--camera", "v4l2", "--control", "gain=32", "-o", str(out)]) == 0
+    given = ["--camera", "v4l2", "--control", "gain=32", "--lights", "external"]
+    assert main([*command, *given, "-o", str(out)]) == 0
     recording = open_recording(out)
     assert {row.illumination for row in recording.rows} == {Illumination.NONE}
     image = cv2.imread(str(out / recording.rows[0].file), cv2.IMREAD_UNCHANGED)
