@@ -95,9 +95,7 @@ def led_change(before: Image, after: Image) -> Led:
     valid = _valid(before, after)
     if valid < VALID_LEAST * before.size:
         return Led.UNSURE
-    on, off = (
-        _broad(over, LED_NEVER * valid) / valid for over in (_over(after, before), _over(before, after))
-    )
+    on, off = (_broad(over, LED_NEVER * valid) / valid for over in _each_over(after, before))
     if max(on, off) <= LED_NEVER:
         return Led.SAME
     if on >= LED_LEAST and off <= LED_NEVER:
@@ -112,11 +110,10 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
     valid = _valid(ambient, led)
     if valid < VALID_LEAST * ambient.size:
         return Evidence(-inf, -inf, -inf, -inf)
-    led_gain, laser_gain = _over(led, ambient), _over(laser, ambient)
-    led_loss, laser_loss = _over(ambient, led), _over(ambient, laser)
-    led_over_laser = _over(led, laser)
+    (led_gain, led_loss), (laser_gain, laser_loss) = _each_over(led, ambient), _each_over(laser, ambient)
+    led_over_laser, laser_over_led = _each_over(led, laser)
     near = _near(np.minimum(led_gain, led_over_laser))
-    flash = _thin(np.minimum(laser_gain, _over(laser, led)))
+    flash = _thin(np.minimum(laser_gain, laser_over_led))
     on_hand = cv2.countNonZero(cv2.bitwise_and(flash, near))
     elsewhere = cv2.countNonZero(cv2.subtract(flash, cv2.dilate(near, _AROUND)))
     own = _shared(np.minimum(laser_loss, led_loss), lambda: _near(led_over_laser))
@@ -133,13 +130,17 @@ def evidence(ambient: Image, laser: Image, led: Image) -> Evidence:
 
 def _valid(first: Image, second: Image) -> int:
     """Number of cells in which one of the frames may be brighter than the other."""
-    return int(np.count_nonzero(np.minimum(first, second) < _SATURATED))
+    return cv2.countNonZero(
+        cv2.threshold(cv2.min(first, second), _SATURATED - 1, 255, cv2.THRESH_BINARY_INV)[1]
+    )
 
 
-def _over(bright: Image, dark: Image) -> Image:
-    """How far one frame is brighter than another beyond what noise and a swing of ambient light explain [levels]."""
-    explained = cv2.LUT(np.minimum(bright, dark), _EXPLAINED)
-    return np.asarray(cv2.subtract(cv2.subtract(bright, dark), explained), np.uint8)
+def _each_over(first: Image, second: Image) -> tuple[Image, Image]:
+    """How far each frame is brighter than the other beyond what noise and a swing of ambient light explain [levels]."""
+    explained = cv2.LUT(cv2.min(first, second), _EXPLAINED)
+    pairs = ((first, second), (second, first))
+    one, other = (cv2.subtract(cv2.subtract(bright, dark), explained) for bright, dark in pairs)
+    return np.asarray(one, np.uint8), np.asarray(other, np.uint8)
 
 
 def _lit(over: Image) -> cv2.typing.MatLike:
