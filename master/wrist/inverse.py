@@ -10,8 +10,8 @@ low, or bent and high, may show its tip at the same place. All are looked for, t
 1. **table**: for every PIP of a grid the node that explains best what was seen (`PoseTable.candidates`), brought by
    Gauss-Newton steps on the interpolated table to the least energy at that PIP;
 2. **dips** of this energy over the PIP: from there the PIP moves too, and those that meet are one;
-3. **exactly**: the few that are left are refined with the laser's cut itself. Its derivatives are those of the table,
-   mended after every step by what the step did (Broyden 1965).
+3. **exactly**: the few that are left are refined with the laser's cut itself. Its derivatives are differences for the
+   first steps, and then mended after every step by what the step did (Broyden 1965).
 
 An unknown at the end of its range stays there while the energy falls towards the outside (projected Newton, Bertsekas
 1982).
@@ -29,9 +29,12 @@ from master.wrist.setup import WristSetup
 
 MINIMA = 3  # of one finger that are refined
 _PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 8
+_NUDGED = 2  # of the exact steps: those whose derivatives are differences of what is seen
+_NUDGE_RAD = np.radians(0.2)
 _FARTHEST_RAD = np.radians(12.0)  # of one step
 _ARRIVED_RAD = np.radians(0.05)  # what is left after so short a step is a part of it
 _SAME_RAD = np.radians(4.0)  # nearer to each other than this, two candidates are on their way to one minimum
+_BEATEN = 15.0  # nor is it refined further if it is exactly known to be worse by this
 _HOPELESS = 40.0  # worse than the best by this on the table, a candidate is none; a table is wrong by less
 
 
@@ -113,11 +116,16 @@ class InverseModel:
         slot = np.arange(count) - np.searchsorted(finger, finger)
         best_x, best, length = x.copy(), np.full(count, np.inf), np.full(count, np.nan)
         _, J, _ = self._table.views(x, finger)
+        first, rank = np.unique(finger, return_index=True, return_inverse=True)[1:]
         best_J, moving = J.copy(), np.ones(count, np.bool_)
         y_before, x_before = np.full((count, SEEN), np.nan), x
-        for _ in range(_EXACT_STEPS if count else 0):
-            y, long = self._views(x, finger, slot, moving)
-            J = _mended(J, x - x_before, y - y_before)
+        for k in range(_EXACT_STEPS if count else 0):
+            if k < _NUDGED:
+                y, long, nudged = self._nudged(x, finger, slot, moving)
+                J = np.where(np.isfinite(nudged).all(axis=(1, 2), keepdims=True), nudged, J)
+            else:
+                y, long = self._views(x, finger, slot, moving)
+                J = _mended(J, x - x_before, y - y_before)
             misfit, to = self._step(x, finger, white, seen - y, J)
             won = misfit < best
             best_x[won], best[won], length[won], best_J[won] = x[won], misfit[won], long[won], J[won]
@@ -127,7 +135,7 @@ class InverseModel:
             moving &= (np.abs(to) > _ARRIVED_RAD).any(axis=1)
             arrived = won & ~moving
             best_x[arrived] = x[arrived]
-            moving &= best < best[np.searchsorted(finger, finger)] + _HOPELESS
+            moving &= best < np.minimum.reduceat(best, first)[rank] + _BEATEN
             if not moving.any():
                 break
         order = np.lexsort((best, finger))
@@ -140,9 +148,25 @@ class InverseModel:
             finger, slot, x_rad=best_x, cov_rad2=cov, misfit=best, length_px=length[order], midway=midway
         )
 
+    def _nudged(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float, Float]:
+        """As `_views`, and how it changes with each unknown (N, 4, 3) [1/rad]."""
+        count = len(x)
+        many = np.repeat(x[None], 1 + UNKNOWNS, axis=0)
+        inwards: Float = np.where(x + _NUDGE_RAD > self.poses.high[finger], -_NUDGE_RAD, _NUDGE_RAD)
+        for k in range(UNKNOWNS):
+            many[1 + k, :, k] += inwards[:, k]
+        slots = slot + MINIMA * np.arange(1 + UNKNOWNS)[:, None]
+        of_all = np.tile(finger, 1 + UNKNOWNS), slots.ravel(), np.tile(wanted, 1 + UNKNOWNS)
+        y, length = self._views(many.reshape(-1, UNKNOWNS), *of_all)
+        by = np.empty((count, SEEN, UNKNOWNS))
+        for k in range(UNKNOWNS):
+            by[..., k] = (y[(1 + k) * count : (2 + k) * count] - y[:count]) / inwards[:, k, None]
+        return y[:count], length[:count], by
+
     def _views(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float]:
         """What is seen (N, 4) of poses (N, 3), exactly, and how long the line is (N,); NaN where not wanted."""
-        grid, which = np.zeros((MINIMA, 5, UNKNOWNS)), np.zeros((MINIMA, 5), np.bool_)
+        slots = int(slot.max()) + 1
+        grid, which = np.zeros((slots, 5, UNKNOWNS)), np.zeros((slots, 5), np.bool_)
         grid[slot, finger], which[slot, finger] = x, wanted
         views = self.poses.views(grid, which)
         return views.seen[slot, finger], views.length_px[slot, finger]

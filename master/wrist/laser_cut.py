@@ -7,14 +7,14 @@ plane: that is what the sensing calls the laser point. Other fingers, which may 
 **Smooth.** Whoever inverts it follows the point over hundredths of a degree, so nothing may jump by a ray. The fan ends
 at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing ray moves along the
 skin with the root of its angle. Where the line goes out of the camera's sight, the chord between the last ray that is
-seen and the first that is not counts by share.
+seen and the first that is not counts by share: as far as the edge of the phalanx that hides the rest, or of its own.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.geometry import transform
 from common.round_cones import Cones, first_hits, terms
 from master.wrist.laser_plane import PlaneAxes
@@ -77,13 +77,17 @@ class LaserCut:
         lit = np.isfinite(far) & ((body >= ROOT - 1) | ~np.asarray(thumb)[..., None])
         points = laser + np.where(lit, far, 1.0)[..., None] * rays
         distance = np.sqrt(np.vecdot(points, points))
-        seen_at = _hits(terms(chain, np.zeros(3), np.float64), points / distance[..., None]).min(axis=-1)
+        sights, from_camera = points / distance[..., None], terms(chain, np.zeros(3), np.float64)
+        before = _hits(from_camera, sights)
+        seen_at = before.min(axis=-1)
         # How clearly it is seen [m]: at most _SEEN_M, and not at all below 0.
         clear = np.where(lit, np.minimum(seen_at - distance, 0.0) + _SEEN_M, -np.inf)
         step = np.diff(points, axis=-2)
         whole = lit[..., 1:] & lit[..., :-1]
         whole &= np.vecdot(step, step) < (_STRETCH * broad[..., None]) ** 2
         first, last = _seen_part(clear[..., :-1], clear[..., 1:])
+        cut = np.nonzero(whole & ((clear[..., 1:] > 0.0) != (clear[..., :-1] > 0.0)))
+        _at_edge(first, last, cut, clear, sights, before, from_camera)
         image = points[..., :2] / points[..., 2:]
         step = np.diff(image, axis=-2)
         weight = np.where(whole, np.sqrt(np.vecdot(step, step)) * (last - first), 0.0)
@@ -152,3 +156,55 @@ def _seen_part(here: Float, there: Float) -> tuple[Float, Float]:
     cut = (here > 0.0) != (there > 0.0)
     first = np.where(here > 0.0, 0.0, np.where(cut, gone, 1.0))
     return first, np.where(there > 0.0, 1.0, np.where(cut, gone, 0.0)).clip(min=first)
+
+
+def _at_edge(
+    first: Float,
+    last: Float,
+    cut: tuple[Int, ...],
+    clear: Float,
+    sights: Float,
+    before: Float,
+    from_camera: Float,
+) -> None:
+    """Let chords that another part of the finger cuts off end at the edge of that part.
+
+    Args:
+        first, last: (..., R - 1) seen part of each chord, which is changed.
+        cut: Indices of the chords of which one end is seen.
+        clear: (..., R) how clearly rays are seen.
+        sights: (..., R, 3) unit rays of the camera.
+        before: (..., R, K - 1) where the cones begin on them.
+        from_camera: (12, ..., K - 1) terms of the cones.
+    """
+    if not len(cut[0]):
+        return
+    lead, chord = cut[:-1], cut[-1]
+    rises = clear[*lead, chord + 1] > 0.0
+    hidden, seen = np.where(rises, chord, chord + 1), np.where(rises, chord + 1, chord)
+    body = before[*lead, hidden].argmin(axis=-1)
+    known = from_camera[:, *lead, body]
+    inside, foot = _depths(known, sights[*lead, hidden].T)
+    outside, _ = _depths(known, sights[*lead, seen].T)
+    crossed = (inside > 0.0) & (outside < 0.0)
+    crossed[2] &= (foot > 0.0) & (foot < known[6])
+    share = np.where(crossed, outside / np.where(crossed, outside - inside, 1.0), np.inf).min(axis=0)
+    # Where the part's own surface turns away from the camera no ray passes it by, and clearness says how far.
+    edge = np.isfinite(share)
+    up, down = edge & rises, edge & ~rises
+    first[tuple(i[up] for i in cut)] = 1.0 - share[up]
+    last[tuple(i[down] for i in cut)] = share[down]
+
+
+def _depths(known: Float, rays: Float) -> tuple[Float, Float]:
+    """How deep rays (3, M) pass into both spheres and the side of cones of terms (12, M), below 0: beside them (3, M).
+
+    Also the feet (M,) of their hits of the side, as in `common.round_cones`.
+    """
+    d2, k0, lean, shift, c1, c2 = known[6:]
+    m2, m3 = (rays * known[:3]).sum(axis=0), (rays * known[3:6]).sum(axis=0)
+    k1, k2 = d2 * m3 + m2 * lean, d2 - m2 * m2
+    side = k1 * k1 - k0 * k2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        foot = shift - (np.sqrt(np.maximum(side, 0.0)) + k1) / k2 * m2
+    return np.stack([m3 * m3 - c1, (m3 - m2) ** 2 - c2, side]), foot

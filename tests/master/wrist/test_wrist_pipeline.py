@@ -34,8 +34,9 @@ def rig(root: Path) -> RigSetup:
 
 @pytest.fixture(scope="module")
 def setup(rig: RigSetup) -> WristSetup:
+    """Of the level of laser points alone, of which these tests are."""
     assert rig.wrist is not None
-    return rig.wrist
+    return replace(rig.wrist, level="fk")
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +299,10 @@ def test_what_the_rig_says_of_stamps_and_volume_holds(
     alone: WristPipeline, rig: RigSetup, setup: WristSetup
 ) -> None:
     stated = msgspec.structs.replace(
-        rig.rig, stamp_offset_us={"wrist": 1500.0}, volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1))
+        rig.rig,
+        level="fk",
+        stamp_offset_us={"wrist": 1500.0},
+        volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1)),
     )
     pipeline = WristPipeline(
         WristSetup.of(stated, rig.cameras["wrist"], rig.hand), continuous=False, inverse=alone.inverse
