@@ -87,7 +87,7 @@ def _imu(options: argparse.Namespace) -> int:
     if rig.imu is None or options.name != rig.imu.name:
         has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
         raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
-    orientation = orientation_of(rig.imu, options.imu, options.orientation)
+    orientation = orientation_of(rig.imu)
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
@@ -282,7 +282,7 @@ def _imu_beside(
 
     if rig.imu is None:
         raise CalibrationError(f"rig {rig.name!r}: imu: missing; there is none to record")
-    orientation, stop = orientation_of(rig.imu, options.imu, "fused"), threading.Event()
+    orientation, stop = orientation_of(rig.imu), threading.Event()
     beside = ImuRecorder(
         open_real(rig.imu.name, options.imu, rig.imu.rate_hz, clock, stop), orientation, stop
     )

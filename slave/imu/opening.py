@@ -38,28 +38,14 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of an IMU that is sent live."""
     parser.add_argument("--imu", required=True, metavar="DRIVER", help=IMUS)
     parser.add_argument("--list", action=ListPlaces, help="say where an IMU may be connected, and end")
-    parser.add_argument(
-        "--orientation",
-        choices=("fused", "own"),
-        default="fused",
-        help="fused: reckoned here from rates and forces; own: what the sensor itself says, which so far only the "
-        "synthetic one does (default: %(default)s)",
-    )
 
 
-def orientation_of(imu: ImuCalibration, driver: str, orientation: str) -> OrientationFilter | None:
-    """What makes the orientation of the samples; None: the sensor itself.
+def orientation_of(imu: ImuCalibration) -> OrientationFilter:
+    """What makes the orientation of the samples.
 
     Raises:
-        ImuError: The sensor's own is asked for, and it has none.
         CalibrationError: The rig trusts a heading that nobody knows.
     """
-    if orientation == "own":
-        if driver != "synthetic":
-            raise ImuError(
-                f"--orientation own: {driver} is read without an orientation of its own: leave it away"
-            )
-        return None
     if imu.heading_sigma_rad is not None:
         raise CalibrationError(
             f"imu.heading_sigma_rad: {imu.heading_sigma_rad:g}, but an orientation from rates and forces has no "

@@ -76,7 +76,7 @@ class ReopeningImu:
         self._drop()
 
     def counts(self) -> Mapping[str, int]:
-        """`lost` and `back`, and the events of all IMUs that were opened."""
+        """`lost`, `back`; `late`: samples no later than the one before; the events of all IMUs that were opened."""
         source = self._source
         counts = Counter(self._counts)
         counts.update(source.counts() if isinstance(source, Telling) else {})
@@ -121,7 +121,7 @@ class ReopeningImu:
     def _number(self, sample: ImuSample) -> ImuSample | None:
         """The sample with a number that goes on where the last IMU ended; None: it is from before the loss."""
         if self._last is not None and sample.t_ns <= self._last[1]:
-            self._counts["broken.late"] += 1
+            self._counts["late"] += 1
             return None
         if self._away_ns is not None:
             _LOG.warning("IMU: back after loss number %d", self._counts["lost"])

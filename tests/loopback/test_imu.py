@@ -97,9 +97,9 @@ def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path)
     skew = ["--scene-epoch-ns", str(epoch_ns), "--clock-offset-ms", "4000", "--clock-ppm", "80"]
     with ExitStack() as stack:
         bus, ingest = master(stack, raw, beacon, here, endpoint)
-        slave = stack.enter_context(process(files, log, key, port, "--orientation", "own", *skew))
+        slave = stack.enter_context(process(files, log, key, port, *skew))
         got: list[ImuSample] = []
-        assert until(lambda: take(ingest, got) >= 60, 60.0), log.read_text()
+        assert until(lambda: take(ingest, got) >= 150, 60.0), log.read_text()
         assert until(lambda: "palm-imu" in bus.alive(), 20.0), log.read_text()
         health = bus.ask(Command("palm-imu", "report", ""), 10.0)
         assert health.counts["sent"] >= 60
@@ -116,14 +116,15 @@ def test_its_samples_are_those_of_the_scene_on_the_masters_clock(tmp_path: Path)
     rig = load(files / "rigs/desk-imu.json", RigCalibration)
     ours, other = simulated(files, rig, 5), simulated(files, rig, 6)
     for one in got:
-        t_s = one.seq / 120.0  # up to the 80 ppm: 5 ms after a minute
+        t_s = one.seq / 120.0 / (1.0 + 80e-6)
         assert abs(one.t_ns - epoch_ns - t_s * 1e9) < APART_NS
         apart = [
             np.abs(one.gyro_rad_s - imu.sample(one.seq, t_s, 0).gyro_rad_s).max() for imu in (ours, other)
         ]
-        assert apart[0] < 2e-3  # what five milliseconds change of the motion
+        assert apart[0] < 1e-4
         assert apart[1] > 5e-3
-        assert np.isnan(one.orientation_wxyz).all()  # the part has none of its own
+    known = [one for one in got if np.isfinite(one.orientation_wxyz).all()]
+    assert known[-1] is got[-1], "it is the filter's, which needs a second"
 
 
 def test_an_ximu3_is_read_lost_and_back(tmp_path: Path) -> None:
@@ -139,9 +140,9 @@ def test_an_ximu3_is_read_lost_and_back(tmp_path: Path) -> None:
         device.unplug()
         assert until(lambda: health(bus).counts["lost"] == 1, 20.0), log.read_text()
         assert health(bus).counts["back"] == 0
-        while ingest.get(0.0) is not None:  # what was on its way
-            pass
-        before = got[-1]
+        while (late := ingest.get(0.0)) is not None:  # what was on its way
+            assert isinstance(late, ImuSample)
+            got.append(late)
         device = FakeXimu3(link, streams=True, begins_us=0)  # it has begun anew
         stack.callback(device.unplug)
         again: list[ImuSample] = []
@@ -159,10 +160,8 @@ def test_an_ximu3_is_read_lost_and_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(run[0].gyro_rad_s, np.radians([5.0, 0.0, -3.0]), rtol=1e-6)
         np.testing.assert_allclose(run[0].accel_m_s2, [0.0, 0.0, 9.80665], rtol=1e-6)
         assert np.isnan(run[0].mag_ut).all()
-    absent_ns = again[0].t_ns - before.t_ns
-    assert absent_ns > 0
-    assert again[0].seq - before.seq > 1
-    assert abs((again[0].seq - before.seq) * 7.5e6 - absent_ns) < 50e6, "the gap is the absence"
+    assert again[0].t_ns > got[-1].t_ns
+    assert again[0].seq > got[-1].seq + 1, "the absence is a gap"
     assert np.isfinite(got[-1].orientation_wxyz).all(), "a filter knows its tilt after a second"
     assert again[-1].t_ns < SystemClock().now_ns()
 

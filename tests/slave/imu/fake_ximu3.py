@@ -74,8 +74,13 @@ class FakeXimu3:
             self.send(Kind.INERTIAL, *gyro, 0.0, 0.0, 1.0)
 
     def write(self, data: bytes) -> None:
-        """Send bytes as they are."""
-        os.write(self._near, data)
+        """Send bytes as they are, all of them, or none where there is no room for the first."""
+        sent = os.write(self._near, data)
+        while sent < len(data) and self._plugged.is_set():
+            try:
+                sent += os.write(self._near, data[sent:])
+            except BlockingIOError:
+                time.sleep(0.001)
 
     def _work(self) -> None:
         rest = b""

@@ -183,10 +183,6 @@ def test_it_reports_and_stops_on_the_bus() -> None:
         (["--name", "imu", "--imu", "lsm6dsox:99"], "I2C bus 99, address 0x6a: there is no /dev/i2c-99"),
         (["--name", "imu", "--imu", "lsm6dsox:1:zwei"], "write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS"),
         (["--name", "imu", "--imu", "lsm6dsox:1:0x99"], "write lsm6dsox:BUS or lsm6dsox:BUS:ADDRESS"),
-        (
-            ["--name", "imu", "--imu", "lsm6dsox:1", "--orientation", "own"],
-            "without an orientation of its own",
-        ),
         (["--name", "imu", "--rig", "trusting"], "imu.heading_sigma_rad: 0.1, but an orientation from rates"),
     ],
 )
