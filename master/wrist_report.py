@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from common.arrays import Image
+from common.arrays import Float, Image
 from common.frame_recording import Illumination
 from common.geometry import quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
@@ -44,11 +44,12 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
         return {}
     up = quaternion_to_matrix(np.array(imu.q_rig_world))[:, 2]
     true_up = np.empty((len(rows), 3))
-    for row, t_ns in enumerate(poses.t_ns[rows].tolist()):
-        true_up[row] = up @ scene.motion.at((t_ns - epoch_ns) * 1e-9).T_rig_palm[:3, :3]
+    for k, row in enumerate(rows):
+        t_s = (int(poses.t_ns[row]) - epoch_ns) * 1e-9
+        true_up[k] = up @ scene.motion.at(t_s).T_rig_palm[:3, :3]
     said_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
-    off_rad = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
-    return {"forearm_tilt_deg": float(np.degrees(np.sqrt(np.mean(off_rad**2))))}
+    off_rad: Float = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
+    return {"forearm_tilt_deg": round(float(np.degrees(np.sqrt((off_rad**2).mean()))), 4)}
 
 
 def lit_view(renderer: WristRenderer, t_s: float) -> Image:

@@ -55,7 +55,8 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
     position, target = (_WRIST_EYE_M, _WRIST_TARGET_M) if rig.kind == "wrist" else (_eye_of(rig), _TARGET_M)
     eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
     scene = rrb.Spatial3DView(
-        origin=WORLD,
+        origin="/",  # above the world: a wrist device's is turned as the forearm is held
+        contents=f"{WORLD}/**",
         name="Hand and rig",
         background=_BACKGROUND,
         line_grid=rrb.LineGrid3D(visible=False),

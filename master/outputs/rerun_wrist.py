@@ -1,5 +1,6 @@
 """What a wrist device adds to the viewer's scene: the fan of its laser, where that meets each finger, and its sights.
 
+world                                the whole device, turned as the forearm is held, up is up; where an IMU tells it
 world/laser/fan                      the laser's light, as far as the rig says where it goes
 world/laser/points                   where it meets each finger, in the finger's colour
 world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
@@ -14,6 +15,7 @@ import rerun as rr
 
 from common.arrays import Float
 from common.camera_model import CameraModel
+from common.geometry import matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import TIPS
 from common.messages import FINGER_COUNT, WristDetections
 from master.outputs.laser_fan import LASER_RGB, fan
@@ -25,18 +27,21 @@ from master.wrist.setup import WristSetup
 
 _FAN_LINE_M = 0.0003
 _POINT_M = 0.0025
+_UPRIGHT = 0.98  # cosine of 11 degrees off the vertical
 _DETECTED_PX, _POINT_PX = 4.0, 3.0
 _FINGER_RGB = [series_rgb(finger) for finger in range(FINGER_COUNT)]
 
 
 class WristLayer:
-    """Logs one wrist device to a recording that belongs to the caller; holds nothing that changes."""
+    """Logs one wrist device to a recording that belongs to the caller; holds which way the first pose looked."""
 
     def __init__(
         self, recording: rr.RecordingStream, camera: str, model: CameraModel, setup: WristSetup, spread: Float
     ) -> None:
         """Log the laser's fan; `spread` are its rays' directions (K, 3), see `fan_rays`."""
         self._rows = Columns(recording)
+        self._palm_camera = setup.T_camera_palm[:3, :3].T
+        self._level_world: Float | None = None
         self._camera, self._model = camera, model
         lines = fan(setup.laser_m, spread)
         recording.log(
@@ -46,7 +51,8 @@ class WristLayer:
         )
 
     def log_poses(self, poses: Poses) -> None:
-        """Log laser points and sights of a batch of poses."""
+        """Log laser points, sights and how the forearm is held, of a batch of poses."""
+        self._log_held(poses)
         t, points = poses.t_ns, poses.laser_m
         colours = np.broadcast_to(pack(_FINGER_RGB), points.shape[:2])
         self._rows.points(f"{WORLD}/laser/points", t, points, seen(points), colours, _POINT_M)
@@ -59,6 +65,18 @@ class WristLayer:
         )
         self._rows.scalars("plots/seen/laser_points", t, seen(points).sum(axis=1).astype(np.float64))
 
+    def _log_held(self, poses: Poses) -> None:
+        """Turn the scene: down, y, is down; what the camera looked along at first, z, stays ahead."""
+        known = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
+        if not len(known):
+            return
+        world_camera = quaternion_to_matrix(poses.palm_world_wxyz[known]) @ self._palm_camera
+        if self._level_world is None:
+            self._level_world = _level(world_camera[0])
+        turned = matrix_to_quaternion(self._level_world @ world_camera)
+        columns = rr.Transform3D.columns(quaternion=turned[:, [1, 2, 3, 0]])
+        self._rows.send(WORLD, poses.t_ns[known], columns, None)
+
     def log_detections(self, frames: Sequence[WristDetections]) -> None:
         """Log what the camera saw of laser and fingertips, in its image; frames in the order of time."""
         t = np.array([frame.t_ns for frame in frames], np.int64)
@@ -69,3 +87,12 @@ class WristLayer:
             ("tips", np.array([frame.tip_uv for frame in frames])),
         ):
             self._rows.pixels(f"{path}/{name}", t, uv, colours, _DETECTED_PX)
+
+
+def _level(world_camera: Float) -> Float:
+    """The IMU's world -> x right, y down, z ahead: where the camera looks, or its image's top where it looks up."""
+    up = np.array([0.0, 0.0, 1.0])
+    along = world_camera[:, 2] if abs(world_camera[2, 2]) < _UPRIGHT else -world_camera[:, 1]
+    ahead = along - (along @ up) * up
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(ahead, up), -up, ahead])

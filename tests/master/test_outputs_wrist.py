@@ -1,6 +1,7 @@
 """A wrist device in the viewer and in the picture of a run."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 import rerun as rr
 
 from common.arrays import Float, Image
+from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristTruth
 from master.outputs.laser_fan import fan, fan_rays
@@ -153,3 +155,27 @@ def test_a_pose_of_which_nothing_is_known_can_be_drawn(
     _, points = column(tmp_path / "run.rrd", "/world/laser/points", "positions")
     assert not points[0]
     assert points[1]
+
+
+def test_the_scene_is_turned_as_the_forearm_is_held(
+    setup: RigSetup, truths: list[WristTruth], tmp_path: Path
+) -> None:
+    poses = true_poses(setup, truths)
+    write_rrd(tmp_path / "still.rrd", poses, setup.rig, setup.cameras, setup.hand)
+    assert "/world" not in rows_of(tmp_path / "still.rrd")  # nobody tells how
+    assert setup.wrist is not None
+    camera_palm = setup.wrist.T_camera_palm[:3, :3]
+    world_camera = [axis_rotation(2, 0.7) @ axis_rotation(0, -1.2 + 0.2 * k) for k in range(len(poses))]
+    held = replace(poses, palm_world_wxyz=matrix_to_quaternion(np.array(world_camera) @ camera_palm))
+    held.palm_world_wxyz[3] = np.nan
+    write_rrd(tmp_path / "held.rrd", held, setup.rig, setup.cameras, setup.hand)
+    times, said = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
+    known = [k for k in range(len(poses)) if k != 3]
+    assert times == poses.t_ns[known].tolist()
+    xyzw = np.array(said, np.float64)[:, 0]
+    turned = quaternion_to_matrix(xyzw[:, [3, 0, 1, 2]])
+    up = np.array([R[2] for R in world_camera])[known]  # in the camera's frame
+    np.testing.assert_allclose((turned @ up[..., None])[..., 0], np.tile([0.0, -1.0, 0.0], (7, 1)), atol=1e-6)
+    assert turned[0, 0, 2] == pytest.approx(
+        0.0, abs=1e-6
+    )  # what the camera looks along begins straight ahead
