@@ -66,7 +66,7 @@ def wearer(
             f"rig {device.file_name!r}: T_camera_palm: a first guess is needed, such as from the drawing of the device;"
             " or lay a board on the palm (calibrate palm)"
         )
-    profile = load(hand or calibration / "hands" / f"{device.rig.hand}.json", HandProfile)
+    profile = load(hand or _hand_of(device.rig.hand, calibration, out), HandProfile)
     triples = list(recorded_triples(detections, device.camera.name))
     try:
         found = calibrate_wearer(triples, device.rig, device.camera, profile, device.source)
@@ -82,6 +82,13 @@ def wearer(
     written = _write(out, device, found, new)
     if json_file is not None:
         write_summary(json_file, summary(found) | {"written": written})
+
+
+def _hand_of(name: str, calibration: Path, out: Path | None) -> Path:
+    """The rig's hand file: beside the rig in the tree of the results if that has it, as the rig itself."""
+    trees = [calibration] if out is None else [out, calibration]
+    paths = [tree / "hands" / f"{name}.json" for tree in trees]
+    return next((path for path in paths if path.exists()), paths[-1])
 
 
 def _write(out: Path | None, device: Device, found: Wearer, hand: HandProfile) -> list[str]:

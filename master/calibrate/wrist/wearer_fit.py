@@ -26,7 +26,9 @@ _TIP_SIGMA_M = 2e-3  # what is seen as the tip of a finger is anywhere on its pu
 _FLAT_RAD = np.radians(4.0)  # how flat people hold a hand
 _STRAIGHT_RAD = np.radians(5.0)  # how straight they keep a finger that bends at its knuckle
 _RATIO_SPREAD = 0.15  # MCP of a fist against the natural ratio
-_ASIDE_RAD = np.radians(5.0)
+_ASIDE_RAD = np.radians(
+    17.0
+)  # 5 of a finger, who keeps to it all the time: its triples together count as one
 _ANY_RAD = np.radians(60.0)  # of an angle that the motion leaves open
 _KNUCKLE_M = 3e-3  # against a hand of this size, per axis
 _INDEPENDENT = 4.0  # triples of a bend

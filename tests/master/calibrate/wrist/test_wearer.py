@@ -1,16 +1,23 @@
 """Who wears a device: knuckles and palm of simulated people are found again, and motions that tell nothing refused."""
 
+import json
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
+import typer
 from msgspec.structs import replace
 
 from bench.wrist_wearers import CALIB, Person, knuckles
 from common.arrays import Float
-from common.calibration import HandProfile, load, parse
+from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
 from common.geometry import rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, HandModel
+from common.npz import write_npz
 from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.cli import calibrate_app
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, guided
 from master.calibrate.wrist.wearer import calibrate_wearer
@@ -61,7 +68,7 @@ def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(people: dict[in
     triples = person.detected("wearer")[0]
     found = calibrate_wearer(triples, person.rig, person.camera, person.hand)
     told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
-    assert told.knuckle_m[:, 0].max() < 0.6  # across
+    assert told.knuckle_m[:, 0].max() < 0.7  # across
     assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
     # With a palm that a board has placed, knuckles are known better.
     rig = replace(person.true_rig, provenance={"T_camera_palm": provenance("calibrate palm", (), {})})
@@ -178,3 +185,41 @@ def test_a_thickness_that_is_none_is_refused_with_its_key(key: str, value: str) 
     wrong = raw.replace('"version": 1,', f'"version": 1, "palmar_scale": {{"{key}": {value}}},', 1)
     with pytest.raises(CalibrationError, match=r"me\.json.*palmar_scale"):
         parse(wrong.encode(), HandProfile, "me.json")
+
+
+def test_the_command_writes_rig_and_hand_and_draws(people: dict[int, Person], tmp_path: Path) -> None:
+    person = people[40]
+    rows = person.detected("wearer")[0]
+    for folder, name, value in (
+        ("rigs", person.rig.name, person.rig),
+        ("cameras", person.camera.name, person.camera),
+        ("hands", person.rig.hand, replace(person.hand, name=person.rig.hand)),
+    ):
+        (tmp_path / "tree" / folder).mkdir(parents=True, exist_ok=True)
+        save(tmp_path / "tree" / folder / f"{name}.json", value)
+    (tmp_path / "found").mkdir()
+    columns = {
+        key: np.array([getattr(row, key) for row in rows])
+        for key in ("t_ns", "seq", "laser_uv", "laser_sigma_px", "tip_uv", "tip_sigma_px")
+    }
+    write_npz(tmp_path / "found" / f"detections_{person.camera.name}.npz", columns)
+    out, picture = tmp_path / "out", tmp_path / "wearer.png"
+    options = [
+        "--detections",
+        tmp_path / "found",
+        "--rig",
+        person.rig.name,
+        "--calibration",
+        tmp_path / "tree",
+    ]
+    options += ["--name", "me", "--out", out, "--picture", picture, "--json", tmp_path / "told.json"]
+    app = typer.main.get_command(calibrate_app())
+    app.main(["wearer", str(tmp_path / "guided"), *map(str, options)], standalone_mode=False)
+    rig = load(out / "rigs" / f"{person.rig.name}.json", RigCalibration)
+    hand = load(out / "hands" / "me.json", HandProfile)
+    assert rig.hand == hand.name == "me"
+    assert hand.palmar_scale.keys() == {"index", "middle", "ring", "little"}
+    assert cv2.imread(str(picture)) is not None
+    told = json.loads((tmp_path / "told.json").read_text())
+    assert told["fingers"]["ring"]["knuckle_sigma_mm"][0] < 3.0
+    WristSetup.of(rig, person.camera, HandModel.of(hand))
