@@ -10,8 +10,9 @@ low, or bent and high, may show its tip at the same place. All are looked for, t
 1. **table**: for every PIP of a grid the node that explains best what was seen (`PoseTable.candidates`), brought by
    Gauss-Newton steps on the interpolated table to the least energy at that PIP;
 2. **dips** of this energy over the PIP: from there the PIP moves too, and those that meet are one;
-3. **exactly**: the few that are left are refined with the laser's cut itself. Its derivatives are differences for the
-   first steps, and then mended after every step by what the step did (Broyden 1965).
+3. **exactly**: the few that are left are refined with the laser's cut itself, until a step is short against what the
+   noise of the sensing makes of angles. Its derivatives are those of the table for one step, differences for two, and
+   then mended after every step by what the step did (Broyden 1965).
 
 An unknown at the end of its range stays there while the energy falls towards the outside (projected Newton, Bertsekas
 1982).
@@ -65,13 +66,14 @@ class InverseModel:
         self._table = PoseTable(setup, self.poses)
         self._loose = 12.0 / (self.poses.high - self.poses.low) ** 2  # (5, 3): anywhere within the range
 
-    def __call__(self, seen: Float, cov: Float) -> Minima:
+    def __call__(self, seen: Float, cov: Float, coarse_rad: Float | None = None) -> Minima:
         """The minima.
 
         Args:
             seen: (5, 4) laser point on its plane (across, along) [m] and tip (x / z, y / z); NaN: a finger of which
                 not both are known, and which is left out.
             cov: (5, 4, 4) its covariance, finite.
+            coarse_rad: (5,) what the noise of the sensing makes of angles: a step shorter than half of it is the last.
         """
         told: Bool = np.isfinite(seen.sum(axis=1)) & self._table.met
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
@@ -81,7 +83,10 @@ class InverseModel:
             y, J, _ = self._table.views(x, finger)
             misfit, to = self._step(x, finger, white[finger], seen - y, J)
             x = x + to
-        return self._exact(*self._left(x, finger, misfit, seen), white)
+        arrived = np.full(5, _ARRIVED_RAD)
+        if coarse_rad is not None:
+            arrived = np.fmax(arrived, 0.5 * coarse_rad)
+        return self._exact(*self._left(x, finger, misfit, seen), white, arrived)
 
     def _dips(self, seen: Float, told: Bool, white: Float) -> tuple[Float, Int]:
         """Where the least energy for each PIP has its minima over the PIP: poses (N, 3) and their fingers (N,)."""
@@ -110,7 +115,7 @@ class InverseModel:
         keep &= (better & keep).sum(axis=1) < MINIMA
         return x[keep], finger[keep], seen[keep]
 
-    def _exact(self, x: Float, finger: Int, seen: Float, white: Float) -> Minima:
+    def _exact(self, x: Float, finger: Int, seen: Float, white: Float, arrived_rad: Float) -> Minima:
         """The minima that poses (N, 3) of fingers (N,), sorted, are near to; `seen` (N, 4) of each."""
         count, white = len(x), white[finger]
         slot = np.arange(count) - np.searchsorted(finger, finger)
@@ -120,7 +125,7 @@ class InverseModel:
         best_J, moving = J.copy(), np.ones(count, np.bool_)
         y_before, x_before = np.full((count, SEEN), np.nan), x
         for k in range(_EXACT_STEPS if count else 0):
-            if k < _NUDGED:
+            if 0 < k <= _NUDGED:
                 y, long, nudged = self._nudged(x, finger, slot, moving)
                 J = np.where(np.isfinite(nudged).all(axis=(1, 2), keepdims=True), nudged, J)
             else:
@@ -132,7 +137,7 @@ class InverseModel:
             # Where the laser misses, or a step led uphill: half the way back to the best.
             to = np.where(won[:, None], to, 0.5 * (best_x - x))
             x_before, y_before, x = x, y, x + to
-            moving &= (np.abs(to) > _ARRIVED_RAD).any(axis=1)
+            moving &= (np.abs(to) > arrived_rad[finger, None]).any(axis=1)
             arrived = won & ~moving
             best_x[arrived] = x[arrived]
             moving &= best < np.minimum.reduceat(best, first)[rank] + _BEATEN
@@ -152,7 +157,7 @@ class InverseModel:
         """As `_views`, and how it changes with each unknown (N, 4, 3) [1/rad]."""
         count = len(x)
         many = np.repeat(x[None], 1 + UNKNOWNS, axis=0)
-        inwards: Float = np.where(x + _NUDGE_RAD > self.poses.high[finger], -_NUDGE_RAD, _NUDGE_RAD)
+        inwards = _NUDGE_RAD * (1.0 - 2.0 * (x + _NUDGE_RAD > self.poses.high[finger]))
         for k in range(UNKNOWNS):
             many[1 + k, :, k] += inwards[:, k]
         slots = slot + MINIMA * np.arange(1 + UNKNOWNS)[:, None]

@@ -82,7 +82,8 @@ class Levels:
         """
         seen = np.concatenate([sight.laser_m, sight.tip], axis=1)
         both: Bool = np.isfinite(seen.sum(axis=1))
-        minima = self._model(seen, self._noise(sight, both))
+        coarse_rad = self._sight.turn_rad(sight.tip_sigma_px, sight.distance_m)
+        minima = self._model(seen, self._noise(sight, both), coarse_rad)
         shown = self._sight.shown(np.nan_to_num(minima.length_px[:, 0]), sight.laser_px)
         solved = both & (minima.misfit[:, 0] < _REFUSED) & (shown >= HARDLY)
         found = self._angles(minima, solved, last_rad)

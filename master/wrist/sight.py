@@ -27,9 +27,9 @@ class SightNoise:
         self._skin_m2 = (SPREAD * Skin.of(setup.model).palmar_m.mean(axis=1)) ** 2
         beyond_m = Fingertips.of(setup.model).beyond_m
         self._tip_m2 = (SPREAD * beyond_m) ** 2 + _PALM_M2
-        lever_m = np.linalg.norm(setup.model.bone_m[:, 1:], axis=-1).sum(axis=1) + beyond_m
+        self._lever_m = np.linalg.norm(setup.model.bone_m[:, 1:], axis=-1).sum(axis=1) + beyond_m
         hinge = setup.T_camera_palm[:2, 0] / np.linalg.norm(setup.T_camera_palm[:2, 0])
-        self._rolled_m2 = (_HINGE_RAD * lever_m)[:, None, None] ** 2 * np.outer(hinge, hinge)
+        self._rolled_m2 = (_HINGE_RAD * self._lever_m)[:, None, None] ** 2 * np.outer(hinge, hinge)
         self._focal_px = setup.optics.matrix[0, 0]
 
     def laser_m2(self, cov_m2: Float, distance_m: Float, whole_px: Float, shown: Float) -> Float:
@@ -58,6 +58,10 @@ class SightNoise:
         """
         sensed = (sigma_px / self._focal_px) ** 2 + self._tip_m2 / distance_m**2
         return sensed[:, None, None] * np.eye(2) + self._rolled_m2 / distance_m[:, None, None] ** 2
+
+    def turn_rad(self, sigma_px: Float, distance_m: Float) -> Float:
+        """By how much a PIP turns (5,) to move a tip across the sight by its standard deviation; NaN: not seen."""
+        return sigma_px / self._focal_px * distance_m / self._lever_m
 
     @staticmethod
     def shown(whole_px: Float, laser_px: Float) -> Float:
