@@ -1,4 +1,5 @@
-"""Fingertips of the wrist device: how near, how many, how many of something else, and the time they take.
+"""Fingertips of the wrist device: how near, how many, how many of something else, how sure they
+say they are, and the time they take.
 
 On the recordings, where they are, and on simulated hands and palm poses of other seeds in every light. A tip counts as
 found within 6 px of the end of its finger; false is a report more than 25 px from it, or of an end that is not seen.
@@ -22,13 +23,14 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import AMBIENTS, WristScene
 from slave.wrist.background import lit
 from slave.wrist.fingers import separate
-from slave.wrist.fingertips import fingertips
+from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.view import WristView
 
-MOTIONS = ("curl", "poses", "spread")
+MOTIONS = ("standard", "curl", "poses", "spread")
 HAND_LENGTHS_M = (0.17, 0.185, 0.2)  # one for each seed
 SEEDS, POSES = (201, 202, 203), 14
 FOUND_PX, ELSEWHERE_PX = 6.0, 25.0
+TOUCHING_PX, EDGE_PX = 45.0, 40.0  # between the ends of two fingers: a diameter; to the edge of the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +113,48 @@ def _scored(name: str, shown: list[Shown]) -> Iterator[Row]:
         "%",
         f"goal <= 5; of an end that is not seen {100.0 * float((reported & ~seen).sum() / max(reported.sum(), 1)):.1f}",
     )
-    pull = off[both] / sigma[both][:, None]
+    thumb, shows = reported[:, 0], seen[:, 0]
+    if shows.any():
+        found_of = 100.0 * float(thumb[shows].mean())
+        yield Row(f"{name}: thumbs found", found_of, "%", f"of {shows.sum()} seen")
+    yield Row(f"{name}: thumbs that are not seen", float((thumb & ~shows).sum()), "", "goal 0")
+    for kind, some in _kinds(shown, reported, seen).items():
+        pull = np.abs(off[some] / sigma[some][:, None])
+        if len(pull):
+            yield Row(
+                f"{name}: within 1.96 sigma, {kind}",
+                100.0 * float((pull < 1.96).mean()),
+                "%",
+                f"goal 95; {len(pull)} tips, median sigma {float(np.median(sigma[some])):.1f} px",
+            )
     yield Row(
-        f"{name}: error by sigma", float(np.median(np.abs(pull)) / 0.6745), "", "goal 1, of the middle half"
+        f"{name}: given to another finger",
+        1000.0 * float(_swapped(found, shown).sum() / max(reported.sum(), 1)),
+        "per 1000",
+        "goal 0",
     )
+
+
+def _kinds(shown: list[Shown], reported: Bool, seen: Bool) -> dict[str, Bool]:
+    """Which reports (N, 5) are of ends in the clear, beside another end, near the image's edge, or not seen."""
+    truth = np.array([one.truth_px for one in shown])
+    apart = np.linalg.norm(truth[:, :, None] - truth[:, None], axis=-1) + 1e9 * np.eye(5)
+    touching = apart.min(axis=2) < TOUCHING_PX
+    height, width = shown[0].led.shape
+    edge = (np.minimum(truth, [width, height] - truth) < EDGE_PX).any(axis=2)
+    both = reported & seen
+    return {
+        "clear": both & ~touching & ~edge,
+        "touching": both & touching & ~edge,
+        "near the edge": both & edge,
+        "not seen": reported & ~seen,
+    }
+
+
+def _swapped(found: list[Fingertips], shown: list[Shown]) -> Bool:
+    """Which reports (N, 5) lie on the end of another finger than their own."""
+    at, truth = np.array([tips.uv for tips in found]), np.array([one.truth_px for one in shown])
+    distance = np.linalg.norm(at[:, :, None] - truth[:, None], axis=-1)
+    own = np.diagonal(distance, axis1=1, axis2=2)
+    others = (distance + 1e9 * np.eye(5)).min(axis=2)
+    return (others < own) & (others < TOUCHING_PX / 3.0)
