@@ -115,16 +115,19 @@ def rows() -> Iterator[Row]:
             "recorded: skipped", 0.0, "", f"no recordings at {_DATASETS / 'broad'}: set PHALANX_DATASETS"
         )
     for name, recording in found.items():
+        what = name.strip("0123456789_B").removeprefix("undisturbed_").replace("_", " ")
         for peer, make in _PEERS.items():
             push = make(recording.rate_hz)
             if push is None:
-                yield Row(f"{name[:24]}, {peer}", float("nan"), "", "not installed")
+                yield Row(f"{what}, {peer}", float("nan"), "", "not installed")
                 continue
             errors = Errors.of(played(push, recording), recording)
             note = "goal 1" if peer == "this filter" else ""
-            yield Row(f"{name[:24]}, {peer}: inclination", errors.inclination_rms_deg, "deg rms", note)
+            yield Row(f"{what}, {peer}: inclination", errors.inclination_rms_deg, "deg rms", note)
+            if make is forces_alone:  # it has no heading
+                continue
             note = f"{_rms(errors.heading_deg):.2f} deg rms against its begin"
-            yield Row(f"{name[:24]}, {peer}: heading", errors.drift_deg_per_min, "deg/min", note)
+            yield Row(f"{what}, {peer}: heading", errors.drift_deg_per_min, "deg/min", note)
     for part in _PARTS:
         for rest_s in (3.0, 0.0):
             yield from _simulated(part, rest_s)
