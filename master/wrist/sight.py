@@ -17,7 +17,9 @@ _WHOLE = 0.75  # a line seen to this share of its length is not missing a part
 HARDLY = 0.5  # less of it than this is no measurement of the finger
 _CURVES = 1 / 3
 _HINGE_RAD = np.radians(4.0)  # by which the axes of real hinges lie askew to those of a hand file
-_DIP_RAD = np.radians(4.3)  # DIP per PIP is 2/3 or 0.84, says who is asked (row I12): by so much at a PIP of 50 degrees
+_DIP_RAD = np.radians(
+    4.3
+)  # DIP per PIP is 2/3 or 0.84, says who is asked (row I12): by so much at a PIP of 50 degrees
 _PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 
 
