@@ -165,10 +165,12 @@ class StrobeController:
 
     def _work(self) -> None:
         with self._news:
-            while not self._closed:
-                again_ns = self._strober.step()
-                if again_ns is None:
-                    self._news.wait(IDLE_S)
-                elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
-                    self._news.wait(left_s)
-            self._strober.dark()
+            try:
+                while not self._closed:
+                    again_ns = self._strober.step()
+                    if again_ns is None:
+                        self._news.wait(IDLE_S)
+                    elif (left_s := (again_ns - self._clock.now_ns()) * 1e-9) > 0.0:
+                        self._news.wait(left_s)
+            finally:
+                self._strober.dark()

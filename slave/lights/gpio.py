@@ -4,13 +4,15 @@
 after a line that lights when it is low. Both lines are set by one call of the kernel, so never is one half of a change
 seen, and read back.
 
-A slave that is killed during a pulse darkens nothing, and what a pin does whose process is gone is the matter of the
-chip's driver: it may become an input, or keep its level. So a second process inherits the request and sets the lines
-dark when the first one is gone (`gpio_heir`). Against a kernel that is dead, or a kill of both, only wires help: a
-pull-down resistor, and a monostable in series (docs/safety.md).
+A slave that is killed or stopped during a pulse darkens nothing, and what a pin does whose process is gone is the
+matter of the chip's driver: it may become an input, or keep its level. So a second process inherits the request, is
+told of every pulse, and sets the lines dark when one lasts too long or the first process is gone (`gpio_heir`). Nothing
+is lit without it. Against a kernel that is dead, or a kill of both, only wires help: a pull-down resistor, and a
+monostable in series (docs/safety.md).
 """
 
 import errno
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ from typing import TYPE_CHECKING
 
 from common.errors import LightsError
 from common.frame_recording import Illumination
+from slave.lights.gpio_heir import DARK, LIT
 
 if TYPE_CHECKING:
     from gpiod import LineRequest
@@ -58,11 +61,12 @@ class Line:
 class GpioLights:
     """`Lights` behind two lines. Holds the request of the lines and its heir; None while the chip is away."""
 
-    def __init__(self, place: str) -> None:
+    def __init__(self, place: str, longest_s: float) -> None:
         """Request the lines, dark.
 
         Args:
             place: CHIP:LASER,LED.
+            longest_s: No light is on for longer, whatever becomes of this process [s].
 
         Raises:
             LightsError: No such chip or line, not allowed, in use by somebody else, or the library is missing.
@@ -75,6 +79,7 @@ class GpioLights:
         self._laser, self._led = Line.of(names[0]), Line.of(names[1])
         if self._laser.place == self._led.place:
             raise LightsError(f"--lights gpio:{place}: laser and LEDs on one line; {FORM}")
+        self._longest_s = longest_s
         self._gpiod = _library()
         self._closed = False
         self._heir: subprocess.Popen[bytes] | None = None
@@ -85,20 +90,24 @@ class GpioLights:
         """Set both lines; lines that were lost are requested again first.
 
         Raises:
-            LightsError: The chip is gone, or a line does not follow.
+            LightsError: The chip or the heir is gone, or a line does not follow.
         """
         if self._closed:
             return
         if self._request is None:
             self._request = self._requested()
             self._reopened += 1
+        shines = lit in (Illumination.LASER, Illumination.LED)
+        if shines:
+            self._tell_heir(LIT)
         value = self._gpiod.line.Value
         lights = (Illumination.LASER, Illumination.LED)
         wanted = [value.ACTIVE if lit is light else value.INACTIVE for light in lights]
-        places = [self._laser.place, self._led.place]
+        places, request = [self._laser.place, self._led.place], self._request
+        assert request is not None  # `_tell_heir` raises where it has lost it
         try:
-            self._request.set_values(dict(zip(places, wanted, strict=True)))
-            got = self._request.get_values(places)
+            request.set_values(dict(zip(places, wanted, strict=True)))
+            got = request.get_values(places)
         except OSError as error:
             self._lose()
             raise LightsError(f"{self._chip}: lost: {error.strerror or error}") from error
@@ -107,6 +116,8 @@ class GpioLights:
                 f"{self._chip}: lines {places[0]} and {places[1]} were set to {_levels(wanted)} and read"
                 f" {_levels(got)}: something else drives them, or they are shorted"
             )
+        if not shines:
+            self._tell_heir(DARK)
 
     def off(self) -> None:
         """Set both lines dark."""
@@ -124,6 +135,20 @@ class GpioLights:
     def counts(self) -> dict[str, int]:
         """`reopened`: how often the chip was lost and came back."""
         return {"reopened": self._reopened}
+
+    def _tell_heir(self, what: bytes) -> None:
+        """Before a light goes on, and after it went off."""
+        heir = self._heir
+        assert heir is not None  # there is one wherever there is a request
+        assert heir.stdin is not None
+        try:
+            os.write(heir.stdin.fileno(), what)
+        except OSError as error:  # it has ended, or is stopped and its pipe is full
+            self._lose()
+            raise LightsError(
+                f"{self._chip}: the process {heir.pid} that darkens the lines when this one cannot does not listen"
+                f" ({error.strerror}); it is started anew"
+            ) from error
 
     def _lose(self) -> None:
         request, self._request = self._request, None
@@ -152,12 +177,20 @@ class GpioLights:
             request: LineRequest = self._gpiod.request_lines(self._chip, config=config, consumer=CONSUMER)
         except (OSError, ValueError) as error:
             raise LightsError(self._why(error)) from error
-        self._heir = subprocess.Popen(
-            [sys.executable, "-I", str(HEIR), str(request.fd)],
-            stdin=subprocess.PIPE,
-            pass_fds=(request.fd,),
-            start_new_session=True,
-        )
+        try:
+            heir = subprocess.Popen(
+                [sys.executable, "-I", str(HEIR), str(request.fd), str(self._longest_s)],
+                stdin=subprocess.PIPE,
+                bufsize=0,
+                pass_fds=(request.fd,),
+                start_new_session=True,
+            )
+        except OSError as error:
+            request.release()
+            raise LightsError(f"{self._chip}: no second process can be started: {error.strerror}") from error
+        assert heir.stdin is not None
+        os.set_blocking(heir.stdin.fileno(), False)  # nobody waits for it while a light is on
+        self._heir = heir
         return request
 
     def _why(self, error: OSError | ValueError) -> str:

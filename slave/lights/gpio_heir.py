@@ -1,30 +1,44 @@
-"""Darkens two GPIO lines when the slave that lit them has died, of whatever: a process of its own, started beside it.
+"""Darkens two GPIO lines when the slave that lit them cannot: a process of its own, started beside it.
 
-    python gpio_heir.py FD        standard input: a pipe that the slave holds and never writes to
+    python gpio_heir.py FD LONGEST_S        standard input: a pipe on which the slave says `1` before a light goes on
+                                            and `0` after it went off
 
-It inherits the slave's request of the lines. While it lives the kernel does not give them back; when the pipe ends,
-because the slave closed it or is gone, it sets both lines inactive and ends. It imports nothing that could hold it up,
-and no signal of a terminal or of a service's stop ends it earlier: then the slave ends first, and in order.
+It inherits the slave's request of the lines: while it lives the kernel does not give them back. It sets both lines
+inactive where a light is on for `LONGEST_S` (the slave was stopped, or something in it holds up all its threads), and
+when the pipe ends, because the slave closed it or has died of whatever; then it ends, too. It imports nothing that
+could hold it up, and no signal of a terminal or of a service's stop ends it earlier: the slave ends first, in order.
 """
 
 import fcntl
 import os
+import select
 import signal
 import struct
 import sys
 
+LIT, DARK = b"1", b"0"
 SET_VALUES = 0xC010B40F  # GPIO_V2_LINE_SET_VALUES_IOCTL of linux/gpio.h: _IOWR(0xB4, 0x0F, two 64-bit words)
 BOTH = 0b11  # lines of the request, in its order
 INACTIVE = 0
 
 
 def main() -> int:
-    """Wait for the end of standard input; 0: the lines are dark, 1: they are not there any more."""
+    """Watch until standard input ends; 0: the lines are dark, 1: they are not there any more."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    lines = int(sys.argv[1])
-    while os.read(0, 1):
-        pass
+    lines, longest_s = int(sys.argv[1]), float(sys.argv[2])
+    said = DARK
+    while said:
+        heard, _, _ = select.select([0], [], [], longest_s if said.endswith(LIT) else None)
+        if heard:
+            said = os.read(0, 4096)
+        else:  # again and again until it says that it is dark: it may light late, when it goes on
+            darken(lines)
+    return darken(lines)
+
+
+def darken(lines: int) -> int:
+    """Set both lines of a request inactive; 1: it cannot be done."""
     try:
         fcntl.ioctl(lines, SET_VALUES, struct.pack("=QQ", INACTIVE, BOTH))  # bits, mask
     except OSError:

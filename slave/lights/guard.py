@@ -11,6 +11,7 @@ import atexit
 import logging
 import threading
 from collections import Counter, deque
+from collections.abc import Callable
 
 from common.clock import Clock, SystemClock
 from common.errors import LightsError
@@ -71,7 +72,7 @@ class Guard:
         """Have a light on for so long [ns]; whoever begins also calls `end`.
 
         Returns:
-            False, and nothing is on, if that is too long, too much, or something is on already.
+            False, and nothing is on, if that is too long, too much, or something is on already or may be.
 
         Raises:
             LightsError: The driver failed.
@@ -79,17 +80,12 @@ class Guard:
         with self._changed:
             now_ns = self._clock.now_ns()
             may_ns = self._allowance_ns(lit, now_ns)
-            if self._closed or self._on is not None or not 0 < length_ns <= may_ns:
+            if self._closed or self._failing or self._on is not None or not 0 < length_ns <= may_ns:
                 self.counts["refused"] += 1
                 return False
             self._on, self._since_ns, self._until_ns = lit, now_ns, now_ns + may_ns
             self._changed.notify_all()
-            try:
-                self._lights.switch(lit)
-            except LightsError:
-                self.counts["failed"] += 1
-                self._failing = True  # it may be on all the same: the watchdog darkens it
-                raise
+            self._order(lambda: self._lights.switch(lit))
             self.counts["pulses"] += 1
             return True
 
@@ -100,13 +96,7 @@ class Guard:
             LightsError: The driver failed; the watchdog goes on trying.
         """
         with self._changed:
-            try:
-                self._lights.off()
-            except LightsError:
-                self.counts["failed"] += 1
-                self._failing = True
-                self._changed.notify_all()
-                raise
+            self._order(self._lights.off)
             if self._on is not None:
                 self._past[self._on].append((self._since_ns, self._clock.now_ns()))
             self._on, self._failing = None, False
@@ -146,6 +136,20 @@ class Guard:
     def events(self) -> dict[str, int]:
         """Of the guard and of the driver."""
         return {**self.counts, **self._lights.counts()}
+
+    def _order(self, order: Callable[[], None]) -> None:
+        """Tell the driver; whatever it raises is a failure, after which a light may be on: the watchdog's work."""
+        try:
+            order()
+        except (
+            Exception
+        ) as error:  # also what a library below it raises: no thread that darkens may end by it
+            self.counts["failed"] += 1
+            self._failing = True
+            self._changed.notify_all()
+            if isinstance(error, LightsError):
+                raise
+            raise LightsError(f"{type(error).__name__}: {error}") from error
 
     def _allowance_ns(self, lit: Illumination, now_ns: int) -> int:
         """How long a light may be on from now [ns]; 0 and below: not at all."""

@@ -13,6 +13,7 @@ again before the next pulse. Registers are written at 400 kHz in 70 us, at 100 k
 Torch and IR mode, in which no time-out ends the light, are never written.
 """
 
+import fcntl
 from collections import Counter
 
 from smbus2 import SMBus
@@ -169,8 +170,9 @@ class FlashDriverLights:
             bus.close()
 
     def _opened(self) -> SMBus:
+        """The bus, with a lock that every program of lights takes: each keeps the limits for itself alone."""
         try:
-            return SMBus(self._number)
+            bus = SMBus(self._number)
         except FileNotFoundError as error:
             raise LightsError(
                 f"I2C bus {self._number}: no /dev/i2c-{self._number}; on a Pi: sudo raspi-config nonint do_i2c 0"
@@ -181,6 +183,15 @@ class FlashDriverLights:
             ) from error
         except OSError as error:
             raise LightsError(f"I2C bus {self._number}: cannot be opened: {error.strerror}") from error
+        assert bus.fd is not None  # it was opened
+        try:
+            fcntl.flock(bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            bus.close()
+            raise LightsError(
+                f"I2C bus {self._number}: another phalanx-slave has its lights ({error.strerror}); stop that first"
+            ) from error
+        return bus
 
 
 def current_code(current_a: float | None, light: str) -> int:

@@ -75,7 +75,7 @@ def open_guarded(lights: str, rig: RigCalibration) -> Guard:
     if kind == "gpio":
         from slave.lights.gpio import GpioLights
 
-        return Guard(GpioLights(place), strobe)
+        return Guard(GpioLights(place, strobe.max_pulse_us * 1e-6), strobe)
     if kind == "i2c":
         from slave.lights.i2c_led import FlashDriverLights
 

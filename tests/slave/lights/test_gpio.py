@@ -19,11 +19,13 @@ import pytest
 
 from common.errors import LightsError
 from slave.__main__ import main
+from slave.lights import gpio
 from slave.lights.gpio import CONSUMER, HEIR, GpioLights
-from slave.lights.gpio_heir import SET_VALUES
+from slave.lights.gpio_heir import DARK, LIT, SET_VALUES
 from tests.slave.lights.stage import AMBIENT, LASER, LED, ROOT
 
 VALUE = gpiod.line.Value
+LONGEST_S = 0.005
 CONFIGFS = Path("/sys/kernel/config/gpio-sim")
 
 
@@ -145,7 +147,7 @@ def test_the_stand_in_takes_what_the_library_takes() -> None:
 def test_one_light_at_a_time_and_dark_at_both_ends(
     kernel: FakeGpio, chip: str, lines: str, low: tuple[int, int]
 ) -> None:
-    lights = GpioLights(f"{chip}:{lines}")
+    lights = GpioLights(f"{chip}:{lines}", LONGEST_S)
 
     def lit() -> tuple[bool, bool]:
         return bool(kernel.level[17] ^ low[0]), bool(kernel.level[27] ^ low[1])
@@ -173,7 +175,7 @@ def test_one_light_at_a_time_and_dark_at_both_ends(
 
 
 def test_a_chip_that_is_unplugged_comes_back(kernel: FakeGpio) -> None:
-    lights = GpioLights("0:17,27")
+    lights = GpioLights("0:17,27", LONGEST_S)
     lights.switch(LASER)
     kernel.gone = True
     for _ in range(2):
@@ -186,8 +188,48 @@ def test_a_chip_that_is_unplugged_comes_back(kernel: FakeGpio) -> None:
     assert lights.counts() == {"reopened": 1}
 
 
+def test_without_its_heir_nothing_is_lit_until_there_is_another(
+    kernel: FakeGpio, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(gpio, "HEIR_S", 0.1)
+    lights = GpioLights("0:17,27", LONGEST_S)
+
+    def killed(heir: subprocess.Popen[bytes]) -> None:
+        heir.kill()
+        heir.wait()
+
+    def stopped(heir: subprocess.Popen[bytes]) -> None:
+        heir.send_signal(signal.SIGSTOP)
+        assert heir.stdin is not None
+        os.write(heir.stdin.fileno(), DARK * (1 << 20))  # as many as fit
+        with pytest.raises(BlockingIOError):
+            os.write(heir.stdin.fileno(), DARK)
+
+    for deaf in (killed, stopped):
+        first = lights._heir
+        assert first is not None
+        deaf(first)
+        with pytest.raises(LightsError, match="does not listen"):
+            lights.switch(LASER)
+        assert (kernel.level[17], kernel.level[27]) == (0, 0)
+        assert first.returncode == -signal.SIGKILL
+        lights.switch(LASER)
+        assert kernel.level[17] == 1
+        assert lights._heir is not first
+        lights.off()
+    lights.close()
+    assert not any(17 in request.lit for request in kernel.requests[:1])
+
+
+def test_no_second_process_no_light(kernel: FakeGpio, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "executable", "/nowhere/python")
+    with pytest.raises(LightsError, match="no second process can be started: No such file"):
+        GpioLights("0:17,27", LONGEST_S)
+    assert kernel.requests[0].released
+
+
 def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
-    lights = GpioLights("0:17,27")
+    lights = GpioLights("0:17,27", LONGEST_S)
     kernel.stuck = {17}
     with pytest.raises(LightsError, match="17 and 27 were set to active inactive and read inactive inactive"):
         lights.switch(LASER)
@@ -211,7 +253,7 @@ def test_a_line_that_does_not_follow_is_said(kernel: FakeGpio) -> None:
 def test_what_cannot_be_opened_says_why(kernel: FakeGpio, place: str, fails: int | None, says: str) -> None:
     kernel.fails = fails
     with pytest.raises(LightsError, match=says):
-        GpioLights(place)
+        GpioLights(place, LONGEST_S)
 
 
 def test_the_command_blinks_within_the_limits_and_ends_dark(
@@ -234,23 +276,23 @@ def test_the_command_blinks_within_the_limits_and_ends_dark(
 def test_a_busy_line_names_its_user(kernel: FakeGpio) -> None:
     kernel.users[27] = "w1-gpio"
     with pytest.raises(LightsError, match=r"in use by w1-gpio \(27\)"):
-        GpioLights("0:17,27")
+        GpioLights("0:17,27", LONGEST_S)
 
 
 def test_without_the_library_it_is_said_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gpiod", None)
     with pytest.raises(LightsError, match=r"phalanx-hand\[wrist\].*python3-libgpiod"):
-        GpioLights("0:17,27")
+        GpioLights("0:17,27", LONGEST_S)
     monkeypatch.setitem(sys.modules, "gpiod", SimpleNamespace(__version__="1.6.3"))
     with pytest.raises(LightsError, match=r"gpiod 1.6.3 is too old"):
-        GpioLights("0:17,27")
+        GpioLights("0:17,27", LONGEST_S)
 
 
 # A slave with an heir, whose call of the kernel is printed.
 SLAVE = """
 import subprocess, sys, time
 run = "import fcntl, runpy, sys; fcntl.ioctl = lambda *call: print(*call, flush=True); "
-run += f"sys.argv = [{sys.argv[1]!r}, '9']; runpy.run_path(sys.argv[0], run_name='__main__')"
+run += f"sys.argv = [{sys.argv[1]!r}, '9', '0.02']; runpy.run_path(sys.argv[0], run_name='__main__')"
 heir = subprocess.Popen([sys.executable, "-I", "-c", run], stdin=subprocess.PIPE, start_new_session=True)
 print(heir.pid, flush=True)
 time.sleep(600)
@@ -268,6 +310,29 @@ def test_the_heir_of_a_killed_slave_darkens_both_lines() -> None:
     slave.wait()
     slave.stdout.close()
     assert said == f"9 {0xC010B40F} {struct.pack('=QQ', 0, 3)!r}\n"
+
+
+# The heir by itself, its call of the kernel printed.
+WATCHED = "import fcntl, runpy, sys; fcntl.ioctl = lambda *call: print(*call, flush=True); "
+
+
+def test_the_heir_of_a_stopped_slave_darkens_what_is_on_for_too_long() -> None:
+    run = (
+        WATCHED + f"sys.argv = [{str(HEIR)!r}, '9', '0.02']; runpy.run_path(sys.argv[0], run_name='__main__')"
+    )
+    dark = f"9 {SET_VALUES} {struct.pack('=QQ', 0, 3)!r}\n".encode()
+    with subprocess.Popen(
+        [sys.executable, "-I", "-c", run], stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0
+    ) as heir:
+        assert heir.stdin is not None
+        assert heir.stdout is not None
+        heir.stdin.write(LIT + DARK)  # over before it was looked at
+        heir.stdin.write(LIT)
+        for _ in range(2):  # and whoever goes on only now, and lights, is darkened again
+            assert heir.stdout.read(len(dark)) == dark
+        heir.stdin.write(DARK)
+        heir.stdin.close()
+        assert set(heir.stdout.read().splitlines(keepends=True)) == {dark}
 
 
 def ignores_stops(pid: int) -> bool:
@@ -297,7 +362,7 @@ def test_the_kernels_own_simulated_lines_follow() -> None:
         (device / "live").write_text("1")
         chip = (bank / "chip_name").read_text().strip()
         levels = Path("/sys/devices/platform") / (device / "dev_name").read_text().strip() / chip
-        lights = GpioLights(f"{chip}:2,5/low")
+        lights = GpioLights(f"{chip}:2,5/low", LONGEST_S)
         for kind, seen in ((AMBIENT, "01"), (LASER, "11"), (LED, "00")):
             lights.switch(kind)
             assert "".join((levels / f"sim_gpio{line}/value").read_text().strip() for line in (2, 5)) == seen

@@ -150,6 +150,32 @@ def test_a_driver_that_fails_is_darkened_as_soon_as_it_answers() -> None:
     assert guard.counts["off_by_watchdog"] == 0  # the driver failed, nobody overslept
 
 
+@pytest.mark.parametrize("raised", [LightsError("unplugged"), RuntimeError("released"), ValueError("closed")])
+def test_nothing_that_a_driver_raises_ends_the_watchdog(raised: Exception) -> None:
+    dark = threading.Event()
+
+    class Raising(NotedLights):
+        left = 3
+
+        def off(self) -> None:
+            self.left -= 1
+            if self.left > 0:
+                raise raised
+            super().off()
+            dark.set()
+
+    lights = Raising(SetClock())
+    guard = Guard(lights, LIMITS)
+    assert guard.begin(LASER, MS)
+    with pytest.raises(LightsError, match=str(raised)):
+        guard.end()
+    assert not guard.begin(LED, MS)  # it may be lit still
+    assert dark.wait(30.0)
+    guard.close()
+    assert lights.lit is AMBIENT
+    assert guard.counts["failed"] == 2
+
+
 def test_the_watchdog_ends_a_pulse_by_itself() -> None:
     dark = threading.Event()
 

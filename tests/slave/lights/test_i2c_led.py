@@ -2,6 +2,8 @@
 
 import errno
 import inspect
+import os
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -96,11 +98,13 @@ class FakeBus:
     chip: Chip
     opened: list["FakeBus"]
     fails: OSError | None
+    node: Path
 
     def __init__(self, bus: int) -> None:
         if (error := type(self).fails) is not None:
             raise error
         self.closed = False
+        self.fd = os.open(self.node, os.O_RDWR)
         type(self).opened.append(self)
 
     def write_byte_data(self, i2c_addr: int, register: int, value: int, force: bool | None = None) -> None:
@@ -112,6 +116,8 @@ class FakeBus:
         return self.chip.read(register)
 
     def close(self) -> None:
+        if not self.closed:
+            os.close(self.fd)
         self.closed = True
 
     def _acknowledged(self, address: int) -> None:
@@ -121,8 +127,9 @@ class FakeBus:
 
 
 @pytest.fixture
-def chip(monkeypatch: pytest.MonkeyPatch) -> Chip:
-    FakeBus.chip, FakeBus.opened, FakeBus.fails = Chip(), [], None
+def chip(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Chip:
+    FakeBus.chip, FakeBus.opened, FakeBus.fails, FakeBus.node = Chip(), [], None, tmp_path / "i2c-1"
+    FakeBus.node.touch()
     monkeypatch.setattr(i2c_led, "SMBus", FakeBus)
     return FakeBus.chip
 
@@ -200,6 +207,15 @@ def test_an_unplugged_chip_is_an_error_and_is_set_up_again_when_it_returns(chip:
     assert chip.lit == "led"
     assert chip.registers[0x08] & 0x0F == 0
     assert lights.counts()["reopened"] == 1
+
+
+def test_two_do_not_light_by_one_chip(chip: Chip) -> None:
+    first = FlashDriverLights("1", STROBE)
+    with pytest.raises(LightsError, match="another phalanx-slave has its lights"):
+        FlashDriverLights("1", STROBE)
+    assert FakeBus.opened[-1].closed
+    first.close()
+    FlashDriverLights("1", STROBE).close()
 
 
 def test_a_chip_that_does_not_go_dark_is_said(chip: Chip) -> None:
