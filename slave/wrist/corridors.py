@@ -30,6 +30,9 @@ _RARE = 0.02  # share of the postures of a sweep left out at either end
 _OF_SPREAD = 0.75  # share of the abduction range that two neighbours are taken to lean the same way
 _LEAST_OF_SPACING = 0.25
 _MOST_OF_SPACING = 0.7  # half width of a corridor, in spacings of fingers: beyond lies another seam
+_WEB = 0.4  # of the proximal phalanx: where the webs between the fingers end, and the palm begins
+_WEB_OFF_M = 4e-3  # how far the palm may lie from where it is thought to: 3 degrees at the knuckles
+_OF_PALM = 0.05  # weight of what the palm shows, against fingers
 _UNSEEN = "T_camera_palm: the camera does not see the {} of this hand; calibrate the palm's pose"
 
 
@@ -45,6 +48,8 @@ class Corridors:
         thumb_side: +1.0 where the thumb is to the right in the image, -1.0 to the left.
         middle: (4, S) middle of each corridor: u [px], or angle [rad].
         half: (4, S) half width.
+        weight: (S, sum of the first three LATERAL + 2 MARGIN each) of what the image shows there: little on the palm,
+            whose skin every seam must cross, and one farther aside less of it than one between fingers.
         thumb_crosses: How many of the circles the thumb crosses however it is held.
         map_x, map_y: (S, sum of LATERAL + 2 MARGIN each) where to read the image, float32; the corridors side
             by side, each with its margins.
@@ -58,6 +63,7 @@ class Corridors:
     thumb_side: float
     middle: Float
     half: Float
+    weight: Float32
     thumb_crosses: int
     map_x: Float32
     map_y: Float32
@@ -112,12 +118,13 @@ def corridors_of(view: WristView) -> Corridors:
     row = view.optics.height_px - STATION_PX * stations
     empty = np.empty((4, stations))
     still = Corridors(
-        row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, 0, _NO_MAP, _NO_MAP, _palm(view)
+        row, _FIRST_RADIUS_PX, root, up, thumb_side, empty, empty, _NO_MAP, 0, _NO_MAP, _NO_MAP, _palm(view)
     )
     *reach, crossed = _thumb_reach(view, still, stations)
-    three = _between_fingers(view, row + STATION_PX * np.arange(stations, dtype=np.float64))
+    rows = row + STATION_PX * np.arange(stations, dtype=np.float64)
+    three = _between_fingers(view, rows)
     middle, half = (np.vstack([three[k], np.full(stations, reach[k])]) for k in (0, 1))
-    placed = replace(still, middle=middle, half=half, thumb_crosses=crossed)
+    placed = replace(still, middle=middle, half=half, weight=_weight(view, rows), thumb_crosses=crossed)
     grids = [placed.pixels(seam, placed.lateral(seam)) for seam in range(4)]
     grid = np.concatenate(grids, axis=1)
     return replace(placed, map_x=grid[..., 0].astype(np.float32), map_y=grid[..., 1].astype(np.float32))
@@ -151,6 +158,16 @@ def _between_fingers(view: WristView, rows: Float) -> tuple[Float, Float]:
         seen = (depth > NEAREST_M) & np.isfinite(uv).all(axis=-1)
         out[:, seam] = _strip(uv[..., 1][seen], (uv[..., 0] - free)[seen], (uv[..., 0] + free)[seen], rows)
     return out[0], out[1]
+
+
+def _weight(view: WristView, rows: Float) -> Float32:
+    """`Corridors.weight` of stations at the given rows (S,)."""
+    knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
+    along = ends - knuckles
+    off = _WEB + _WEB_OFF_M / np.linalg.norm(along, axis=1, keepdims=True)
+    webs = in_image(view, knuckles + off * along)[0][:, 1]
+    columns = [np.full(n + 2 * MARGIN, 0.5 * (webs[k] + webs[k + 1])) for k, n in enumerate(LATERAL[:3])]
+    return np.where(rows[:, None] < np.concatenate(columns), 1.0, _OF_PALM).astype(np.float32)
 
 
 def _strip(at: Float, low: Float, high: Float, stations: Float) -> tuple[Float, Float]:

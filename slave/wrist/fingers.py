@@ -73,6 +73,7 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
         cv2.remap(dark, corridors.map_x, corridors.map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE),
     )
     energy = engine.energy(strips, corridors.thumb_crosses)
+    energy[:, : STARTS[3]] *= corridors.weight
     paths = engine.least_paths(energy, WIDTHS)
     _part(paths[:3], strips, energy, corridors, engine)
     seams = corridors.across(slice(0, 4), paths)
