@@ -13,6 +13,7 @@ from common.errors import CalibrationError
 from master.options import CALIB_JSON, Calibration
 from master.study.line import Level
 from master.study.one import CAUSES, Condition, Task
+from master.study.one import Resume as From
 from master.study.paper import BLOCKS, PARTICIPANTS
 from master.study.participant import Known
 
@@ -59,9 +60,11 @@ Jobs = Annotated[
 Step = Annotated[int, typer.Option(min=1, max=8, help="Rendering: px between the rays that shade skin.")]
 Guided = Annotated[int, typer.Option(min=16, max=480, help="Triples of the guided motion before the trials.")]
 Resume = Annotated[
-    bool,
+    From | None,
     typer.Option(
-        help="Take what an earlier study of the same settings rendered, calibrated and detected in --out; solve anew."
+        help="Take from --out what an earlier study of the same settings left: frames (of --keep; detect, calibrate and"
+        " solve anew), or detections (solve anew).",
+        show_default=False,
     ),
 ]
 Keep = Annotated[bool, typer.Option(help="Keep all frames to look at: 140 MB for each participant.")]
@@ -89,7 +92,7 @@ def study(
     jobs: Jobs = 0,
     step: Step = 2,
     guided: Guided = 96,
-    resume: Resume = False,
+    resume: Resume = None,
     keep: Keep = False,
 ) -> None:
     """Repeat the paper's study: people of different hands, six poses, several blocks, errors and repeatability.
@@ -107,7 +110,7 @@ def study(
 
       phalanx-master evaluate study --causes --out out/study                   where errors come from
 
-      phalanx-master evaluate study --level fk --resume --out out/study        solve again, without rendering
+      phalanx-master evaluate study --level fk --resume detections --out out/study     solve again
 
       phalanx-master evaluate study --participants 2 --blocks 2 --known all --out out/small
 

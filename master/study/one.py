@@ -2,7 +2,9 @@
 
 import shutil
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from msgspec import Struct
@@ -15,12 +17,13 @@ from common.geometry import transform
 from master.calibrate.wrist.wearer import calibrate_wearer
 from master.recorded import recorded_triples
 from master.study.line import Inputs, Level, claim, detect, solved, write_exact
-from master.study.participant import Known, Participant, participant
+from master.study.participant import Known, Participant, about, participant
 from master.study.session import TRIAL_S, record_guided, record_trials
 from master.study.trials import Trial, trials_of
 from master.summary import read_summary, write_summary
 
 Condition = tuple[Known, Inputs]
+Resume = Literal["frames", "detections"]
 CAUSES: tuple[Condition, ...] = (
     ("all", "exact"),
     ("all", "detected"),
@@ -29,6 +32,8 @@ CAUSES: tuple[Condition, ...] = (
     ("nothing", "detected"),
 )
 GUIDED, TRIALS = "guided", "trials"  # recordings
+KNOWN: tuple[Known, ...] = get_args(Known)
+INPUTS: tuple[Inputs, ...] = get_args(Inputs)
 DONE, RIG, HAND, SAID = "made.json", "rig.json", "hand.json", "calibration.json"
 _KNUCKLES_M = np.array([0.0, 0.0, 0.08])  # palm frame
 
@@ -46,7 +51,8 @@ class Task:
         step: Pixels between the rays that shade skin.
         guided: Triples of the guided motion.
         out: Folder of the study.
-        resume: Take rendered and detected recordings that are there from a study of the same settings.
+        resume: Take what is there from a study of the same settings: frames that it kept, or what was detected in them
+            and calibrated, too. None: nothing.
         keep: Keep all frames, 140 MB for a participant of three blocks.
         trial_s: How long each trial takes [s].
     """
@@ -61,7 +67,7 @@ class Task:
     step: int
     guided: int
     out: Path
-    resume: bool
+    resume: Resume | None
     keep: bool
     trial_s: float = TRIAL_S
 
@@ -126,7 +132,6 @@ def run_participant(task: Task, number: int) -> Outcome:
     if not task.keep:
         for recording in (GUIDED, TRIALS):
             shutil.rmtree(folder / recording / camera, ignore_errors=True)
-    write_summary(folder / DONE, _settings(task))
     calibrated = load(folder / "calibrated" / SAID, Calibrated) if "calibrated" in asked else None
     return Outcome(
         participant=who.name, reflectance=round(who.reflectance, 3), calibrated=calibrated, trials=trials
@@ -147,10 +152,16 @@ def _settings(task: Task) -> dict[str, object]:
 
 
 def _may_go_on(task: Task, folder: Path) -> bool:
-    """Whether all that needs frames is there from before: exact inputs need none, the guided motion does."""
+    """Whether all that is needed is there from before: frames, or what was made of them.
+
+    Exact inputs need no frames, the guided motion does.
+    """
     if not task.resume or not (folder / DONE).exists() or read_summary(folder / DONE) != _settings(task):
         return False
-    return all(
+    needed = [TRIALS, *([GUIDED] if any(known == "calibrated" for known, _ in task.conditions) else [])]
+    if all((folder / name / task.camera.name).is_dir() for name in needed):
+        return True
+    return task.resume == "detections" and all(
         (folder / known).exists() and (inputs == "exact" or (folder / f"{known}-{inputs}").exists())
         for known, inputs in task.conditions
         if known == "calibrated" or inputs == "detected"
@@ -160,6 +171,9 @@ def _may_go_on(task: Task, folder: Path) -> bool:
 def _perform(task: Task, who: Participant, folder: Path) -> None:
     """Render what this participant does, unless it was already and may be taken."""
     if _may_go_on(task, folder):
+        if task.resume == "frames":
+            for made in (*KNOWN, *("-".join(condition) for condition in product(KNOWN, INPUTS))):
+                shutil.rmtree(folder / made, ignore_errors=True)
         return
     try:
         if folder.exists():
@@ -170,6 +184,7 @@ def _perform(task: Task, who: Participant, folder: Path) -> None:
     if any(known == "calibrated" for known, _ in task.conditions):
         record_guided(folder / GUIDED, who, task.camera, task.guided, task.step)
     record_trials(folder / TRIALS, who, task.camera, task.blocks, task.step, task.trial_s)
+    write_summary(folder / DONE, _settings(task))
 
 
 def _knowledge(
@@ -194,7 +209,7 @@ def _calibrated(
     task: Task, who: Participant, guided: Path, there: Path
 ) -> tuple[RigCalibration, HandProfile, Calibrated]:
     """Rig and hand as our own calibration makes them of this participant's guided motion."""
-    rig, hand, refused = task.rig, who.measured, False
+    rig, hand, refused = about(task.rig), who.measured, False
     claim(guided, rig)
     save(there / "measured.json", hand)
     detect(guided, task.camera.name, there / "measured.json", there)

@@ -18,7 +18,8 @@ from common.arrays import Float
 from common.calibration import HandProfile, RestJoint, RigCalibration
 from common.calibration_parts import Matrix4
 from common.geometry import rotation_vector_to_matrix
-from common.hand_model import FINGER_JOINTS, JOINTS
+from common.hand_model import FINGER_JOINTS, FINGERS, JOINTS
+from master.calibrate.tree_files import provenance
 
 Known = Literal["all", "calibrated", "nothing"]
 
@@ -74,10 +75,20 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
         number=number,
         seed=1000 * study_seed + number,
         hand=with_bones(usual, palm, bones),
-        measured=with_bones(usual, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong),
+        measured=_measured(with_bones(usual, palm * (1.0 + PALM_SIGMA * float(rng.normal())), bones + wrong)),
         rig=turned(rig, turn, shift),
         reflectance=reflectance,
     )
+
+
+def about(rig: RigCalibration) -> RigCalibration:
+    """The rig file with what its maker knows: how differently people wear the device (standard deviations)."""
+    known = {
+        "turn_sigma_deg": round(float(np.degrees(TURN_RAD)) / np.sqrt(3.0), 4),
+        "shift_sigma_mm": round(1e3 * SHIFT_M / np.sqrt(3.0), 4),
+    }
+    how = provenance("study", (), known, "how the device sits on the wrists of people")
+    return replace(rig, provenance=rig.provenance | {"T_camera_palm": how})
 
 
 def with_bones(hand: HandProfile, palm: float, bones: Float) -> HandProfile:
@@ -105,6 +116,13 @@ def turned(rig: RigCalibration, turn_rad: Float, shift_m: Float) -> RigCalibrati
     pose[:3, :3] = rotation_vector_to_matrix(turn_rad) @ pose[:3, :3]
     pose[:3, 3] += shift_m
     return replace(rig, T_camera_palm=_matrix(pose))
+
+
+def _measured(hand: HandProfile) -> HandProfile:
+    """The hand with the provenance that `calibrate hand` gives to fingers whose length it measured."""
+    sigma = {"finger_sigma_mm": 1e3 * FINGER_SIGMA_M, "bone_sigma_mm": 1e3 * BONE_SIGMA_M}
+    how = {name: provenance("calibrate hand", ("study",), sigma) for name in FINGERS[1:]}
+    return replace(hand, provenance=hand.provenance | how)
 
 
 def _lengths(hand: HandProfile) -> Float:

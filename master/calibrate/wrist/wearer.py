@@ -110,12 +110,16 @@ def calibrate_wearer(
 
 
 def _pose_sigma(rig: RigCalibration) -> Float:
-    """(6,) how far the palm's pose in the rig file may be off [rad, m]."""
+    """(6,) how far the palm's pose in the rig file may be off [rad, m]: turned about the wrist joint, and shifted.
+
+    A rig whose maker knows how differently it is worn says so in the residual of the pose's provenance.
+    """
     how = rig.provenance.get("T_camera_palm")
-    if how is None or how.tool != "calibrate palm":
-        return np.repeat(_GUESS, 3)
-    turn, shift = np.radians(how.residual.get("turn_sigma_deg", 0.0)), how.residual.get("shift_sigma_mm", 0.0)
-    return np.repeat([np.hypot(turn, _RULER[0]), np.hypot(1e-3 * shift, _RULER[1])], 3)
+    told = {} if how is None or how.tool == TOOL else how.residual
+    turn, shift = np.radians(told.get("turn_sigma_deg", 0.0)), 1e-3 * told.get("shift_sigma_mm", 0.0)
+    if how is not None and how.tool == "calibrate palm":
+        return np.repeat([np.hypot(turn, _RULER[0]), np.hypot(shift, _RULER[1])], 3)
+    return np.repeat([turn, shift] if turn > 0.0 and shift > 0.0 else _GUESS, 3)
 
 
 def _length_sigma(hand: HandProfile) -> Float:

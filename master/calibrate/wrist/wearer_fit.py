@@ -40,6 +40,7 @@ _GRID_RAD = np.radians(np.arange(0.0, 97.0, 4.0))
 _PAST_RAD = np.radians(84.0)  # PIP beyond which the last phalanx may fold into the light
 _ROUNDS = (4, 4, 12)  # steps, from one guess of angles to the next
 _TRIALS, _SETTLED = 6, 0.02  # of a step; the gain that is none
+_CLEARLY = 2.0  # ratio of costs
 _KNUCKLES, _FIST = 0, 1
 
 
@@ -148,10 +149,9 @@ class _Problem:
         far = np.where(unseen, 0.0, np.nan_to_num(np.abs(along), nan=_ROUGHEST))
         cost: Float = (np.minimum(far, _ROUGHEST) ** 2).sum(axis=-1)  # (T, 2, G, 4)
         least = cost.min(axis=2).sum(axis=2)
-        fist = np.zeros(len(least), dtype=np.bool_)
-        for bend in np.unique(self._bend[self._bend != FLAT]):
-            own = self._bend == bend
-            fist[own] = least[own, _FIST].sum() < least[own, _KNUCKLES].sum()
+        bends = np.unique(self._bend[self._bend != FLAT])
+        fists = bends[_fists(np.array([least[self._bend == bend].sum(axis=0) for bend in bends]))]
+        fist = np.isin(self._bend, fists)
         own_cost = cost[np.arange(len(fist)), fist.astype(np.int64)]  # (T, G, 4); a fist is number _FIST
         node: Int = own_cost.argmin(axis=1)
         angles = habits[fist.astype(np.int64)[:, None], node, np.arange(4)]
@@ -278,6 +278,20 @@ class _Normal:
         information, pull, by_shared, alone = self.reduced(damping)
         step = -_solve(information, pull[:, None])[:, 0]
         return step, -alone - by_shared @ step
+
+
+def _fists(cost: Float) -> Bool:
+    """Which bends are fists, by what either kind costs (B, 2). The kind is told by tips, of which some are false.
+
+    A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.
+    """
+    better: Float = np.log((cost[:, _KNUCKLES] + 1.0) / (cost[:, _FIST] + 1.0))
+    clear = np.abs(better) > np.log(_CLEARLY)
+    if clear.any() and (better[clear] > 0.0).all():
+        return clear
+    if clear.any() and (better[clear] < 0.0).all():
+        return ~clear
+    return better > 0.0
 
 
 def _solve(a: Float, b: Float) -> Float:

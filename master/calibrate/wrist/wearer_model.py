@@ -35,7 +35,8 @@ class Unknown:
     """What is unknown of a wearer, as changes of a setup.
 
     Attributes:
-        pose: (6,) turn [rad] about the middle of the knuckles and shift [m] of the palm, camera axes.
+        pose: (6,) turn [rad] about the wrist joint and shift [m] of the palm, camera axes. A strap holds a device at
+            the wrist and lets it turn: knuckles that lie elsewhere tell of a turn first.
         knuckle_m: (4, 3) shift of each knuckle, palm frame.
         thick, long: (4,) natural logarithms of the factors of thickness and length.
     """
@@ -58,9 +59,8 @@ class WearerModel:
         self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
         self._cut, self._tips = LaserCut(setup, _RAYS), Fingertips.of(setup.model)
         self._root = setup.model.rest_position_m[CHAINS[:, 0]]
-        self._pivot = self._root[FINGERS].mean(axis=0)
         curve = NaturalCurve.of(setup.model)
-        distance = np.linalg.norm(transform(setup.T_camera_palm, self._pivot))
+        distance = np.linalg.norm(transform(setup.T_camera_palm, self._root[FINGERS].mean(axis=0)))
         self.px_per_m = float(setup.optics.matrix[0, 0] / distance)  # at the knuckles
         self.mcp_per_pip, self.dip_per_pip = curve.slope[FINGERS, 1], curve.slope[FINGERS, DIP]
 
@@ -76,8 +76,8 @@ class WearerModel:
     def palm(self, unknown: Unknown) -> Float:
         """T_camera_palm (4, 4)."""
         guess = self._setup.T_camera_palm
-        pivot, turn = transform(guess, self._pivot), rotation_vector_to_matrix(unknown.pose[:3])
-        return rigid(turn @ guess[:3, :3], pivot + turn @ (guess[:3, 3] - pivot) + unknown.pose[3:])
+        turn = rotation_vector_to_matrix(unknown.pose[:3])
+        return rigid(turn @ guess[:3, :3], guess[:3, 3] + unknown.pose[3:])
 
     def knuckles(self, unknown: Unknown) -> Float:
         """(4, 3) of index ... little, camera frame [m]."""

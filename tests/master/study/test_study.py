@@ -38,7 +38,7 @@ def task(out: Path) -> Task:
         step=6,
         guided=8,
         out=out,
-        resume=True,
+        resume="detections",
         keep=True,
         trial_s=0.2,
     )
