@@ -160,22 +160,30 @@ def _reach_lines(cells: list[Cell], poses: list[str]) -> list[str]:
         lines.append(
             f"| {finger} | " + " | ".join(f"{cell.told} / {cell.tip} of {cell.trials}" for cell in own) + " |"
         )
-    return lines
+    blind = [cell for cell in cells if cell.blind]
+    told = ", ".join(f"{cell.finger} {_LETTER[cell.pose]} {cell.blind}" for cell in blind) or "none"
+    return [*lines, "", f"Trials in which a finger was tracked and neither was in sight: {told}."]
 
 
 def _icc_lines(again: list[Repeated]) -> list[str]:
     lines = [
         _REPEATED,
         "",
-        "| finger | ICC | in truth | targets | paper |",
-        "|---|--:|--:|--:|--:|",
+        "| finger | ICC | in truth | targets | reached cells | paper |",
+        "|---|--:|--:|--:|--:|--:|",
     ]
     for one in again:
         shown = [f"{value:.3f}" if math.isfinite(value) else "none" for value in (one.icc, one.truth_icc)]
         lines.append(
-            f"| {one.finger} | {shown[0]} | {shown[1]} | {one.targets} | {paper.ICC[one.finger]:.2f} |"
+            f"| {one.finger} | {shown[0]} | {shown[1]} | {one.targets} | {_of_cells(one)}"
+            f" | {paper.ICC[one.finger]:.2f} |"
         )
     return lines
+
+
+def _of_cells(one: Repeated) -> str:
+    """How many cells a coefficient is of, marked where they are fewer than half of the poses."""
+    return f"{one.cells}{' (few)' if 2 * one.cells < len(POSES) else ''}"
 
 
 def _cause_lines(result: Result) -> list[str]:

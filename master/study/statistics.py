@@ -21,6 +21,8 @@ class Cell:
         trials: How many there were.
         reached: In how many of them the finger was tracked: a laser point or fingertip told it.
         told: In how many the truth says that enough of the laser line was seen on it; tip: that its tip was.
+        blind: In how many it was tracked although neither was: whatever told it was of something else. They count in
+            the error like all others.
         mean_deg, sd_deg: Of the absolute error of the PIP over the trials that were reached; NaN: not reached, fewer
             than half of them. sd_deg is that of single trials, n - 1.
     """
@@ -31,6 +33,7 @@ class Cell:
     reached: int
     told: int
     tip: int
+    blind: int
     mean_deg: float
     sd_deg: float
 
@@ -44,10 +47,12 @@ class Cell:
 class Repeated:
     """How alike two trials of a finger are: ICC(1,1), mean over the draws, and how many targets it is of.
 
-    `truth_icc` is that of the true angles of the same trials: nobody makes a pose twice alike.
+    Targets of one or two poses are alike, and what is small in itself makes a low coefficient: `cells` says of how many
+    reached cells they are. `truth_icc` is that of the true angles of the same trials: nobody makes a pose twice alike.
     """
 
     finger: str
+    cells: int
     targets: int
     icc: float
     truth_icc: float
@@ -82,8 +87,11 @@ def repeated(trials: list[Trial], seed: int, draws: int = DRAWS) -> list[Repeate
             targets.append(len(pairs))
             measured.append(icc_1_1(pairs[:, :, 0]))
             true.append(icc_1_1(pairs[:, :, 1]))
+        cells = sum(own == name for own, _ in reached)
         out.append(
-            Repeated(name, round(float(np.mean(targets))), float(np.mean(measured)), float(np.mean(true)))
+            Repeated(
+                name, cells, round(float(np.mean(targets))), float(np.mean(measured)), float(np.mean(true))
+            )
         )
     return out
 
@@ -118,6 +126,9 @@ def _cell(trials: list[Trial], finger: int, pose: str) -> Cell:
         reached=count,
         told=sum(one.laser_seen[finger] for one in own),
         tip=sum(one.tip_seen[finger] for one in own),
+        blind=sum(
+            one.tracked[finger] and not (one.laser_seen[finger] or one.tip_seen[finger]) for one in own
+        ),
         mean_deg=float(error.mean()) if shown and count else float("nan"),
         sd_deg=float(error.std(ddof=1)) if shown and count > 1 else float("nan"),
     )

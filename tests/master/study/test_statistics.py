@@ -73,7 +73,7 @@ def test_a_cell_is_mean_and_sd_of_absolute_errors() -> None:
     )
     assert [cell.pose for cell in found] == ["pinch"] * 5
     for cell in found:
-        assert (cell.trials, cell.reached, cell.told, cell.tip) == (4, 3, 4, 0)
+        assert (cell.trials, cell.reached, cell.told, cell.tip, cell.blind) == (4, 3, 4, 0, 0)
         assert cell.is_reached
         assert cell.mean_deg == pytest.approx(3.0)
         assert cell.sd_deg == pytest.approx(2.0)  # of 3, 5, 1 about 3, n - 1
@@ -87,6 +87,12 @@ def test_a_finger_tracked_in_fewer_than_half_of_the_trials_is_not_filled_in(
     assert cell.is_reached is reached
     assert np.isnan(cell.mean_deg) is not reached
     assert (cell.reached, cell.trials) == (tracked, 4)
+
+
+def test_a_finger_that_was_told_by_something_else_is_counted_and_its_error_kept() -> None:
+    cell = cells_of([trial(1, off=2.0), trial(2, off=30.0, seen=False)])[0]
+    assert (cell.reached, cell.blind) == (2, 1)
+    assert cell.mean_deg == pytest.approx(16.0)
 
 
 def test_angles_that_do_not_exist_spoil_nothing() -> None:
@@ -103,7 +109,7 @@ def test_repeatability_is_of_participants_and_poses_and_leaves_out_what_is_not_r
         for k, pose in enumerate(POSES)
     ]
     found = repeated(trials, seed=1)
-    assert [one.targets for one in found] == [20] * 5  # pointing is missing
+    assert [(one.targets, one.cells) for one in found] == [(20, 5)] * 5  # pointing is missing
     for one in found:
         assert 0.99 < one.icc < 1.0
         assert one.truth_icc == 1.0
