@@ -84,8 +84,8 @@ def participant(study_seed: int, number: int, rig: RigCalibration, hand: HandPro
 def about(rig: RigCalibration) -> RigCalibration:
     """The rig file with what its maker knows: how differently people wear the device (standard deviations)."""
     known = {
-        "turn_sigma_deg": round(float(np.degrees(TURN_RAD)) / np.sqrt(3.0), 4),
-        "shift_sigma_mm": round(1e3 * SHIFT_M / np.sqrt(3.0), 4),
+        "turn_sigma_deg": round(float(np.degrees(TURN_RAD) / np.sqrt(3.0)), 4),
+        "shift_sigma_mm": round(float(1e3 * SHIFT_M / np.sqrt(3.0)), 4),
     }
     how = provenance("study", (), known, "how the device sits on the wrists of people")
     return replace(rig, provenance=rig.provenance | {"T_camera_palm": how})
