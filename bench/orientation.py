@@ -146,7 +146,7 @@ def errors_of(run: _Run, imu: ImuCalibration | None, seed: int) -> _Errors:
     held: list[float] = []
     for message in heapq.merge(samples, run.messages, key=lambda one: one.t_ns):
         if isinstance(message, ImuSample):
-            pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             continue
         for solved in pipeline.push(message):
             pose, truth = solved.pose, run.scene.truth((solved.pose.t_ns - START_NS) * 1e-9)

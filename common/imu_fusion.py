@@ -21,7 +21,7 @@ Magnetometers are not used: steel in a desk turns them by more than a gyroscope 
 """
 
 from collections import Counter
-from math import hypot, radians, sqrt, tan
+from math import hypot, nan, radians, sqrt, tan
 
 import imufusion
 import numpy as np
@@ -82,11 +82,20 @@ class OrientationFilter:
         return self._doubt.heading_rad
 
     def push(self, sample: ImuSample) -> ImuSample:
-        """The same sample with `orientation_wxyz`, sensor axes -> a world whose z axis is up; NaN: not known."""
+        """The same sample with `orientation_wxyz`, sensor axes -> a world whose z axis is up, and `heading_sigma_rad`.
+
+        Both are NaN where they are not known.
+        """
+        found = self._pushed(sample)
+        drifted = nan if found is _NONE else self._doubt.heading_rad
+        return replace(sample, orientation_wxyz=found, heading_sigma_rad=drifted)
+
+    def _pushed(self, sample: ImuSample) -> Float:
+        """Take a sample; the orientation (4,) at its instant."""
         rate, force = sample.gyro_rad_s, sample.accel_m_s2
         if not np.abs(rate).max() < _RATE_RAD_S:
             self.counts["fusion.missing"] += 1
-            return replace(sample, orientation_wxyz=_NONE)
+            return _NONE
         falls = not _FALLING_M_S2 < np.abs(force).max() < _FORCE_M_S2
         if falls:
             self.counts["fusion.no_gravity"] += 1
@@ -94,11 +103,11 @@ class OrientationFilter:
             if not falls:
                 self._ahrs = _upright(force)
                 self._last_ns, self._rate = sample.t_ns, rate
-            return replace(sample, orientation_wxyz=_NONE)
+            return _NONE
         step_s = 1e-9 * (sample.t_ns - self._last_ns)
         if -_CLOCK_S < step_s <= 0.0:
             self.counts["fusion.late"] += 1
-            return replace(sample, orientation_wxyz=_NONE)
+            return _NONE
         if 0.0 < step_s <= self._bridged_s:
             self._turn(self._ahrs, step_s, 0.5 * (self._rate + rate) - self.bias_rad_s)
             if not falls:
@@ -110,7 +119,7 @@ class OrientationFilter:
             self._stillness.moved()
         self._last_ns, self._rate = sample.t_ns, rate
         known = self._doubt.tilt_rad < _SETTLED_RAD
-        return replace(sample, orientation_wxyz=_quaternion(self._ahrs) if known else _NONE)
+        return _quaternion(self._ahrs) if known else _NONE
 
     def _turn(self, ahrs: imufusion.Ahrs, step_s: float, rate: Float) -> None:
         """Sum up one step at a rate (3,) [rad/s]; the library's is of first order, the tangent makes it exact."""

@@ -1,8 +1,9 @@
 """The IMU of a recording: imu.csv beside frames.csv, one row per sample, on the same clock.
 
-`t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz]` in rad/s, m/s^2 and uT; the quaternion takes the sensor's axes to
-its world, whose z axis is vertical. `nan` is a value that the sensor did not give. As of frames.csv, only the last
-row can be cut by whatever ended the recording: it is left out, every other broken row is an error.
+`t_ns,gx,gy,gz,ax,ay,az[,mx,my,mz][,qw,qx,qy,qz[,heading_sigma]]` in rad/s, m/s^2, uT and rad; the quaternion takes
+the sensor's axes to its world, whose z axis is vertical, and its heading may have drifted so far. `nan` is a value that
+the sensor did not give. As of frames.csv, only the last row can be cut by whatever ended the recording: it is left out,
+every other broken row is an error.
 """
 
 import csv
@@ -10,6 +11,7 @@ import io
 import logging
 import re
 from collections.abc import Iterable, Sequence
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +23,10 @@ from common.replacing import replacing
 
 IMU = "imu.csv"
 _RATES = ("gx", "gy", "gz", "ax", "ay", "az")
-_FIELD, _TURN = ("mx", "my", "mz"), ("qw", "qx", "qy", "qz")
-HEADERS = tuple(("t_ns", *_RATES, *field, *turn) for field in ((), _FIELD) for turn in ((), _TURN))
+_FIELD, _TURN, _DRIFT = ("mx", "my", "mz"), ("qw", "qx", "qy", "qz"), "heading_sigma"
+HEADERS = tuple(
+    ("t_ns", *_RATES, *field, *turn) for field in ((), _FIELD) for turn in ((), _TURN, (*_TURN, _DRIFT))
+)
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
 _LOG = logging.getLogger(__name__)
 
@@ -52,7 +56,8 @@ def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
     except csv.Error as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
     if header not in HEADERS:
-        allowed = f"t_ns,{','.join(_RATES)}, then {','.join(_FIELD)} or not, then {','.join(_TURN)} or not"
+        turn = f"{','.join(_TURN)}, with or without {_DRIFT}, or not"
+        allowed = f"t_ns,{','.join(_RATES)}, then {','.join(_FIELD)} or not, then {turn}"
         raise RecordingError(f"{path}: header {','.join(header)}: must be {allowed}")
     samples: list[ImuSample] = []
     for number, line in lines:
@@ -85,7 +90,7 @@ def write_imu(folder: Path, samples: Iterable[ImuSample]) -> None:
 def row(sample: ImuSample) -> list[int | float]:
     """One row of a table with all columns, those of the last of `HEADERS`."""
     values = [sample.gyro_rad_s, sample.accel_m_s2, sample.mag_ut, sample.orientation_wxyz]
-    return [sample.t_ns, *np.concatenate(values).tolist()]
+    return [sample.t_ns, *np.concatenate(values).tolist(), sample.heading_sigma_rad]
 
 
 def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequence[str]) -> ImuSample:
@@ -94,6 +99,9 @@ def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequ
     if not _INTEGER.fullmatch(line[0]):
         raise RecordingError(f"{where}: t_ns: {line[0]!r} is not an integer")
     values = {name: _number(where, name, text) for name, text in zip(header[1:], line[1:], strict=True)}
+
+    if (drift := values.get(_DRIFT, nan)) < 0.0:
+        raise RecordingError(f"{where}: {_DRIFT}: {drift:g} is below 0")
 
     def vector(*names: str) -> Float:
         return np.array([values.get(name, np.nan) for name in names])
@@ -107,6 +115,7 @@ def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequ
         accel_m_s2=vector(*_RATES[3:]),
         mag_ut=vector(*_FIELD),
         orientation_wxyz=vector(*_TURN),
+        heading_sigma_rad=drift,
     )
 
 

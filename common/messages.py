@@ -10,6 +10,7 @@ described in docs/wire.md.
 from copy import copy
 from enum import IntEnum
 from functools import cache
+from math import isinf, nan
 from typing import Annotated, TypeAlias, cast
 
 import msgspec
@@ -172,6 +173,8 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
         accel_m_s2: Specific force (3,) [m/s^2]: at rest it points up, 9.81 long.
         mag_ut: Magnetic field (3,) [uT].
         orientation_wxyz: (4,) quaternion, sensor axes -> the sensor's world, whose z axis is vertical.
+        heading_sigma_rad: Standard deviation of what its turn about the vertical has drifted since its beginning,
+            which was anywhere [rad]. NaN: who made the orientation does not say.
     """
 
     source: Name
@@ -182,12 +185,15 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
     accel_m_s2: Float
     mag_ut: Float
     orientation_wxyz: Float
+    heading_sigma_rad: float = nan
 
     def __post_init__(self) -> None:
         _freeze(self, "gyro_rad_s", np.float64, (3,))
         _freeze(self, "accel_m_s2", np.float64, (3,))
         _freeze(self, "mag_ut", np.float64, (3,))
         _freeze(self, "orientation_wxyz", np.float64, (4,))
+        if self.heading_sigma_rad < 0.0 or isinf(self.heading_sigma_rad):
+            raise ValueError(f"heading_sigma_rad: {self.heading_sigma_rad}: must be 0 or more, or NaN")
 
 
 class HandPose(Message, frozen=True, eq=False, tag=True):

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from math import nan
 from typing import Protocol, TypeVar
 
 import msgspec
@@ -38,7 +39,7 @@ class Solver(Protocol[SeenT_contra]):
         """Take one camera's detections; return the poses they complete, oldest first."""
         ...
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its own orientation (4,)."""
         ...
 
@@ -88,7 +89,7 @@ def run(
         if message is None:
             continue
         if isinstance(message, ImuSample):
-            pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             continue
         figures.rates.push(message)
         for solved in pipeline.push(message):

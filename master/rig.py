@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
+from math import nan
 from pathlib import Path
 from typing import Protocol, cast
 
@@ -34,7 +35,7 @@ class Pipeline(Protocol):
         """Take one camera's detections; return the poses they complete, oldest first."""
         ...
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its own orientation (4,)."""
         ...
 

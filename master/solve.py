@@ -7,6 +7,7 @@ same bytes. Only the stage times of the summary are measured.
 import heapq
 import logging
 from collections.abc import Callable, Sequence
+from math import isfinite
 from pathlib import Path
 
 import msgspec
@@ -68,7 +69,7 @@ def solve(
     done = 0
     for message in heapq.merge(samples, messages, key=lambda message: message.t_ns):
         if isinstance(message, ImuSample):
-            pipeline.push_orientation(message.t_ns, message.orientation_wxyz)
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             continue
         poses += [solved.pose for solved in pipeline.push(message)]
         rates.push(message)
@@ -139,12 +140,16 @@ def _samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[ImuSampl
             _LOG.warning("%s: not used: rig %r: %s", path, setup.rig.name, _UNPLACED)
         return (), setup
     samples = read_imu(recording.folder, imu.name)
-    if not samples or any(np.isfinite(one.orientation_wxyz).all() for one in samples):
-        return samples, setup
-    if imu.heading_sigma_rad is not None:
-        _LOG.warning("%s: no quaternions: imu.heading_sigma_rad not used", recording.folder / IMU)
+    told = any(np.isfinite(one.orientation_wxyz).all() for one in samples)
+    reckoned = not told or any(isfinite(one.heading_sigma_rad) for one in samples)
+    if reckoned and samples and imu.heading_sigma_rad is not None:
+        _LOG.warning(
+            "%s: orientations of rates and forces: imu.heading_sigma_rad not used", recording.folder / IMU
+        )
         rig = msgspec.structs.replace(setup.rig, imu=msgspec.structs.replace(imu, heading_sigma_rad=None))
         setup = RigSetup.of(rig, setup.cameras, setup.hand)
+    if told:
+        return samples, setup
     fusion = OrientationFilter(imu.rate_hz)
     return tuple(fusion.push(one) for one in samples), setup
 

@@ -9,6 +9,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from math import nan
 from pathlib import Path
 
 from common.arrays import Float
@@ -94,9 +95,9 @@ class LivePipeline:
             self._last_ns = solved[-1].pose.t_ns
         return solved
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its orientation (4,); a pipeline that takes over begins without."""
-        self._now.push_orientation(t_ns, orientation_wxyz)
+        self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def change(self, setup: RigSetup) -> None:
         """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.

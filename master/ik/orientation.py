@@ -10,7 +10,7 @@ and wide about it. A heading of which nothing is known is taken from the hand as
 """
 
 from collections import Counter
-from math import atan2
+from math import atan2, hypot, nan
 
 import numpy as np
 
@@ -46,11 +46,11 @@ class OrientationTrack:
         self._rig_world = turn_of("q_rig_world", imu.q_rig_world)
         self._up = self._rig_world[:, 2]
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._samples = OrientationSamples(self.counts)
+        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
 
-    def push(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world; see `OrientationSamples.push`."""
-        self._samples.push(t_ns, orientation_wxyz)
+        self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def at(self, t_ns: int, near: HandSolution | None) -> Orientation | None:
         """The palm's orientation at an instant; None where no sample is near enough.
@@ -60,25 +60,23 @@ class OrientationTrack:
             near: The hand as it was solved, which gives the heading where the IMU has none; None: not known.
         """
         found = self._samples.between(t_ns)
-        heading_rad = self._heading_rad(t_ns)
+        heading_rad = None if found is None else self._heading_rad(found.drift_rad)
         if found is None or (heading_rad is None and near is None):
             self.counts["orientation.absent"] += 1
             return None
         self.counts["orientation.used"] += 1
-        q, away_s = found
-        rotation = self._rig_world @ quaternion_to_matrix(q) @ self._palm_imu.T
+        rotation = self._rig_world @ quaternion_to_matrix(found.q_wxyz) @ self._palm_imu.T
         if heading_rad is None and near is not None:
             rotation = _turn_about(self._up, near.T_rig_palm[:3, :3] @ rotation.T) @ rotation
-        tilt_2 = self._imu.orientation_sigma_rad**2 + (TURN_RAD_S * away_s) ** 2
+        tilt_2 = self._imu.orientation_sigma_rad**2 + (TURN_RAD_S * found.away_s) ** 2
         about_2 = max((_FREE_RAD if heading_rad is None else heading_rad) ** 2, tilt_2)
         return Orientation(rotation, tilt_2 * np.eye(3) + (about_2 - tilt_2) * np.outer(self._up, self._up))
 
-    def _heading_rad(self, t_ns: int) -> float | None:
-        """Standard deviation of the heading; None: not known."""
-        sigma, heard_s = self._imu.heading_sigma_rad, self._samples.heard_s(t_ns)
-        if sigma is None or heard_s is None:
+    def _heading_rad(self, drift_rad: float) -> float | None:
+        """Standard deviation of the heading after such a drift; None: not known."""
+        if self._imu.heading_sigma_rad is None:
             return None
-        grown = float(np.hypot(sigma, self._imu.heading_drift_rad_s * heard_s))
+        grown = hypot(self._imu.heading_sigma_rad, drift_rad)
         return grown if grown < _LOST_RAD else None
 
 

@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from dataclasses import dataclass
+from math import isnan, nan
 
 import numpy as np
 
@@ -17,6 +18,22 @@ _STRAIGHT = 1e-9  # sine of an angle below which an arc is a straight line
 class _Sample:
     t_ns: int
     q_wxyz: Float
+    drift_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Between:
+    """An IMU's orientation at an instant.
+
+    Attributes:
+        q_wxyz: Quaternion (4,).
+        away_s: How far from samples that is [s].
+        drift_rad: How far its heading has drifted since the first sample, standard deviation [rad].
+    """
+
+    q_wxyz: Float
+    away_s: float
+    drift_rad: float
 
 
 class OrientationSamples:
@@ -26,9 +43,9 @@ class OrientationSamples:
         counts: Samples left out: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
     """
 
-    def __init__(self, counts: Counter[str]) -> None:
-        """Begin without any, counting into `counts`."""
-        self.counts = counts
+    def __init__(self, counts: Counter[str], drift_rad_s: float) -> None:
+        """Begin without any, counting into `counts`; headings drift so fast where samples do not say how far."""
+        self.counts, self._drift_rad_s = counts, drift_rad_s
         self._samples: deque[_Sample] = deque(maxlen=_KEPT)
         self._first_ns: int | None = None
 
@@ -36,8 +53,8 @@ class OrientationSamples:
         """How many it holds."""
         return len(self._samples)
 
-    def push(self, t_ns: int, orientation_wxyz: Float) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world, q as good as -q.
+    def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take one sample: quaternion (4,), IMU axes -> its world, q as good as -q; how far its heading has drifted.
 
         What is no rotation is left out. A sample long before the newest means that a clock was set back, or that the
         newest came from a time that is not yet: the others are forgotten.
@@ -54,14 +71,13 @@ class OrientationSamples:
                     return
                 self._samples.clear()
             self._first_ns = t_ns if self._first_ns is None else min(self._first_ns, t_ns)
-            self._samples.append(_Sample(t_ns, orientation_wxyz / length))
+            drift_rad = heading_sigma_rad
+            if isnan(drift_rad):
+                drift_rad = 1e-9 * (t_ns - self._first_ns) * self._drift_rad_s
+            self._samples.append(_Sample(t_ns, orientation_wxyz / length, drift_rad))
 
-    def heard_s(self, t_ns: int) -> float | None:
-        """How long before an instant the first sample was [s], at least 0; None: there was none."""
-        return None if self._first_ns is None else 1e-9 * max(t_ns - self._first_ns, 0)
-
-    def between(self, t_ns: int) -> tuple[Float, float] | None:
-        """Quaternion (4,) at an instant, and how far from samples that is [s]; None: too far.
+    def between(self, t_ns: int) -> Between | None:
+        """The orientation at an instant; None: too far from any sample.
 
         The times to both sides count as resistors in parallel do: with one side alone it is the time to that.
         """
@@ -78,9 +94,10 @@ class OrientationSamples:
             after = None
         if before is not None and after is not None:
             a, b = t_ns - before.t_ns, after.t_ns - t_ns
-            return slerp(before.q_wxyz, after.q_wxyz, a / (a + b)), 1e-9 * a * b / (a + b)
+            q = slerp(before.q_wxyz, after.q_wxyz, a / (a + b))
+            return Between(q, 1e-9 * a * b / (a + b), after.drift_rad)
         one = before or after
-        return None if one is None else (one.q_wxyz, 1e-9 * abs(t_ns - one.t_ns))
+        return None if one is None else Between(one.q_wxyz, 1e-9 * abs(t_ns - one.t_ns), one.drift_rad)
 
 
 def slerp(first: Float, second: Float, share: float) -> Float:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from math import nan
 
 import msgspec
 import numpy as np
@@ -109,12 +110,12 @@ class MarkerPipeline:
             instants = self._pairing.push(message)
         return [self._solve(instant) for instant in instants]
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its own orientation (4,), for the instants about `t_ns`."""
         if self._orientation is None:
             self.counts["orientation.unplaced"] += 1
         else:
-            self._orientation.push(t_ns, orientation_wxyz)
+            self._orientation.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: the poses that still wait for a camera."""

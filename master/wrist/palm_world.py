@@ -7,11 +7,11 @@ whose z axis is up, is
 
 and the rig's frame, which moves with the camera, is not needed; `imu.q_rig_world` tells only where a simulated forearm
 begins. Gravity holds the tilt. Nothing holds the heading: it is zero anywhere, and its standard deviation is how far
-it may have drifted since the first sample.
+it may have drifted since the first sample: as the slave's filter says with each sample, or the rig's figure for that.
 """
 
 from collections import Counter
-from math import hypot, pi, sqrt
+from math import hypot, nan, pi, sqrt
 
 import numpy as np
 
@@ -41,11 +41,11 @@ class PalmWorld:
         """
         self._imu, self._imu_palm = imu, turn_of("q_palm_imu", imu.q_palm_imu).T
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._samples = OrientationSamples(self.counts)
+        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
 
-    def push(self, t_ns: int, wxyz: Float) -> None:
-        """Take one sample: quaternion (4,), IMU axes -> its world."""
-        self._samples.push(t_ns, wxyz)
+    def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""
+        self._samples.push(t_ns, wxyz, heading_sigma_rad)
 
     def at(self, t_ns: int) -> tuple[Float, Float]:
         """The palm at an instant: palm axes -> the IMU's world.
@@ -58,9 +58,8 @@ class PalmWorld:
             self.counts["orientation.absent"] += 1
             return NO_WORLD
         self.counts["orientation.used"] += 1
-        q, away_s = found
-        tilt = hypot(self._imu.orientation_sigma_rad, TURN_RAD_S * away_s)
-        drift = self._imu.heading_drift_rad_s * (self._samples.heard_s(t_ns) or 0.0)
-        heading = hypot(self._imu.heading_sigma_rad or 0.0, drift, TURN_RAD_S * away_s)
-        palm = matrix_to_quaternion(quaternion_to_matrix(q) @ self._imu_palm)
+        turned = TURN_RAD_S * found.away_s
+        tilt = hypot(self._imu.orientation_sigma_rad, turned)
+        heading = hypot(self._imu.heading_sigma_rad or 0.0, found.drift_rad, turned)
+        palm = matrix_to_quaternion(quaternion_to_matrix(found.q_wxyz) @ self._imu_palm)
         return palm, np.array([tilt, min(heading, _ANYWHERE_RAD)])

@@ -18,6 +18,7 @@ What it says of a finger:
 from collections import Counter
 from contextlib import nullcontext
 from dataclasses import replace
+from math import nan
 
 import numpy as np
 
@@ -109,12 +110,12 @@ class WristPipeline:
         self.counts["poses"] += 1
         return [SolvedPose(pose, message.ready_t_ns)]
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float) -> None:
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its own orientation (4,): that of the forearm, and so of the palm, in its world."""
         if self._palm_world is None:
             self.counts["orientation.unplaced"] += 1
         else:
-            self._palm_world.push(t_ns, orientation_wxyz)
+            self._palm_world.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: nothing waits."""

@@ -17,8 +17,10 @@ def samples(count: int = 20) -> list[ImuSample]:
     rng = np.random.default_rng(3)
     nothing = np.full(3, np.nan)
     return [
-        ImuSample("imu", 0, k, 10**9 + 8_333_333 * k, rng.normal(size=3), rng.normal(size=3), nothing, q)
-        for k, q in enumerate(rng.normal(size=(count, 4)))
+        ImuSample("imu", 0, k, 10**9 + 8_333_333 * k, gyro, accel, nothing, q, np.nan if k < 5 else 0.1 * k)
+        for k, (gyro, accel, q) in enumerate(
+            zip(*rng.normal(size=(2, count, 3)), rng.normal(size=(count, 4)), strict=True)
+        )
     ]
 
 
@@ -29,7 +31,7 @@ def test_what_is_written_is_read_back_to_the_last_bit(tmp_path: Path) -> None:
     assert len(read) == len(written)
     for a, b in zip(read, written, strict=True):
         assert (a.source, a.seq, a.t_ns) == (b.source, b.seq, b.t_ns)
-        for field in ("gyro_rad_s", "accel_m_s2", "mag_ut", "orientation_wxyz"):
+        for field in ("gyro_rad_s", "accel_m_s2", "mag_ut", "orientation_wxyz", "heading_sigma_rad"):
             np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
 
 
@@ -47,6 +49,7 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
     np.testing.assert_array_equal(one.accel_m_s2, [4, 5, 6])
     assert np.isfinite(one.mag_ut).all() == ("mx" in header)
     assert np.isfinite(one.orientation_wxyz).all() == ("qw" in header)
+    assert np.isfinite(one.heading_sigma_rad) == ("heading_sigma" in header)
 
 
 @pytest.mark.parametrize(
@@ -58,6 +61,7 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
         (f"{FULL}\n{ROW.replace('1000', '1.5e3')}\n", r"line 2: t_ns: '1\.5e3' is not an integer"),
         (f"{FULL}\n{ROW.replace('0.2', 'fast')}\n", r"line 2: gy: 'fast' is not a number"),
         (f"{FULL}\n{ROW.replace('9.81', 'inf')}\n", r"line 2: az: 'inf' is not a finite number"),
+        (f"{FULL},heading_sigma\n{ROW},-0.1\n", r"line 2: heading_sigma: -0\.1 is below 0"),
         (f"{FULL}\n{ROW}\n{ROW}\n", r"line 3: t_ns: 1000 is not after 1000"),
     ],
 )

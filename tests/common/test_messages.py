@@ -128,6 +128,7 @@ imu_samples = st.builds(
     accel_m_s2=floats(3),
     mag_ut=floats(3),
     orientation_wxyz=floats(4),
+    heading_sigma_rad=st.just(float("nan")) | st.floats(0.0, 10.0),
 )
 healths = st.builds(
     Health,
@@ -202,7 +203,7 @@ def assert_same(a: Message, b: Message) -> None:
             assert x.dtype == y.dtype
             np.testing.assert_array_equal(x, y, err_msg=field)  # NaN equals NaN here
         else:
-            assert x == y, field
+            assert x == y or (x != x and y != y), field
 
 
 def as_map(message: Message) -> dict[str, object]:
@@ -363,6 +364,8 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (WristDetections, {"tip_depth": b"\0" * 8}),
         (WristDetections, {"uv": b""}),
         (WristDetections, {"exposure_us": -1.0}),
+        (ImuSample, {"heading_sigma_rad": -0.1}),
+        (ImuSample, {"heading_sigma_rad": float("inf")}),
         (HandPose, {"laser_m": b"\0" * 8 * 14}),
         (HandPose, {"level": b"\3\0\0\0\0"}),
         (HandPose, {"ambiguous": b"\0" * 4}),
@@ -379,7 +382,7 @@ def test_one_wrong_field_is_refused(sample: type[Message], change: dict[str, obj
 
 DEFAULTED = {
     *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
-    *("t_sigma_ns", "exposure_us", "body"),
+    *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
 }
 
 

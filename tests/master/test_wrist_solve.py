@@ -139,9 +139,15 @@ def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
     without = load_poses(tmp_path / "poses.npz")
     assert np.isnan(without.palm_world_wxyz).all()
     rows = [f"{START_NS + 8_000_000 * k},0,0,0,0,0,9.81,1,0,0,0" for k in range(40)]
-    (tmp_path / "imu.csv").write_text("\n".join(["t_ns,gx,gy,gz,ax,ay,az,qw,qx,qy,qz", *rows]) + "\n")
+    header = "t_ns,gx,gy,gz,ax,ay,az,qw,qx,qy,qz"
+    (tmp_path / "imu.csv").write_text("\n".join([header, *rows]) + "\n")
     summary = solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
     found = load_poses(tmp_path / "poses.npz")
+    (tmp_path / "imu.csv").write_text(
+        "\n".join([f"{header},heading_sigma", *(f"{row},0.3" for row in rows)]) + "\n"
+    )
+    solve(recording(tmp_path, setup), setup, tmp_path, tmp_path)
+    told = load_poses(tmp_path / "poses.npz")
     np.testing.assert_array_equal(found.position_m, without.position_m)
     np.testing.assert_array_equal(found.angles_rad, without.angles_rad)
     imu = setup.rig.imu
@@ -157,6 +163,10 @@ def test_its_imu_turns_the_palm_in_the_world_and_nothing_in_the_camera(
         np.broadcast_to(quaternion_to_matrix(np.array(imu.q_palm_imu)).T, (heard.sum(), 3, 3)),
         atol=1e-9,
     )
+    drift_rad = imu.heading_drift_rad_s * 1e-9 * (found.t_ns[heard] - START_NS)  # as the rig file has it
+    np.testing.assert_allclose(found.palm_world_sigma_rad[heard, 1], drift_rad, atol=0.17)  # 50 ms at 3 rad/s
+    assert found.palm_world_sigma_rad[heard, 1].min() < 0.02
+    np.testing.assert_allclose(told.palm_world_sigma_rad[heard, 1], 0.3, rtol=0.15)  # as the IMU says
     counts = summary["counts"]
     assert isinstance(counts, dict)
     assert counts["orientation.used"] == heard.sum()

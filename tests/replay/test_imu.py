@@ -85,7 +85,8 @@ def fused(one: Recorded, folder: Path) -> Path:
     """The recording as of a sensor that tells its own orientation; its heading is as little known."""
     copytree(one.folder, folder)
     fusion = OrientationFilter(IMU.rate_hz)
-    write_imu(folder, [fusion.push(sample) for sample in read_imu(one.folder, IMU.name)])
+    samples = [fusion.push(sample) for sample in read_imu(one.folder, IMU.name)]
+    write_imu(folder, [msgspec.structs.replace(one, heading_sigma_rad=np.nan) for one in samples])
     return folder
 
 
@@ -118,8 +119,14 @@ def test_a_heading_is_not_believed_of_a_sensor_that_measured_none(
     used = recorded[0].solved(tmp_path / "used", IMU)
     with caplog.at_level(logging.WARNING):
         told = recorded[0].solved(tmp_path / "told", msgspec.structs.replace(IMU, heading_sigma_rad=0.05))
-    assert "imu.csv: no quaternions: imu.heading_sigma_rad not used" in caplog.text
+    assert "imu.csv: orientations of rates and forces: imu.heading_sigma_rad not used" in caplog.text
     np.testing.assert_array_equal(told, used)
+    folder = tmp_path / "of a slave"  # which writes what its filter made of the same
+    copytree(recorded[0].folder, folder)
+    fusion = OrientationFilter(IMU.rate_hz)
+    write_imu(folder, [fusion.push(sample) for sample in read_imu(folder, IMU.name)])
+    trusting = msgspec.structs.replace(IMU, heading_sigma_rad=0.05)
+    np.testing.assert_array_equal(recorded[0].solved(tmp_path / "slave", trusting, folder), used)
 
 
 def test_quaternions_of_the_recording_are_used_as_they_are(recorded: list[Recorded], tmp_path: Path) -> None:

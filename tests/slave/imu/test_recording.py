@@ -97,7 +97,7 @@ def test_rows_begin_with_the_recording_and_are_whole_at_any_time(tmp_path: Path)
     assert recorder.close() == counts
     assert source.closed
     with (tmp_path / IMU).open(newline="") as file:
-        assert {len(line) for line in csv.reader(file)} == {14}
+        assert {len(line) for line in csv.reader(file)} == {15}
 
 
 def test_what_nobody_keeps_is_taken_away_and_what_broke_is_told(tmp_path: Path) -> None:
