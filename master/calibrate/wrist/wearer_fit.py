@@ -150,7 +150,7 @@ class _Problem:
         cost: Float = (np.minimum(far, _ROUGHEST) ** 2).sum(axis=-1)  # (T, 2, G, 4)
         least = cost.min(axis=2).sum(axis=2)
         bends = np.unique(self._bend[self._bend != FLAT])
-        fists = bends[_fists(np.array([least[self._bend == bend].sum(axis=0) for bend in bends]))]
+        fists = bends[fists_of(np.array([least[self._bend == bend].sum(axis=0) for bend in bends]))]
         fist = np.isin(self._bend, fists)
         own_cost = cost[np.arange(len(fist)), fist.astype(np.int64)]  # (T, G, 4); a fist is number _FIST
         node: Int = own_cost.argmin(axis=1)
@@ -280,7 +280,7 @@ class _Normal:
         return step, -alone - by_shared @ step
 
 
-def _fists(cost: Float) -> Bool:
+def fists_of(cost: Float) -> Bool:
     """Which bends are fists, by what either kind costs (B, 2). The kind is told by tips, of which some are false.
 
     A bend that suits both kinds about equally is of the one that nothing else is: people are asked for both.

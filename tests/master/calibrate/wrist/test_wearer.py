@@ -15,12 +15,14 @@ from common.calibration import HandProfile, RigCalibration, load, parse, save
 from common.errors import CalibrationError, FitError
 from common.geometry import rotation_vector_to_matrix, transform
 from common.hand_model import CHAINS, HandModel
+from common.messages import WristDetections
 from common.npz import write_npz
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cli import calibrate_app
 from master.calibrate.tree_files import provenance
 from master.calibrate.wrist.guided import FLAT, guided
-from master.calibrate.wrist.wearer import calibrate_wearer
+from master.calibrate.wrist.wearer import Wearer, calibrate_wearer
+from master.calibrate.wrist.wearer_fit import fists_of
 from master.calibrate.wrist.wearer_model import UNKNOWN, Unknown, WearerModel, wearing
 from master.wrist.setup import WristSetup
 from master.wrist.skin import Skin
@@ -40,12 +42,26 @@ def people() -> dict[int, Person]:
     return {seed: Person.of(seed) for seed in (40, 41)}
 
 
+@pytest.fixture(scope="module")
+def motions(people: dict[int, Person]) -> dict[int, list[WristDetections]]:
+    """The guided motion of each, as seen."""
+    return {seed: person.detected("wearer")[0] for seed, person in people.items()}
+
+
+@pytest.fixture(scope="module")
+def wearers(people: dict[int, Person], motions: dict[int, list[WristDetections]]) -> dict[int, Wearer]:
+    """What is made of it."""
+    return {
+        seed: calibrate_wearer(motions[seed], person.rig, person.camera, person.hand)
+        for seed, person in people.items()
+    }
+
+
 @pytest.mark.parametrize("seed", [40, 41])
 def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
-    people: dict[int, Person], seed: int
+    people: dict[int, Person], wearers: dict[int, Wearer], seed: int
 ) -> None:
-    person = people[seed]
-    found = calibrate_wearer(person.detected("wearer")[0], person.rig, person.camera, person.hand)
+    person, found = people[seed], wearers[seed]
     turn_before, before = person.errors(person.rig, person.hand)
     turn, after = person.errors(found.rig, found.hand)
     assert np.sqrt(np.mean(after**2)) < 0.75 * np.sqrt(np.mean(before**2))
@@ -63,10 +79,10 @@ def test_knuckles_5_mm_off_and_a_palm_askew_are_found_within_stated_sigma(
     np.testing.assert_allclose(written, found.model.knuckles(found.unknown), atol=1e-7)
 
 
-def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(people: dict[int, Person]) -> None:
-    person = people[40]
-    triples = person.detected("wearer")[0]
-    found = calibrate_wearer(triples, person.rig, person.camera, person.hand)
+def test_what_the_laser_cannot_tell_keeps_its_belief_and_says_so(
+    people: dict[int, Person], motions: dict[int, list[WristDetections]], wearers: dict[int, Wearer]
+) -> None:
+    person, triples, found = people[40], motions[40], wearers[40]
     told = Unknown.of(np.sqrt(np.diag(found.fit.covariance)) / found.fit.prior_sigma)
     assert told.knuckle_m[:, 0].max() < 0.7  # across
     assert told.thick.min() > 0.8  # a thicker finger looks like a knuckle farther away
@@ -103,6 +119,23 @@ def test_the_files_written_show_what_was_fitted(people: dict[int, Person]) -> No
         np.testing.assert_allclose(shown[..., :2], fitted[..., :2], atol=3e-4)
         np.testing.assert_allclose(shown[..., 2:], fitted[..., 2:], atol=2.0)
         assert (new.rest_position_m[CHAINS[0]] == setup.model.rest_position_m[CHAINS[0]]).all()
+
+
+@pytest.mark.parametrize(
+    ("cost", "fists"),
+    [
+        (((10.0, 165.0), (204.0, 38.0)), [False, True]),
+        (((10.0, 165.0), (81.0, 95.0)), [False, True]),  # false tips: it suits neither
+        (((90.0, 80.0), (150.0, 20.0)), [False, True]),
+        (((150.0, 20.0), (140.0, 30.0)), [True, True]),  # what was clearly done is not made another
+        (((10.0, 165.0), (12.0, 150.0)), [False, False]),
+        (((20.0, 25.0), (30.0, 25.0)), [False, True]),
+    ],
+)
+def test_an_unclear_bend_is_of_the_kind_that_is_missing(
+    cost: tuple[tuple[float, float], ...], fists: list[bool]
+) -> None:
+    assert fists_of(np.array(cost)).tolist() == fists
 
 
 def along(*bends: float, flat: float = 0.17) -> Float:
@@ -148,10 +181,11 @@ def test_a_motion_without_its_parts_is_refused(seen: Float, match: str) -> None:
         ("plane", "no likely wearer.*laser plane measured|never|bent at their knuckles"),
     ],
 )
-def test_what_tells_nothing_or_a_lie_is_refused(people: dict[int, Person], what: str, match: str) -> None:
-    person = people[40]
+def test_what_tells_nothing_or_a_lie_is_refused(
+    people: dict[int, Person], motions: dict[int, list[WristDetections]], what: str, match: str
+) -> None:
+    person, triples = people[40], motions[40]
     rig, hand = person.rig, person.hand
-    triples = person.detected("wearer")[0]
     if what == "half":  # back from where the knuckles are bent by 40 degrees
         triples = triples[:10] + triples[10:13] + triples[27:]
     elif what == "fists":
@@ -187,9 +221,10 @@ def test_a_thickness_that_is_none_is_refused_with_its_key(key: str, value: str) 
         parse(wrong.encode(), HandProfile, "me.json")
 
 
-def test_the_command_writes_rig_and_hand_and_draws(people: dict[int, Person], tmp_path: Path) -> None:
-    person = people[40]
-    rows = person.detected("wearer")[0]
+def test_the_command_writes_rig_and_hand_and_draws(
+    people: dict[int, Person], motions: dict[int, list[WristDetections]], tmp_path: Path
+) -> None:
+    person, rows = people[40], motions[40]
     for folder, name, value in (
         ("rigs", person.rig.name, person.rig),
         ("cameras", person.camera.name, person.camera),
