@@ -6,34 +6,36 @@ places are then measured at full resolution (`tip_ends`); and how likely that en
 away ends behind its own horizon, one that is folded shows its back: no tip is reported.
 
 The thumb is one more finger, read along its own way (`strips`). It shows its end where it is raised off the palm. Where
-its seam cuts it, neither half has an end that could be told from a finger's.
+a seam runs over skin and not through a crease, it cuts a finger, mostly the thumb before others: what lies beside it
+there is a part of something, and no finger is given its end.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Bool, Float, Image
 from slave.wrist.fingers import Fingers
 from slave.wrist.half_spheres import half_spheres
 from slave.wrist.led_depth import SHRINK, Float32, LedOptics, depth_about, led_optics, nearness, shrink
 from slave.wrist.spines import borders, spines
 from slave.wrist.strips import ROW_PX, THUMB, Strips, strips_of
 from slave.wrist.tip_bends import Bend, bends_of, palm_gain, profiles
-from slave.wrist.tip_ends import BEFORE_END, LEAST_FACING, End, edges, full_profile, through_end
+from slave.wrist.tip_ends import LEAST_FACING, End, edges, full_profile, through_end
 from slave.wrist.tip_templates import templates_of
 from slave.wrist.view import WristView
 
-LEAST_SEEN = 0.6  # probability that the end of the finger is seen
-FOLDED_SEEN = 0.8  # where it points at the palm: nails differ more than pads, and hide it or do not
-THUMB_SEEN = 0.65  # of the thumb: its side is before the camera, its end mostly just beyond the horizon
-THUMB_LIKENESS = 0.995  # where nothing is before it, it is broad and plain
+LEAST_SEEN = 0.65  # probability that the end of the finger is seen
+# Of thumb and fingers: where nothing is before it, the thumb is broad and plain; a finger behind another or behind the
+# thumb looks like none of the templates.
+LEAST_LIKENESS = 0.995, 0.985
 MOST_SIGMA = 0.5  # of a fingertip's radius
-LEAST_LIKENESS = 0.985  # a finger behind another or behind the thumb looks like none of the templates
-LEAST = (THUMB_SEEN, THUMB_LIKENESS), (LEAST_SEEN, LEAST_LIKENESS)
-VALLEY = 0.85  # of the nearness of the thumb: a seam beside it is darker
-SAME_SKIN = 0.85  # of the nearness of the thumb: as near as its rest
-LAST_BONE = 4.5  # of the thumb's radius: how far its end can be from where a seam cuts it at the last joint
+VALLEY = 0.85  # of the nearness of a finger: a crease beside it is darker
+LAST_BONE = 1.0, 3.5  # of a fingertip's radius above its end and below: where its sides are looked at
+CUT = (
+    2,
+    4,
+)  # stations of thumb and finger there with skin at a side: a cut, not a spot where two fingers touch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,29 +65,23 @@ def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
     lines = spines(strip, border, bank.unit.shape[2])
     seen = profiles(strip, lines, border, bank)
     bends = bends_of(seen, bank, gain)
-    thumb = bends[THUMB]
-    cut = None if thumb is None else cut_off(strip, lines[THUMB], border[THUMB, 0], strips, thumb)
+    skin = over_skin(strip, border, seen, strips)
     ends: list[End] = []
     for k, bend in enumerate(bends):
-        least_seen, least_likeness = LEAST[min(k, 1)]
-        if bend is not None and bend.down:
-            least_seen = FOLDED_SEEN
-        if bend is None or bend.seen < least_seen or bend.likeness < least_likeness:
+        if bend is None or bend.seen < LEAST_SEEN or bend.likeness < LEAST_LIKENESS[min(k, 1)]:
             continue
-        if k != THUMB or cut is None:
-            line = through_end(lines[k, : int(bank.rows[k])], bend)
-            ends += edges(k, *full_profile(led, line, k, strips), bend)
+        line = through_end(lines[k, : int(bank.rows[k])], bend)
+        ends += edges(k, *full_profile(led, line, k, strips), bend)
     for end, middle in zip(ends, _middles(ends, near, optics, strips), strict=True):
         at, spread = end.place(middle)
         k, radius = end.finger, end.bend.radius_px
         low, high = border[k, :, min(max(int(at[1]) // ROW_PX, 0), border.shape[2] - 1)].tolist()
         if spread > MOST_SIGMA * radius or not low <= (at[0] - 0.5 * (SHRINK - 1)) / SHRINK <= high:
             continue
+        last = _last_bone(end.bend, at[1])
+        if not seen[k, last].any() or np.count_nonzero(skin[k, last]) >= CUT[min(k, 1)]:
+            continue
         found = strips.to_image(k, np.array(at))
-        if thumb is not None and cut is not None:
-            beside = float(np.hypot(*(found - cut))) < LAST_BONE * thumb.radius_px
-            if beside and float(seen[k].max()) > SAME_SKIN * float(seen[THUMB].max()):
-                continue
         uv[k], sigma[k] = found, spread
         depth[k] = depth_about(near, optics, float(found[0]), float(found[1]), radius)
     return Fingertips(uv, sigma, depth)
@@ -104,15 +100,29 @@ def _middles(ends: list["End"], near: Float32, optics: LedOptics, strips: Strips
     return out
 
 
-def cut_off(strip: Float32, line: Float, seam: Float32, strips: Strips, bend: Bend) -> Float | None:
-    """Where (2,) [px] the thumb ends if its seam runs over bright skin there: its rest lies with other fingers."""
-    rows = [int((bend.top_v + share * bend.radius_px) / ROW_PX) for share in BEFORE_END]
-    low, high = (min(max(row, 0), len(line) - 1) for row in rows)
-    first, last = int(strips.first_u) // SHRINK, strip.shape[1] - 1
-    column = np.rint(seam[low : high + 1]).astype(np.int64)
-    light, row = strip[low : high + 1], np.arange(high + 1 - low)
-    across = np.minimum(light[row, column.clip(first, last)], light[row, (column - 1).clip(first, last)])
-    bright = across > VALLEY * light[:, first:].max(axis=1)
-    if not (bright & (column > first) & (column <= last)).any():
-        return None
-    return strips.to_image(THUMB, np.array([line[low] * SHRINK, low * ROW_PX]))
+def _last_bone(bend: Bend, v: float) -> slice:
+    """The stations of a finger's last bone, whose end is at row v."""
+    above, below = (LAST_BONE[1], 0.0) if bend.down else LAST_BONE
+    first, last = (max(int((v + x * bend.radius_px) / ROW_PX), 0) for x in (-above, below))
+    return slice(first, last + 1)
+
+
+def over_skin(strip: Float32, border: Float32, seen: Float32, strips: Strips) -> Bool:
+    """At which stations (5, R) a finger is as near at one of its borders as in its middle.
+
+    Args:
+        strip: (R or more, columns) nearness of the strips.
+        border: (5, 2, R or more) columns between which the fingers are.
+        seen: (5, R) their profiles.
+        strips: Whose.
+    """
+    rows, width, first = seen.shape[1], strip.shape[1], int(strips.first_u) // SHRINK
+    low, high = np.full((5, 1, 1), 1), np.full((5, 1, 1), first - 2)
+    low[THUMB], high[THUMB] = first + 1, width - 2
+    column = np.rint(border[..., :rows]).astype(np.int64)
+    inside = (column >= low) & (column <= high)
+    at = column.clip(low, high) + np.arange(rows, dtype=np.int64) * width
+    flat = strip.ravel()
+    beside = np.minimum(np.minimum(flat[at - 1], flat[at]), flat[at + 1])
+    skin: Bool = (beside > VALLEY * seen[:, None]) & inside & (seen[:, None] > 0.0)
+    return skin[:, 0] | skin[:, 1]
