@@ -16,12 +16,12 @@ from slave.wrist.view import WristView
 Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
-# The border between thumb and thenar is where the head of the thumb's metacarpal ends, a little beyond the middle of
-# the joint. It is known no better than the bone's length (5 %) and than bending the joint by 40 degrees moves the
-# plane that halves its angle, at a finger's radius: 3 mm each.
-_WEB = 1.05  # of the metacarpal
-_BORDER_M = 3e-3
-_LEAST_SHARE = 0.005  # a line that lies on the ball of the thumb alone is the best that is known of the thumb
+# Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
+# half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
+_THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
+_BALL_M = -3e-3  # nearer there is no finger
+_LEAST_SPACING_M = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
+_BESIDE_PALM = 0.5  # place: beyond the outside of the index
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,13 +30,15 @@ class Reach:
 
     Attributes:
         pixels: (5, H, W), thumb ... little.
-        thumb_share: (H, W) how sure the laser on the thumb's line is beyond the ball of the thumb, 0 ... 1.
+        beyond_m: (H, W) how far the plane there is beyond the skin of the thumb's MCP, from the thumb's root [m].
+        place: (H, W) beside whose axis the plane is: 1 index ... 4 little, and between and beyond them.
         depth_per_focal_m: (H, W) how much of the plane one pixel shows there [m]; 0: none.
         first_row: Above it the laser meets no finger.
     """
 
     pixels: Bool
-    thumb_share: Float32
+    beyond_m: Float32
+    place: Float32
     depth_per_focal_m: Float32
     first_row: int
 
@@ -45,10 +47,18 @@ class Reach:
         column, row = self._cell(uv)
         return self.pixels[finger, row, column]
 
-    def of_thumb(self, uv: Float) -> Float:
-        """`thumb_share` (N,) at pixels (N, 2) of the image."""
+    def on_plane(self, uv: Float) -> tuple[Float, Float]:
+        """`beyond_m` and `place` (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
-        return self.thumb_share[row, column].astype(np.float64)
+        return self.beyond_m[row, column].astype(np.float64), self.place[row, column].astype(np.float64)
+
+    def only_thumb(self, beyond_m: Float, place: Float) -> Bool:
+        """Whether there (N,) the laser meets the thumb or nothing."""
+        return (beyond_m < _THUMBS_M) & (place < 1.5)
+
+    def no_thumb(self, beyond_m: Float, place: Float) -> Bool:
+        """Whether there (N,) the laser never meets the thumb."""
+        return (beyond_m > _NO_THUMBS_M) & (place > _BESIDE_PALM)
 
     def metres_per_px(self, uv: Float) -> Float:
         """`depth_per_focal_m` (N,) at pixels (N, 2) of the image; 0 where they are NaN."""
@@ -75,10 +85,10 @@ def reach_of(view: WristView) -> Reach:
     pixels = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_NEAREST) for part in cells]).astype(
         np.bool_
     )
-    share, metres = _on_plane(view)
-    pixels[1:] &= share > _LEAST_SHARE  # no finger is where the ball of the thumb is
+    beyond, place, metres = _on_plane(view)
+    pixels[1:] &= beyond > _BALL_M
     rows = np.flatnonzero(pixels.any(axis=(0, 2)))
-    return Reach(pixels, share, metres, int(rows[0]) if len(rows) else size[1] - 1)
+    return Reach(pixels, beyond, place, metres, int(rows[0]) if len(rows) else size[1] - 1)
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
@@ -109,19 +119,37 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
     return out
 
 
-def _on_plane(view: WristView) -> tuple[Float32, Float32]:
-    """How sure it is (H, W) that a laser point of the thumb's line lies on the thumb and not on its ball (thenar); and
-    how much of the laser plane a pixel shows (H, W) [m].
+def _on_plane(view: WristView) -> tuple[Float32, Float32, Float32]:
+    """`beyond_m`, `place` and `depth_per_focal_m` of every pixel, each (H, W).
 
-    However the thumb is turned, the skin over its MCP lies about as far from its root (CMC); so the border is a sphere
-    about the root, and a fixed line in the image.
+    However the thumb is turned, the skin over its MCP lies about as far from its root (CMC); so it is a sphere about
+    the root, and a fixed line in the image.
     """
     model, T = view.model, view.T_camera_palm
     root, knuckle = model.rest_position_m[CHAINS[0, :2]]
-    border = np.hypot(_WEB * np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]])
+    border = np.hypot(np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]])
     u, v = np.meshgrid(np.arange(view.optics.width_px), np.arange(view.optics.height_px))
-    points = view.on_plane(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
-    away = np.linalg.norm(points - (T[:3, :3] @ root + T[:3, 3]), axis=1)
-    share = np.clip(0.5 + (np.nan_to_num(away) - border) / (2.0 * _BORDER_M), _LEAST_SHARE, 1.0)
-    metres = np.nan_to_num(points[:, 2]) / view.optics.matrix[0, 0]
-    return share.reshape(u.shape).astype(np.float32), metres.reshape(u.shape).astype(np.float32)
+    points = np.nan_to_num(view.on_plane(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)))
+    palm = (points - T[:3, 3]) @ T[:3, :3]
+    beyond = np.linalg.norm(palm - root, axis=1) - border
+    metres = points[:, 2] / view.optics.matrix[0, 0]
+    shown = [values.reshape(u.shape).astype(np.float32) for values in (beyond, _place(view, palm), metres)]
+    return shown[0], shown[1], shown[2]
+
+
+def _place(view: WristView, palm: Float) -> Float:
+    """Beside whose axis, from index 1 to little 4, points (N, 3) of the palm frame are (N,), seen from before the palm.
+
+    Between two axes, and beyond the outer ones, by their distances.
+    """
+    knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]][:, ::2] for k in (0, 1))
+    along = (ends - knuckles) / np.linalg.norm(ends - knuckles, axis=1, keepdims=True)
+    aside = np.stack([along[:, 1], -along[:, 0]], axis=-1)
+    if aside[0] @ (knuckles[3] - knuckles[0]) < 0.0:
+        aside = -aside
+    off = np.stack(
+        [(palm[:, ::2] - knuckles[k]) @ aside[k] for k in range(4)], axis=-1
+    )  # falls finger by finger
+    left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
+    here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
+    return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)

@@ -1,0 +1,74 @@
+"""Whose each part of the laser line is, by where it lies on the laser's plane, where the seams cannot be right.
+
+A pixel of the plane is a known place before the palm. Fingers lean little to the side, so that it lies nearest to the
+axis of its own (`Reach.place`), even where seams were drawn through another valley. The thumb crosses the plane near
+its MCP or beside the palm: what lies as near to its root is its own, and what lies before the knuckles and farther
+away than that never is.
+"""
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from slave.wrist.pieces import NONE
+from slave.wrist.reach import Reach
+from slave.wrist.runs import SHORT, Runs
+
+_THUMB = 0
+# Where `Reach.place` is a finger's, thumb ... little: half a spacing from its axis and what the palm may be off. Folded
+# fingers point to the root of the thumb, the little one a quarter of a spacing towards it.
+_FROM: Float = np.array([-np.inf, -np.inf, 1.35, 2.3, 3.1])
+_TO: Float = np.array([np.inf, 1.65, 2.65, 3.65, np.inf])
+_CREASE_PX = 20  # columns on either side of a seam in which the crease may be
+
+
+def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
+    """Fingers (N,) of runs at pixels (N, 2), from those that seams say (N,), `NONE` where there is no line."""
+    beyond, place = reach.on_plane(points)
+    on = finger != NONE
+    near = on & reach.only_thumb(beyond, place)
+    out = np.where(near, _THUMB, finger)
+    out = _at_creases(out, runs)
+    ends = out[1:] != out[:-1]
+    ends[runs.first[1:] - 1] = True
+    first = np.concatenate([[0], np.flatnonzero(ends) + 1])
+    count = np.diff(np.append(first, len(out)))
+    middle = np.add.reduceat(place, first) / count
+    of = out[first]
+    nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
+    no_thumb = (of == _THUMB) & reach.no_thumb(np.add.reduceat(beyond, first) / count, middle)
+    aside = (of > _THUMB) & ((middle < _FROM[of]) | (middle > _TO[of]))
+    return np.repeat(np.where(no_thumb | aside, nearest, of), count)
+
+
+def _at_creases(finger: Int, runs: Runs) -> Int:
+    """Fingers (N,) of runs, with each change of finger along a line moved to the crease near by.
+
+    A line bends away at the sides of every finger, so that between two that touch its farthest, in the image its
+    uppermost, point is the crease; where no crease is near, the line ends and is one finger's.
+    """
+    out = finger.copy()
+    change = finger[1:] != finger[:-1]
+    change &= (finger[1:] >= 0) & (finger[:-1] >= 0)
+    change[runs.first[1:] - 1] = False
+    for i in np.flatnonzero(change).tolist():
+        of_line = int(np.searchsorted(runs.first, i, side="right"))
+        end = int(runs.first[of_line]) if of_line < len(runs.first) else len(finger)
+        begin = _climb(i, range(i - 1, int(runs.first[of_line - 1]) - 1, -1), runs.row, out == out[i])
+        stop = _climb(i + 1, range(i + 2, end), runs.row, finger == finger[i + 1]) + 1
+        top = begin + int(runs.row[begin:stop].argmin())
+        if stop - top < SHORT:
+            top = stop
+        elif top - begin < SHORT:
+            top = begin
+        out[begin:top], out[top:stop] = out[i], finger[i + 1]
+    return out
+
+
+def _climb(start: int, along: range, row: Float, same: Bool) -> int:
+    """The last run from one on along a line, of the same finger: some columns, and farther while it rises."""
+    last = start
+    for count, k in enumerate(along, 1):
+        if not (same[k] and (count < _CREASE_PX or row[k] < row[last])):
+            break
+        last = k
+    return last

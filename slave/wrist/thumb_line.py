@@ -1,0 +1,46 @@
+"""Which part of the thumb's laser line lies beyond its ball (thenar), as far as that is known, and where its middle is.
+
+The two run into each other; the plane that halves the angle of the MCP parts them (D5). When the metacarpal stands
+across the laser's plane, a millimetre decides whether all of the line is the thumb's or none: so the centroid is taken
+for borders from near to far, each as likely as the next, and their mean and spread are what is known.
+"""
+
+import numpy as np
+
+from common.arrays import Float, Int
+from slave.wrist.runs import Runs
+
+# Where the border lies, beyond where the skin over the MCP of a straight thumb is: bending it by 50 degrees takes the
+# plane that halves its angle back by half a radius on the palm's side, and nowhere at its side. It is known no better
+# than bones (1 mm, calibrated), the device's shift (1 mm along the thumb) and turn (2.5 degrees at 6 cm).
+_BORDER_M, _BORDER_SIGMA_M = -1.5e-3, 3e-3
+# Middles of nine parts, alike in probability, of a normal distribution.
+_NORMAL = np.array([-1.593, -0.967, -0.589, -0.282, 0.0, 0.282, 0.589, 0.967, 1.593])
+_BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _NORMAL
+_LEAST_PX = 4.0  # of line, for a centroid
+
+
+def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
+    """How much the thumb's part of a line has its centroid beside that of the whole (2,), and its deviation [px].
+
+    Args:
+        runs: The runs.
+        of_thumb: (N,) which of them are on the thumb or its ball.
+        beyond_m: (N,) how far each is beyond the MCP's skin [m], from the thumb's root.
+    """
+    points: Float = np.stack([runs.column[of_thumb], runs.row[of_thumb]], axis=-1, dtype=np.float64)
+    length = np.ones(len(points))
+    if len(points) > 2:
+        step = np.hypot(1.0, np.minimum(np.abs(np.diff(points[:, 1])), _LEAST_PX))
+        length[1:-1] = 0.5 * (step[1:] + step[:-1])
+    weights = (beyond_m > _BORDERS_M[:, None]) * length
+    total = weights.sum(axis=1)
+    seen = total >= _LEAST_PX
+    whole = length @ points / length.sum()
+    if (
+        not seen.any()
+    ):  # all of it on the ball: nearest to the thumb is where it is seen farthest from the root
+        return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
+    off = weights[seen] @ points / total[seen, None] - whole
+    mean = off.mean(axis=0)
+    return mean, float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))
