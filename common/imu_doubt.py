@@ -92,6 +92,11 @@ class Doubt:
         self._tilt_bias *= 1.0 - share
         return share
 
+    def contradicted(self, heading_rad: float) -> None:
+        """Rest tells another bias than rest before; one of them was a turn, and the heading may be off by so much."""
+        self._upright_bias, self._heading_bias = _BIAS_RAD_S**2, 0.0
+        self._heading = min(self._heading + heading_rad**2, _ANYWHERE_RAD**2)
+
     def _warmed(self, step_s: float) -> None:
         walk = _BIAS_WALK**2 * step_s
         self._bias = min(self._bias + walk, _BIAS_RAD_S**2)

@@ -15,7 +15,8 @@ own:
   mean that is zero moves the mean.
 - **Bias** is taken where `Stillness` sees rest, also above the library's 3 deg/s, at once where it is quite unknown; in
   motion gravity tells that of the axes that are level. The latter is noisy: it is kept apart and level, so that it
-  never turns the heading.
+  never turns the heading. Slow even turns look like rest: they move a bias that rest has told by little. Where rest
+  contradicts it for long, one of the two was a turn: the bias is learnt anew, and the heading is as unsure as that.
 
 Magnetometers are not used: steel in a desk turns them by more than a gyroscope drifts in minutes.
 """
@@ -40,6 +41,7 @@ _RATE_RAD_S, _FORCE_M_S2 = 100.0, 2000.0  # beyond any range there is (4000 deg/
 _FALLING_M_S2 = 1.0  # shorter forces have no direction
 _BIAS_RAD_S = radians(7.5)  # three sigma of what `Doubt` begins with
 _SURPRISE_RAD_S = radians(0.1)  # three of it beyond what is believed: rather a slow turn
+_CONTRARY_S = 6.0  # of such rest: an even turn hardly lasts so long, rather the bias was learnt in one
 _DAMPED = 4.0  # gain times the memory of gravity's mean is a quarter: critical damping
 _NONE, _ZERO, _UP = np.full(4, np.nan), np.zeros(3), np.array([0.0, 0.0, _G_M_S2])
 
@@ -60,6 +62,7 @@ class OrientationFilter:
         self._doubt, self._stillness = Doubt(), Stillness()
         self._bias, self._lean, self._gravity = _ZERO, _ZERO, _UP
         self._last_ns, self._rate = 0, _ZERO
+        self._agreed_s = self._contrary_s = 0.0  # since rest agreed with the bias; for how long it has not
 
     @property
     def at_rest(self) -> bool:
@@ -144,11 +147,21 @@ class OrientationFilter:
     def _rest(self, step_s: float, rate: Float, force: Float) -> None:
         """Learn the bias where the sensor lies still."""
         self._stillness.push(step_s, rate, force)
-        if self._stillness.still:
-            most = 3.0 * hypot(self._doubt.bias_rad_s, _SURPRISE_RAD_S)
-            share = self._doubt.rest(step_s)
-            self._bias = self._bias + share * np.clip(rate - self._bias, -most, most)
-            self._lean = (1.0 - share) * self._lean
+        self._agreed_s += step_s
+        if not self._stillness.still:
+            self._contrary_s = 0.0
+            return
+        off, most = rate - self._bias, 3.0 * hypot(self._doubt.bias_rad_s, _SURPRISE_RAD_S)
+        if np.abs(off).max() <= most:
+            self._agreed_s = self._contrary_s = 0.0
+        else:
+            self._contrary_s += step_s
+        if self._contrary_s > _CONTRARY_S:
+            self._doubt.contradicted(sqrt(off @ off) * (self._agreed_s + _CONTRARY_S))
+            self._contrary_s = 0.0
+        share = self._doubt.rest(step_s)
+        self._bias = self._bias + share * np.clip(off, -most, most)
+        self._lean = (1.0 - share) * self._lean
 
 
 def _settings(gain: float, step_s: float) -> imufusion.AhrsSettings:

@@ -288,7 +288,7 @@ class Ximu3Imu:
         """Errors of the port, in words that say what to do."""
         try:
             yield
-        except (OSError, termios.error) as error:
+        except (OSError, termios.error, ValueError, OverflowError) as error:  # the last two: of a baud rate
             number = error.errno if isinstance(error, OSError) else None
             raise ImuError(f"{self._place.path} {what}: {_why(number, error)}") from error
 
@@ -328,4 +328,8 @@ def _why(number: int | None, error: Exception) -> str:
         return "permission denied: `sudo usermod -aG dialout $USER`, then log in again"
     if number in (EBUSY, EWOULDBLOCK):
         return "another program has it open"
+    if "configure" in str(error):  # pyserial's word, without a number
+        return f"it is no serial port, or has not this baud rate ({error}); `phalanx-slave imu --list` lists ports"
+    if isinstance(error, ValueError | OverflowError):
+        return f"it does not take this baud rate: {error}"
     return str(error)

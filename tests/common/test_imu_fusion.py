@@ -236,6 +236,35 @@ def test_one_sample_of_the_future_does_not_shut_out_those_that_follow() -> None:
     assert fusion.counts == {"fusion.gap": 2}
 
 
+@pytest.mark.parametrize(
+    ("parts", "within_deg"),
+    [
+        (
+            [(4.0, 5.0), (20.0, 0.0)],
+            60.0,
+        ),  # learnt in a turn: 4 s of it and 6.5 s of rest with 5 deg/s are lost
+        ([(10.0, 0.0), (4.0, 5.0), (20.0, 0.0)], 3.0),  # a turn after rest moves what that has told by little
+        (
+            [(10.0, 0.0), (12.0, 3.0), (20.0, 0.0)],
+            45.0,
+        ),  # so long an even turn is taken for rest, until there is some
+    ],
+)
+def test_an_even_turn_that_looks_like_rest_is_found_out(
+    parts: list[tuple[float, float]], within_deg: float
+) -> None:
+    fusion, first, turned_deg = OrientationFilter(RATE_HZ), 0, 0.0
+    found = run(fusion, still(-60, 0.5))
+    for seconds, upright_deg_s in parts:
+        found = run(fusion, still(first, seconds, np.radians([0.2, -0.2, upright_deg_s])))
+        first += round(seconds * RATE_HZ)
+        turned_deg += seconds * upright_deg_s
+    off_deg = abs((heading_deg(found) - turned_deg + 180.0) % 360.0 - 180.0)
+    assert off_deg < within_deg
+    assert off_deg < 2.0 * np.degrees(found.heading_sigma_rad)
+    assert np.degrees(fusion.bias_rad_s) == pytest.approx([0.2, -0.2, 0.0], abs=0.05)
+
+
 def test_a_slow_sensor_has_no_gap_between_its_samples() -> None:
     fusion = OrientationFilter(8.0)
     found = run(fusion, still(0, 5.0)[::15])
