@@ -7,7 +7,6 @@ probability for each; what is believed is the mean over all.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from common.arrays import Float, Int
 from slave.wrist.led_depth import DARK, SATURATED, Float32
@@ -87,7 +86,8 @@ def bends_of(seen: Float32, bank: TipTemplates, gain: float) -> list[Bend | None
     reach = len(SHIFTS) // 2
     padded = np.zeros((5, seen.shape[1] + 2 * reach), dtype=np.float32)
     padded[:, reach:-reach] = seen
-    shifted = sliding_window_view(padded, seen.shape[1], axis=1).swapaxes(1, 2)
+    # Copied, not a view of windows: products of matrices want their numbers side by side.
+    shifted = np.stack([padded[:, k : k + seen.shape[1]] for k in range(len(SHIFTS))], axis=2)
     likeness, score = _score(unit, log_length, shifted, gain)
     score -= _SHIFT_PRIOR
     weight = np.exp(score - score.max(axis=(1, 2), keepdims=True))

@@ -14,16 +14,16 @@ from slave.wrist.strips import ROW_PX, THUMB, Strips
 from slave.wrist.tip_bends import Bend
 
 # Standard deviations, of a fingertip's radius: how far skin is off its cones, by radii that differ by 5 % from person
-# to person and by folds; and by the pulp, which shifts the middle of a tip that points at the camera or is folded.
+# to person and by folds; and by the pulp, which shifts the middle of a tip that points at the camera, is folded, or
+# turns about its own axis as the thumb's does.
 FLESH, PULP = 0.07, 0.12
 # Of the same: the templates are so far apart that where beliefs spread less, ends of simulated hands stray less still.
 BELIEF = 0.2
 PIXEL = 0.7  # px: edges in the noise
 # Of the brightness within: where a contour is drawn, the skin there being seen almost edge on.
 EDGE_SHARE = 0.2
-RIM = (
-    0.5 * EDGE_SHARE**2
-)  # of the radius: by Lambert's cosine a sphere is that dark so far inside its contour
+# Of the radius: by Lambert's cosine a sphere is that dark so far inside its contour.
+RIM = 0.5 * EDGE_SHARE**2
 CONTOUR_PX = 24.0  # how far from where it is expected a contour is sought
 BOTTOM_SHARE = 0.5  # of the steepest step of light: where it ends
 LEAST_FACING = 0.7  # from here on the end of a finger is seen whole, and the step below it too
@@ -79,7 +79,8 @@ class End:
     def place(self, middle: Float | None) -> tuple[tuple[float, float], float]:
         """Where it is and its standard deviation [px], with the middle (2,) of its half sphere where that is known."""
         bend, found, last = self.bend, list(self.found), len(self.column) - 1
-        pulp = PULP * (1.0 if bend.down else max(bend.facing, 0.0))
+        aside = bend.down or self.finger == THUMB
+        pulp = PULP * (1.0 if aside else max(bend.facing, 0.0))
         flesh = bend.radius_px * (FLESH**2 + pulp**2) ** 0.5
         if middle is not None:
             found.append((float(middle[1]) + bend.radius_px - bend.above_bottom, bend.above_bottom_sigma))
@@ -93,8 +94,7 @@ class End:
         u, row = (float(self.column[k]), k) if middle is None else (float(middle[0]), float(middle[1]))
         u += slope * (v - row)
         # What the edges differ by more than they may, all of them may be off by.
-        aside = pulp * bend.radius_px
-        spread = (max(1.0, apart) / sum(weights) + aside**2 + PIXEL**2) ** 0.5
+        spread = (max(1.0, apart) / sum(weights) + (pulp * bend.radius_px) ** 2 + PIXEL**2) ** 0.5
         return (u, v), spread
 
 
