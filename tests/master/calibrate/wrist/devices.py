@@ -38,7 +38,7 @@ def scene_of(seed: int, views: int, *, anywhere: bool = False) -> WristBoardScen
     poses = board_poses(
         OPTICS, BOARD.columns, BOARD.rows, BOARD.square_m, None if anywhere else plane, views, seed
     )
-    rig = replace(RIG, laser_plane=plane, laser=None, flat_field=None)
+    rig = replace(RIG, laser_plane=plane, laser=None, strobe=None, flat_field=None)
     return WristBoardScene(rig, CAMERA, BOARD.columns, BOARD.rows, BOARD.square_m, poses, seed=seed)
 
 
