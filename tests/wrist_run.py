@@ -41,7 +41,7 @@ def exact_triple(setup: RigSetup, now: WristTruth, k: int, t_ns: int | None = No
         laser_px=_where_seen(laser, 20.0),
         tip_uv=tips,
         tip_sigma_px=_where_seen(tips, 2.0),
-        tip_depth=_where_seen(tips, 0.1),
+        tip_depth=np.where(now.tip_visible, now.tip_xyz[:, 2], np.nan),
     )
 
 

@@ -94,9 +94,7 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
                 "laser_px": np.where(np.isnan(laser[..., 0]), np.nan, length_px),
                 "tip_uv": tip,
                 "tip_sigma_px": _where_seen(tip, TIP_SIGMA_PX),
-                "tip_depth": np.where(
-                    np.isnan(tip[..., 0]), np.nan, np.linalg.norm(truth["tip_xyz"], axis=2)
-                ),
+                "tip_depth": np.where(np.isnan(tip[..., 0]), np.nan, truth["tip_xyz"][..., 2]),
             },
         )
     except KeyError as error:

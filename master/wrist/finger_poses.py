@@ -78,6 +78,10 @@ class FingerPoses:
         out[..., DIP] = np.clip(base + slope * x[..., PIP], low, high)
         return out
 
+    def tips(self, angles_rad: Float) -> Float:
+        """Tips (..., 5, 3) [m], camera frame, of angles (..., 5, 4)."""
+        return transform(self._setup.T_camera_palm, self._tips.points(self._setup.model.chains(angles_rad)))
+
     def views(self, x: Float, wanted: Bool, cut: LaserCut | None = None) -> Views:
         """What is seen of some of the fingers with unknowns (N, 5, 3): the `wanted` (N, 5); NaN of the others."""
         cut = cut or self._cut

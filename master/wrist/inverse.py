@@ -63,7 +63,7 @@ class InverseModel:
 
     def __init__(self, setup: WristSetup) -> None:
         self.poses = FingerPoses(setup)
-        self._table = PoseTable(setup, self.poses)
+        self.table = PoseTable(setup, self.poses)
         self._loose = 12.0 / (self.poses.high - self.poses.low) ** 2  # (5, 3): anywhere within the range
 
     def __call__(self, seen: Float, cov: Float, coarse_rad: Float | None = None) -> Minima:
@@ -75,12 +75,12 @@ class InverseModel:
             cov: (5, 4, 4) its covariance, finite.
             coarse_rad: (5,) what the noise of the sensing makes of angles: a step shorter than half of it is the last.
         """
-        told: Bool = np.isfinite(seen.sum(axis=1)) & self._table.met
+        told: Bool = np.isfinite(seen.sum(axis=1)) & self.table.met
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
         x, finger = self._dips(np.where(told[:, None], seen, 0.0), told, white)
         misfit, seen = np.zeros(len(x)), seen[finger]
         for _ in range(_TABLE_STEPS):
-            y, J, _ = self._table.views(x, finger)
+            y, J, _ = self.table.views(x, finger)
             misfit, to = self._step(x, finger, white[finger], seen - y, J)
             x = x + to
         arrived = np.full(5, _ARRIVED_RAD)
@@ -90,11 +90,11 @@ class InverseModel:
 
     def _dips(self, seen: Float, told: Bool, white: Float) -> tuple[Float, Int]:
         """Where the least energy for each PIP has its minima over the PIP: poses (N, 3) and their fingers (N,)."""
-        places, energy = self._table.candidates(seen)
+        places, energy = self.table.candidates(seen)
         finger, _ = rows = np.nonzero(np.isfinite(energy) & told[:, None])
         x, profile = places[rows], np.full(energy.shape, np.inf)
         for _ in range(_PROFILE_STEPS):
-            y, J, _ = self._table.views(x, finger)
+            y, J, _ = self.table.views(x, finger)
             profile[rows], to = self._step(x, finger, white[finger], seen[finger] - y, J, bend=False)
             x = x + to
         places[rows] = x
@@ -120,7 +120,7 @@ class InverseModel:
         count, white = len(x), white[finger]
         slot = np.arange(count) - np.searchsorted(finger, finger)
         best_x, best, length = x.copy(), np.full(count, np.inf), np.full(count, np.nan)
-        _, J, _ = self._table.views(x, finger)
+        _, J, _ = self.table.views(x, finger)
         first, rank = np.unique(finger, return_index=True, return_inverse=True)[1:]
         best_J, moving = J.copy(), np.ones(count, np.bool_)
         y_before, x_before = np.full((count, SEEN), np.nan), x
@@ -146,7 +146,7 @@ class InverseModel:
         order = np.lexsort((best, finger))
         best_x, best = best_x[order], best[order]
         middle = 0.5 * (best_x + best_x[np.searchsorted(finger, finger)])
-        y, J, _ = self._table.views(middle, finger)
+        y, J, _ = self.table.views(middle, finger)
         midway, _ = self._step(middle, finger, white, seen - y, J)
         cov = self._cov(best_J[order], white, finger)
         return _minima(

@@ -1,44 +1,53 @@
 """Which level a finger is solved at (row D22): from its laser point by habit (FK), or from laser and fingertip (IK).
 
     fk     laser points only
-    ik     only fingers of which both are seen and agree; of the others nothing is said
-    auto   IK where it can be, else FK
+    ik     only fingers of which both are seen and agree, without habits; of the others nothing is said
+    auto   IK where it can be, habits counting as much as they are worth; else FK
 
-**A tip that is none** must not win by itself. Of the four numbers that are seen three are used up by the unknowns: what
-is left, the misfit, is chi-square with one degree of freedom, and more than three standard deviations refuse the tip
-(counted `tip_refused`). So does a line of which the pose found would show twice as much.
+**The angles** are the median of what is believed along the finger's valley (`master.wrist.valley`): it errs least, on
+average. How far light says the tip is away counts too, as soon as its unit is known (`master.wrist.light_unit`).
 
-**Ambiguous** is a finger of which two clearly different poses misfit by amounts that do not differ significantly
-(chi-square of one degree of freedom, 95 %). Of these the one nearest to the finger's last angles is taken, if these are
-fresh, else the most natural one; a pose that is so unnatural that this outweighs what it explains better is none of
-them. The covariance is widened to hold all. Where a fingertip turns back in the image, at the nearest place of its way
-to the camera, both sides of that turn explain it: if the misfit between them is no more than noise they are one wide
-valley, and its mean is taken.
+**A tip that is none** must not win by itself. Where no pose explains laser and tip together within three standard
+deviations it is refused (counted `tip_refused`), and where the pose found would show a line twice as long as was seen.
+
+**Habits** are those of a natural hand, a straight or a free one, and all fingers tell which of them it is: a finger
+that defies habit clearly takes from the others the belief in it. Then FK is not believed either: a finger of which only
+the laser point is known may have any PIP that explains this point and hides the tip, and all of them are its doubt.
+
+**Ambiguous** is a finger whose belief has two parts, with a PIP between them that is clearly less likely, or one so
+wide that it is as good as two. That part is believed which weighs more, or where frames follow each other which is
+near to the last angles. The covariance holds all of them.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Bool, Float
-from common.hand_limits import FLEXION
+from common.arrays import Bool, Float, Int
 from common.messages import Level
-from master.ik.priors import FreeHand, Priors
+from master.ik.priors import Priors
 from master.wrist.belief import FingerAngles
 from master.wrist.finger_poses import SEEN, UNKNOWNS
 from master.wrist.forward import DIP, PIP
-from master.wrist.inverse import InverseModel, Minima
+from master.wrist.inverse import InverseModel
+from master.wrist.light_unit import LightUnit
+from master.wrist.pose_table import SHAPE
 from master.wrist.setup import WristSetup
 from master.wrist.sight import HARDLY, SightNoise
+from master.wrist.valley import Valley, Valleys
 
 _REFUSED = 9.0
-_AS_GOOD = 3.84
-_FLAT = 1.0  # two minima with no more than one standard deviation between them are one
-_APART_RAD = np.radians(10.0)  # in flexion or PIP: clearly another pose
+_APART_RAD = np.radians(10.0)  # in PIP: clearly another pose
+_PASS = 0.4  # of the lower top that a density falls below between two parts
+_OTHER = 0.05  # of all belief: less than this is no other part
+_GOES_ON_RAD = np.radians(20.0)  # by which a PIP may have moved since the finger was last seen
+_CONTRADICTED = 0.01  # less probable than this, a natural hand is none
 _RATIOS = 0.5 * (
     0.84 - 2.0 / 3.0
 )  # the papers' DIP per PIP lie by this to both sides of their middle (row I12)
 _STIFF_RAD = np.radians(1.0)
+_FLESH_RAD = np.radians(2.5)  # 2 mm of a tip that is not quite where the hand file has it, over two bones
+_SHOWN = np.log(10.0)  # of ten tips that the model says are seen nine are found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +61,7 @@ class Sighting:
         laser_px: (5,) lengths of the lines.
         tip: (5, 2) tips (x / z, y / z).
         tip_sigma_px: (5,).
+        tip_depth: (5,) of them by light, relative.
     """
 
     laser_m: Float
@@ -60,46 +70,60 @@ class Sighting:
     laser_px: Float
     tip: Float
     tip_sigma_px: Float
+    tip_depth: Float
 
 
 class Levels:
     """Solves fingers at the level that the rig asks for. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup, model: InverseModel, priors: Priors | None = None) -> None:
-        self._model, self._hand, self._sight = model, setup.model, SightNoise(setup)
+        priors = priors or Priors()
+        self._poses, self._table, self._hand = model.poses, model.table, setup.model
+        self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, model.table, priors)
         self._alone = setup.level == "ik"
-        habits = priors or Priors()
-        natural = habits.natural_share
-        self._hands = (natural, habits.natural_flexion), (1.0 - natural, (habits.free or FreeHand()).pip)
+        self._share = np.log([priors.natural_share, *2 * [0.5 * (1.0 - priors.natural_share)]])
 
-    def __call__(self, natural: FingerAngles, sight: Sighting, last_rad: Float) -> tuple[FingerAngles, Bool]:
+    def __call__(
+        self, natural: FingerAngles, sight: Sighting, last_rad: Float, unit: LightUnit, news: float = 1.0
+    ) -> tuple[FingerAngles, Bool]:
         """Angles of fingers, and whose tip was refused (5,).
 
         Args:
             natural: What the laser points say by habit.
             sight: What was seen.
             last_rad: (5, 4) the fingers' last angles; NaN where those are too old.
+            unit: What is known of the unit of `sight.tip_depth`; it is told more.
+            news: How far this pose is from the last one: 1 where they are unrelated.
         """
         seen = np.concatenate([sight.laser_m, sight.tip], axis=1)
         both: Bool = np.isfinite(seen.sum(axis=1))
-        coarse_rad = self._sight.turn_rad(sight.tip_sigma_px, sight.distance_m)
-        minima = self._model(seen, self._noise(sight, both), coarse_rad)
-        shown = self._sight.shown(np.nan_to_num(minima.length_px[:, 0]), sight.laser_px)
-        solved = both & (minima.misfit[:, 0] < _REFUSED) & (shown >= HARDLY)
-        found = self._angles(minima, solved, last_rad)
-        no = ~solved
-        kept = replace(natural, angles_rad=natural.angles_rad.copy(), cov_rad2=natural.cov_rad2.copy())
+        nodes, energy = self._table.candidates(np.where(both[:, None], seen, 0.0))
+        nodes[~(np.isfinite(energy) & both[:, None])] = np.nan
+        valley = self._valleys(nodes, np.where(both[:, None], seen, np.nan), self._noise(sight, both))
+        believed = both & (valley.misfit.min(axis=1) < _REFUSED)
+        mixed, habit = self._mixed(valley, believed)
+        x = np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)
+        depth_m = self._poses.tips(self._poses.angles(x))[..., 2].T
+        log = mixed + unit.push(
+            np.where(believed, sight.tip_depth, np.nan), depth_m, _probable(mixed, believed), news
+        )
+        found, at = self._angles(valley, log, believed, last_rad)
+        shown = self._sight.shown(valley.length_px[np.arange(5), at], sight.laser_px)
+        solved = believed & (shown >= HARDLY)
+        kept = natural if habit > _CONTRADICTED else self._free(natural, sight, solved)
+        kept = replace(kept, angles_rad=kept.angles_rad.copy(), cov_rad2=kept.cov_rad2.copy())
         kept.angles_rad[solved], kept.cov_rad2[solved] = found.angles_rad[solved], found.cov_rad2[solved]
+        no = ~solved
         if self._alone:
             kept.angles_rad[no], kept.cov_rad2[no] = np.nan, np.nan
-        level = natural.level if not self._alone else np.full(5, np.uint8(Level.NONE))
+        level = kept.level if not self._alone else np.full(5, np.uint8(Level.NONE))
         return replace(
             kept,
-            told=solved | (natural.told & (not self._alone)),
-            past=natural.past & no,
-            off=natural.off & no,
+            told=solved | (kept.told & (not self._alone)),
+            past=kept.past & no,
+            off=kept.off & no,
             level=np.where(solved, np.uint8(Level.IK), level),
-            ambiguous=found.ambiguous,
+            ambiguous=found.ambiguous & solved,
         ), both & no
 
     def _noise(self, sight: Sighting, both: Bool) -> Float:
@@ -111,54 +135,116 @@ class Levels:
         out[:, 2:, 2:] = np.where(both[:, None, None], tip, np.eye(2))
         return out
 
-    def _angles(self, minima: Minima, solved: Bool, last_rad: Float) -> FingerAngles:
-        """Of the minima of each finger the one that is believed."""
-        rows, x = np.arange(5), minima.x_rad
-        unnatural = self._unnatural(x)
-        cost = minima.misfit + unnatural
-        walked = (np.abs(x - last_rad[:, None, :UNKNOWNS]) ** 2).sum(axis=-1)
-        rank = np.where(np.isfinite(last_rad[:, :1]), walked, unnatural)
-        likely = cost <= cost.min(axis=1, keepdims=True) + _AS_GOOD
-        best = np.where(likely, np.nan_to_num(rank, nan=np.inf), np.inf).argmin(axis=1)
-        near = (np.abs(x[rows, best] - x[:, 0])[:, 1:] <= _APART_RAD).all(axis=1)
-        best = np.where(near, 0, best)
-        chosen = x[rows, best]
-        as_good = solved[:, None] & (minima.misfit <= minima.misfit[rows, best][:, None] + _AS_GOOD)
-        away = np.where(as_good[..., None], x - chosen[:, None], 0.0)
-        ambiguous = (np.abs(away[..., 1:]) > _APART_RAD).any(axis=(1, 2))
-        weight = as_good / np.maximum(as_good.sum(axis=1, keepdims=True), 1)
-        cov = minima.cov_rad2[rows, best] + np.swapaxes(away, 1, 2) @ (weight[..., None] * away)
-        # Of one wide valley the mean is believed.
-        valley = as_good & (minima.midway < minima.misfit[:, :1] + _FLAT)
-        worse = np.nan_to_num(cost, posinf=1e9) - np.nan_to_num(cost[rows, best], posinf=1e9)[:, None]
-        part = np.where(valley, np.exp(-0.5 * np.clip(worse, -50.0, 50.0)), 0.0)
-        part[rows, best] = np.maximum(part[rows, best], 1e-9)
-        wide = (valley.sum(axis=1) > 1) & valley[rows, best] & ambiguous
-        mean = chosen + (part[..., None] * away).sum(axis=1) / part.sum(axis=1)[:, None]
-        return self._whole(np.where(wide[:, None], mean, chosen), cov, solved, ambiguous)
+    def _mixed(self, valley: Valley, believed: Bool) -> tuple[Float, float]:
+        """Logarithms of what is believed of each pose (5, P), and how probable it is that the hand is natural."""
+        if self._alone:
+            return valley.likely, 1.0
+        of_all = np.where(believed, valley.evidence, 0.0).sum(axis=1) + self._share
+        hands = of_all - np.logaddexp.reduce(of_all)
+        return np.logaddexp.reduce(hands[:, None, None] + valley.log), float(np.exp(hands[0]))
 
-    def _unnatural(self, x: Float) -> Float:
-        """What poses (5, K, 3) cost by being unnatural, as chi-square: -2 ln of how rare that is; inf where NaN.
+    def _free(self, natural: FingerAngles, sight: Sighting, solved: Bool) -> FingerAngles:
+        """Fingers of a hand that is not natural, of which the laser point alone is known: what is possible."""
+        point = np.isfinite(sight.laser_m[:, 0]) & np.isfinite(natural.angles_rad[:, 0]) & ~solved
+        if not point.any():
+            return natural
+        start = np.repeat(natural.angles_rad[:, None, :UNKNOWNS], SHAPE[PIP], axis=1)
+        start[..., PIP] = self._table.first[:, None, PIP] + self._table.step[:, None, PIP] * np.arange(
+            SHAPE[PIP]
+        )
+        start[~point] = np.nan
+        nobody = np.zeros(5, np.bool_)
+        valley = self._valleys(start, sight.laser_m, self._noise(sight, nobody)[:, :2, :2])
+        log = np.logaddexp(valley.log[1], valley.log[2])
+        log[self._poses.tips_shown(np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)).T] -= _SHOWN
+        found, _ = self._angles(valley, log, point, np.full((5, 4), np.nan))
+        point &= valley.misfit.min(axis=1) < _REFUSED
+        angles, cov = natural.angles_rad.copy(), natural.cov_rad2.copy()
+        angles[point], cov[point] = found.angles_rad[point], found.cov_rad2[point]
+        return replace(
+            natural, angles_rad=angles, cov_rad2=cov, told=natural.told & ~point, off=natural.off | point
+        )
 
-        Some hands bend by habit and some are free (`master.ik.priors`), so it is no more than some units.
-        """
-        slope, base = self._model.poses.habit
-        strayed = x[..., FLEXION] - base[:, None] - slope[:, None] * x[..., PIP]
-        share, rare = 0.0, 0.0
-        for part, sigma in self._hands:
-            share = share + part / sigma * np.exp(-0.5 * (strayed / sigma) ** 2)
-            rare += part / sigma
-        return -2.0 * np.log(np.nan_to_num(share / rare, nan=0.0) + 1e-300)
+    def _angles(self, valley: Valley, log: Float, known: Bool, last_rad: Float) -> tuple[FingerAngles, Int]:
+        """The angles that are believed, and at which of the poses (5,) they lie."""
+        x, p = np.nan_to_num(valley.x_rad), np.nan_to_num(_probable(log, known))
+        pip = x[..., PIP]
+        going = np.exp(-0.5 * ((pip - last_rad[:, PIP, None]) / _GOES_ON_RAD) ** 2)
+        part, parted = _part(p, p * np.nan_to_num(going, nan=1.0))
+        inside = np.where(part, p, 0.0)
+        at, chosen = _median(x, inside)
+        away = x - chosen[:, None]
+        cov = np.swapaxes(away, 1, 2) @ (p[..., None] * away)
+        cov[:, :2, :2] += (p[..., None, None] * np.nan_to_num(valley.side_rad2)).sum(axis=1)
+        cov[:, range(UNKNOWNS), range(UNKNOWNS)] += _STIFF_RAD**2
+        cov[:, PIP, PIP] += _FLESH_RAD**2
+        ambiguous = known & parted & ((p * (np.abs(away[..., PIP]) > _APART_RAD)).sum(axis=1) > _OTHER)
+        return self._whole(chosen, cov, known, ambiguous), at
 
     def _whole(self, x: Float, cov: Float, solved: Bool, ambiguous: Bool) -> FingerAngles:
         """Four angles of three unknowns (5, 3)."""
         by = np.zeros((5, 4, UNKNOWNS))
         by[:, range(UNKNOWNS), range(UNKNOWNS)] = 1.0
-        by[:, DIP, PIP] = self._model.poses.dip_per_pip
+        by[:, DIP, PIP] = self._poses.dip_per_pip
         whole = by @ cov @ np.swapaxes(by, 1, 2)
         loose = max(self._hand.dip_spread_rad, _STIFF_RAD)
         whole[:, DIP, DIP] += loose**2 + (_RATIOS * x[:, PIP]) ** 2
-        angles = self._hand.clamp(self._model.poses.angles(x))
+        angles = self._hand.clamp(self._poses.angles(x))
         level = np.where(solved, np.uint8(Level.IK), np.uint8(Level.NONE))
         no = np.zeros(5, np.bool_)
         return FingerAngles(angles, whole, solved, no, no, level, ambiguous)
+
+
+def _probable(log: Float, known: Bool) -> Float:
+    """Probabilities (5, P) of logarithms; NaN of fingers of which nothing is known."""
+    top = log.max(axis=1, keepdims=True)
+    p = np.exp(log - np.where(np.isfinite(top), top, 0.0))
+    total = p.sum(axis=1, keepdims=True)
+    return np.where(known[:, None] & (total > 0.0), p / np.where(total > 0.0, total, 1.0), np.nan)
+
+
+def _median(x: Float, p: Float) -> tuple[Int, Float]:
+    """Where along poses (5, P, 3) half of the weights (5, P) lies, and the pose there (5, 3)."""
+    rows, last = np.arange(len(p)), p.shape[1] - 1
+    half = np.cumsum(p, axis=1) - 0.5 * p - 0.5 * p.sum(axis=1, keepdims=True)
+    at = np.clip((half < 0.0).sum(axis=1) - 1, 0, last)
+    after = np.minimum(at + 1, last)
+    way = half[rows, after] - half[rows, at]
+    share = np.where(
+        (way > 0.0) & (p[rows, after] > 0.0), -half[rows, at] / np.where(way > 0.0, way, 1.0), 0.0
+    )
+    share = np.clip(share, 0.0, 1.0)[:, None]
+    return at, (1.0 - share) * x[rows, at] + share * x[rows, after]
+
+
+def _part(p: Float, preferred: Float) -> tuple[Bool, Bool]:
+    """Which poses (5, P) make up the part of a density (5, P) that is preferred, and whether there are others (5,).
+
+    Two tops are of one part where the density does not fall clearly between them.
+    """
+    part, parted = np.ones(p.shape, np.bool_), np.zeros(len(p), np.bool_)
+    for f, row in enumerate(p):
+        ends = _ends(row)
+        parted[f] = len(ends) > 2
+        if parted[f]:
+            weight = np.add.reduceat(preferred[f], ends[:-1])
+            best = int(weight.argmax())
+            part[f] = False
+            part[f, ends[best] : ends[best + 1]] = True
+    return part, parted
+
+
+def _ends(row: Float) -> Int:
+    """Where the parts of a density (P,) begin, and its length."""
+    rising = np.diff(row, prepend=0.0, append=0.0)
+    tops = np.flatnonzero((rising[:-1] > 0.0) & (rising[1:] <= 0.0))
+    ends = [0]
+    top = tops[0] if len(tops) else 0
+    for other in tops[1:]:
+        low = top + int(row[top : other + 1].argmin())
+        if row[low] < _PASS * min(row[top], row[other]):
+            ends.append(low)
+            top = other
+        elif row[other] > row[top]:
+            top = other
+    return np.array([*ends, len(row)])

@@ -35,11 +35,15 @@ from master.wrist.inverse import InverseModel
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
 from master.wrist.levels import Levels, Sighting
+from master.wrist.light_unit import LightUnit
 from master.wrist.palm_world import NO_WORLD, PalmWorld
 from master.wrist.pose import PoseMaker
 from master.wrist.setup import WristSetup
 
 _FORGET_S = 0.5
+_LINGERS_S = (
+    0.5  # a hand at work has another pose after such a time: sooner, poses tell the same of the light
+)
 _NEVER_NS = -(2**62)
 _AWAY_M = 0.1  # of fingertips from the camera, where a filter must know millimetres
 
@@ -78,6 +82,7 @@ class WristPipeline:
         self._smooth, self._smooth_tips = (
             _point_filter(setup, self._axes) if continuous else None for _ in range(2)
         )
+        self._light, self._told_ns = LightUnit(), _NEVER_NS
         self._last_ns = _NEVER_NS
         self._angles, self._cov = np.full((5, 4), np.nan), np.full((5, 4, 4), np.nan)
         self._seen_ns = np.full(5, _NEVER_NS)
@@ -134,10 +139,13 @@ class WristPipeline:
         if self._levels is None:
             return natural
         tip, sigma_px = self._tips(t_ns, message)
-        sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px)
+        sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px, message.tip_depth)
         fresh = self._continuous & (1e-9 * (t_ns - self._seen_ns) <= _FORGET_S)
         last = np.where(fresh[:, None], self._angles, np.nan)
-        found, refused = self._levels(natural, sight, last)
+        gone_s = 1e-9 * (t_ns - self._told_ns)
+        news = -np.expm1(-gone_s / _LINGERS_S) if self._continuous else 1.0
+        self._told_ns = t_ns
+        found, refused = self._levels(natural, sight, last, self._light, float(news))
         self._count("tip_refused", refused)
         self._count("ik", found.level == Level.IK)
         return found

@@ -17,9 +17,6 @@ _WHOLE = 0.75  # a line seen to this share of its length is not missing a part
 HARDLY = 0.5  # less of it than this is no measurement of the finger
 _CURVES = 1 / 3
 _HINGE_RAD = np.radians(4.0)  # by which the axes of real hinges lie askew to those of a hand file
-_DIP_RAD = np.radians(
-    4.3
-)  # DIP per PIP is 2/3 or 0.84, says who is asked (row I12): by so much at a PIP of 50 degrees
 _PALM_M2 = (7e-4) ** 2  # what calibration leaves of plane and palm: a palm pitched by 0.2 degrees, and 0.3 mm
 
 
@@ -29,8 +26,7 @@ class SightNoise:
     def __init__(self, setup: WristSetup) -> None:
         self._skin_m2 = (SPREAD * Skin.of(setup.model).palmar_m.mean(axis=1)) ** 2
         beyond_m = Fingertips.of(setup.model).beyond_m
-        last_m = np.linalg.norm(setup.model.bone_m[:, 2], axis=-1) + beyond_m
-        self._tip_m2 = (SPREAD * beyond_m) ** 2 + _PALM_M2 + (_DIP_RAD * last_m) ** 2
+        self._tip_m2 = (SPREAD * beyond_m) ** 2 + _PALM_M2
         self._lever_m = np.linalg.norm(setup.model.bone_m[:, 1:], axis=-1).sum(axis=1) + beyond_m
         hinge = setup.T_camera_palm[:2, 0] / np.linalg.norm(setup.T_camera_palm[:2, 0])
         self._rolled_m2 = (_HINGE_RAD * self._lever_m)[:, None, None] ** 2 * np.outer(hinge, hinge)
