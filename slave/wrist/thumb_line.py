@@ -12,11 +12,12 @@ from slave.wrist.runs import Runs
 
 # Where the border lies, beyond where the skin over the MCP of a straight thumb is: bending it by 50 degrees takes the
 # plane that halves its angle back by half a radius on the palm's side, and nowhere at its side. It is known no better
-# than bones (1 mm, calibrated), the device's shift (1 mm along the thumb) and turn (2.5 degrees at 6 cm).
-_BORDER_M, _BORDER_SIGMA_M = -1.5e-3, 3e-3
-# Middles of nine parts, alike in probability, of a normal distribution.
-_NORMAL = np.array([-1.593, -0.967, -0.589, -0.282, 0.0, 0.282, 0.589, 0.967, 1.593])
-_BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _NORMAL
+# than its bone (8 %, 3 mm), the device's shift (1 mm along the thumb) and turn (2.5 degrees at 6 cm).
+_BORDER_M, _BORDER_SIGMA_M = -1.5e-3, 4e-3
+# Middles of nine parts, alike in probability, of Student's t with three degrees of freedom: some hands are far off.
+_T3 = np.array([-2.23, -1.15, -0.66, -0.31, 0.0, 0.31, 0.66, 1.15, 2.23])
+_BORDERS_M: Float = _BORDER_M + _BORDER_SIGMA_M * _T3
+_TAILS = 1.5  # centroids lump at the whole line and at its end: 1.96 deviations of that hold less than 95 %
 _LEAST_PX = 4.0  # of line, for a centroid
 
 
@@ -43,4 +44,4 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
         return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
     off = weights[seen] @ points / total[seen, None] - whole
     mean = off.mean(axis=0)
-    return mean, float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))
+    return mean, _TAILS * float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))
