@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.geometry import transform
 from common.hand_limits import ABDUCTION, FLEXION
 from master.wrist.fingertip import Fingertips
@@ -95,6 +95,18 @@ class FingerPoses:
         seen[wanted, :2], length[wanted] = line.point_m, line.length_px
         seen[..., 2:] = tips[..., :2] / tips[..., 2:]
         return Views(seen, length)
+
+    def of_fingers(self, x: Float, finger: Int) -> tuple[Float, Float]:
+        """What is seen (N, 4) of poses (N, 3) of fingers (N,), each its own, and the lengths of the lines (N,) [px]."""
+        rank = np.empty(len(x), np.int64)
+        for f in range(5):
+            of = finger == f
+            rank[of] = np.arange(np.count_nonzero(of))
+        rows = int(rank.max(initial=-1)) + 1
+        grid, wanted = np.zeros((rows, 5, UNKNOWNS)), np.zeros((rows, 5), np.bool_)
+        grid[rank, finger], wanted[rank, finger] = x, True
+        views = self.views(grid, wanted)
+        return views.seen[rank, finger], views.length_px[rank, finger]
 
     def tips_shown(self, x: Float) -> Bool:
         """Whether the camera sees the tips (N, 5) of unknowns (N, 5, 3), or these lie just behind a finger's edge."""

@@ -10,9 +10,12 @@ low, or bent and high, may show its tip at the same place. All are looked for, t
 1. **table**: for every PIP of a grid the node that explains best what was seen (`PoseTable.candidates`), brought by
    Gauss-Newton steps on the interpolated table to the least energy at that PIP;
 2. **dips** of this energy over the PIP: from there the PIP moves too, and those that meet are one;
-3. **exactly**: the few that are left are refined with the laser's cut itself, until a step is short against what the
-   noise of the sensing makes of angles. Its derivatives are those of the table for one step, differences for two, and
-   then mended after every step by what the step did (Broyden 1965).
+3. **exactly**: where the corners of the table's cell differ by much of the noise in what they say of the laser point,
+   the few that are left are refined with the laser's cut itself, until a step is short against what the noise of the
+   sensing makes of angles. Derivatives are those of the table, mended after every step by what the step did (Broyden
+   1965). Elsewhere the table is as good as the cut;
+4. where the sensing has **no noise** to speak of, all are followed down to what rounding leaves of the energy, and who
+   has none is sought on (`master.wrist.exact_search`).
 
 An unknown at the end of its range stays there while the energy falls towards the outside (projected Newton, Bertsekas
 1982).
@@ -23,20 +26,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
+from master.wrist.candidates import MINIMA, Found, apart
+from master.wrist.exact_search import ExactSearch
+from master.wrist.finger_poses import SEEN, FingerPoses
 from master.wrist.forward import PIP
 from master.wrist.pose_table import PoseTable
 from master.wrist.setup import WristSetup
 
-MINIMA = 3  # of one finger that are refined
-_PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 8
-_NUDGED = 2  # of the exact steps: those whose derivatives are differences of what is seen
-_NUDGE_RAD = np.radians(0.2)
+_PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 3
 _FARTHEST_RAD = np.radians(12.0)  # of one step
 _ARRIVED_RAD = np.radians(0.05)  # what is left after so short a step is a part of it
-_SAME_RAD = np.radians(4.0)  # nearer to each other than this, two candidates are on their way to one minimum
+_IN_DOUBT = (
+    0.5  # standard deviations by which a table's corners may differ, which is twice what it is wrong by
+)
+_EXACT_RAD = np.radians(0.02)  # sensing that turns a finger by no more is none
 _BEATEN = 15.0  # nor is it refined further if it is exactly known to be worse by this
-_HOPELESS = 40.0  # worse than the best by this on the table, a candidate is none; a table is wrong by less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +68,7 @@ class InverseModel:
     def __init__(self, setup: WristSetup) -> None:
         self.poses = FingerPoses(setup)
         self.table = PoseTable(setup, self.poses)
+        self._search = ExactSearch(self.poses, self.table)
         self._loose = 12.0 / (self.poses.high - self.poses.low) ** 2  # (5, 3): anywhere within the range
 
     def __call__(self, seen: Float, cov: Float, coarse_rad: Float | None = None) -> Minima:
@@ -78,15 +83,18 @@ class InverseModel:
         told: Bool = np.isfinite(seen.sum(axis=1)) & self.table.met
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(cov)), np.float64)
         x, finger = self._dips(np.where(told[:, None], seen, 0.0), told, white)
-        misfit, seen = np.zeros(len(x)), seen[finger]
+        misfit = np.zeros(len(x))
         for _ in range(_TABLE_STEPS):
             y, J, _ = self.table.views(x, finger)
-            misfit, to = self._step(x, finger, white[finger], seen - y, J)
+            misfit, to = self._step(x, finger, white[finger], seen[finger] - y, J)
             x = x + to
-        arrived = np.full(5, _ARRIVED_RAD)
-        if coarse_rad is not None:
-            arrived = np.fmax(arrived, 0.5 * coarse_rad)
-        return self._exact(*self._left(x, finger, misfit, seen), white, arrived)
+        keep = apart(x, finger, misfit)
+        coarse = np.zeros(5) if coarse_rad is None else np.nan_to_num(coarse_rad)
+        exact = told & (coarse < _EXACT_RAD)
+        found = self._refined(x[keep], finger[keep], seen, white, np.fmax(0.5 * coarse, _ARRIVED_RAD), exact)
+        if exact.any():
+            found = self._search(found, exact, seen, white)
+        return self._minima(found, seen, white)
 
     def _dips(self, seen: Float, told: Bool, white: Float) -> tuple[Float, Int]:
         """Where the least energy for each PIP has its minima over the PIP: poses (N, 3) and their fingers (N,)."""
@@ -103,78 +111,59 @@ class InverseModel:
         dip[:, :-1] &= profile[:, :-1] <= profile[:, 1:]
         return places[dip], np.nonzero(dip)[0]
 
-    def _left(self, x: Float, finger: Int, misfit: Float, seen: Float) -> tuple[Float, Int, Float]:
-        """Of candidates (N) those that are worth refining, sorted by finger and misfit, with what was seen of each."""
-        order = np.lexsort((misfit, finger))
-        x, finger, misfit, seen = x[order], finger[order], misfit[order], seen[order]
-        rank = np.arange(len(x))
-        better = (finger[:, None] == finger) & (rank < rank[:, None])
-        close = (np.abs(x[:, None] - x)[..., 1:] < _SAME_RAD).all(axis=-1)
-        first = np.searchsorted(finger, finger)
-        keep = ~(better & close).any(axis=1) & (misfit < misfit[first] + _HOPELESS)
-        keep &= (better & keep).sum(axis=1) < MINIMA
-        return x[keep], finger[keep], seen[keep]
+    def _refined(
+        self, x: Float, finger: Int, seen: Float, white: Float, arrived_rad: Float, exact: Bool
+    ) -> Found:
+        """What candidates (N, 3) of fingers (N,) lead to; by the cut where the table is in doubt.
 
-    def _exact(self, x: Float, finger: Int, seen: Float, white: Float, arrived_rad: Float) -> Minima:
-        """The minima that poses (N, 3) of fingers (N,), sorted, are near to; `seen` (N, 4) of each."""
-        count, white = len(x), white[finger]
-        slot = np.arange(count) - np.searchsorted(finger, finger)
-        best_x, best, length = x.copy(), np.full(count, np.inf), np.full(count, np.nan)
-        _, J, _ = self.table.views(x, finger)
-        first, rank = np.unique(finger, return_index=True, return_inverse=True)[1:]
-        best_J, moving = J.copy(), np.ones(count, np.bool_)
-        y_before, x_before = np.full((count, SEEN), np.nan), x
-        for k in range(_EXACT_STEPS if count else 0):
-            if 0 < k <= _NUDGED:
-                y, long, nudged = self._nudged(x, finger, slot, moving)
-                J = np.where(np.isfinite(nudged).all(axis=(1, 2), keepdims=True), nudged, J)
-            else:
-                y, long = self._views(x, finger, slot, moving)
-                J = _mended(J, x - x_before, y - y_before)
+        Those of `exact` (5,) fingers are left as they are.
+        """
+        white, seen = white[finger], seen[finger]
+        y, J, length = self.table.views(x, finger)
+        doubt = self.table.doubt(x, finger)
+        doubt = (white[:, :2, :2] @ doubt[..., None])[..., 0]
+        moving = ~exact[finger] & (np.abs(doubt).max(axis=1) > _IN_DOUBT)
+        best, _ = self._step(x, finger, white, seen - y, J)
+        best[moving], length[moving] = np.inf, np.nan
+        best_x, best_J = x.copy(), J.copy()
+        y_before, x_before = np.full((len(x), SEEN), np.nan), x
+        for _ in range(_EXACT_STEPS):
+            if not moving.any():
+                break
+            y, long = np.full((len(x), SEEN), np.nan), np.full(len(x), np.nan)
+            y[moving], long[moving] = self.poses.of_fingers(x[moving], finger[moving])
+            J = _mended(J, x - x_before, y - y_before)
             misfit, to = self._step(x, finger, white, seen - y, J)
             won = misfit < best
             best_x[won], best[won], length[won], best_J[won] = x[won], misfit[won], long[won], J[won]
             # Where the laser misses, or a step led uphill: half the way back to the best.
             to = np.where(won[:, None], to, 0.5 * (best_x - x))
             x_before, y_before, x = x, y, x + to
-            moving &= (np.abs(to) > arrived_rad[finger, None]).any(axis=1)
-            arrived = won & ~moving
+            short = (np.abs(to) <= arrived_rad[finger, None]).all(axis=1)
+            arrived = moving & won & short
             best_x[arrived] = x[arrived]
-            moving &= best < np.minimum.reduceat(best, first)[rank] + _BEATEN
-            if not moving.any():
-                break
-        order = np.lexsort((best, finger))
-        best_x, best = best_x[order], best[order]
-        middle = 0.5 * (best_x + best_x[np.searchsorted(finger, finger)])
+            least = np.full(5, np.inf)
+            np.minimum.at(least, finger, best)
+            moving &= ~short & (best < least[finger] + _BEATEN)
+        return Found(best_x, finger, best, length, best_J)
+
+    def _minima(self, found: Found, seen: Float, white: Float) -> Minima:
+        """Those of each finger in their order, with what is told of them."""
+        found = found.of(np.lexsort((found.misfit, found.finger)))
+        finger = found.finger
+        slot = np.arange(len(finger)) - np.searchsorted(finger, finger)
+        middle = 0.5 * (found.x_rad + found.x_rad[np.searchsorted(finger, finger)])
         y, J, _ = self.table.views(middle, finger)
-        midway, _ = self._step(middle, finger, white, seen - y, J)
-        cov = self._cov(best_J[order], white, finger)
-        return _minima(
-            finger, slot, x_rad=best_x, cov_rad2=cov, misfit=best, length_px=length[order], midway=midway
+        midway, _ = self._step(middle, finger, white[finger], seen[finger] - y, J)
+        return _table_of(
+            finger,
+            slot,
+            x_rad=found.x_rad,
+            cov_rad2=self._cov(found.J, white[finger], finger),
+            misfit=found.misfit,
+            length_px=found.length_px,
+            midway=midway,
         )
-
-    def _nudged(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float, Float]:
-        """As `_views`, and how it changes with each unknown (N, 4, 3) [1/rad]."""
-        count = len(x)
-        many = np.repeat(x[None], 1 + UNKNOWNS, axis=0)
-        inwards = _NUDGE_RAD * (1.0 - 2.0 * (x + _NUDGE_RAD > self.poses.high[finger]))
-        for k in range(UNKNOWNS):
-            many[1 + k, :, k] += inwards[:, k]
-        slots = slot + MINIMA * np.arange(1 + UNKNOWNS)[:, None]
-        of_all = np.tile(finger, 1 + UNKNOWNS), slots.ravel(), np.tile(wanted, 1 + UNKNOWNS)
-        y, length = self._views(many.reshape(-1, UNKNOWNS), *of_all)
-        by = np.empty((count, SEEN, UNKNOWNS))
-        for k in range(UNKNOWNS):
-            by[..., k] = (y[(1 + k) * count : (2 + k) * count] - y[:count]) / inwards[:, k, None]
-        return y[:count], length[:count], by
-
-    def _views(self, x: Float, finger: Int, slot: Int, wanted: Bool) -> tuple[Float, Float]:
-        """What is seen (N, 4) of poses (N, 3), exactly, and how long the line is (N,); NaN where not wanted."""
-        slots = int(slot.max()) + 1
-        grid, which = np.zeros((slots, 5, UNKNOWNS)), np.zeros((slots, 5), np.bool_)
-        grid[slot, finger], which[slot, finger] = x, wanted
-        views = self.poses.views(grid, which)
-        return views.seen[slot, finger], views.length_px[slot, finger]
 
     def _step(
         self, x: Float, finger: Int, white: Float, off: Float, J: Float, bend: bool = True
@@ -204,8 +193,8 @@ class InverseModel:
         return np.asarray(np.linalg.inv(information), np.float64)
 
 
-def _minima(finger: Int, slot: Int, **values: Float) -> Minima:
-    """Values (N, ...) of minima, as many of each finger."""
+def _table_of(finger: Int, slot: Int, **values: Float) -> Minima:
+    """Values (N, ...) of minima in their places, as many of each finger."""
     empty = {"misfit": np.inf, "midway": np.inf}
     table: dict[str, Float] = {}
     for name, value in values.items():

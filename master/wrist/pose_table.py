@@ -79,6 +79,20 @@ class PoseTable:
         node[..., 2] = np.arange(SHAPE[2])
         return self.first[:, None] + node * self.step[:, None], np.where(value < _PLAUSIBLE, value, np.inf)
 
+    def starts(self, seen: Float, finger: int, count: int) -> Float:
+        """Nodes (N, 3) [rad], at most so many, from which a pose may be sought that explains what was seen (4,) of one.
+
+        The best one for every flexion and for every PIP, and of these the best.
+        """
+        told = np.concatenate([seen * seen, seen]).astype(np.float32)
+        energy: Float = np.asarray(self._constant[finger] + self._linear[finger] @ told, np.float64)
+        order: Int = energy.argsort()
+        of_flexion = np.unique(order // SHAPE[2] % SHAPE[1], return_index=True)[1]
+        of_pip = np.unique(order % SHAPE[2], return_index=True)[1]
+        best = np.unique(np.concatenate([of_flexion, of_pip]))[:count]
+        node = np.stack(np.unravel_index(order[best], SHAPE), axis=-1)
+        return self.first[finger] + node * self.step[finger]
+
     def views(self, x: Float, finger: Int) -> tuple[Float, Float, Float]:
         """What is seen of poses (N, 3) [rad] of fingers (N,), interpolated between nodes.
 
@@ -103,6 +117,22 @@ class PoseTable:
         found[:, :SEEN] += (towards @ by_step.reshape(-1, 8 * UNKNOWNS, SEEN))[:, 0]
         J = found[:, SEEN + 1 :].reshape(-1, UNKNOWNS, SEEN) / step[..., None]
         return found[:, :SEEN], np.swapaxes(J, 1, 2), found[:, SEEN]
+
+    def doubt(self, x: Float, finger: Int) -> Float:
+        """How far the corners of a cell differ in what they say of the laser point (N, 2) [m] of poses (N, 3).
+
+        The table is wrong by half of that or less.
+        """
+        at = (x - self.first[finger]) / self.step[finger]
+        cell: Int = np.clip(at, 0.0, _LAST_CELL).astype(np.int64)
+        away = (at - cell)[:, None] - _CORNERS
+        weight = np.abs(away - 1.0 + 2.0 * _CORNERS).prod(axis=-1)[:, None]
+        node = finger * (SHAPE[0] * self._strides[0]) + cell @ self._strides
+        corners = self._values[node[:, None] + self._offset]
+        by_step = corners[..., SEEN + 1 :].reshape(-1, 8, UNKNOWNS, SEEN)
+        said = corners[..., :2] + (away[:, :, None] @ by_step[..., :2])[:, :, 0]
+        off = said - weight @ said
+        return np.sqrt((weight @ (off * off))[:, 0])
 
 
 def _filled(seen: Float) -> Float:

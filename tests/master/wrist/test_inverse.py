@@ -11,7 +11,7 @@ from common.arrays import Bool, Float
 from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.messages import HandPose, Level, Source, WristDetections
-from master.wrist.finger_poses import FingerPoses
+from master.wrist.finger_poses import UNKNOWNS, FingerPoses
 from master.wrist.fingertip import Fingertips
 from master.wrist.forward import ForwardTable
 from master.wrist.inverse import InverseModel
@@ -93,6 +93,25 @@ def test_unnatural_fingers_are_found_to_a_tenth_of_a_degree(device: Device, mcp:
     clear = ~(found.misfit[:, 1] < 3.84)
     assert clear.sum() >= 3
     np.testing.assert_allclose(np.degrees(found.x_rad[:, 0] - x)[clear], 0.0, atol=0.1)
+
+
+def test_of_random_poses_every_one_that_is_alone_is_found(device: Device) -> None:
+    rng = np.random.default_rng(23)
+    cov = np.tile(np.diag([1e-6, 1e-6, 1e-4, 1e-4]), (5, 1, 1))
+    asked = lost = 0
+    for _ in range(12):
+        limits = device.setup.model.limits_rad[:, :UNKNOWNS]
+        x = rng.uniform(limits[..., 0], limits[..., 1])
+        x = device.setup.model.clamp(device.poses.angles(x))[..., :UNKNOWNS]
+        shown = device.poses.tips_shown(x[None])[0]
+        views = device.poses.views(x[None], np.ones((1, 5), np.bool_))
+        shown &= views.length_px[0] > 10.0
+        found = device.model(np.where(shown[:, None], views.seen[0], np.nan), cov)
+        off = np.degrees(np.abs(found.x_rad - x[:, None]).max(axis=-1))
+        asked += int(shown.sum())
+        lost += int((shown & ~(off < 0.1).any(axis=1)).sum())
+    assert asked > 20
+    assert lost == 0
 
 
 def test_by_the_laser_alone_the_same_fingers_are_far_off(device: Device) -> None:
