@@ -1,6 +1,7 @@
 """A small study through the real line: rendered, detected by the slave's process, calibrated, solved, judged."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -120,6 +121,20 @@ def test_a_study_goes_on_from_what_was_detected_and_solves_anew(out: Path, told:
     assert np.abs(np.array(palm.pip_deg) - palm.truth_deg)[1:].max() < 15.0
     assert (out / "participant-02/trials/wrist").is_dir()
     assert not (out / "participant-01/trials/wrist").exists()  # not kept
+
+
+def test_a_study_takes_frames_again_and_makes_all_else_anew(
+    out: Path, told: dict[str, Any], tmp_path: Path
+) -> None:
+    shutil.copytree(out / "participant-02", tmp_path / "participant-02")
+    folder = tmp_path / "participant-02"
+    frame = folder / "trials/wrist/000000.png"
+    before = frame.stat().st_mtime_ns
+    assert (folder / "calibrated-detected").is_dir()
+    found = run_participant(replace(task(tmp_path), resume="frames", conditions=(EXACT,)), 2)
+    assert [len(trials) for trials in found.trials.values()] == [6]
+    assert frame.stat().st_mtime_ns == before
+    assert not (folder / "calibrated-detected").exists()
 
 
 def test_a_recording_gives_the_same_trials(out: Path, told: dict[str, Any], tmp_path: Path) -> None:
