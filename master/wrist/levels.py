@@ -4,8 +4,10 @@
     ik     only fingers of which both are seen and agree, without habits; of the others nothing is said
     auto   IK where it can be, habits counting as much as they are worth; else FK
 
-**The angles** are the median of what is believed along the finger's valley (`master.wrist.valley`): it errs least, on
-average. How far light says the tip is away counts too, as soon as its unit is known (`master.wrist.light_unit`).
+**The angles** of ik are those of the least energy (row D16, `master.wrist.inverse`): of exact sights the exact pose.
+Those of auto are the median of what is believed along the finger's valley (`master.wrist.valley`): of noisy sights it
+errs least, on average. How far light says the tip is away counts too, as soon as its unit is known
+(`master.wrist.light_unit`): for ik, between poses that explain laser and tip alike.
 
 **A tip that is none** must not win by itself. Where no pose explains laser and tip together within three standard
 deviations it is refused (counted `tip_refused`), and where the pose found would show a line twice as long as was seen.
@@ -29,7 +31,7 @@ from master.ik.priors import Priors
 from master.wrist.belief import FingerAngles
 from master.wrist.finger_poses import SEEN, UNKNOWNS
 from master.wrist.forward import DIP, PIP
-from master.wrist.inverse import InverseModel
+from master.wrist.inverse import InverseModel, Minima
 from master.wrist.light_unit import LightUnit
 from master.wrist.pose_table import SHAPE
 from master.wrist.setup import WristSetup
@@ -37,6 +39,7 @@ from master.wrist.sight import HARDLY, SightNoise
 from master.wrist.valley import Valley, Valleys
 
 _REFUSED = 9.0
+_AS_GOOD = 3.84  # chi-square of one degree of freedom, 95 %: poses whose misfits differ by less explain alike
 _APART_RAD = np.radians(10.0)  # in PIP: clearly another pose
 _PASS = 0.4  # of the lower top that a density falls below between two parts
 _OTHER = 0.05  # of all belief: less than this is no other part
@@ -78,7 +81,7 @@ class Levels:
 
     def __init__(self, setup: WristSetup, model: InverseModel, priors: Priors | None = None) -> None:
         priors = priors or Priors()
-        self._poses, self._table, self._hand = model.poses, model.table, setup.model
+        self._model, self._poses, self._table, self._hand = model, model.poses, model.table, setup.model
         self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, model.table, priors)
         self._alone = setup.level == "ik"
         self._share = np.log([priors.natural_share, *2 * [0.5 * (1.0 - priors.natural_share)]])
@@ -99,7 +102,8 @@ class Levels:
         both: Bool = np.isfinite(seen.sum(axis=1))
         nodes, energy = self._table.candidates(np.where(both[:, None], seen, 0.0))
         nodes[~(np.isfinite(energy) & both[:, None])] = np.nan
-        valley = self._valleys(nodes, np.where(both[:, None], seen, np.nan), self._noise(sight, both))
+        noise = self._noise(sight, both)
+        valley = self._valleys(nodes, np.where(both[:, None], seen, np.nan), noise)
         believed = both & (valley.misfit.min(axis=1) < _REFUSED)
         mixed, habit = self._mixed(valley, believed)
         x = np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)
@@ -107,7 +111,12 @@ class Levels:
         log = mixed + unit.push(
             np.where(believed, sight.tip_depth, np.nan), depth_m, _probable(mixed, believed), news
         )
-        found, at = self._angles(valley, log, believed, last_rad)
+        least = None
+        if self._alone:
+            coarse_rad = self._sight.turn_rad(sight.tip_sigma_px, sight.distance_m)
+            minima = self._model(np.where(believed[:, None], seen, np.nan), noise, coarse_rad)
+            least = _least(minima, valley, log, last_rad)
+        found, at = self._angles(valley, log, believed, last_rad, least)
         shown = self._sight.shown(valley.length_px[np.arange(5), at], sight.laser_px)
         solved = believed & (shown >= HARDLY)
         kept = natural if habit > _CONTRADICTED else self._free(natural, sight, solved)
@@ -165,20 +174,31 @@ class Levels:
             natural, angles_rad=angles, cov_rad2=cov, told=natural.told & ~point, off=natural.off | point
         )
 
-    def _angles(self, valley: Valley, log: Float, known: Bool, last_rad: Float) -> tuple[FingerAngles, Int]:
-        """The angles that are believed, and at which of the poses (5,) they lie."""
+    def _angles(
+        self,
+        valley: Valley,
+        log: Float,
+        known: Bool,
+        last_rad: Float,
+        least: tuple[Float, Bool] | None = None,
+    ) -> tuple[FingerAngles, Int]:
+        """The angles that are believed, or those of `least` energy, and at which of the poses (5,) they lie."""
         x, p = np.nan_to_num(valley.x_rad), np.nan_to_num(_probable(log, known))
         pip = x[..., PIP]
         going = np.exp(-0.5 * ((pip - last_rad[:, PIP, None]) / _GOES_ON_RAD) ** 2)
         part, parted = _part(p, p * np.nan_to_num(going, nan=1.0))
         inside = np.where(part, p, 0.0)
         at, chosen = _median(x, inside)
+        twice = np.zeros(5, np.bool_)
+        if least is not None:
+            at, chosen, twice = np.abs(pip - least[0][:, None, PIP]).argmin(axis=1), *least
         away = x - chosen[:, None]
         cov = np.swapaxes(away, 1, 2) @ (p[..., None] * away)
         cov[:, :2, :2] += (p[..., None, None] * np.nan_to_num(valley.side_rad2)).sum(axis=1)
         cov[:, range(UNKNOWNS), range(UNKNOWNS)] += _STIFF_RAD**2
         cov[:, PIP, PIP] += _FLESH_RAD**2
-        ambiguous = known & parted & ((p * (np.abs(away[..., PIP]) > _APART_RAD)).sum(axis=1) > _OTHER)
+        other = (p * (np.abs(away[..., PIP]) > _APART_RAD)).sum(axis=1) > _OTHER
+        ambiguous = known & ((parted & other) | twice)
         return self._whole(chosen, cov, known, ambiguous), at
 
     def _whole(self, x: Float, cov: Float, solved: Bool, ambiguous: Bool) -> FingerAngles:
@@ -193,6 +213,22 @@ class Levels:
         level = np.where(solved, np.uint8(Level.IK), np.uint8(Level.NONE))
         no = np.zeros(5, np.bool_)
         return FingerAngles(angles, whole, solved, no, no, level, ambiguous)
+
+
+def _least(minima: Minima, valley: Valley, log: Float, last_rad: Float) -> tuple[Float, Bool]:
+    """Poses (5, 3) of least energy, and whether another, clearly apart, explains as much (5,).
+
+    Of those that explain alike it is the one that is near to the last angles, or else that light and valley favour.
+    """
+    rows, x = np.arange(5), np.nan_to_num(minima.x_rad)
+    as_good = minima.misfit <= minima.misfit[:, :1] + _AS_GOOD
+    node = np.abs(np.nan_to_num(valley.x_rad)[:, None, :, PIP] - x[..., PIP, None]).argmin(axis=2)
+    walked = -np.abs(x[..., PIP] - last_rad[:, None, PIP])
+    rank = np.where(np.isfinite(walked), walked, np.take_along_axis(log, node, axis=1))
+    best = np.where(as_good, np.nan_to_num(rank, neginf=-1e9), -np.inf).argmax(axis=1)
+    near = np.abs(x[rows, best] - x[:, 0])[:, PIP] <= _APART_RAD
+    chosen = x[rows, np.where(near, 0, best)]
+    return chosen, (as_good & (np.abs(x[..., PIP] - chosen[:, None, PIP]) > _APART_RAD)).any(axis=1)
 
 
 def _probable(log: Float, known: Bool) -> Float:

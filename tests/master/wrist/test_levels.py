@@ -45,7 +45,8 @@ def test_light_resolves_what_laser_and_tip_leave_open(
     off, blind = (np.abs(one.angles_rad[:, PIP] - x[:, PIP])[both] for one in (pose, without))
     assert np.degrees(off).max() < 6.0
     assert off.mean() <= blind.mean() + np.radians(0.5)
-    assert not pose.ambiguous[1:].any()
+    if level == "auto":  # ik calls ambiguous what laser and tip alone leave open
+        assert not pose.ambiguous[1:].any()
 
 
 def test_the_unit_of_light_is_learnt_and_a_finger_is_no_witness_of_itself() -> None:
