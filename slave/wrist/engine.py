@@ -14,7 +14,7 @@ from slave.wrist.valleys import energy
 Energy: TypeAlias = Callable[[Image, int], Float32]
 LeastPaths: TypeAlias = Callable[[Float32, tuple[int, ...]], Int]
 Lines: TypeAlias = Callable[[Image, int], tuple[Runs, Bool]]
-Measure: TypeAlias = Callable[[Runs, Int, Float | None, int], Pieces]
+Measure: TypeAlias = Callable[[Runs, Int, int], Pieces]
 
 
 @dataclass(frozen=True, slots=True)

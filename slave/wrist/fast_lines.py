@@ -129,14 +129,13 @@ def _link(whole: Int, parts: Float, jump: float, order: Int, line: Int, joins: I
     return number
 
 
-def measure(runs_: Runs, finger: Int, share: Float | None, width_px: int) -> Pieces:
+def measure(runs_: Runs, finger: Int, width_px: int) -> Pieces:
     """As `pieces.measure`."""
-    out = np.zeros((9, 5))
-    sure = np.ones(0) if share is None else share
+    out = np.zeros((6, 5))
     limits = (pieces.STEEPEST, pieces.LONG, width_px)
-    _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, sure, limits, out)
-    line, length, u, v, doubt, apart, cut, brightest, _ = out
-    return Pieces(line, length, np.stack([u, v], axis=-1), doubt, apart, cut > 0.0, brightest)
+    _measure(runs_.column, runs_.row, runs_.peak, runs_.first, finger, limits, out)
+    line, u, v, apart, cut, brightest = out
+    return Pieces(line, np.stack([u, v], axis=-1), apart, cut > 0.0, brightest)
 
 
 @compiled
@@ -146,57 +145,47 @@ def _measure(
     peak: Float,
     first: Int,
     finger: Int,
-    share: Float,
     limits: tuple[float, int, int],
     out: Float,
 ) -> None:
-    """Over the parts of lines: sums and centroids; then, where the thumb's is doubtful, how far that lies."""
+    """Over the parts of lines: sums, then centroids."""
     longest = np.zeros(5)
     mean, middle, columns = np.zeros((5, 2)), np.zeros((5, 2)), np.zeros(5)
     parts = np.zeros(5)
-    for again in range(2):
-        if again == 1 and len(share) == 0:
-            break
-        for n in range(len(first)):
-            stop = first[n + 1] if n + 1 < len(first) else len(row)
-            left = first[n]
-            while left < stop:
-                of, right = int(finger[left]), left
-                if of < 0:
-                    left += 1
-                    continue
-                while right + 1 < stop and finger[right + 1] == of:
-                    right += 1
-                if again == 0:
-                    count = right - left + 1
-                    u = v = 0.0
-                    for k in range(left, right + 1):
-                        u += column[k]
-                        v += row[k]
-                        out[7, of] = max(out[7, of], peak[k])
-                        if column[k] < 1 or column[k] > limits[2] - 2:
-                            out[6, of] = 1.0
-                    parts[of] += 1
-                    columns[of] += count
-                    mean[of, 0] += u
-                    mean[of, 1] += v
-                    if count > longest[of]:
-                        longest[of] = count
-                        middle[of, 0], middle[of, 1] = u / count, v / count
-                if again == 0 or of == 0:
-                    _part(column, row, left, right, of, share, limits, again == 1, out)
-                left = right + 1
-        if again == 0:
-            for of in range(5):
-                out[2, of], out[3, of] = out[2, of] / out[1, of], out[3, of] / out[1, of]
-                out[5, of] = np.nan
-                if parts[of] > 1:
-                    du, dv = (
-                        mean[of, 0] / columns[of] - middle[of, 0],
-                        mean[of, 1] / columns[of] - middle[of, 1],
-                    )
-                    out[5, of] = 0.5 * math.hypot(du, dv)
-    out[4, 0] /= max(out[1, 0], 1e-9)
+    for n in range(len(first)):
+        stop = first[n + 1] if n + 1 < len(first) else len(row)
+        left = first[n]
+        while left < stop:
+            of, right = int(finger[left]), left
+            if of < 0:
+                left += 1
+                continue
+            while right + 1 < stop and finger[right + 1] == of:
+                right += 1
+            count = right - left + 1
+            u = v = 0.0
+            for k in range(left, right + 1):
+                u += column[k]
+                v += row[k]
+                out[5, of] = max(out[5, of], peak[k])
+                if column[k] < 1 or column[k] > limits[2] - 2:
+                    out[4, of] = 1.0
+            parts[of] += 1
+            columns[of] += count
+            mean[of, 0] += u
+            mean[of, 1] += v
+            if count > longest[of]:
+                longest[of] = count
+                middle[of, 0], middle[of, 1] = u / count, v / count
+            _part(column, row, left, right, of, limits, out)
+            left = right + 1
+    for of in range(5):
+        out[1, of], out[2, of] = out[1, of] / out[0, of], out[2, of] / out[0, of]
+        out[3, of] = np.nan
+        if parts[of] > 1:
+            du = mean[of, 0] / columns[of] - middle[of, 0]
+            dv = mean[of, 1] / columns[of] - middle[of, 1]
+            out[3, of] = 0.5 * math.hypot(du, dv)
 
 
 @compiled
@@ -206,12 +195,10 @@ def _part(
     left: int,
     right: int,
     of: int,
-    share: Float,
     limits: tuple[float, int, int],
-    doubtful: bool,
     out: Float,
 ) -> None:
-    """Add the pieces of one part, from its left end to its right one, or what is doubtful of them."""
+    """Add the pieces of one part, from its left end to its right one."""
     inner = 2 if right - left >= limits[1] else 0
     for k in range(left - 1, right + 1):
         if k < left or k == right:  # beyond the last run
@@ -221,23 +208,15 @@ def _part(
             if inner:
                 bend = (row[end + limits[1] * aside] - row[at]) / (math.sqrt(5.5) - math.sqrt(2.5))
                 bend = min(max(bend, 0.0), limits[0])
-            u, v, sure = column[end] - 0.5 * aside, row[at] - bend * math.sqrt(2.5), 1.0
-            if len(share):
-                sure = share[end]
+            u, v = column[end] - 0.5 * aside, row[at] - bend * math.sqrt(2.5)
             du, dv = u - column[at], v - row[at]
             u, v = (u + column[at]) / 2.0, (v + row[at]) / 2.0
         else:
             if k < left + inner or k >= right - inner:
                 continue
             du, dv = 1.0, row[k + 1] - row[k]
-            u, v, sure = column[k] + 0.5, (row[k] + row[k + 1]) / 2.0, 1.0
-            if len(share):
-                sure = (share[k] + share[k + 1]) / 2.0
+            u, v = column[k] + 0.5, (row[k] + row[k + 1]) / 2.0
         piece = math.hypot(du, dv)
-        if doubtful:
-            out[4, of] += abs(u - out[2, of]) * piece * sure * (1.0 - sure)
-            continue
         out[0, of] += piece
-        out[1, of] += piece * sure
-        out[2, of] += piece * sure * u
-        out[3, of] += piece * sure * v
+        out[1, of] += piece * u
+        out[2, of] += piece * v

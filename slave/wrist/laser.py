@@ -53,7 +53,7 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
     finger[~on_line] = NONE
     finger = owners(finger, runs, points, reach)
     finger[~reach.holds(finger, points)] = NONE
-    pieces = engine.measure(runs, finger, None, view.optics.width_px)
+    pieces = engine.measure(runs, finger, view.optics.width_px)
     uv, length = pieces.uv, pieces.line
     seen = length * reach.metres_per_px(uv) >= _LEAST_M
     sigma = _sigma_px(pieces, shown=fingers.shown)

@@ -21,30 +21,25 @@ class Pieces(NamedTuple):
 
     Attributes:
         line: (5,) its length [px].
-        length: (5,) the same, weighed with how sure it is the finger's.
-        uv: (5, 2) its centroid, so weighed [px]; NaN: none.
-        doubt: (5,) mean distance of what is not sure from the centroid [px].
+        uv: (5, 2) its centroid [px]; NaN: none.
         apart: (5,) half of how far the middle of a line in parts lies from that of its longest part [px]; NaN: whole.
         cut: (5,) whether the image ends on it.
         brightest: (5,) its highest level.
     """
 
     line: Float
-    length: Float
     uv: Float
-    doubt: Float
     apart: Float
     cut: Bool
     brightest: Float
 
 
-def measure(runs: Runs, finger: Int, share: Float | None, width_px: int) -> Pieces:
-    """Of the pieces of line of each finger (N,), with their shares (N,) of it; None: all sure.
+def measure(runs: Runs, finger: Int, width_px: int) -> Pieces:
+    """Of the pieces of line of each finger.
 
     Args:
         runs: The runs.
-        finger: Whose each of them is; `NONE`: nobody's.
-        share: How sure it is the finger's, of the thumb alone below 1.
+        finger: (N,) whose each of them is; `NONE`: nobody's.
         width_px: Of the image.
     """
     points: Float = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
@@ -69,22 +64,14 @@ def measure(runs: Runs, finger: Int, share: Float | None, width_px: int) -> Piec
     middle_u = np.concatenate([u[:-1] + 0.5, (outer[:, 0] + u[inner]) / 2.0])
     middle_v = np.concatenate([(v[1:] + v[:-1]) / 2.0, (outer[:, 1] + v[inner]) / 2.0])
     of = np.concatenate([finger[:-1], finger[last]]) + 1
-    line, doubt = _of_fingers(of, piece), np.zeros(5)
-    sure = (
-        np.ones(len(of)) if share is None else np.concatenate([(share[1:] + share[:-1]) / 2.0, share[last]])
-    )
-    weight = piece * sure
-    length = _of_fingers(of, weight)
+    line = _of_fingers(of, piece)
     with np.errstate(divide="ignore", invalid="ignore"):
-        uv = np.stack([_of_fingers(of, weight * m) / length for m in (middle_u, middle_v)], axis=-1)
-    if share is not None:  # of the thumb alone
-        away = np.abs(middle_u - uv[0, 0]) * (weight * (1.0 - sure)) * (of == 1)
-        doubt[0] = away.sum() / max(length[0], 1e-9)
+        uv = np.stack([_of_fingers(of, piece * m) / line for m in (middle_u, middle_v)], axis=-1)
     cut = np.zeros(5, dtype=np.bool_)
     cut[finger[on & ((u < 1.0) | (u > width_px - 2.0))]] = True
     brightest = np.zeros(6)
     np.maximum.at(brightest, finger, runs.peak)  # those of no finger come last
-    return Pieces(line, length, uv, doubt, _apart(points, finger, left, right), cut, brightest[:5])
+    return Pieces(line, uv, _apart(points, finger, left, right), cut, brightest[:5])
 
 
 def _of_fingers(of: Int, weight: Float) -> Float:
