@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
-from common.arrays import Bool, Float, Image, Int
+from common.arrays import Bool, Image, Int
 from slave.wrist.corridors import Float32
 from slave.wrist.paths import least_paths
 from slave.wrist.pieces import Pieces, measure
