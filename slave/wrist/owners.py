@@ -37,7 +37,18 @@ def owners(finger: Int, runs: Runs, points: Float, reach: Reach) -> Int:
     nearest = np.clip(np.rint(middle), 1, 4).astype(np.int64)
     no_thumb = (of == _THUMB) & reach.no_thumb(np.add.reduceat(beyond, first) / count, middle)
     aside = (of > _THUMB) & ((middle < _FROM[of]) | (middle > _TO[of]))
+    aside &= _room(of, nearest, aside | no_thumb)
     return np.repeat(np.where(no_thumb | aside, nearest, of), count)
+
+
+def _room(of: Int, nearest: Int, moving: Bool) -> Bool:
+    """Which parts (N,) of fingers `of` may go to the `nearest`: not all of a finger's line to one that has its own.
+
+    Then the finger is spread, or the palm is not quite where it should be.
+    """
+    stays = np.zeros(6, np.bool_)
+    stays[of[~moving]] = True  # those of no finger come last
+    return stays[of] | ~stays[nearest]
 
 
 def _at_creases(finger: Int, runs: Runs) -> Int:

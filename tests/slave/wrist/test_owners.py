@@ -1,0 +1,63 @@
+"""Whose a part of the laser line is, where the palm is not quite where calibration found it, or the seams are wrong."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from common.geometry import rotation_vector_to_matrix
+from common.sim.wrist.render import WristRenderer
+from slave.cameras.synthetic import STROBE
+from slave.wrist.background import lit
+from slave.wrist.fingers import separate
+from slave.wrist.laser import laser_lines
+from slave.wrist.owners import owners
+from slave.wrist.pieces import NONE
+from slave.wrist.reach import reach_of
+from slave.wrist.runs import line_runs
+from slave.wrist.view import WristView
+from tests.slave.wrist.wrist_frames import CAMERA, HAND, RIG, VIEW, scene
+
+VISIBLE_M = 2e-3
+NEAR_PX = 10.0
+
+
+def turned(degrees: tuple[float, float, float]) -> WristView:
+    """The view of a device whose palm is believed to be turned against where it is."""
+    palm = VIEW.T_camera_palm.copy()
+    palm[:3, :3] = rotation_vector_to_matrix(np.radians(degrees)) @ palm[:3, :3]
+    rows = tuple(tuple(row) for row in palm.tolist())
+    return WristView.of(replace(RIG, T_camera_palm=rows), CAMERA, HAND)
+
+
+@pytest.mark.parametrize("name", ["spread@indoor", "poses@indoor"])
+@pytest.mark.parametrize("degrees", [(0.0, 2.0, 0.0), (0.0, -2.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.0, -3.0)])
+def test_fingers_are_told_apart_though_the_palm_is_not_quite_where_it_should_be(
+    name: str, degrees: tuple[float, float, float]
+) -> None:
+    one, view = scene(name, 61), turned(degrees)
+    renderer = WristRenderer(one, "wrist", 2)
+    right: list[bool] = []
+    for t in np.linspace(1.0, 58.0, 9).tolist():
+        ambient, laser, led = (renderer.render(t, kind) for kind in STROBE)
+        found = laser_lines(lit(laser, ambient), separate(lit(led, ambient), view), view)
+        truth = one.truth(t)
+        near = np.linalg.norm(found.uv - truth.laser_uv[1:6], axis=1) < NEAR_PX
+        right += near[1:][truth.laser_len_vis[2:6] >= VISIBLE_M].tolist()
+    assert len(right) >= 30
+    assert np.mean(right) >= 0.85
+
+
+def test_seams_that_lie_one_finger_aside_do_not_move_the_line() -> None:
+    renderer = WristRenderer(scene("spread@indoor", 61), "wrist", 2)
+    ambient, laser, led = (renderer.render(1.0, kind) for kind in STROBE)
+    reach = reach_of(VIEW)
+    runs = line_runs(lit(laser, ambient), reach.first_row)
+    points = np.stack([runs.column, runs.row], axis=-1, dtype=np.float64)
+    finger = separate(lit(led, ambient), VIEW).finger_of(points)
+    whose = owners(finger, runs, points, reach)
+    assert np.unique(whose[whose > 0]).tolist() == [1, 2, 3, 4]
+    aside = np.where(finger > 0, finger + 1, finger)
+    aside[finger == 4] = NONE
+    assert (aside != whose)[whose > 0].mean() > 0.9
+    kept = (whose > 0) & (finger != 4)
+    assert (owners(aside, runs, points, reach) == whose)[kept].mean() > 0.9
