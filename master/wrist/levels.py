@@ -50,6 +50,7 @@ _RATIOS = 0.5 * (
 )  # the papers' DIP per PIP lie by this to both sides of their middle (row I12)
 _STIFF_RAD = np.radians(1.0)
 _FLESH_RAD = np.radians(2.5)  # 2 mm of a tip that is not quite where the hand file has it, over two bones
+_CLEARLY_RAD, _INSIDE_PX = np.radians(10.0), 20.0  # by which a tip is in sight that is hardly ever missed
 _SHOWN = np.log(10.0)  # of ten tips that the model says are seen nine are found
 
 
@@ -83,7 +84,7 @@ class Levels:
         priors = priors or Priors()
         self._model, self._poses, self._table, self._hand = model, model.poses, model.table, setup.model
         self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, model.table, priors)
-        self._alone = setup.level == "ik"
+        self._alone, self._optics = setup.level == "ik", setup.optics
         self._share = np.log([priors.natural_share, *2 * [0.5 * (1.0 - priors.natural_share)]])
 
     def __call__(
@@ -120,6 +121,9 @@ class Levels:
         shown = self._sight.shown(valley.length_px[np.arange(5), at], sight.laser_px)
         solved = believed & (shown >= HARDLY)
         kept = natural if habit > _CONTRADICTED else self._free(natural, sight, solved)
+        if not self._alone:
+            hidden = self._should_show(kept, np.isnan(sight.tip[:, 0]))
+            kept = replace(kept, told=kept.told & ~hidden, off=kept.off | hidden)
         kept = replace(kept, angles_rad=kept.angles_rad.copy(), cov_rad2=kept.cov_rad2.copy())
         kept.angles_rad[solved], kept.cov_rad2[solved] = found.angles_rad[solved], found.cov_rad2[solved]
         no = ~solved
@@ -151,6 +155,24 @@ class Levels:
         of_all = np.where(believed, valley.evidence, 0.0).sum(axis=1) + self._share
         hands = of_all - np.logaddexp.reduce(of_all)
         return np.logaddexp.reduce(hands[:, None, None] + valley.log), float(np.exp(hands[0]))
+
+    def _should_show(self, natural: FingerAngles, unseen: Bool) -> Bool:
+        """Fingers (5,) whose tip is not seen though habit has it in sight and other fingers show theirs.
+
+        They are bent otherwise, or something hides the tip.
+        """
+        asked = natural.told & unseen
+        asked[0] = False  # the tip of a thumb is hardly ever found
+        if unseen.all() or not asked.any():
+            return np.zeros(5, np.bool_)
+        x = np.nan_to_num(natural.angles_rad[:, :UNKNOWNS]) + np.array([-1.0, 0.0, 1.0])[
+            :, None, None
+        ] * np.array([0.0, 0.0, _CLEARLY_RAD])
+        tips = self._poses.tips(self._poses.angles(x))
+        uv = self._optics.project(tips)
+        size = np.array([self._optics.width_px, self._optics.height_px])
+        inside = ((uv > _INSIDE_PX) & (uv < size - _INSIDE_PX)).all(axis=-1)
+        return asked & (inside & self._poses.tips_shown(x)).all(axis=0)
 
     def _free(self, natural: FingerAngles, sight: Sighting, solved: Bool) -> FingerAngles:
         """Fingers of a hand that is not natural, of which the laser point alone is known: what is possible."""

@@ -129,7 +129,10 @@ def test_a_missing_tip_falls_back_or_is_left_out(device: Device) -> None:
     auto, alone = pushed(device.pipeline("auto"), laser, tip), pushed(device.pipeline("ik"), laser, tip)
     np.testing.assert_array_equal(solved_by(auto, Level.IK), [True, False, True, True, True])
     assert auto.level[1] == Level.FK
-    assert auto.tracked[CHAINS[1]].all()
+    assert auto.valid[CHAINS[1]].all()
+    assert not auto.tracked[CHAINS[1]].any()  # habit has its tip in sight, and the others show theirs
+    unlit = pushed(device.pipeline("auto"), laser, np.full_like(tip, np.nan))
+    assert unlit.tracked[CHAINS[1]].all()
     assert alone.level[1] == Level.NONE
     assert alone.source[CHAINS[1, 1]] == Source.NONE
     assert np.isnan(alone.angles_rad[1]).all()
