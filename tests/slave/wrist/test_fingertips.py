@@ -213,7 +213,7 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
     assert not reported[:, 0].any()  # the thumb's end is never in sight there
     assert (distance[visible] <= 6.0).mean() >= 0.8
     assert (distance[reported] > ELSEWHERE_PX).mean() <= 0.02
-    assert (~visible[reported]).mean() <= 0.08
+    assert (~visible[reported]).mean() <= 0.09
 
 
 def test_relative_depth_orders_the_tips_by_their_distance() -> None:
