@@ -20,7 +20,7 @@ from msgspec import Meta, Struct, field
 from common.arrays import Bool, Code, Float
 from common.errors import MessageError
 
-WIRE_VERSION = 6
+WIRE_VERSION = 7
 MAX_MARKERS = 48
 JOINT_COUNT = 26
 FINGER_COUNT = 5
@@ -227,6 +227,9 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
             vertical. NaN: not known, or no such device.
         palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
+        wrist_bend_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
+            (`common.wrist_bend`). NaN: no such device, or nothing tells.
+        wrist_bend_sigma_rad: (2,) their standard deviations.
     """
 
     hand: Name
@@ -249,6 +252,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
     palm_world_wxyz: Float = field(default_factory=lambda: _NO_ROTATION)
     palm_world_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
         j = JOINT_COUNT
@@ -276,6 +281,8 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "ambiguous", np.bool_, (FINGER_COUNT,))
         _freeze(self, "palm_world_wxyz", np.float64, (4,))
         _freeze(self, "palm_world_sigma_rad", np.float64, (2,))
+        _freeze(self, "wrist_bend_rad", np.float64, (2,))
+        _freeze(self, "wrist_bend_sigma_rad", np.float64, (2,))
 
 
 class Health(Message, frozen=True, eq=False, tag=True):

@@ -15,6 +15,8 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
+from common.sim.held import Cylinder
+from common.wrist_bend import STRAIGHT
 
 PERIOD_S = 60.0
 PEAK_SPEED_M_S = 1.0
@@ -39,10 +41,19 @@ WAVE_CREST = ((12, 8, 12), (5, 34, 30), (0, 34, 30), (-5, 34, 30), (-10, 34, 30)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandState:
-    """One instant: palm pose `T_rig_palm` (4, 4) [m] and `angles_rad` (5, 4) [rad]."""
+    """One instant.
+
+    Attributes:
+        T_rig_palm: Palm pose (4, 4) [m].
+        angles_rad: (5, 4) [rad].
+        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        things: What stands about, or is held.
+    """
 
     T_rig_palm: Float
     angles_rad: Float
+    bend_rad: Float = STRAIGHT
+    things: tuple[Cylinder, ...] = ()
 
 
 class HandMotion(Protocol):

@@ -115,6 +115,8 @@ def hand_poses(draw: st.DrawFn) -> HandPose:
         ambiguous=draw(arrays(np.bool_, FINGER_COUNT)),
         palm_world_wxyz=draw(floats(4)),
         palm_world_sigma_rad=draw(floats(2)),
+        wrist_bend_rad=draw(floats(2)),
+        wrist_bend_sigma_rad=draw(floats(2)),
     )
 
 
@@ -382,6 +384,7 @@ def test_one_wrong_field_is_refused(sample: type[Message], change: dict[str, obj
 
 DEFAULTED = {
     *("latency_ns", "laser_m", "level", "ambiguous", "palm_world_wxyz", "palm_world_sigma_rad"),
+    *("wrist_bend_rad", "wrist_bend_sigma_rad"),
     *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
 }
 
