@@ -7,7 +7,7 @@ ones do, so that a solver's prior is never exactly true.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -52,7 +52,7 @@ class HandState:
 
     T_rig_palm: Float
     angles_rad: Float
-    bend_rad: Float = STRAIGHT
+    bend_rad: Float = field(default_factory=lambda: STRAIGHT)
     things: tuple[Cylinder, ...] = ()
 
 
