@@ -296,6 +296,12 @@ def import_in_silence(modules: list[str], path: Path) -> subprocess.CompletedPro
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def fonts_known() -> None:
+    """Matplotlib asks the system for its fonts when it is imported for the first time on a machine."""
+    subprocess.run([sys.executable, "-c", "import matplotlib.font_manager"], check=True)
+
+
 @pytest.mark.parametrize("package", PACKAGES)
 def test_importing_every_module_touches_nothing(package: str) -> None:
     # Drivers of hardware and the viewer load foreign libraries, which may do what they like.
