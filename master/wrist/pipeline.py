@@ -1,15 +1,9 @@
 """The wrist device's straight line: detections -> laser points on their plane, fingertips -> angles -> pose.
 
 `WristPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages and get
-the same poses.
+the same poses. What is seen of the fingers is said by `master.wrist.fingers`; tracked is what that is told. A finger
+that it says nothing of is
 
-What it says of a finger:
-
-- **seen**: laser point and tip tell its angles, or its laser point how far it is closed by habit (`level`); tracked.
-- **ambiguous**: so, but another pose explains as much; tracked, and its doubt holds both.
-- **past the branch**: bent so far that the point no longer moves with it: not tracked, the angles are the middle of
-  what is left, with its whole width as doubt.
-- **off**: the point fits no natural finger: angles as found, not tracked.
 - **held**: not seen for less than half a second, where frames follow each other: the last angles, their doubt growing
   as that of a hidden finger of the marker rig.
 - **none**: not valid, NaN. Nothing is made up for it.
@@ -23,33 +17,20 @@ from math import nan
 import numpy as np
 
 from common.arrays import Bool, Code, Float
-from common.hand_model import FINGERS
-from common.messages import Level, Source, WristDetections
-from master.filters import OneEuroParameters, PointFilter
+from common.messages import Source, WristDetections
 from master.ik.hidden import strayed_rad2
 from master.stereo.pipeline import SolvedPose, Stage
-from master.wrist.belief import AngleBelief, FingerAngles
-from master.wrist.cubic import CubicLaw
-from master.wrist.forward import ForwardTable
+from master.wrist.belief import FingerAngles
+from master.wrist.fingers import FORGET_S, NEVER_NS, WristFingers, count
 from master.wrist.inverse import InverseModel
 from master.wrist.invert import Inverse
-from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
-from master.wrist.levels import Levels, Sighting
-from master.wrist.light_unit import LightUnit
 from master.wrist.palm_world import NO_WORLD, PalmWorld
 from master.wrist.pose import PoseMaker
 from master.wrist.setup import WristSetup
 
-_FORGET_S = 0.5
-_LINGERS_S = (
-    0.5  # a hand at work has another pose after such a time: sooner, poses tell the same of the light
-)
-_NEVER_NS = -(2**62)
-_AWAY_M = 0.1  # of fingertips from the camera, where a filter must know millimetres
-
 
 class WristPipeline:
-    """Push machine. Holds the filter of the laser points, and of each finger the last angles and when it was seen."""
+    """Push machine. Holds of each finger the last angles and when it was seen."""
 
     def __init__(
         self,
@@ -70,48 +51,26 @@ class WristPipeline:
             model: The inverse model of the same, for levels above "fk"; None: a new one, which takes a second.
         """
         self.counts: Counter[str] = Counter()
-        self._setup, self._stage, self._continuous = setup, stage, continuous
-        self._axes = PlaneAxes.of(setup)
-        self.inverse = Inverse(ForwardTable.of(setup)) if inverse is None else inverse
-        table = self.inverse.table
-        self._believe = AngleBelief(setup, table)
-        self._cubic = CubicLaw(setup, table) if setup.cubic else None
-        self._levels = None if setup.level == "fk" else Levels(setup, model or InverseModel(setup))
+        self._stage, self._continuous = stage, continuous
+        self.fingers = WristFingers(
+            setup, self.counts, continuous=continuous, stage=stage, inverse=inverse, model=model
+        )
         self._pose = PoseMaker(setup)
         self._palm_world = None if setup.imu is None else PalmWorld(setup.imu, self.counts)
-        self._smooth, self._smooth_tips = (
-            _point_filter(setup, self._axes) if continuous else None for _ in range(2)
-        )
-        self._light, self._told_ns = LightUnit(), _NEVER_NS
-        self._last_ns = _NEVER_NS
         self._angles, self._cov = np.full((5, 4), np.nan), np.full((5, 4, 4), np.nan)
-        self._seen_ns = np.full(5, _NEVER_NS)
+        self._seen_ns = np.full(5, NEVER_NS)
 
     def push(self, message: WristDetections) -> list[SolvedPose]:
         """Take what one triple showed; return its pose. A message not later than the last is counted and dropped."""
-        t_ns = message.t_ns + self._setup.late_ns
-        if t_ns <= self._last_ns:
-            self.counts["late"] += 1
+        seen = self.fingers.push(message)
+        if seen is None:
             return []
-        self._last_ns = t_ns
-        with self._stage("laser"):
-            told = np.isfinite(message.laser_uv).all(axis=1)
-            shown = in_image(self._setup, message.laser_uv, message.laser_sigma_px)
-            self._count("outside", told & ~shown)
-            points = laser_points(
-                self._setup, np.where(shown[:, None], message.laser_uv, np.nan), message.laser_sigma_px
-            )
-            self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("hand"):
-            found = self._angles_of(t_ns, message, points)
-            shown, source = self._remembered(t_ns, found)
-            world = NO_WORLD if self._palm_world is None else self._palm_world.at(t_ns)
-            pose = self._pose(t_ns, shown, source, points.point_m, world)
-        self._count("past", found.past)
-        self._count("off", found.off)
-        self._count("ambiguous", found.ambiguous)
-        self._count("held", source == Source.HELD)
-        self._count("unseen", source == Source.NONE)
+            shown, source = self._remembered(seen.t_ns, seen.found)
+            world = NO_WORLD if self._palm_world is None else self._palm_world.at(seen.t_ns)
+            pose = self._pose(seen.t_ns, shown, source, seen.laser_m, world)
+        count(self.counts, "held", source == Source.HELD)
+        count(self.counts, "unseen", source == Source.NONE)
         self.counts["poses"] += 1
         return [SolvedPose(pose, message.ready_t_ns)]
 
@@ -126,47 +85,6 @@ class WristPipeline:
         """At the end of a recording: nothing waits."""
         return []
 
-    def _angles_of(self, t_ns: int, message: WristDetections, points: LaserPoints) -> FingerAngles:
-        """What laser and tips say of the fingers."""
-        point = points.point_m
-        if self._smooth is not None:
-            point = self._smooth.push(t_ns, point, points.cov_m2)
-        flat, cov = self._axes.flat(point), self._axes.flat_cov(points.cov_m2)
-        closed = self.inverse(flat)
-        if self._cubic is not None:
-            closed = self._cubic(flat, closed)
-        natural = self._believe(closed, cov, point[:, 2], message.laser_px)
-        if self._levels is None:
-            return natural
-        tip, sigma_px = self._tips(t_ns, message)
-        sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px, message.tip_depth)
-        fresh = self._continuous & (1e-9 * (t_ns - self._seen_ns) <= _FORGET_S)
-        last = np.where(fresh[:, None], self._angles, np.nan)
-        gone_s = 1e-9 * (t_ns - self._told_ns)
-        news = -np.expm1(-gone_s / _LINGERS_S) if self._continuous else 1.0
-        self._told_ns = t_ns
-        found, refused = self._levels(natural, sight, last, self._light, float(news))
-        self._count("tip_refused", refused)
-        self._count("ik", found.level == Level.IK)
-        return found
-
-    def _tips(self, t_ns: int, message: WristDetections) -> tuple[Float, Float]:
-        """Fingertips (5, 2) as x / z, y / z, and their standard deviations (5,) [px]; NaN: not seen.
-
-        They are filtered like the laser points, as if all were as far away as a hand usually is: in step with these.
-        """
-        told = np.isfinite(message.tip_uv).all(axis=1)
-        shown = in_image(self._setup, message.tip_uv, message.tip_sigma_px)
-        self._count("tip_outside", told & ~shown)
-        tip = self._setup.optics.undistort(np.where(shown[:, None], message.tip_uv, np.nan))
-        sigma_px = np.where(shown, message.tip_sigma_px, np.nan)
-        if self._smooth_tips is not None:
-            point = _AWAY_M * np.concatenate([tip, np.ones((5, 1))], axis=1)
-            noise_m = _AWAY_M * sigma_px / self._setup.optics.matrix[0, 0]
-            cov = (noise_m**2)[:, None, None] * np.eye(3)
-            tip = self._smooth_tips.push(t_ns, point, cov)[:, :2] / _AWAY_M
-        return tip, sigma_px
-
     def _remembered(self, t_ns: int, found: FingerAngles) -> tuple[FingerAngles, Code]:
         """The fingers with those that were seen a moment ago, and their sources (5,)."""
         seen = np.isfinite(found.angles_rad[:, 0])
@@ -175,7 +93,7 @@ class WristPipeline:
             self._remember(t_ns, found, seen)
             return found, source
         gone_s = 1e-9 * (t_ns - self._seen_ns)
-        held = ~seen & (gone_s <= _FORGET_S)
+        held = ~seen & (gone_s <= FORGET_S)
         source[held] = Source.HELD
         angles, cov = found.angles_rad.copy(), found.cov_rad2.copy()
         angles[held] = self._angles[held]
@@ -189,18 +107,3 @@ class WristPipeline:
             found.cov_rad2[seen],
             t_ns,
         )
-
-    def _count(self, event: str, fingers: Bool) -> None:
-        """Count an event of each of the fingers (5,) by name."""
-        for f in np.flatnonzero(fingers):
-            self.counts[f"{event}.{FINGERS[f]}"] += 1
-
-
-def _point_filter(setup: WristSetup, axes: PlaneAxes) -> PointFilter:
-    """The rig's 1 € filter, across, out of and along the plane."""
-    settings = setup.filter
-    return PointFilter(
-        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
-        settings.jitter_m,
-        np.stack([axes.axes[0], setup.normal, axes.axes[1]]),
-    )

@@ -61,7 +61,7 @@ def bent(mcp_deg: float, pip_deg: float, aside_deg: float = 0.0) -> Float:
 def pushed(
     pipeline: WristPipeline, laser: Float, tip: Float, sigma_px: float = 2.0, depth: Float | None = None
 ) -> HandPose:
-    t_ns = max(pipeline._last_ns, 0) + TRIPLE_NS
+    t_ns = max(pipeline.fingers._last_ns, 0) + TRIPLE_NS
     message = WristDetections(
         camera="wrist",
         session=1,

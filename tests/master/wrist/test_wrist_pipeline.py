@@ -63,7 +63,7 @@ def message(uv: Float, t_ns: int, sigma_px: float = 0.2) -> WristDetections:
 
 
 def solved(pipeline: WristPipeline, uv: Float, t_ns: int | None = None) -> HandPose:
-    at_ns = pipeline._last_ns + TRIPLE_NS if t_ns is None else t_ns
+    at_ns = pipeline.fingers._last_ns + TRIPLE_NS if t_ns is None else t_ns
     (only,) = pipeline.push(message(uv, max(at_ns, TRIPLE_NS)))
     return only.pose
 
@@ -134,7 +134,9 @@ def test_angles_stay_within_limits_whatever_is_reported(
     rng = np.random.default_rng(seed)
     uv = rng.uniform([-200.0, -200.0], [900.0, 700.0], (5, 2))
     uv[rng.random(5) < 0.2] = np.nan
-    (only,) = alone.push(message(uv, alone._last_ns + TRIPLE_NS if alone._last_ns > 0 else 1, sigma_px))
+    (only,) = alone.push(
+        message(uv, alone.fingers._last_ns + TRIPLE_NS if alone.fingers._last_ns > 0 else 1, sigma_px)
+    )
     pose, known = only.pose, np.isfinite(only.pose.angles_rad[:, 0])
     assert (setup.model.within_limits(pose.angles_rad)[known]).all()
     np.testing.assert_array_equal(pose.valid[CHAINS].all(axis=1), known)
@@ -152,7 +154,7 @@ def test_what_no_camera_can_have_seen_is_counted_and_not_seen(
     with np.errstate(all="raise"):
         pose = solved(alone, uv)
         for sigma in (1e308, 700.0):
-            alone.push(message(uv, alone._last_ns + TRIPLE_NS, sigma))
+            alone.push(message(uv, alone.fingers._last_ns + TRIPLE_NS, sigma))
     for f, times in enumerate((2, 3, 3, 3, 2)):
         assert alone.counts[f"outside.{FINGERS[f]}"] == before[f"outside.{FINGERS[f]}"] + times
     assert not pose.valid[CHAINS[1:4]].any()
@@ -163,7 +165,9 @@ def test_a_line_of_impossible_length_is_a_whole_one(alone: WristPipeline, setup:
     uv = shown(setup, natural(setup, 40.0))
     poses: list[HandPose] = []
     for length in (1.7e308, 1e4):
-        whole = msgspec.structs.replace(message(uv, alone._last_ns + TRIPLE_NS), laser_px=np.full(5, length))
+        whole = msgspec.structs.replace(
+            message(uv, alone.fingers._last_ns + TRIPLE_NS), laser_px=np.full(5, length)
+        )
         with np.errstate(all="raise"):
             poses += [found.pose for found in alone.push(whole)]
     np.testing.assert_array_equal(poses[0].position_m, poses[1].position_m)
@@ -192,7 +196,7 @@ def test_a_palm_that_the_laser_passes_by_is_refused(setup: WristSetup) -> None:
 def test_a_finger_that_is_lost_is_held_for_half_a_second_with_growing_doubt(
     alone: WristPipeline, setup: WristSetup
 ) -> None:
-    pipeline = WristPipeline(setup, inverse=alone.inverse)
+    pipeline = WristPipeline(setup, inverse=alone.fingers.inverse)
     uv = shown(setup, natural(setup, 40.0))
     first = solved(pipeline, uv, TRIPLE_NS)
     uv[1] = np.nan
@@ -222,7 +226,7 @@ def test_unrelated_poses_remember_nothing(alone: WristPipeline, setup: WristSetu
 def test_late_and_doubled_messages_are_counted_and_change_nothing(
     alone: WristPipeline, setup: WristSetup
 ) -> None:
-    plain, troubled = (WristPipeline(setup, inverse=alone.inverse) for _ in range(2))
+    plain, troubled = (WristPipeline(setup, inverse=alone.fingers.inverse) for _ in range(2))
     rng = np.random.default_rng(3)
     sent = [
         message(shown(setup, natural(setup, 30.0 + k)) + 0.2 * rng.normal(size=(5, 2)), (k + 1) * TRIPLE_NS)
@@ -251,7 +255,7 @@ def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(
     noise = 0.5 * rng.normal(size=(60, 5, 2))
     spread: list[Float] = []
     for continuous in (True, False):
-        pipeline = WristPipeline(setup, continuous=continuous, inverse=alone.inverse)
+        pipeline = WristPipeline(setup, continuous=continuous, inverse=alone.fingers.inverse)
         angles = [
             solved(pipeline, uv + off, (k + 1) * TRIPLE_NS).angles_rad[1:, 2] for k, off in enumerate(noise)
         ]
@@ -261,7 +265,7 @@ def test_a_finger_at_rest_trembles_less_where_frames_follow_each_other(
 
 def test_nineteen_of_twenty_joints_lie_in_their_regions(alone: WristPipeline, setup: WristSetup) -> None:
     """Of hands that stray from habits and whose skin differs as much as is believed: between 90 and 99 of 100."""
-    pipeline, priors = WristPipeline(setup, continuous=False, inverse=alone.inverse), Priors()
+    pipeline, priors = WristPipeline(setup, continuous=False, inverse=alone.fingers.inverse), Priors()
     rng = np.random.default_rng(12)
     inside: list[bool] = []
     for _ in range(150):
@@ -286,7 +290,7 @@ def test_nineteen_of_twenty_joints_lie_in_their_regions(alone: WristPipeline, se
 
 
 def test_the_cubic_is_a_preset(alone: WristPipeline, setup: WristSetup) -> None:
-    pipeline = WristPipeline(replace(setup, cubic=True), continuous=False, inverse=alone.inverse)
+    pipeline = WristPipeline(replace(setup, cubic=True), continuous=False, inverse=alone.fingers.inverse)
     flexed: list[Float] = []
     for pip in (10.0, 40.0, 70.0):
         pose = solved(pipeline, shown(setup, natural(setup, pip)))
@@ -305,7 +309,7 @@ def test_what_the_rig_says_of_stamps_and_volume_holds(
         volume=Volume(low_m=(-1, -1, 0.15), high_m=(1, 1, 1)),
     )
     pipeline = WristPipeline(
-        WristSetup.of(stated, rig.cameras["wrist"], rig.hand), continuous=False, inverse=alone.inverse
+        WristSetup.of(stated, rig.cameras["wrist"], rig.hand), continuous=False, inverse=alone.fingers.inverse
     )
     pose = solved(pipeline, shown(setup, natural(setup, 20.0)), TRIPLE_NS)
     assert pose.t_ns == TRIPLE_NS + 1_500_000
@@ -359,6 +363,6 @@ def solved_with_share(pipeline: WristPipeline, setup: WristSetup, pip_deg: float
     """The pose of a natural hand of which only that share of each line is seen, about its centre."""
     angles = natural(setup, pip_deg)
     length_px = LaserCut(setup)(angles[None, None])[1][:, 0, 0]
-    whole = message(shown(setup, angles), pipeline._last_ns + TRIPLE_NS)
+    whole = message(shown(setup, angles), pipeline.fingers._last_ns + TRIPLE_NS)
     (only,) = pipeline.push(msgspec.structs.replace(whole, laser_px=share * length_px))
     return only.pose
