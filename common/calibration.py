@@ -152,6 +152,8 @@ class RigCalibration(Part, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
+    `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
+    `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
     From `laser_plane` on, the keys of a wrist rig, in its camera's frame; `forward`: how the place of the laser on a
     finger becomes its flexion, by the table of this hand or by the cubic printed in the paper; `finger_lines`: finger
@@ -167,7 +169,9 @@ class RigCalibration(Part, frozen=True):
     hand: Name
     markers: Markers = ("thumb", "index", "middle", "ring", "little", "back")
     free_markers: tuple[Name, ...] = ()
+    other_hands: tuple[Name, ...] = ()
     T_rig_camera: dict[Name, Matrix4] = {}
+    T_world_rig: Matrix4 | None = None
     depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
     power_law: PowerLawCalibration | None = None
     affine_disparity: AffineDisparityCalibration | None = None
@@ -352,23 +356,32 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
     if rig.kind == "wrist":
         if len(rig.cameras) != 1:
             raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")
+        for key in ("other_hands", "T_world_rig"):
+            if getattr(rig, key):
+                raise CalibrationError(f"{where}: {key}: of marker rigs; a wrist device is worn by one hand")
         return
+    if len({rig.hand, *rig.other_hands}) != 1 + len(rig.other_hands):
+        raise CalibrationError(f"{where}: other_hands: a hand stands twice")
+    if rig.T_world_rig is not None:
+        _check_pose(np.array(rig.T_world_rig), f"{where}: T_world_rig")
     # None at all: a rig that is still to be measured.
     for camera in rig.cameras if rig.T_rig_camera else ():
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
-        pose = rig.camera_pose(camera)
-        if (
-            not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-4)
-            or np.linalg.det(pose[:3, :3]) < 0
-        ):
-            raise CalibrationError(f"{where}: T_rig_camera.{camera}: upper left 3x3 is not a rotation")
-        if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
-            raise CalibrationError(f"{where}: T_rig_camera.{camera}: last row must be 0 0 0 1")
+        _check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
         )
+
+
+def _check_pose(pose: Float, where: str) -> None:
+    """Refuse a matrix (4, 4) that is no rotation and shift."""
+    turned = pose[:3, :3]
+    if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-4) or np.linalg.det(turned) < 0:
+        raise CalibrationError(f"{where}: upper left 3x3 is not a rotation")
+    if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
+        raise CalibrationError(f"{where}: last row must be 0 0 0 1")
 
 
 def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> None:

@@ -1,12 +1,15 @@
-"""From JSON to pipeline: reads rig, cameras and hand of a calibration folder and joins the parts they name."""
+"""From JSON to pipeline: reads rigs, cameras and hands of a calibration folder and joins the parts they name."""
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from dataclasses import replace as with_fields
 from math import nan
 from pathlib import Path
 from typing import Protocol, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
@@ -14,10 +17,11 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.hand_model import HandModel
-from common.messages import Detections
+from common.messages import Detections, MarkerDetections
 from master.filters import OneEuroParameters, PointFilter
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
+from master.rig_merge import merged_rig, refuse_shared_senders, rigs_by_hand
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
@@ -46,14 +50,16 @@ class Pipeline(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigSetup:
-    """A rig with everything its file refers to, checked; of markers, or of a wrist device.
+    """What watches one hand, with everything the files refer to, checked: a marker rig, a wrist device, or both.
 
     Attributes:
-        rig: The rig file.
-        cameras: Camera files by name, in the rig's order.
-        models: The same as camera models, placed in the rig.
+        rig: The rig file; of several marker rigs what they are together; with markers and a wrist device the former.
+        cameras: Camera files by name, in the order of the rigs.
+        models: Those of `rig` as camera models, placed in its frame, which is that of the poses.
         hand: The hand model.
-        wrist: Laser plane and palm of a wrist device; None: a marker rig.
+        wrist: Laser plane and palm of a wrist device; None: there is none.
+        wrist_rig: The rig file of that device.
+        rows: Camera -> which rows of its messages are `markers`, where it watches another hand as well.
     """
 
     rig: RigCalibration
@@ -61,16 +67,28 @@ class RigSetup:
     models: dict[str, CameraModel]
     hand: HandModel
     wrist: WristSetup | None = None
+    wrist_rig: RigCalibration | None = None
+    rows: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])
+
+    @property
+    def has_markers(self) -> bool:
+        """Whether cameras watch painted markers."""
+        return self.rig.kind == "markers"
 
     @property
     def markers(self) -> tuple[str, ...]:
-        """Names of the rig's markers; a wrist device has none."""
-        return self.rig.markers if self.wrist is None else ()
+        """Names of the markers; a wrist device has none."""
+        return self.rig.markers if self.has_markers else ()
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """All cameras, those of markers first."""
+        return tuple(self.cameras)
 
     @property
     def wrist_cameras(self) -> tuple[str, ...]:
         """The cameras that send strobed triples and no markers."""
-        return () if self.wrist is None else self.rig.cameras
+        return () if self.wrist_rig is None else self.wrist_rig.cameras
 
     @property
     def hand_markers(self) -> tuple[str, ...]:
@@ -79,31 +97,155 @@ class RigSetup:
 
     @property
     def imus(self) -> tuple[str, ...]:
-        """The rig's IMU, if it has one."""
-        return () if self.rig.imu is None else (self.rig.imu.name,)
+        """The IMU on the palm or on the forearm, if there is one."""
+        rigs = (self.rig,) if self.wrist_rig in (None, self.rig) else (self.rig, self.wrist_rig)
+        return tuple(rig.imu.name for rig in rigs if rig.imu is not None)
+
+    def own(self, message: Detections) -> Detections:
+        """The message with the markers of this hand alone."""
+        rows = self.rows.get(message.camera)
+        if rows is None or not isinstance(message, MarkerDetections):
+            return message
+        chosen = list(rows)
+        return replace(
+            message,
+            uv=message.uv[chosen],
+            area=message.area[chosen],
+            quality=message.quality[chosen],
+            sigma_px=message.sigma_px[chosen],
+            rival_uv=message.rival_uv[chosen],
+        )
 
     @classmethod
-    def of(cls, rig: RigCalibration, cameras: dict[str, CameraCalibration], hand: HandModel) -> "RigSetup":
-        """Join the files.
+    def of(cls, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandModel) -> "RigSetup":
+        """Join the files of a rig that watches one hand.
 
         Raises:
             CalibrationError: A camera of the rig is missing or has no intrinsics; of a marker rig: fewer than two
-                cameras, or a marker the hand does not mount and that is not free; of a wrist device: no laser plane
-                or no palm pose.
+                cameras, several hands, or a marker the hand does not mount and that is not free; of a wrist device: no
+                laser plane or no palm pose.
         """
         if rig.kind == "markers" and len(rig.cameras) < 2:
             raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
+        if rig.other_hands:
+            raise CalibrationError(
+                f"rig {rig.name!r}: other_hands: it watches {1 + len(rig.other_hands)} hands, this needs a rig of one"
+            )
         missing = [name for name in rig.cameras if name not in cameras]
         if missing:
             raise CalibrationError(f"rig {rig.name!r}: no camera file for {missing[0]!r}")
         ordered = {name: cameras[name] for name in rig.cameras}
         models = {name: CameraModel.of(camera, rig.camera_pose(name)) for name, camera in ordered.items()}
         if rig.kind == "wrist":
-            return cls(rig, ordered, models, hand, WristSetup.of(rig, ordered[rig.cameras[0]], hand))
+            wrist = WristSetup.of(rig, ordered[rig.cameras[0]], hand)
+            return cls(rig, ordered, models, hand, wrist, rig)
         for name in rig.markers:
             if name not in rig.free_markers:
                 hand.mount(name)
         return cls(rig, ordered, models, hand)
+
+    @classmethod
+    def joined(cls, setups: Sequence["RigSetup"]) -> "RigSetup":
+        """All that watches one hand: its marker rigs become one of N cameras in the frame that they share
+        (`T_world_rig`), and its wrist device stands beside them.
+
+        Args:
+            setups: One or more, of one hand.
+
+        Raises:
+            CalibrationError: They are of different hands, two are wrist devices, two have a camera or IMU of the same
+                name or two IMUs, or the marker rigs cannot be merged (`merged_rig`).
+        """
+        marked = [setup for setup in setups if setup.has_markers]
+        worn = [setup for setup in setups if not setup.has_markers]
+        rigs = [setup.rig for setup in setups]
+        _refuse_two(setups, worn)
+        refuse_shared_senders(rigs)
+        if not marked:
+            return worn[0]
+        cameras = {name: file for setup in marked for name, file in setup.cameras.items()}
+        out = cls.of(merged_rig([setup.rig for setup in marked]), cameras, setups[0].hand)
+        rows = {name: which for setup in marked for name, which in setup.rows.items()}
+        if not worn:
+            return with_fields(out, rows=rows)
+        return with_fields(
+            out, cameras=cameras | worn[0].cameras, wrist=worn[0].wrist, wrist_rig=worn[0].rig, rows=rows
+        )
+
+
+def _refuse_two(setups: Sequence[RigSetup], worn: Sequence[RigSetup]) -> None:
+    """Refuse rigs that are not of one hand, or of which two claim what a hand has once.
+
+    Raises:
+        CalibrationError: With both rigs.
+    """
+    first = setups[0]
+    for setup in setups:
+        if setup.hand.profile != first.hand.profile:
+            raise CalibrationError(
+                f"rigs {first.rig.name!r} and {setup.rig.name!r} are of different hands,"
+                f" {first.hand.profile.name!r} and {setup.hand.profile.name!r}"
+            )
+    if len(worn) > 1:
+        raise CalibrationError(
+            f"rigs {worn[0].rig.name!r} and {worn[1].rig.name!r} are both of kind 'wrist' and of hand"
+            f" {first.hand.profile.name!r}: a hand wears one wrist device"
+        )
+    sensed = [setup.rig.name for setup in setups if setup.rig.imu is not None]
+    if len(sensed) > 1:
+        raise CalibrationError(
+            f"rigs {sensed[0]!r} and {sensed[1]!r} both have an IMU: imu: a hand has one, on the palm or on the forearm"
+        )
+
+
+def setups_of(
+    rigs: Sequence[RigCalibration],
+    cameras: Mapping[str, CameraCalibration],
+    hand_named: Callable[[str], HandModel],
+) -> tuple[RigSetup, ...]:
+    """What watches each hand of these rigs, in the order in which they name the hands.
+
+    A marker rig with `other_hands` watches several: each of its markers is that of the hand that mounts it. Free
+    markers stay with the rig's first hand.
+
+    Raises:
+        CalibrationError: As of `RigSetup.joined`; of a rig of several hands a marker is mounted by none or by two.
+    """
+    refuse_shared_senders(rigs)
+    found: dict[str, list[RigSetup]] = {}
+    for rig in rigs:
+        hands = {name: hand_named(name) for name in (rig.hand, *rig.other_hands)}
+        for name, own, chosen in rigs_by_hand(rig, hands):
+            setup = RigSetup.of(own, cameras, hands[name])
+            rows = dict.fromkeys(rig.cameras, chosen) if rig.other_hands else {}
+            found.setdefault(name, []).append(with_fields(setup, rows=rows))
+    return tuple(RigSetup.joined(setups) for setups in found.values())
+
+
+def load_setups(
+    calibration: Path, rig_names: Sequence[str], hand_file: Path | None = None
+) -> tuple[RigSetup, ...]:
+    """Read rigs/<rig>.json of each rig, their cameras and hands from a calib_json tree: a setup for each hand.
+
+    Args:
+        calibration: The tree.
+        rig_names: One or more.
+        hand_file: Profile of the hand, in place of that which the rigs name.
+
+    Raises:
+        CalibrationError: A file is missing, broken or contradicts another; as of `setups_of`.
+    """
+    rigs = [load(calibration / "rigs" / f"{name}.json", RigCalibration) for name in rig_names]
+    names = tuple(dict.fromkeys(name for rig in rigs for name in (rig.hand, *rig.other_hands)))
+    if hand_file is not None and len(names) > 1:
+        raise CalibrationError(f"--hand {hand_file}: is one hand; the rigs are of {', '.join(names)}")
+    cameras = {
+        name: load(calibration / "cameras" / f"{name}.json", CameraCalibration)
+        for rig in rigs
+        for name in rig.cameras
+    }
+    hands = {name: load_hand(calibration, name, hand_file) for name in names}
+    return setups_of(rigs, cameras, hands.__getitem__)
 
 
 def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) -> RigSetup:
@@ -162,7 +304,7 @@ def hand_filter(setup: RigSetup) -> HandFilter:
 def build_pipeline(
     setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
 ) -> MarkerPipeline:
-    """The pipeline this marker rig's file describes.
+    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used.
 
     Args:
         setup: The rig.
@@ -173,9 +315,9 @@ def build_pipeline(
     Raises:
         CalibrationError: The depth model does not fit the rig, or it is no marker rig.
     """
-    if setup.wrist is not None:
+    if not setup.has_markers:
         raise CalibrationError(f"rig {setup.rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
-    rates = {name: camera.frame_rate_hz for name, camera in setup.cameras.items()}
+    rates = {name: setup.cameras[name].frame_rate_hz for name in setup.models}
     return MarkerPipeline(
         setup.models,
         setup.hand,
@@ -203,6 +345,8 @@ def pipeline_of(
     It takes what the cameras of its own kind of rig send, and nothing else is ever pushed: the link refuses a camera
     that sends what those of the other kind do.
     """
+    if setup.has_markers and setup.wrist is not None:
+        raise CalibrationError(f"rig {setup.rig.name!r}: cannot be solved together with a wrist device yet")
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
     try:
