@@ -8,6 +8,10 @@ from hypothesis import HealthCheck, settings
 
 ROOT = Path(__file__).resolve().parents[1]
 
+# A test keeps to one core, as do the processes that it starts: on as many cores as there are, the matrix products of
+# one would hold up those beside it. Read by the library when numpy is first imported, which is after this file.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Seeded and without deadlines: a test fails because the code is wrong, never because the machine was slow.
 settings.register_profile(
     "house", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
