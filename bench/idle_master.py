@@ -11,7 +11,9 @@ from master.__main__ import main
 from master.ik.tracker import TrackedHand, pose_of
 from master.stereo.pipeline import MarkerPipeline, SolvedPose
 
-_NOTHING = TrackedHand(None, np.zeros(26, bool), np.zeros(26, bool), np.zeros(26, np.uint8))
+_NOTHING = TrackedHand(
+    None, np.zeros(26, bool), np.zeros(26, bool), np.zeros(26, np.uint8), np.zeros(6, np.int64)
+)
 
 
 def pass_on(self: MarkerPipeline, message: MarkerDetections) -> list[SolvedPose]:

@@ -46,13 +46,16 @@ class FingerRefiner:
                 )
                 self._fingers[finger] = (index, closed_form, fabrik)
 
-    def __call__(self, hand: HandSolution, points_m: Float, cov_m2: Float) -> HandSolution:
+    def __call__(
+        self, hand: HandSolution, points_m: Float, cov_m2: Float, told: frozenset[int] = frozenset()
+    ) -> HandSolution:
         """The same palm with every seen finger on its cap, as far as noise asks and limits allow.
 
         Args:
             hand: Solution of the whole-hand fit.
             points_m: Cap centroids (M, 3) [m], rig frame; NaN: not seen.
             cov_m2: (M, 3, 3) [m^2].
+            told: Fingers whose angles another sensor tells: the search begins from these, not from the closed form.
         """
         surprise = surprise_of(points_m - self._model.marker_points(hand.joints, self._markers), cov_m2)
         T_palm_rig, angles = invert(hand.T_rig_palm), hand.angles_rad.copy()
@@ -60,7 +63,7 @@ class FingerRefiner:
             if not surprise[marker] >= EXPLAINED:  # NaN: not seen
                 continue
             x, y, z = (float(value) for value in transform(T_palm_rig, points_m[marker]))
-            determined = closed_form.chain.coupling is not None
+            determined = closed_form.chain.coupling is not None and finger not in told
             found = _solve(closed_form, fabrik, (x, y, z), None if determined else angles[finger])
             if found is not None:
                 angles[finger] = found

@@ -16,6 +16,7 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
+from master.ik.finger_belief import FingerBelief
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
 from master.ik.palm import Facing, Orientation, PalmPrior
@@ -69,7 +70,7 @@ class HandSolution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Told:
-    """What `HandSolver.solve` is told; `seen` (M,): which markers, `shown`: which fingers have one."""
+    """What `HandSolver.solve` is told; `seen` (M,): which markers, `shown`: fingers that have one or are told of."""
 
     points_m: Float
     cov_m2: Float
@@ -83,6 +84,7 @@ class _Told:
     enough: float
     near: HandSolution | None
     orientation: Orientation | None
+    fingers: FingerBelief | None
 
 
 class HandSolver:
@@ -121,8 +123,9 @@ class HandSolver:
         near: HandSolution | None = None,
         orientation: Orientation | None = None,
         age_s: Float | None = None,
+        fingers: FingerBelief | None = None,
     ) -> HandSolution | None:
-        """Fit the hand to its markers.
+        """Fit the hand to its markers, and to what other sensors say of palm and fingers.
 
         Args:
             points_m: Cap centroids (M, 3) [m], rig frame; NaN row: not seen.
@@ -138,7 +141,8 @@ class HandSolver:
                 ends where all markers are explained. Nothing else is taken from it, and fingers without a marker
                 begin at a natural posture.
             orientation: The palm's orientation as an IMU has it; None: not known.
-            age_s: (6,) [s] how long ago markers told of each finger, and of the palm, what `last` says; None: `dt_s`.
+            age_s: (6,) [s] how long ago each finger, and the palm, was told of what `last` says; None: `dt_s`.
+            fingers: The fingers' angles as another sensor has them; None: there is none.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
@@ -148,9 +152,23 @@ class HandSolver:
         if last is None and not _determined(points_m[seen], facing, orientation):
             return None
         shown = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
+        if fingers is not None:
+            shown |= fingers.fingers
         age_s = np.full(6, dt_s) if age_s is None else age_s
         told = _Told(
-            points_m, cov_m2, seen, shown, last, dt_s, age_s, hidden, facing, enough, near, orientation
+            points_m,
+            cov_m2,
+            seen,
+            shown,
+            last,
+            dt_s,
+            age_s,
+            hidden,
+            facing,
+            enough,
+            near,
+            orientation,
+            fingers,
         )
         # A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         like = frozenset(f for f in (2, 3) if hidden is None and f not in shown and {f - 1, f + 1} <= shown)
@@ -163,6 +181,9 @@ class HandSolver:
         habits = self._habits(told, like)
         # Where a hidden finger was held is a memory, not what this instant tells.
         alone = habits if told.hidden is None else self._priors[frozenset()]
+        if told.fingers is not None:
+            rows = told.fingers.rows(self.parameters)
+            habits, alone = habits.and_joint(*rows), alone.and_joint(*rows)
         problem = self._problem(told, habits)
         last, near, points = told.last, told.near, told.points_m
         if last is not None:
@@ -170,11 +191,11 @@ class HandSolver:
             way = problem.minimise(*self._seed_of(last), told.enough)
             return self._solution(problem, alone, way, points, before)
         if near is not None:
-            way = problem.minimise(*self._seed_near(near, told.shown), told.enough)
+            way = problem.minimise(*self._seed_near(near, told), told.enough)
             found = self._solution(problem, alone, way, points)
             if found.iterations < MAX_ITERATIONS and self._explains(found, problem, told):
                 return found
-        best = problem.minimise(*self._seeds(points, told.seen, told.facing), told.enough)
+        best = problem.minimise(*self._seeds(points, told), told.enough)
         return self._solution(problem, alone, best, points)
 
     def _problem(self, told: _Told, habits: AnglePrior) -> HandProblem:
@@ -222,21 +243,38 @@ class HandSolver:
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self.parameters.of_angles(last.angles_rad)[None]
 
-    def _seed_near(self, hand: HandSolution, shown: frozenset[int]) -> tuple[Float, Float]:
-        known = np.isin(self.parameters.free // 4, list(shown))
+    def _seed_near(self, hand: HandSolution, told: _Told) -> tuple[Float, Float]:
+        known = np.isin(self.parameters.free // 4, list(told.shown))
         x = np.where(known, self.parameters.of_angles(hand.angles_rad), self._natural)
-        return hand.T_rig_palm[None], x[None]
+        return hand.T_rig_palm[None], self._as_told(x[None], told.fingers)
 
-    def _seeds(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
+    def _as_told(self, x: Float, fingers: FingerBelief | None) -> Float:
+        """Free angles (S, n) with those of fingers that another sensor tells."""
+        if fingers is None or not fingers.told.any():
+            return x
+        known = np.isin(self.parameters.free // 4, list(fingers.fingers))
+        return np.where(known, self.parameters.of_angles(np.nan_to_num(fingers.angles_rad)), x)
+
+    def _seeds(self, points: Float, told: _Told) -> tuple[Float, Float]:
         """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
+        seen, facing = told.seen, told.facing
         weight = np.where(self._attached.on_finger[seen, 0], 1.0, 3.0)
-        observed, expected = points[seen], self._shapes_m[:, seen]
+        postures, shapes_m = self._as_told(self._postures, told.fingers), self._shapes_m
+        if postures is not self._postures:
+            shapes_m = self._attached.place(self.model.chains(self.parameters.angles(postures)))
+        observed, expected = points[seen], shapes_m[:, seen]
         if facing is not None:
             # A point above the wrist stands for "the back of the hand faces the cameras".
             above = expected.mean(axis=1, keepdims=True) + np.array([0.0, 0.05, 0.0])
             observed = np.vstack([observed, observed.mean(axis=0) + 0.05 * facing])
             expected, weight = np.concatenate([expected, above], axis=1), np.append(weight, 0.3)
-        return fit_rigid(observed, expected, weight), self._postures
+        if told.orientation is not None and told.orientation.sure:
+            R = told.orientation.rotation
+            T = np.tile(np.eye(4), (len(postures), 1, 1))
+            T[:, :3, :3] = R
+            T[:, :3, 3] = np.average(observed - expected @ R.T, axis=1, weights=weight)
+            return T, postures
+        return fit_rigid(observed, expected, weight), postures
 
     def _solution(
         self,

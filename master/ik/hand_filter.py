@@ -11,10 +11,12 @@ The joints come from forward kinematics of what was filtered, so bones keep thei
 PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
 limits; what has to be cut is an abduction that the filtered flexion does not allow.
 
-**Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held. The difference between what was
-shown last and what is solved now is added to the solution and fades within a tenth of a second, as networked games
-lead a player over to where the server says it is: the motion goes on, the error goes. While it fades, the covariance
-of a joint contains the square of how far it is shown from where it is solved to be.
+**Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held; and where another sensor takes over
+from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
+solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
+the server says it is: the motion goes on, the error goes. A hand that other sensors kept in sight meanwhile is led no
+faster than a given speed. While it fades, the covariance of a joint contains the square of how far it is shown from
+where it is solved to be, and such a joint is not called tracked while it is shown more than 5 mm from there.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
@@ -26,16 +28,17 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, unskew
-from common.hand_model import CHAINS, MIDDLE_PROXIMAL, PALM, TIPS, HandJoints, HandModel
+from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
 from master.ik.hand import HandSolution
 from master.ik.part_filter import PartFilter
 from master.ik.tracker import TrackedHand
 
 LEAD_OVER_S = 0.1
+_STEEPEST = 1.5  # slope of the fading where it is steepest
+_ELSEWHERE_M = 5e-3
 _FORGET_S = 0.5  # after this long without a hand the next one begins anew
 _PLACE, _TURN, _ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 _PARTS = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
-_SEEN_BY = np.append(TIPS, PALM)  # part -> joint that is tracked when it is
 
 
 @dataclass(slots=True, eq=False)
@@ -45,52 +48,59 @@ class _Shown:
     Attributes:
         smooth: The filter of the 26 signals: place (3), turn (3), angles (5, 4), all [m].
         t_ns: When.
-        seen: (6,) which fingers, and the palm, had a marker.
+        rests: (6,) what the fingers, and the palm, rested on: `TrackedHand.rests`.
         values: (26,) [m] the filtered signals.
         rotation: (3, 3) palm to rig, as filtered.
         offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
-        since_ns: (6,) when that was.
+        since_ns, takes_s: (6,) when that was, and how long [s] it fades.
         until_ns: When nothing is left of any.
     """
 
     smooth: PartFilter
     t_ns: int
-    seen: Bool
+    rests: Int
     values: Float
     rotation: Float
     offset: Float
     since_ns: Int
+    takes_s: Float
     until_ns: int
 
-    def leap(self, t_ns: int, parts: Bool, solved: Float) -> None:
-        """Parts (6,) are seen again, at signals (26,)."""
+    def leap(self, t_ns: int, parts: Bool, solved: Float, lead_m_s: float) -> None:
+        """Parts (6,) are seen again, or otherwise, at signals (26,)."""
         self.offset = np.where(parts[_PARTS], self.values - solved, self.offset)
+        size_m = np.bincount(_PARTS, np.abs(self.offset))
+        takes_s = np.maximum(LEAD_OVER_S, _STEEPEST * size_m / lead_m_s)
         self.since_ns = np.where(parts, t_ns, self.since_ns)
-        self.until_ns = t_ns + round(LEAD_OVER_S * 1e9)
+        self.takes_s = np.where(parts, takes_s, self.takes_s)
+        self.until_ns = int((self.since_ns + np.rint(1e9 * self.takes_s).astype(np.int64)).max())
 
     def left(self, t_ns: int) -> Float | None:
         """What is left of the leaps (26,) [m]; None: nothing."""
         if t_ns >= self.until_ns:
             return None
-        x = np.minimum((t_ns - self.since_ns) * (1e-9 / LEAD_OVER_S), 1.0)
+        x = np.minimum((t_ns - self.since_ns) * 1e-9 / self.takes_s, 1.0)
         return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[_PARTS]  # smooth at both ends
 
 
 class HandFilter:
     """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
 
-    def __init__(self, model: HandModel, markers: tuple[str, ...], jitter_m: float) -> None:
+    def __init__(
+        self, model: HandModel, markers: tuple[str, ...], jitter_m: float, lead_m_s: float | None = None
+    ) -> None:
         """Set up.
 
         Args:
             model: The hand.
             markers: Names of its markers in the order of the covariances.
             jitter_m: Standard deviation that may be left of a signal's noise at rest [m].
+            lead_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
 
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._jitter_m = model, jitter_m
+        self._model, self._jitter_m, self._lead_m_s = model, jitter_m, lead_m_s
         rest = model.rest_position_m
         self._knuckle = rest[MIDDLE_PROXIMAL]
         fingers = [model.mount(name).finger for name in markers]
@@ -114,16 +124,19 @@ class HandFilter:
         if solution is None or not hand.valid.any():
             self._shown = None
             return hand
-        seen = hand.tracked[_SEEN_BY]
+        rests = hand.rests
+        seen: Bool = rests > 0
         gap_s = 0.0 if shown is None else (t_ns - shown.t_ns) * 1e-9
         if shown is None or gap_s > _FORGET_S:
-            shown = self._shown = self._begin(t_ns, solution, seen)
+            shown = self._shown = self._begin(t_ns, solution, rests)
         elif gap_s <= 0.0:
             return hand
         else:
-            again = seen if gap_s > LEAD_OVER_S else seen & ~shown.seen  # without frames, nothing was seen
+            again = (
+                seen if gap_s > LEAD_OVER_S else seen & (rests != shown.rests)
+            )  # without frames, nothing was seen
             if again.any():
-                shown.leap(t_ns, again, self._signals(solution, shown))
+                shown.leap(t_ns, again, self._signals(solution, shown), self._lead_m_s or np.inf)
         left = shown.left(t_ns)
         signals = self._signals(solution, shown)
         if left is not None:
@@ -133,20 +146,25 @@ class HandFilter:
             rotation_vector_to_matrix((signals - shown.values)[_TURN] / self._across_m) @ shown.rotation
         )
         joints, angles = self._posed(signals, rotation)
-        cov = solution.cov_m2
+        cov, tracked = solution.cov_m2, hand.tracked
         if left is not None:
             off = joints.position_m - solution.joints.position_m
             cov = cov + off[:, :, None] * off[:, None, :]
-        shown.t_ns, shown.seen, shown.values, shown.rotation = t_ns, seen, signals, rotation
+            if self._lead_m_s is not None:
+                tracked = tracked & (np.vecdot(off, off) < _ELSEWHERE_M**2)
+        shown.t_ns, shown.rests, shown.values, shown.rotation = t_ns, rests, signals, rotation
         T = joints.T_rig_palm
         return replace(
-            hand, solution=replace(solution, T_rig_palm=T, angles_rad=angles, joints=joints, cov_m2=cov)
+            hand,
+            solution=replace(solution, T_rig_palm=T, angles_rad=angles, joints=joints, cov_m2=cov),
+            tracked=tracked,
         )
 
-    def _begin(self, t_ns: int, solution: HandSolution, seen: Bool) -> _Shown:
+    def _begin(self, t_ns: int, solution: HandSolution, rests: Int) -> _Shown:
         smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
-        return _Shown(smooth, t_ns, seen, np.zeros(26), rotation, np.zeros(26), never, t_ns)
+        nothing, soon = np.zeros(26), np.full(6, LEAD_OVER_S)
+        return _Shown(smooth, t_ns, rests, nothing, rotation, nothing, never, soon, t_ns)
 
     def _signals(self, solution: HandSolution, shown: _Shown) -> Float:
         """What is filtered (26,) [m]."""

@@ -79,6 +79,10 @@ class HandParameters:
             x[..., self.abduction] *= self._share(self._flexed(x))
         return (x @ self.complete.T).reshape(*x.shape[:-1], 5, 4)
 
+    def by_angles(self, x: Float) -> Float:
+        """Derivatives (20, n) of all angles by the free ones at x (n,)."""
+        return self.by_parameters(self.complete[:, None].copy(), x)[:, 0]
+
     def by_parameters(self, J: Float, x: Float) -> Float:
         """Derivatives (..., P, 3, n) by the free angles as they are -> by the parameters at x (..., n); in place."""
         if len(self.abduction):

@@ -21,6 +21,7 @@ from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.arcs import Arcs
 from master.ik.doubt import JointDoubt
+from master.ik.finger_belief import FingerBelief
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
@@ -31,17 +32,27 @@ from master.volume import inside
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
+ON_MARKERS, ON_OTHERS = 1, 2
+_PALM_BY_MARKERS = 3
+_SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
 _GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedHand:
-    """A solution with its bits: valid (26,), tracked (26,), source (26,)."""
+    """A solution with its bits.
+
+    Attributes:
+        solution: The hand; None: nothing was solved yet.
+        valid, tracked, source: (26,) as of `HandPose`.
+        rests: (6,) what thumb ... little and the palm rest on now: the sum of `ON_MARKERS` and `ON_OTHERS`.
+    """
 
     solution: HandSolution | None
     valid: Bool
     tracked: Bool
     source: Code
+    rests: Int
 
 
 class HandTracker:
@@ -109,6 +120,7 @@ class HandTracker:
         towards_cameras: Float,
         measured: Bool | None = None,
         orientation: Orientation | None = None,
+        fingers: FingerBelief | None = None,
     ) -> TrackedHand:
         """Solve one instant.
 
@@ -119,47 +131,83 @@ class HandTracker:
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
             measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
             orientation: The palm's orientation as an IMU has it; None: not known.
+            fingers: The fingers' angles as a wrist device has them; None: it says nothing.
         """
         seen = seen_markers(points_m, cov_m2)
-        tells_palm = self._tells_palm(seen, orientation)
+        palm_rests = self._palm_rests(seen, orientation)
+        tells_palm = palm_rests > 0
+        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
+        if fingers is not None:
+            told[:5] |= fingers.told
         last, dt_s = self.recent(t_ns)
         if last is None:
             self._forget()
         facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None
         if last is not None:
-            fingers = frozenset(self._finger[seen].tolist())
-            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, fingers)
+            known = frozenset(np.flatnonzero(told[:5]).tolist())
+            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, known)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
-        age_s = self._ages_s(t_ns, dt_s, seen, tells_palm=tells_palm)
-        solution = self._solver.solve(
-            points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s
-        )
+        age_s = self._ages_s(t_ns, dt_s, told)
+        solution = self._solve(points_m, cov_m2, last, dt_s, held, facing, orientation, age_s, fingers)
         if solution is not None and last is not None:
-            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation)
+            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation, fingers)
             if fresh is not None:
                 solution, last = fresh, None  # the leap was no motion
                 self._forget()
         if solution is not None:
-            solution = self._refine(solution, points_m, cov_m2)
+            solution = self._refine(
+                solution, points_m, cov_m2, frozenset() if fingers is None else fingers.fingers
+            )
             cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
             solution = replace(solution, cov_m2=cov)
             if last is not None:
                 self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)
-        if seen.any():
+        if seen.any() or (fingers is not None and fingers.told.any() and self._knows_place()):
             self._seen_ns = t_ns
         placed = seen if measured is None else seen & measured
-        bits = self._bits(t_ns, solution, seen, placed, tells_palm=tells_palm, held=hidden is not None)
+        bits = self._bits(t_ns, solution, seen, placed, fingers, palm_rests, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
 
-    def _ages_s(self, t_ns: int, dt_s: float, seen: Bool, *, tells_palm: bool) -> Float:
-        """(6,) [s] how old what the last pose says of each finger and of the palm is, where markers now tell of it.
+    def _solve(
+        self,
+        points_m: Float,
+        cov_m2: Float,
+        last: HandSolution | None,
+        dt_s: float,
+        held: tuple[Float, Float] | None,
+        facing: Float | None,
+        orientation: Orientation | None,
+        age_s: Float,
+        fingers: FingerBelief | None,
+    ) -> HandSolution | None:
+        """The fit; once more where markers contradict what is told of a finger, which counts less then."""
+
+        def fit(told: FingerBelief | None) -> HandSolution | None:
+            return self._solver.solve(
+                points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s, fingers=told
+            )
+
+        found = fit(fingers)
+        if found is None or fingers is None:
+            return found
+        weighed = fingers.weighed(found.angles_rad)
+        return found if weighed is None else fit(weighed)
+
+    def _knows_place(self) -> bool:
+        """Whether it is still known where the hand is, when nothing but its fingers is told."""
+        cov = self.doubt.cov
+        if self._seen_ns is None or cov is None:
+            return False
+        return float(np.trace(cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
+
+    def _ages_s(self, t_ns: int, dt_s: float, told: Bool) -> Float:
+        """(6,) [s] how old what the last pose says of each finger and of the palm is, where these are told (6,) now.
 
         A finger that was hidden, or a palm, moved on for as long as nobody saw it, not since the last frame.
         """
-        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
         ages = np.where(told, (t_ns - self._told_ns) * 1e-9, dt_s)
         self._told_ns = np.where(told, t_ns, self._told_ns)
         return ages
@@ -172,6 +220,7 @@ class HandTracker:
         hidden: tuple[Float, Float] | None,
         facing: Float | None,
         orientation: Orientation | None,
+        fingers: FingerBelief | None,
     ) -> HandSolution | None:
         """The hand without the last pose, which may have led into the wrong valley; None: `found` is no worse.
 
@@ -180,7 +229,9 @@ class HandTracker:
         worst_m = self._unexplained_m(found, points_m, cov_m2)
         if worst_m <= _BAD_FIT_M:
             return None
-        fresh = self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation)
+        fresh = self._solver.solve(
+            points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation, fingers=fingers
+        )
         if fresh is None or self._unexplained_m(fresh, points_m, cov_m2) >= 0.5 * worst_m:
             return None
         return fresh
@@ -208,11 +259,11 @@ class HandTracker:
         hidden = None if curled else (np.zeros((5, 4)), np.full(5, np.inf))
         return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, _GLANCE, self.last)
 
-    def _tells_palm(self, seen: Bool, orientation: Orientation | None) -> bool:
-        """Whether this instant tells where the palm is and how it is turned."""
-        if orientation is not None and orientation.sure:
-            return bool(seen.any())
-        return bool(seen.sum() >= 3 or (seen.sum() == 2 and (seen & self._on_palm).any()))
+    def _palm_rests(self, seen: Bool, orientation: Orientation | None) -> int:
+        """What tells at this instant where the palm is and how it is turned; 0: nothing does."""
+        if seen.sum() >= _PALM_BY_MARKERS or (seen.sum() == 2 and (seen & self._on_palm).any()):
+            return ON_MARKERS
+        return ON_OTHERS if orientation is not None and orientation.sure and seen.any() else 0
 
     def _bits(
         self,
@@ -220,16 +271,18 @@ class HandTracker:
         solution: HandSolution | None,
         seen: Bool,
         placed: Bool,
+        fingers: FingerBelief | None,
+        palm_rests: int,
         *,
-        tells_palm: bool,
         held: bool,
     ) -> TrackedHand:
         valid = np.zeros(26, dtype=bool)
         tracked = np.zeros(26, dtype=bool)
         source = np.zeros(26, dtype=np.uint8)
         recent = self._seen_ns is not None and (t_ns - self._seen_ns) * 1e-9 <= _FORGET_S
+        rests, tells_palm = np.zeros(6, np.int64), palm_rests > 0
         if solution is None:
-            return TrackedHand(None, valid, tracked, source)
+            return TrackedHand(None, valid, tracked, source, rests)
         valid[:] = recent
         unseen = Source.HELD if held else Source.SOLVED
         source[:] = unseen
@@ -238,12 +291,20 @@ class HandTracker:
             tracked[palm] = True
             source[palm] = Source.SOLVED
         on_finger = self._finger >= 0
+        rests[5] = palm_rests
+        if fingers is not None:
+            # Where a finger is rests on where the palm is; how it is bent does not.
+            rests[:5] += ON_OTHERS * fingers.told
+            chains = CHAINS[fingers.told]
+            source[chains] = Source.WRIST
+            tracked[chains] = tells_palm
         for f in self._finger[seen & on_finger]:
             told = CHAINS[f] if tells_palm else TIPS[f]
             tracked[told] = True
             source[told] = Source.SOLVED
+        rests[self._finger[seen & on_finger]] += ON_MARKERS
         source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
-        return TrackedHand(solution, valid, tracked & valid, source)
+        return TrackedHand(solution, valid, tracked & valid, source, rests)
 
 
 def pose_of(

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from math import nan
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -19,10 +20,12 @@ from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
 from master.filters import PointFilter
+from master.ik.finger_belief import FingerBelief
 from master.ik.hand import HandSolution
 from master.ik.hand_filter import HandFilter
 from master.ik.orientation import OrientationTrack
-from master.ik.tracker import HandTracker, pose_of
+from master.ik.palm import Orientation
+from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw
@@ -37,6 +40,22 @@ _HAND_DEPTH_M = 0.06  # a marker seen by one camera lies about as deep as the ot
 # Where one camera sees all there is, its depth is held: perspective alone lets it drift.
 _HELD_DEPTH_M = 0.004
 _NAME = 64  # characters of a name in `Health`
+
+
+class OtherSensors(Protocol):
+    """What watches the same hand beside the cameras: a wrist device and its IMU (`master.fusion`)."""
+
+    def palm(self, t_ns: int) -> Orientation | None:
+        """The palm's orientation at an instant, rig frame; None: not known."""
+        ...
+
+    def fingers(self, t_ns: int) -> FingerBelief | None:
+        """The fingers' angles at an instant; None: nothing is known."""
+        ...
+
+    def solved(self, t_ns: int, hand: TrackedHand, palm: Orientation | None) -> None:
+        """Learn from the hand as it was solved, with that orientation among what it was solved from."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +84,7 @@ class MarkerPipeline:
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
+        others: OtherSensors | None = None,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
@@ -82,6 +102,7 @@ class MarkerPipeline:
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
             imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
+            others: What else watches the hand; None: nothing does.
             stage: Opens a timer by stage name.
         """
         self.model, self.markers = model, markers
@@ -97,6 +118,8 @@ class MarkerPipeline:
         self._located = CapLocator(self._cameras, self._caps, self._place)
         self._stage, self._volume = stage, volume
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
+        self._others = others
+        self._last_ns = -(2**63)
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
@@ -108,7 +131,16 @@ class MarkerPipeline:
             message = msgspec.structs.replace(message, t_ns=message.t_ns + late_ns)
         with self._stage("pairing"):
             instants = self._pairing.push(message)
-        return [self._solve(instant) for instant in instants]
+        return self._solved(instants)
+
+    def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
+        """The pose at an instant at which no camera saw anything, by what else watches the hand; None: it is past."""
+        shape = (len(self._cameras), len(self.markers))
+        unseen = np.full(shape, np.nan)
+        nothing = np.full((*shape, 2), np.nan)
+        instant = Instant(t_ns, nothing, unseen, unseen, ready_t_ns, np.ones(len(self._cameras), np.bool_))
+        poses = self._solved([instant])
+        return poses[0] if poses else None
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take what the IMU says of its own orientation (4,), for the instants about `t_ns`."""
@@ -119,7 +151,18 @@ class MarkerPipeline:
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: the poses that still wait for a camera."""
-        return [self._solve(instant) for instant in self._pairing.flush()]
+        return self._solved(self._pairing.flush())
+
+    def _solved(self, instants: list[Instant]) -> list[SolvedPose]:
+        """Poses of instants later than the last pose; others are counted: cameras came back with old frames."""
+        poses: list[SolvedPose] = []
+        for instant in instants:
+            if instant.t_ns <= self._last_ns:
+                self.counts["instants_late"] += 1
+                continue
+            self._last_ns = instant.t_ns
+            poses.append(self._solve(instant))
+        return poses
 
     def _solve(self, instant: Instant) -> SolvedPose:
         last, age_s = self._tracker.recent(instant.t_ns)
@@ -146,9 +189,15 @@ class MarkerPipeline:
             aims = self._with_rays(instant, raw, cov + found.repeated, last, age_s)
             measured = np.isfinite(raw[self._on_hand, 0])
             turned = None if self._orientation is None else self._orientation.at(instant.t_ns, near)
+            fingers = None
+            if self._others is not None:
+                turned = turned or self._others.palm(instant.t_ns)
+                fingers = self._others.fingers(instant.t_ns)
             hand = self._tracker.push(
-                instant.t_ns, *aims, self._towards(raw, instant), measured, orientation=turned
+                instant.t_ns, *aims, self._towards(raw, instant), measured, turned, fingers
             )
+            if self._others is not None:
+                self._others.solved(instant.t_ns, hand, turned)
             if self._steady is not None:
                 hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand])
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)

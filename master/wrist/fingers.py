@@ -95,6 +95,11 @@ class WristFingers:
         self._last_ns = NEVER_NS
         self._angles, self._seen_ns = np.full((5, 4), np.nan), np.full(5, NEVER_NS)
 
+    @property
+    def habits(self) -> Float:
+        """(5, 4, 4) [1/rad^2] what habit adds to what laser points alone tell of the angles."""
+        return self._believe.habits
+
     def push(self, message: WristDetections, bend_rad: Float = STRAIGHT) -> SeenFingers | None:
         """Take what one triple showed.
 

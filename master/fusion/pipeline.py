@@ -1,0 +1,162 @@
+"""One hand from marker cameras, a wrist device and its IMU: not a switch between them but one fit.
+
+`FusedPipeline` is a push machine without clock, socket or thread. Every pose is the marker line's (`master.stereo`),
+with two beliefs more in its fit:
+
+- the fingers' angles as the wrist device has them, each with its covariance (`finger_track`),
+- the palm's turn as the IMU on the forearm has it, through wrist and heading that are learnt while markers tell the
+  palm (`forearm`).
+
+A sensor that says nothing adds nothing; there is no state in which one is used and another not. Poses come at the
+instants of the cameras. Where these are silent they come at the device's triples: the fingers are seen, and where the
+hand is is held, with a doubt that grows.
+"""
+
+from collections import Counter
+from math import nan
+
+import msgspec
+import numpy as np
+
+from common.arrays import Bool, Code, Float
+from common.geometry import (
+    matrix_to_rotation_vector,
+    rotation_vector_to_matrix,
+)
+from common.messages import Detections, HandPose, WristDetections
+from common.wrist_bend import STRAIGHT
+from master.fusion.finger_track import REACH_NS, FingerTrack
+from master.fusion.forearm import Forearm
+from master.ik.finger_belief import FingerBelief
+from master.ik.hand import HandSolution
+from master.ik.palm import Orientation
+from master.ik.tracker import TrackedHand
+from master.stereo.pipeline import MarkerPipeline, SolvedPose
+from master.wrist.fingers import SeenFingers, WristFingers
+
+_SILENT_FRAMES = 2.2  # of the slowest camera: when so long no instant came, the device's triples lead
+_TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do not teach how the palm lies
+_WIDE_BEND = np.radians(15.0) ** 2 * np.eye(2)
+
+
+class WristSide:
+    """Push machine. Holds what wrist device and IMU of a hand said last.
+
+    Attributes:
+        seen: The last triple.
+    """
+
+    def __init__(self, wrist: WristFingers, forearm: Forearm | None) -> None:
+        """Join device and forearm; None: the device has no IMU, or it is not known how that is mounted."""
+        self._wrist, self.forearm = wrist, forearm
+        self._track = FingerTrack(wrist.habits)
+        self.seen: SeenFingers | None = None
+
+    def push(self, message: WristDetections) -> SeenFingers | None:
+        """Take a triple; None: it is late."""
+        bend, cov = self.bend(message.t_ns)
+        seen = self._wrist.push(message, bend)
+        if seen is not None:
+            self._track.push(seen, cov)
+            self.seen = seen
+        return seen
+
+    def bend(self, t_ns: int) -> tuple[Float, Float]:
+        """Bend of the wrist (2,) and its covariance (2, 2)."""
+        return (STRAIGHT, _WIDE_BEND) if self.forearm is None else self.forearm.bend_at(t_ns)
+
+    def palm(self, t_ns: int) -> Orientation | None:
+        """As `OtherSensors.palm`."""
+        return None if self.forearm is None else self.forearm.palm_at(t_ns)
+
+    def fingers(self, t_ns: int) -> FingerBelief | None:
+        """As `OtherSensors.fingers`."""
+        return self._track.at(t_ns)
+
+    def solved(self, t_ns: int, hand: TrackedHand, palm: Orientation | None) -> None:
+        """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from it."""
+        if self.forearm is None or hand.solution is None:
+            return
+        told = palm_alone(hand.solution, palm)
+        if told is not None:
+            self.forearm.saw(t_ns, *told)
+
+
+def palm_alone(hand: HandSolution, palm: Orientation | None) -> tuple[Float, Float] | None:
+    """The palm's rotation (3, 3) and covariance (3, 3) [rad^2] as markers alone tell them; None: they hardly do.
+
+    In a least-squares fit information adds up: what the orientation `palm` added to the turn is taken out again.
+    """
+    rotation, information = hand.T_rig_palm[:3, :3], np.linalg.inv(hand.alone[:3, :3])
+    if palm is not None:
+        off = matrix_to_rotation_vector(rotation @ palm.rotation.T)
+        information = information - palm.information
+        if np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
+            return None
+        rotation = rotation_vector_to_matrix(np.linalg.solve(information, palm.information @ off)) @ rotation
+    elif np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
+        return None
+    return rotation, np.linalg.inv(information)
+
+
+class FusedPipeline:
+    """Push machine. Holds the marker line, the wrist side, and when the last pose was."""
+
+    def __init__(
+        self, markers: MarkerPipeline, side: WristSide, slowest_hz: float, counts: Counter[str]
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            markers: The marker line, `side` among its other sensors.
+            side: Wrist device and IMU.
+            slowest_hz: Frame rate of the slowest marker camera.
+            counts: What the wrist side counts into.
+        """
+        self.counts, self._markers, self._side = counts, markers, side
+        self._silent_ns = round(_SILENT_FRAMES * 1e9 / slowest_hz)
+        self._last_ns: int | None = None
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take what one camera saw; return the poses it completes, oldest first."""
+        if not isinstance(message, WristDetections):
+            return self._told(self._markers.push(message))
+        seen = self._side.push(message)
+        if seen is None or (self._last_ns is not None and seen.t_ns - self._last_ns <= self._silent_ns):
+            return []
+        solved = self._markers.blind(seen.t_ns, message.ready_t_ns)
+        self.counts["poses_by_wrist"] += 1
+        return self._told([] if solved is None else [solved])
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take what the IMU on the forearm says of its own orientation (4,)."""
+        if self._side.forearm is None:
+            self.counts["orientation.unplaced"] += 1
+        else:
+            self._side.forearm.push(t_ns, orientation_wxyz, heading_sigma_rad)
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for a camera."""
+        return self._told(self._markers.flush())
+
+    def _told(self, poses: list[SolvedPose]) -> list[SolvedPose]:
+        """Poses with what else is known of the hand."""
+        if poses:
+            self._last_ns = poses[-1].pose.t_ns
+        return [SolvedPose(self._with_wrist(solved.pose), solved.ready_t_ns) for solved in poses]
+
+    def _with_wrist(self, pose: HandPose) -> HandPose:
+        side, t_ns = self._side, pose.t_ns
+        changes: dict[str, Float | Code | Bool] = {}
+        if side.forearm is not None:
+            bend, cov = side.forearm.bend_at(t_ns)
+            changes["wrist_bend_rad"], changes["wrist_bend_sigma_rad"] = bend, np.sqrt(np.diag(cov))
+            changes["palm_world_wxyz"], changes["palm_world_sigma_rad"] = side.forearm.world_at(t_ns)
+        seen = side.seen
+        if seen is not None and abs(t_ns - seen.t_ns) <= REACH_NS:
+            changes["laser_m"], changes["level"] = seen.laser_m, seen.found.level
+            changes["ambiguous"] = seen.found.ambiguous
+        belief = None if pose.valid.any() else side.fingers(t_ns)
+        if belief is not None:
+            changes["angles_rad"] = belief.angles_rad
+        return msgspec.structs.replace(pose, **changes)
