@@ -114,6 +114,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
         segment=np.array([0, 3]),
         tip=np.zeros(5, dtype=np.int64),
         thumb=np.zeros(2, dtype=np.int64),
+        forearm=np.zeros(0, dtype=np.int64),
         still=1,
     )
     ball = Cones(
@@ -125,6 +126,7 @@ def test_the_line_on_a_ball_is_the_arc_of_its_slice_that_faces_the_laser() -> No
     alone = replace(
         sheet,
         flesh=flesh,
+        still=ball.of(slice(1)),
         still_m=np.full(len(sheet.angle_rad), np.inf),
         still_body=np.zeros(len(sheet.angle_rad), np.int64),
     )

@@ -2,7 +2,8 @@
 
 A solver models a finger as cones with the radii of the profile. Real fingers are not that: so each seed draws other
 radii, adds the pads on the palmar side of every phalanx and the pulp at its tip, and gives the thumb its thenar. What
-the palm carries stands still in the camera's frame; what a finger carries moves with its joints.
+a finger carries moves with its joints; what the palm carries turns with the wrist alone, and while that is straight it
+stands still in the camera's frame, as the end of the forearm always does.
 """
 
 from dataclasses import dataclass
@@ -16,9 +17,11 @@ from common.round_cones import Cones
 
 GROUPS = ("palm", *FINGERS, "thenar")
 PALM_GROUP, THUMB_GROUP, THENAR_GROUP = 0, 1, 6
+THING_GROUP = len(GROUPS)  # of what is no hand: bodies that follow those of the flesh
 THUMB_SEGMENTS, FINGER_SEGMENTS = (0, 1, 3), (1, 2, 3)  # by phalanx: 3 is the last of every finger
 
 _RADIUS_SPREAD = 0.05  # of the radius of a joint, standard deviation: 95 % within a tenth
+_FOREARM_PARTS = 2
 _PAD_M, _PULP_M = (0.0002, 0.0010), (0.0006, 0.0016)  # how far pads and pulps stand out of the cone
 
 
@@ -34,7 +37,8 @@ class Flesh:
         segment: (B,) 0 palm or metacarpal, 1 proximal, 2 intermediate, 3 distal.
         tip: (5,) body that ends each finger.
         thumb: (2,) bodies of the thumb's metacarpal and of the phalanx after it.
-        still: How many bodies, the first ones, belong to the palm.
+        forearm: (F,) bodies of the palm's group that a bent wrist does not turn.
+        still: How many bodies, the first ones, belong to the palm and the forearm.
     """
 
     joint: Int
@@ -46,6 +50,7 @@ class Flesh:
     segment: Int
     tip: Int
     thumb: Int
+    forearm: Int
     still: int
 
     @classmethod
@@ -55,6 +60,7 @@ class Flesh:
         radius = (model.radius_m * np.clip(rng.normal(1.0, _RADIUS_SPREAD, 26), 0.88, 1.12)).tolist()
         parts = _palm(model, radius, rng)
         still = len(parts)
+        forearm = np.arange(still, still + _FOREARM_PARTS) - _FOREARM_PARTS
         tips: list[int] = []
         for finger in range(5):
             parts += _finger(model, radius, finger, rng)
@@ -70,22 +76,39 @@ class Flesh:
             segment=np.array([part.segment for part in parts]),
             tip=np.array(tips),
             thumb=np.array([still, still + 2]),  # the phalanx's pad lies between them
+            forearm=forearm,
             still=still,
         )
 
-    def bodies(self, joints: HandJoints) -> Cones:
-        """Where they are, in the frame of the joints."""
+    def bodies(self, joints: HandJoints, R_straight: Float | None = None) -> Cones:
+        """Where they are, in the frame of the joints; of a bent wrist `R_straight` (3, 3) is the rotation that the
+        wrist's joint had if it was straight: that of the forearm."""
         rotation, position = joints.rotation[self.joint], joints.position_m[self.joint]
+        if R_straight is not None:
+            rotation[self.forearm] = R_straight
         start = position + np.einsum("bij,bj->bi", rotation, self.start)
         stop = position + np.einsum("bij,bj->bi", rotation, self.stop)
         return Cones(start, stop, self.start_radius_m, self.stop_radius_m)
 
+    def same_palm(self, bodies: Cones, others: Cones) -> bool:
+        """Whether the palm lies alike in two sets of bodies, to the last bit: what is true of one is of both."""
+        palm = slice(self.still)
+        return np.array_equal(bodies.start_m[palm], others.start_m[palm]) and np.array_equal(
+            bodies.stop_m[palm], others.stop_m[palm]
+        )
+
+    def group_of(self, body: Int) -> Int:
+        """Groups of bodies (N,); THING_GROUP for those after its own."""
+        last = len(self.group) - 1
+        return np.where(body > last, THING_GROUP, self.group[np.minimum(body, last)])
+
     def parts(self, bodies: Cones, body: Int, points: Float) -> tuple[Int, Int]:
-        """Group and segment (N,) of skin at points (N, 3) [m] of bodies (N,).
+        """Group and segment (N,) of what is lit at points (N, 3) [m] of bodies (N,); a thing has segment 0.
 
         Where the thumb's ball and its phalanx run into each other, the plane that halves their angle parts them.
         """
-        group, segment = self.group[body], self.segment[body]
+        group = self.group_of(body)
+        segment = np.where(group == THING_GROUP, 0, self.segment[np.minimum(body, len(self.segment) - 1)])
         axis = bodies.stop_m[self.thumb] - bodies.start_m[self.thumb]
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         beyond = (points - bodies.start_m[self.thumb[1]]) @ axis.sum(axis=0) > 0.0
@@ -173,6 +196,6 @@ def _palm(model: HandModel, radius: list[float], rng: np.random.Generator) -> li
     thick = -rng.uniform(0.003, 0.006)
     heel = np.array([-0.017 * s, thick - 0.010, 0.012])
     add(heel, heads[3] + np.array([0.0, thick, -0.016]), rng.uniform(0.012, 0.014), 0.0105)
-    for side in (-0.008, 0.010):
+    for side in (-0.008, 0.010):  # _FOREARM_PARTS of them, the last ones
         add(np.array([side * s, -0.004, -0.06]), np.array([0.7 * side * s, -0.004, 0.008]), 0.021, 0.0185)
     return out

@@ -16,7 +16,7 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.hand_model import HandJoints
 from common.round_cones import Cones, distances
-from common.sim.wrist.flesh import GROUPS, Flesh
+from common.sim.wrist.flesh import GROUPS, THING_GROUP, Flesh
 
 RAYS = 1536  # 1.2 mrad apart: 0.2 mm at a finger, half a pixel
 FINER = 24  # parts of a gap between rays at the end of a part
@@ -33,7 +33,7 @@ class LaserCurve:
         rays: Unit directions (K, 3) from the laser's origin, along the fan.
         points: (K, 3) [m], camera frame.
         body: Which body is lit (K,).
-        group, segment: As in `Flesh` (K,).
+        group, segment: As `Flesh.parts` says (K,).
         seen: Whether the camera sees it (K,).
         joined: (K,) whether it and the next one are neighbours on one part of the hand.
     """
@@ -57,8 +57,9 @@ class LaserSheet:
         forward, across: Unit vectors (3,) of the plane: the middle of the fan, and towards its second edge.
         angle_rad: (RAYS,) of the rays to the middle, from one edge of the fan to the other.
         flesh: The hand.
-        still_m: How far along each ray the palm begins (RAYS,) [m]; inf: nowhere.
-        still_body: Which body of the palm that is (RAYS,).
+        still: The palm of a straight wrist, which was met beforehand.
+        still_m: How far along each ray that begins (RAYS,) [m]; inf: nowhere.
+        still_body: Which body of it that is (RAYS,).
     """
 
     origin: Float
@@ -68,12 +69,13 @@ class LaserSheet:
     across: Float
     angle_rad: Float
     flesh: Flesh
+    still: Cones
     still_m: Float
     still_body: Int
 
     @classmethod
-    def of(cls, rig: RigCalibration, optics: CameraModel, flesh: Flesh, joints: HandJoints) -> "LaserSheet":
-        """Of a rig whose palm stands as in `joints`.
+    def of(cls, rig: RigCalibration, flesh: Flesh, joints: HandJoints) -> "LaserSheet":
+        """Of a rig whose palm stands as in `joints` while the wrist is straight.
 
         Raises:
             CalibrationError: The laser is not known well enough to be simulated.
@@ -99,16 +101,19 @@ class LaserSheet:
         angle = np.linspace(-0.5, 0.5, RAYS) * laser.fan_rad
         still = flesh.bodies(joints).of(slice(flesh.still))
         near, body = _nearest(distances(still, origin, _fan(forward, across, angle)))
-        return cls(origin, normal, offset, forward, across, angle, flesh, near, body)
+        return cls(origin, normal, offset, forward, across, angle, flesh, still, near, body)
 
     def cross(self, bodies: Cones) -> LaserCurve:
-        """Where it meets the hand whose flesh is at `bodies`."""
+        """Where it meets the hand whose flesh is at `bodies`, and the things that follow it there."""
         flesh, first = self.flesh, self.flesh.still
         rays = _fan(self.forward, self.across, self.angle_rad)
-        near, body = _nearest(distances(bodies.of(slice(first, None)), self.origin, rays))
-        body = np.where(near < self.still_m, body + first, self.still_body)
-        near = np.minimum(near, self.still_m)
-        met = np.where(np.isfinite(near), flesh.group[body], -1)
+        if flesh.same_palm(bodies, self.still):
+            near, body = _nearest(distances(bodies.of(slice(first, None)), self.origin, rays))
+            body = np.where(near < self.still_m, body + first, self.still_body)
+            near = np.minimum(near, self.still_m)
+        else:
+            near, body = _nearest(distances(bodies, self.origin, rays))
+        met = np.where(np.isfinite(near), flesh.group_of(body), -1)
         with np.errstate(invalid="ignore"):
             ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > JOINED_M))
         part = np.arange(1, FINER) / FINER * (self.angle_rad[1] - self.angle_rad[0])
@@ -158,11 +163,11 @@ class LineTruth:
 
     @classmethod
     def of(cls, curve: LaserCurve, optics: CameraModel, sheet: LaserSheet) -> "LineTruth":
-        """Sum up the chords; those with both ends in the image and seen count as visible."""
+        """Sum up the chords on the hand; those with both ends in the image and seen count as visible."""
         uv = optics.project(curve.points)
         size = np.array([optics.width_px, optics.height_px])
         seen = curve.seen & ((uv > -0.5) & (uv < size - 0.5)).all(axis=1)
-        chords = np.flatnonzero(curve.joined)
+        chords = np.flatnonzero(curve.joined & (curve.group != THING_GROUP))
         both = seen[chords] & seen[chords + 1]
         group, count = curve.group[chords], len(GROUPS)
         length = np.linalg.norm(curve.points[chords + 1] - curve.points[chords], axis=1)

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
-from common.round_cones import Plane
+from common.arrays import Bool, Float, Image
+from common.round_cones import Cones, Plane, first_hits, terms
 
 BLACK_LEVEL = 2.0
 LED_LEVEL = 88.0  # of skin that faces the LEDs at SKIN_AT_M on the axis
 LASER_LEVEL = 2400.0  # of the middle of the line, on skin that faces the laser at SKIN_AT_M
 SKIN_AT_M = 0.13
+SHADOW_GAP_M = 0.001  # nearer to a body nothing is in its shadow: it may be on the body itself
 SHEET_SIGMA_M = 4.2e-4  # of the sheet of laser light
 GLOW = (
     (5.0, 0.13),
@@ -102,14 +103,29 @@ class Leds:
         """Of places (L, 3) [m], camera frame."""
         self._led = led_m.astype(np.float32)
 
-    def on_skin(self, points: Plane, normals: Plane) -> Plane:
-        """Levels (N,) of plain skin at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs."""
+    def on_skin(self, points: Plane, normals: Plane, before: Cones | None = None) -> Plane:
+        """Levels (N,) of plain skin at points (N, 3) [m]: inverse square and Lambert's cosine, summed over the LEDs.
+
+        Only `before` throws shadows: those of one finger on another are narrow, so near to the lens are the LEDs.
+        """
         faced = normals @ self._led.T - np.einsum("ij,ij->i", normals, points)[:, None]
         square = np.einsum("ij,ij->i", points, points)[:, None] - 2.0 * (points @ self._led.T)
         square += (self._led * self._led).sum(axis=1)
         np.maximum(faced, 0.0, out=faced)
+        if before is not None:
+            for led, place in enumerate(self._led):
+                faced[_in_shadow(before, place, points, square[:, led]), led] = 0.0
         faced /= square * np.sqrt(square)
         return faced.sum(axis=1) * np.float32(LED_LEVEL * SKIN_AT_M**2 / len(self._led))
+
+
+def _in_shadow(before: Cones, origin: Plane, points: Plane, square: Plane) -> Bool:
+    """Whether light from an origin (3,) [m] meets a body on its way to points (N, 3) [m], `square` (N,) [m^2] far."""
+    far = np.sqrt(square)
+    ways = np.ascontiguousarray(((points - origin) / far[:, None]).T)
+    known = terms(before, origin.astype(np.float64), np.float32)
+    reach = np.min([first_hits(body, ways) for body in known.T], axis=0)
+    return reach < far - np.float32(SHADOW_GAP_M)
 
 
 class Sensor:

@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
-from common.round_cones import Plane
+from common.round_cones import Cones, Plane
 from common.sim.wrist import light
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.skin import Skin, SkinView
@@ -24,7 +24,8 @@ SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen ed
 
 
 class WristRenderer:
-    """Images of one scene. It holds prepared rays, the palm, the room and noise; a frame is a pure function of t."""
+    """Images of one scene. It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure
+    function of t."""
 
     def __init__(self, scene: WristScene, camera: str, step: int = REAL_TIME_STEP) -> None:
         """Prepare all that stands still (some tenths of a second).
@@ -46,13 +47,11 @@ class WristRenderer:
         optics = scene.optics
         self._sensor = light.Sensor(optics.height_px, optics.width_px, scene.seed)
         self._gain = 1.0
-        behind = self._room.backdrop(self._skin.size, optics.width_px / self._skin.size[0])
+        self._behind = self._room.backdrop(self._skin.size, optics.width_px / self._skin.size[0])
         self._still = {
-            lit: self._shaded(behind, self._skin.palm, lit)
+            lit: self._shaded(self._behind, self._skin.straight.seen, lit)
             for lit in (Illumination.AMBIENT, Illumination.LED)
         }
-        self._hand = np.zeros(self._skin.size[::-1], dtype=np.float32)
-        self._hand.reshape(-1)[self._skin.palm.pixel] = self._skin.palm.albedo**2
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "WristRenderer":
         """The same scene before a camera with other settings; shares all that was prepared.
@@ -67,26 +66,34 @@ class WristRenderer:
 
     def render(self, t_s: float, lit: Illumination) -> Image:
         """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
-        bodies = self._scene.flesh.bodies(self._scene.joints_at(t_s))
-        fingers = self._skin.look(bodies)
+        bodies = self._scene.bodies_at(t_s)
+        palm = self._skin.palm(bodies)
+        fingers = self._skin.look(bodies, palm)
         leds = lit is Illumination.LED
-        coarse = self._shaded(self._still[Illumination.LED if leds else Illumination.AMBIENT], fingers, lit)
+        count = len(self._scene.flesh.group)
+        things = bodies.of(slice(count, None)) if len(bodies.start_m) > count else None
+        if palm is self._skin.straight and not (leds and things):
+            behind = self._still[Illumination.LED if leds else Illumination.AMBIENT]
+        else:
+            behind = self._shaded(self._behind, palm.seen, lit, things)
+        coarse = self._shaded(behind, fingers, lit, things)
         optics = self._scene.optics
         level = _sharp(coarse, (optics.width_px, optics.height_px))
         if lit is Illumination.LASER:
-            hand = self._hand.copy()
-            hand.reshape(-1)[fingers.pixel] = fingers.albedo**2  # through the skin, and out again
+            hand = np.zeros(self._skin.size[::-1], dtype=np.float32)
+            for seen in (palm.seen, fingers):
+                hand.reshape(-1)[seen.pixel] = seen.albedo**2  # through the skin, and out again
             draw_stripe(level, self._scene, bodies, hand)
         if self._gain != 1.0:
             level *= np.float32(self._gain)
         level += np.float32(light.BLACK_LEVEL)
         return self._sensor.bytes_of(level, 4 * round(t_s * 1e6) + _KINDS.index(lit))
 
-    def _shaded(self, behind: Plane, skin: SkinView, lit: Illumination) -> Plane:
-        """Levels on the coarse grid: `behind` with skin before it."""
+    def _shaded(self, behind: Plane, skin: SkinView, lit: Illumination, things: Cones | None = None) -> Plane:
+        """Levels on the coarse grid: `behind` with skin before it, and things in the light of the LEDs."""
         shade = self._room.on_skin(skin.normals)
         if lit is Illumination.LED:
-            shade += self._leds.on_skin(skin.points, skin.normals) * self._skin.flat[skin.pixel]
+            shade += self._leds.on_skin(skin.points, skin.normals, things) * self._skin.flat[skin.pixel]
         level = behind.copy()
         level.reshape(-1)[skin.pixel] = shade * skin.albedo * np.float32(self._scene.reflectance)
         return level

@@ -10,12 +10,16 @@ from common.arrays import Bool, Float, Int
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError, PhalanxError
-from common.hand_model import HandJoints, HandModel
-from common.sim.motion import HandMotion
+from common.geometry import invert, rigid
+from common.hand_model import WRIST, HandJoints, HandModel
+from common.round_cones import Cones
+from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming
 from common.sim.wrist.flesh import Flesh
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
+from common.sim.wrist.things import bodies_of, with_things
+from common.wrist_bend import forearm_palm
 
 Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
@@ -40,6 +44,7 @@ class WristTruth:
         laser_seg: (7,) the segment that carries most of the line (0 metacarpal, 1 proximal ... 3 distal); -1: none.
         tip_xyz, tip_uv: (5, 3) [m], (5, 2) [px] outermost point of the skin along each last bone.
         tip_visible: (5,) whether the camera sees that point, or it lies just behind the edge of its own finger.
+        bend_rad: (2,) how the wrist is bent (`common.wrist_bend`).
     """
 
     t_s: float
@@ -54,6 +59,7 @@ class WristTruth:
     tip_xyz: Float
     tip_uv: Float
     tip_visible: Bool
+    bend_rad: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,14 +70,15 @@ class WristScene:
         rig: Laser, LEDs, palm pose.
         cameras: Camera name -> its file.
         model: The hand.
-        motion: How it moves; its `T_rig_palm` is the forearm's way through the room, which an IMU feels.
+        motion: How it moves; its `T_rig_palm` is the palm's way through the room, which with the bend of the wrist is
+            that of the forearm, where camera and IMU sit.
         ambient: The light of the room.
         seed: Of flesh, skin, room and noise.
         reflectance: How much light the skin gives back, of whatever light, against usual skin.
         optics: The camera.
         flesh: The hand's surface.
         sheet: The laser.
-        T_camera_palm: (4, 4) [m].
+        T_camera_palm: (4, 4) of a straight wrist [m].
     """
 
     rig: RigCalibration
@@ -85,6 +92,7 @@ class WristScene:
     flesh: Flesh = field(init=False)
     sheet: LaserSheet = field(init=False)
     T_camera_palm: Float = field(init=False)
+    _straight: HandJoints = field(init=False)
 
     def __post_init__(self) -> None:
         where = f"rig {self.rig.name!r}"
@@ -104,7 +112,9 @@ class WristScene:
         object.__setattr__(self, "optics", optics)
         object.__setattr__(self, "T_camera_palm", np.array(self.rig.T_camera_palm, dtype=np.float64))
         object.__setattr__(self, "flesh", Flesh.of(self.model, self.seed))
-        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, optics, self.flesh, self.joints_at(0.0)))
+        straight = self.model.forward(self.T_camera_palm, np.zeros((5, 4)))
+        object.__setattr__(self, "_straight", straight)
+        object.__setattr__(self, "sheet", LaserSheet.of(self.rig, self.flesh, straight))
 
     @classmethod
     def by_name(
@@ -139,18 +149,27 @@ class WristScene:
 
     def joints_at(self, t_s: float) -> HandJoints:
         """The joints at scene time `t_s` [s], camera frame."""
-        return self.model.forward(self.T_camera_palm, self.motion.at(t_s).angles_rad)
+        return self._joints(self.motion.at(t_s))
+
+    def bodies_at(self, t_s: float) -> Cones:
+        """All that camera and laser meet at scene time `t_s` [s], camera frame: the flesh, after it the things."""
+        state = self.motion.at(t_s)
+        return self._bodies(state, self._joints(state))
+
+    def straight_bodies(self) -> Cones:
+        """The flesh while wrist and fingers are straight, camera frame."""
+        return self.flesh.bodies(self._straight)
 
     def truth(self, t_s: float) -> WristTruth:
         """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
-        angles = self.motion.at(t_s).angles_rad
-        joints = self.model.forward(self.T_camera_palm, angles)
-        bodies = self.flesh.bodies(joints)
+        state = self.motion.at(t_s)
+        joints = self._joints(state)
+        bodies = self._bodies(state, joints)
         line = LineTruth.of(self.sheet.cross(bodies), self.optics, self.sheet)
         tips = self.flesh.tips(bodies)
         return WristTruth(
             t_s,
-            angles,
+            state.angles_rad,
             joints,
             line.uv,
             line.plane_m,
@@ -161,4 +180,19 @@ class WristScene:
             tips,
             self.optics.project(tips),
             self.sheet.seen(bodies, tips, TIP_WITHIN_M),
+            state.bend_rad,
         )
+
+    def _joints(self, state: HandState) -> HandJoints:
+        """Where the camera, which sits on the forearm, sees them."""
+        T = self.T_camera_palm
+        if state.bend_rad.any():
+            T = T @ rigid(forearm_palm(state.bend_rad), np.zeros(3))
+        return self.model.forward(T, state.angles_rad)
+
+    def _bodies(self, state: HandState, joints: HandJoints) -> Cones:
+        R_straight = self._straight.rotation[WRIST] if state.bend_rad.any() else None
+        flesh = self.flesh.bodies(joints, R_straight)
+        if not state.things:
+            return flesh
+        return with_things(flesh, bodies_of(state.things, joints.T_rig_palm @ invert(state.T_rig_palm)))

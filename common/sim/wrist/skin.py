@@ -1,9 +1,11 @@
 """What skin the camera sees where: rays of a grid against the flesh, and what the skin there looks like.
 
-The palm stands still in the picture: it is looked at once, and its gaps between bones are filled up. Each part of a
-finger is looked for only inside the box of its own image.
+While the wrist is straight the palm stands still in the picture: it is looked at once, and its gaps between bones are
+filled up. Of a bent wrist that is done for every picture. Each part of a finger is looked for only inside the box of
+its own image; so are the things that the hand holds, whose surface is as dark everywhere.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -13,6 +15,7 @@ from common.arrays import Float, Int
 from common.flat_field import flat_of
 from common.round_cones import Cones, Plane, first_hits, terms
 from common.sim.wrist.scene import WristScene
+from common.sim.wrist.things import ALBEDO
 
 CREASE_M, CREASE_DEPTH = 0.0008, 0.08
 PALM_SMOOTH_PX = 9.0  # about 2 mm at the palm's distance
@@ -40,13 +43,21 @@ class SkinView:
     albedo: Plane
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Palm:
+    """The palm where no finger is before it: what is seen of it, and how far along each ray it begins (H * W,) [m]."""
+
+    seen: SkinView
+    depth: Plane
+
+
 class Skin:
     """The grid and the palm of one scene. What it holds was prepared by the constructor.
 
     Attributes:
         size: Of the grid, (W, H).
         flat: (H * W,) how the lens and the LEDs' lobes darken the corners.
-        palm: The seen palm, where no finger is before it.
+        straight: The palm of a straight wrist.
     """
 
     def __init__(self, scene: WristScene, step: int) -> None:
@@ -58,16 +69,30 @@ class Skin:
         self.flat = _flat_field(scene, rays).astype(np.float32)
         self._rays = np.ascontiguousarray(rays.T, dtype=np.float32)
         self._texture = _texture(np.random.default_rng([scene.seed, 41]))
-        bodies = scene.flesh.bodies(scene.joints_at(0.0))
-        self._palm_depth = np.full(len(rays), np.inf, dtype=np.float32)
-        hit = self._cast(bodies, range(scene.flesh.still), self._palm_depth)
-        self.palm = self._smooth(self._view(bodies, np.flatnonzero(hit >= 0), hit, self._palm_depth))
+        self._straight_bodies = scene.straight_bodies()
+        self.straight = self._palm(self._straight_bodies, range(scene.flesh.still))
+        # The forearm lies as it does whatever the wrist does; outside the picture nobody need look for it.
+        forearm = scene.flesh.forearm.tolist()
+        met = self._cast(self._straight_bodies, forearm, np.full(len(rays), np.inf, dtype=np.float32))
+        outside = set(forearm) - set(np.unique(met).tolist())
+        self._turning = [body for body in range(scene.flesh.still) if body not in outside]
 
-    def look(self, bodies: Cones) -> SkinView:
-        """The seen skin of the fingers and the thumb, of a hand whose flesh is at `bodies`."""
-        depth = self._palm_depth.copy()
+    def palm(self, bodies: Cones) -> Palm:
+        """The palm of a hand whose flesh is at `bodies`; `straight` itself while the wrist is straight."""
+        if self._scene.flesh.same_palm(bodies, self._straight_bodies):
+            return self.straight
+        return self._palm(bodies, self._turning)
+
+    def look(self, bodies: Cones, palm: Palm) -> SkinView:
+        """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""
+        depth = palm.depth.copy()
         hit = self._cast(bodies, range(self._scene.flesh.still, len(bodies.start_m)), depth)
         return self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)
+
+    def _palm(self, bodies: Cones, which: Iterable[int]) -> Palm:
+        depth = np.full(self._rays.shape[1], np.inf, dtype=np.float32)
+        hit = self._cast(bodies, which, depth)
+        return Palm(self._smooth(self._view(bodies, np.flatnonzero(hit >= 0), hit, depth)), depth)
 
     def _view(self, bodies: Cones, pixel: Int, hit: Int, depth: Plane) -> SkinView:
         points = np.ascontiguousarray((self._rays[:, pixel] * depth[pixel]).T)
@@ -75,7 +100,7 @@ class Skin:
         normals = bodies.normals(body, points)
         return SkinView(pixel, points, normals, self._albedo(bodies, body, points, normals))
 
-    def _cast(self, bodies: Cones, which: range, depth: Plane) -> Int:
+    def _cast(self, bodies: Cones, which: Iterable[int], depth: Plane) -> Int:
         """Bring nearer `depth` (H * W,) [m] along the rays; say by which body (H * W,), -1: by none of them."""
         low, high = self._boxes(bodies)
         known = terms(bodies, _ORIGIN, np.float32)
@@ -117,7 +142,7 @@ class Skin:
         return np.clip(first, 0, size).astype(np.int64), np.clip(last, 0, size).astype(np.int64)
 
     def _albedo(self, bodies: Cones, body: Int, points: Plane, normals: Plane) -> Plane:
-        """Skin is never even: blotches that stay on their body, and dark lines across it where a joint is."""
+        """Skin is never even: blotches that stay on their body, dark lines across it where a joint is. Things are."""
         axis = bodies.stop_m - bodies.start_m
         axis /= np.linalg.norm(axis, axis=1, keepdims=True)
         aside = np.eye(3)[0] - axis[:, :1] * axis  # across the body, whichever way it is bent
@@ -128,7 +153,10 @@ class Skin:
         row, column = ((x * np.float32(TEXELS_PER_M)).astype(np.int32) for x in (along, across))
         last = self._texture.shape[0] - 1
         texture = self._texture[row & last, (column + 37 * body) & last]
-        return texture * (1.0 - CREASE_DEPTH * np.exp(-((along / np.float32(CREASE_M)) ** 2)))
+        albedo = texture * (1.0 - CREASE_DEPTH * np.exp(-((along / np.float32(CREASE_M)) ** 2)))
+        # Things give back what they do, however bright the skin of this hand is.
+        albedo[body >= len(self._scene.flesh.group)] = ALBEDO / self._scene.reflectance
+        return albedo
 
     def _smooth(self, palm: SkinView) -> SkinView:
         """Fill the gaps between the bones as flesh does: normals of the smoothed surface."""

@@ -10,8 +10,10 @@ import numpy as np
 
 from common.arrays import Float
 from common.round_cones import Cones, Plane
+from common.sim.wrist.flesh import THING_GROUP
 from common.sim.wrist.light import GLOW, LASER_LEVEL, SHEET_SIGMA_M, SKIN_AT_M
 from common.sim.wrist.scene import WristScene
+from common.sim.wrist.things import ALBEDO
 
 LAYERS = np.linspace(-2.4, 2.4, 11)  # across the sheet, in its sigmas
 LENS_SIGMA_PX = 0.9
@@ -22,7 +24,7 @@ _EDGE_PX = 40
 
 def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> None:
     """Add the line to levels (H, W) in place; its glow where skin is, by `hand` (h, w), a coarser grid: what skin
-    gives back, about 1, and 0 where none is."""
+    gives back, about 1, and 0 where none is. Things glow as little as they give back, so not at all here."""
     sheet, optics = scene.sheet, scene.optics
     curve = sheet.cross(bodies)
     chords = np.flatnonzero(curve.joined)
@@ -38,8 +40,10 @@ def draw_stripe(level: Plane, scene: WristScene, bodies: Cones, hand: Plane) -> 
     heights = LAYERS * SHEET_SIGMA_M
     area = np.abs(piece[:, 0] * way[:, 1] - piece[:, 1] * way[:, 0]) * (heights[1] - heights[0])
     reach = np.linalg.norm(points - sheet.origin, axis=1)
-    strength = LASER_LEVEL * scene.reflectance
-    amount = (strength * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(-0.5 * LAYERS**2)
+    given_back = np.where(curve.group[chords] == THING_GROUP, ALBEDO, scene.reflectance)
+    amount = (LASER_LEVEL * given_back * facing * (SKIN_AT_M / reach) * area)[:, None] * np.exp(
+        -0.5 * LAYERS**2
+    )
     place = (uv + 0.5 * piece)[:, None] + heights[:, None] * way[:, None]
     _spread(level, place.reshape(-1, 2), amount.ravel(), hand)
 
