@@ -19,15 +19,18 @@ from common.geometry import cross
 from common.hand_model import HandModel
 from common.messages import Detections, MarkerDetections
 from master.filters import OneEuroParameters, PointFilter
+from master.fusion.pipeline import FusedPipeline, WristSide
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.rig_merge import merged_rig, refuse_shared_senders, rigs_by_hand
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
-from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
+from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
 from master.stereo.place import CalibrationResidual
 from master.wrist.pipeline import WristPipeline
 from master.wrist.setup import WristSetup
+
+_LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
 
 
 class Pipeline(Protocol):
@@ -219,7 +222,11 @@ def setups_of(
             setup = RigSetup.of(own, cameras, hands[name])
             rows = dict.fromkeys(rig.cameras, chosen) if rig.other_hands else {}
             found.setdefault(name, []).append(with_fields(setup, rows=rows))
-    return tuple(RigSetup.joined(setups) for setups in found.values())
+    joined = tuple(RigSetup.joined(setups) for setups in found.values())
+    names = [setup.hand.profile.name for setup in joined]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise CalibrationError(f"hands {', '.join(found)}: two files call their hand {twice[0]!r}")
+    return joined
 
 
 def load_setups(
@@ -298,11 +305,18 @@ def point_filter(setup: RigSetup) -> PointFilter:
 
 def hand_filter(setup: RigSetup) -> HandFilter:
     """The filter of the solved hand, which leaves no more jitter than that of the points may."""
-    return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m)
+    lead_m_s = None if setup.wrist is None else _LEAD_M_S
+    return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
 
 
 def build_pipeline(
-    setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
+    setup: RigSetup,
+    stage: Stage,
+    *,
+    continuous: bool = True,
+    tracker: HandTracker | None = None,
+    others: OtherSensors | None = None,
+    counts: Counter[str] | None = None,
 ) -> MarkerPipeline:
     """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used.
 
@@ -311,6 +325,8 @@ def build_pipeline(
         stage: Measures the stages.
         continuous: False: every frame is an unrelated pose; no filter, no memory.
         tracker: Tracks the hand; None: a new one, which takes most of the time.
+        others: What else watches the hand; None: nothing does.
+        counts: Counted into; None: counts of its own.
 
     Raises:
         CalibrationError: The depth model does not fit the rig, or it is no marker rig.
@@ -333,6 +349,8 @@ def build_pipeline(
         stamp_offset_us=setup.rig.stamp_offset_us,
         volume=setup.rig.volume,
         imu=setup.rig.imu,
+        others=others,
+        counts=counts,
         stage=stage,
     )
 
@@ -345,11 +363,17 @@ def pipeline_of(
     It takes what the cameras of its own kind of rig send, and nothing else is ever pushed: the link refuses a camera
     that sends what those of the other kind do.
     """
-    if setup.has_markers and setup.wrist is not None:
-        raise CalibrationError(f"rig {setup.rig.name!r}: cannot be solved together with a wrist device yet")
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
     try:
+        if setup.has_markers:
+            side = WristSide.of(setup.wrist, counts := Counter[str](), stage, continuous=continuous)
+            markers = build_pipeline(
+                setup, stage, continuous=continuous, tracker=tracker, others=side, counts=counts
+            )
+            return FusedPipeline(
+                markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)
+            )
         return cast(Pipeline, WristPipeline(setup.wrist, continuous=continuous, stage=stage))
     except CalibrationError as error:
         raise CalibrationError(f"rig {setup.rig.name!r}: {error}") from error

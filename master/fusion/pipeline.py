@@ -31,8 +31,9 @@ from master.ik.finger_belief import FingerBelief
 from master.ik.hand import HandSolution
 from master.ik.palm import Orientation
 from master.ik.tracker import TrackedHand
-from master.stereo.pipeline import MarkerPipeline, SolvedPose
+from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.wrist.fingers import SeenFingers, WristFingers
+from master.wrist.setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no instant came, the device's triples lead
 _TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do not teach how the palm lies
@@ -51,6 +52,18 @@ class WristSide:
         self._wrist, self.forearm = wrist, forearm
         self._track = FingerTrack(wrist.habits)
         self.seen: SeenFingers | None = None
+
+    @classmethod
+    def of(
+        cls, setup: WristSetup, counts: Counter[str], stage: Stage, *, continuous: bool = True
+    ) -> "WristSide":
+        """The wrist side of a device.
+
+        Raises:
+            CalibrationError: Its tables cannot be made, or its IMU's world is not placed in the rig.
+        """
+        wrist = WristFingers(setup, counts, continuous=continuous, stage=stage)
+        return cls(wrist, None if setup.imu is None or not setup.imu.placed else Forearm(setup.imu, counts))
 
     def push(self, message: WristDetections) -> SeenFingers | None:
         """Take a triple; None: it is late."""
@@ -87,33 +100,31 @@ def palm_alone(hand: HandSolution, palm: Orientation | None) -> tuple[Float, Flo
 
     In a least-squares fit information adds up: what the orientation `palm` added to the turn is taken out again.
     """
-    rotation, information = hand.T_rig_palm[:3, :3], np.linalg.inv(hand.alone[:3, :3])
+    rotation, information = hand.T_rig_palm[:3, :3], np.asarray(np.linalg.inv(hand.alone[:3, :3]), np.float64)
     if palm is not None:
         off = matrix_to_rotation_vector(rotation @ palm.rotation.T)
         information = information - palm.information
         if np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
             return None
-        rotation = rotation_vector_to_matrix(np.linalg.solve(information, palm.information @ off)) @ rotation
+        turn = np.asarray(np.linalg.solve(information, palm.information @ off), np.float64)
+        rotation = rotation_vector_to_matrix(turn) @ rotation
     elif np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
         return None
-    return rotation, np.linalg.inv(information)
+    return rotation, np.asarray(np.linalg.inv(information), np.float64)
 
 
 class FusedPipeline:
     """Push machine. Holds the marker line, the wrist side, and when the last pose was."""
 
-    def __init__(
-        self, markers: MarkerPipeline, side: WristSide, slowest_hz: float, counts: Counter[str]
-    ) -> None:
+    def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
         """Join the parts.
 
         Args:
-            markers: The marker line, `side` among its other sensors.
+            markers: The marker line, whose other sensors are `side`; both count into the same.
             side: Wrist device and IMU.
             slowest_hz: Frame rate of the slowest marker camera.
-            counts: What the wrist side counts into.
         """
-        self.counts, self._markers, self._side = counts, markers, side
+        self.counts, self._markers, self._side = markers.counts, markers, side
         self._silent_ns = round(_SILENT_FRAMES * 1e9 / slowest_hz)
         self._last_ns: int | None = None
 

@@ -85,6 +85,7 @@ class MarkerPipeline:
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,
         others: OtherSensors | None = None,
+        counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
@@ -103,10 +104,11 @@ class MarkerPipeline:
             volume: What the rig states, or None; joints say whether they lie in it.
             imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
             others: What else watches the hand; None: nothing does.
+            counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
         """
         self.model, self.markers = model, markers
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter() if counts is None else counts
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
         self._pairing, self._smooth, self._tracker, self._steady = pairing, smooth, tracker, steady
         self._lens_shift = LensShift(self._cameras)
