@@ -29,6 +29,7 @@ class PalmWorld:
     """Push machine. Holds the samples of one IMU.
 
     Attributes:
+        samples: What it holds.
         counts: `orientation.used`, instants that had one, `orientation.absent`, those farther than 50 ms from any;
             samples left out, as of `OrientationSamples`.
     """
@@ -41,11 +42,11 @@ class PalmWorld:
         """
         self._imu, self._imu_palm = imu, turn_of("q_palm_imu", imu.q_palm_imu).T
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
+        self.samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
 
     def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""
-        self._samples.push(t_ns, wxyz, heading_sigma_rad)
+        self.samples.push(t_ns, wxyz, heading_sigma_rad)
 
     def at(self, t_ns: int) -> tuple[Float, Float]:
         """The palm at an instant: palm axes -> the IMU's world.
@@ -53,7 +54,7 @@ class PalmWorld:
         Returns:
             Quaternion (4,), and standard deviations (2,) [rad]: tilt per axis, heading; NaN: not known.
         """
-        found = self._samples.between(t_ns)
+        found = self.samples.between(t_ns)
         if found is None:
             self.counts["orientation.absent"] += 1
             return NO_WORLD

@@ -1,0 +1,212 @@
+"""Tilt, heading and the wrist's bend as one Gaussian: how it moves by itself, and what a palm that was seen tells.
+
+With the forearm in the IMU's world the palm lies in the rig
+
+    R_rig_palm = R_rig_world exp(tilt) R_z(heading) R_world_forearm R_forearm_palm(bend)
+
+which has three numbers where the state has five: heading and bend are not told apart where the bend's axes are upright,
+except that the heading is slow, and the bend small, in the palm's axes and quick. So all are estimated together, and
+the covariance keeps what one has to do with the other. By itself
+
+- tilt (2), what the IMU has the vertical off by, stays for seconds;
+- heading walks as far as it is told to;
+- bend (2) is a habit, a posture that somebody keeps, and motion about it, with its rate: a Gauss-Markov process of
+  second order (Matern 3/2), stepped exactly (Hartikainen, Saerkkae 2010, "Kalman filtering and smoothing solutions to
+  temporal Gaussian process regression models"). Wrists at work flex by a median of 1.4...54 deg/s about a median
+  posture of -30...3 deg (43 types of work; Hansson et al. 2009, Int. J. Ind. Ergonomics 39, 221; ours: 20 deg/s); most
+  of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and 15 of deviation (Palmer et al. 1985, J. Hand
+  Surg. 10A, 39);
+- error of the markers (3), in units of the covariance that they come with. On rendered hands it hardly changes from
+  frame to frame, but within a second or two, as shape and hidden fingers do. More than that is taken as new in each
+  frame, so that plain noise does not surprise either.
+"""
+
+from dataclasses import dataclass
+from math import atan2, exp, pi, radians, remainder, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
+from common.wrist_bend import forearm_palm
+
+ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
+HEADING = 2
+_SIZE = 12
+_TILT, _HABIT, _MOTION, _RATE, _ERROR = slice(2), slice(3, 5), slice(5, 7), slice(7, 9), slice(9, 12)
+_TILT_S = 5.0
+_HABIT_RAD, _HABIT_S = np.radians([10.0, 7.0]), 20.0  # flexion, deviation
+_MOTION_RAD, _PACE_1_S = np.radians([10.0, 9.0]), 3.0
+_FRESH, _STAYING, _STAYS_S = (
+    0.4,
+    0.8,
+    1.5,
+)  # shares of the markers' covariance: new in each frame, and staying
+_BEYOND = 16.27  # chi square, three degrees, 99.9 %
+_FLICK_RAD_S, _FLICK_RAD = 5.0, radians(20.0)  # faster than usual, but wrists can; and how far that may go
+_STEPS, _NEAR_RAD = 4, 1e-3
+_EYE, _UP = np.eye(3), np.array([0.0, 0.0, 1.0])
+_BEND = np.zeros((2, _SIZE))  # habit and motion
+_BEND[:, _HABIT] = _BEND[:, _MOTION] = np.eye(2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ForearmState:
+    """A Gaussian over tilt, heading, habit, motion, its rate and the markers' error.
+
+    Attributes:
+        rig_world: (3, 3) the IMU's world -> rig frame, right up to heading and tilt.
+        usual: (12,) variances that doubt grows to; that of the heading, 0, is not one of them.
+        mean: (12,) [rad], [rad/s], [1].
+        cov: (12, 12).
+    """
+
+    rig_world: Float
+    usual: Float
+    mean: Float
+    cov: Float
+
+    @classmethod
+    def of(cls, rig_world: Float, tilt_rad: float, heading_rad: float) -> "ForearmState":
+        """Before anything was seen: standard deviations of the tilt, per axis, and of the heading."""
+        usual = np.zeros(_SIZE)
+        usual[_TILT], usual[_ERROR] = tilt_rad**2, 1.0
+        usual[_HABIT], usual[_MOTION] = _HABIT_RAD**2, _MOTION_RAD**2
+        usual[_RATE] = (_PACE_1_S * _MOTION_RAD) ** 2
+        cov = np.diag(usual)
+        cov[HEADING, HEADING] = heading_rad**2
+        return cls(rig_world, usual, np.zeros(_SIZE), cov)
+
+    @property
+    def bend_rad(self) -> Float:
+        """(2,) flexion and deviation."""
+        return _BEND @ self.mean
+
+    @property
+    def bend_cov(self) -> Float:
+        """Its covariance (2, 2) [rad^2]."""
+        return _BEND @ self.cov @ _BEND.T
+
+    @property
+    def heading_sigma_rad(self) -> float:
+        """Standard deviation of the heading."""
+        return sqrt(self.cov[HEADING, HEADING])
+
+    def palm(self, world_forearm: Float) -> tuple[Float, Float]:
+        """The palm (3, 3) in the rig, and the derivative (3, 12) of a small turn of it, in rig axes, by the state."""
+        bend = self.bend_rad
+        rig_tilted = self.rig_world @ rotation_vector_to_matrix(np.array([*self.mean[_TILT], 0.0]))
+        rig_forearm = rig_tilted @ axis_rotation(2, self.mean[HEADING]) @ world_forearm
+        slope = rig_forearm @ bend_axes(bend) @ _BEND
+        slope[:, _TILT], slope[:, HEADING] = self.rig_world[:, :2], rig_tilted @ _UP
+        return rig_forearm @ forearm_palm(bend), slope
+
+    def after(self, step_s: float, walked_rad2: float) -> "ForearmState":
+        """What it is `step_s` later, or before if negative, when the heading has walked by so much."""
+        moves = _moves(step_s)
+        cov = np.diag(self.usual) + moves @ (self.cov - np.diag(self.usual)) @ moves.T
+        cov[HEADING, HEADING] += walked_rad2
+        return ForearmState(self.rig_world, self.usual, moves @ self.mean, cov)
+
+    def lost(self) -> "ForearmState":
+        """The same with a heading that may be anywhere."""
+        cov = self.cov.copy()
+        cov[HEADING] = cov[:, HEADING] = 0.0
+        cov[HEADING, HEADING] = ANYWHERE_RAD**2
+        return ForearmState(self.rig_world, self.usual, self.mean, cov)
+
+    def anew(self) -> "ForearmState":
+        """As before anything was seen, with a heading that may be anywhere."""
+        return ForearmState(self.rig_world, self.usual, np.zeros(_SIZE), np.diag(self.usual)).lost()
+
+    def towards(self, seen: "SeenPalm") -> "ForearmState":
+        """The same with the heading that comes nearest to a palm, as little as that may say."""
+        tilted = self.rig_world @ rotation_vector_to_matrix(np.array([*self.mean[_TILT], 0.0]))
+        turn = tilted.T @ seen.rotation @ (seen.world_forearm @ forearm_palm(self.bend_rad)).T
+        mean = self.mean.copy()
+        mean[HEADING] = atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
+        return ForearmState(self.rig_world, self.usual, mean, self.cov)
+
+    def told(self, seen: "SeenPalm") -> "ForearmState":
+        """What a palm leaves of it: an iterated Kalman update (Bell, Cathey 1993), its covariance in Joseph's form."""
+        state, off = self, np.zeros(_SIZE)
+        for _ in range(_STEPS):
+            missing, slope = seen.against(state)
+            before, off = off, self._gain(slope, seen.fresh) @ (missing + slope @ off)
+            state = ForearmState(self.rig_world, self.usual, self.mean + off, self.cov)
+            if np.abs(off - before).max() < _NEAR_RAD:
+                break
+        _, slope = seen.against(state)
+        gain = self._gain(slope, seen.fresh)
+        left = np.eye(_SIZE) - gain @ slope
+        cov = left @ self.cov @ left.T + gain @ seen.fresh @ gain.T
+        state.mean[HEADING] = remainder(state.mean[HEADING], 2.0 * pi)
+        return ForearmState(self.rig_world, self.usual, state.mean, 0.5 * (cov + cov.T))
+
+    def _gain(self, slope: Float, fresh: Float) -> Float:
+        """Kalman's gain (12, 3) of an observation with this derivative (3, 12)."""
+        crossed: Float = slope @ self.cov
+        gain: Float = np.linalg.solve(crossed @ slope.T + fresh, crossed)
+        return gain.T
+
+    def flicked(self, step_s: float) -> "ForearmState":
+        """The same after a motion of the wrist that is quicker than usual."""
+        cov = self.cov.copy()
+        bent = min(_FLICK_RAD_S * abs(step_s), _FLICK_RAD) ** 2
+        cov[_MOTION, _MOTION] += bent * np.eye(2)
+        return ForearmState(self.rig_world, self.usual, self.mean, cov)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SeenPalm:
+    """How the palm lies by markers alone, and the forearm by the IMU at the same instant.
+
+    Attributes:
+        rotation: (3, 3) palm axes -> rig frame.
+        world_forearm: (3, 3) forearm axes -> the IMU's world.
+        root: (3, 3) [rad] turns the state's error of the markers into rig axes.
+        fresh: (3, 3) [rad^2] covariance of what is new in each frame.
+    """
+
+    rotation: Float
+    world_forearm: Float
+    root: Float
+    fresh: Float
+
+    @classmethod
+    def of(cls, rotation: Float, cov_rad2: Float, world_forearm: Float) -> "SeenPalm":
+        """From the covariance (3, 3) [rad^2] of the rotation vector, rig axes, that turns it to the true one."""
+        values, axes = np.linalg.eigh(_STAYING * cov_rad2)
+        root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
+        return cls(rotation, world_forearm, root, _FRESH * cov_rad2)
+
+    def against(self, state: ForearmState) -> tuple[Float, Float]:
+        """The turn (3,) [rad], rig axes, from a state's palm to this one, and its derivative (3, 12) by the state."""
+        palm, slope = state.palm(self.world_forearm)
+        slope[:, _ERROR] = self.root
+        return matrix_to_rotation_vector(self.rotation @ palm.T) - self.root @ state.mean[_ERROR], slope
+
+    def surprises(self, state: ForearmState) -> bool:
+        """Whether a state has it beyond what is likely."""
+        off, slope = self.against(state)
+        return float(off @ np.linalg.solve(slope @ state.cov @ slope.T + self.fresh, off)) > _BEYOND
+
+
+def bend_axes(bend_rad: Float) -> Float:
+    """The axes (3, 2) of flexion and deviation in the forearm, of a bend (2,) [rad]."""
+    deviation = axis_rotation(1, bend_rad[1])
+    return np.stack([deviation[:, 0], _EYE[1]], axis=1)
+
+
+def _moves(step_s: float) -> Float:
+    """How the mean (12,) goes on in a step (12, 12); a step back is one of the same process, which has no direction."""
+    away = abs(step_s)
+    moves = np.eye(_SIZE)
+    for part, lasts_s in ((_TILT, _TILT_S), (_HABIT, _HABIT_S), (_ERROR, _STAYS_S)):
+        moves[part, part] *= exp(-away / lasts_s)
+    paced, decay = _PACE_1_S * away, exp(-_PACE_1_S * away)
+    two = np.eye(2)
+    moves[_MOTION, _MOTION], moves[_MOTION, _RATE] = (1.0 + paced) * decay * two, step_s * decay * two
+    moves[_RATE, _MOTION] = -(_PACE_1_S**2) * step_s * decay * two
+    moves[_RATE, _RATE] = (1.0 - paced) * decay * two
+    return moves
