@@ -143,17 +143,17 @@ class ScriptedMotion:
 
 
 def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
-    """Angles (5, 4) [rad] inside the limits, of a posture (5, 3) [deg] and `wobble` (5, 4) about -1..1.
+    """Angles (..., 5, 4) [rad] inside the limits, of postures (..., 5, 3) [deg] and `wobble` (5, 4) about -1..1.
 
     The wobble moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the DIP coupling by up to 12 %.
     """
-    angles = np.empty((5, 4))
-    angles[:, :3] = posture_deg
-    angles[:, 0] += wobble[:, 0]
-    angles[:, 1:3] += 3.0 * wobble[:, 1:3]
+    angles = np.empty((*posture_deg.shape[:-1], 4))
+    angles[..., :3] = posture_deg
+    angles[..., 0] += wobble[:, 0]
+    angles[..., 1:3] += 3.0 * wobble[:, 1:3]
     coupling = 2.0 / 3.0 if model.dip_per_pip is None else model.dip_per_pip
     ratio = np.array([0.9, coupling, coupling, coupling, coupling])
-    angles[:, 3] = ratio * angles[:, 2] * (1.0 + 0.12 * wobble[:, 3])
+    angles[..., 3] = ratio * angles[..., 2] * (1.0 + 0.12 * wobble[:, 3])
     return model.clamp(np.radians(angles))
 
 
@@ -170,20 +170,32 @@ def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float
     return rigid(rotation, centre_m + shift_m - rotation @ middle)
 
 
-class Drift:
-    """Slow natural wandering: random Fourier sums, closed over the period."""
+class Waves:
+    """Some values that wander slowly within -1..1: random Fourier sums, closed over the period."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
-        n = 20 + 6
-        self._cycles = rng.integers(5, 30, (n, 4)).astype(np.float64)
-        self._phase = rng.uniform(0.0, 2.0 * np.pi, (n, 4))
-        self._weight = rng.uniform(0.5, 1.0, (n, 4))
+    def __init__(self, rng: np.random.Generator, count: int, period_s: float = PERIOD_S) -> None:
+        slow, fast = (max(round(rate * period_s / PERIOD_S), 1) for rate in (5, 30))
+        self._period_s = period_s
+        self._cycles = rng.integers(slow, fast, (count, 4)).astype(np.float64)
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, (count, 4))
+        self._weight = rng.uniform(0.5, 1.0, (count, 4))
         self._weight /= self._weight.sum(axis=1, keepdims=True)
+
+    def at(self, t_s: float) -> Float:
+        """The values (count,) at a time [s]."""
+        waves = np.sin(2.0 * np.pi * self._cycles * t_s / self._period_s + self._phase)
+        return (self._weight * waves).sum(axis=1)
+
+
+class Drift:
+    """Slow natural wandering of a hand in the air, closed over the period."""
+
+    def __init__(self, rng: np.random.Generator, period_s: float = PERIOD_S) -> None:
+        self._waves = Waves(rng, 20 + 6, period_s)
 
     def at(self, t_s: float) -> tuple[Float, Float, Float]:
         """Wobble (5, 4) in -1..1, shift (3,) [m], turn (3,) [rad]."""
-        waves = np.sin(2.0 * np.pi * self._cycles * t_s / PERIOD_S + self._phase)
-        value = (self._weight * waves).sum(axis=1)
+        value = self._waves.at(t_s)
         return value[:20].reshape(5, 4), DRIFT_M * value[20:23], np.radians(DRIFT_DEG) * value[23:]
 
 

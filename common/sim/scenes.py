@@ -15,10 +15,11 @@ from common.sim.poses import StudyPoses
 from common.sim.render import Renderer
 from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
+from common.sim.together import TOGETHER, together_motion
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
-NAMES = "standard | lights | poses | hand-routine | leap:FILE.npz"
+NAMES = f"standard | lights | poses | hand-routine | leap:FILE.npz | {' | '.join(TOGETHER)}"
 VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
 
@@ -27,8 +28,8 @@ def scene_by_name(
     name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
 ) -> Scene:
     """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
-    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), or one that follows a
-    recorded motion.
+    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), one that moves as before a
+    wrist device at the same time (`TOGETHER`), or one that follows a recorded motion.
 
     Raises:
         PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
@@ -50,6 +51,9 @@ def scene_by_name(
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
         return Scene.of_motion(rig, cameras, hand, motion, seed)
+    together = together_motion(name, HandModel.of(hand), view_centre(rig), seed)
+    if together is not None:
+        return Scene.of_motion(rig, cameras, hand, together, seed)
     raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board for cameras only)")
 
 

@@ -1,0 +1,137 @@
+"""A hand that grasps a bar, lifts it, turns it and puts it back, five times a minute.
+
+From rest the hand comes from below with open fingers until the bar lies before the palm, presses the palm to it and
+closes (`grip`); the palm then hides the finger tips from cameras that see the back of the hand. It lifts the bar,
+turns it briskly in the picture and towards the cameras, lowers it to its old place, opens and goes back. Place, pace,
+turns and postures are drawn from the seed. While the bar is held it follows the palm, and before and after it lies
+still; the hand stands still to the bar whenever its skin touches it.
+
+The wrist is some degrees extended round the bar, as in every power grip, and bends by up to 8 degrees either way
+about that, and by up to 8 degrees to the sides, while the bar is turned; by 4 and 3 degrees at rest.
+"""
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import HandModel
+from common.sim.grip import SPREAD_DEG, bar_in_palm, closed_round
+from common.sim.held import Cylinder
+from common.sim.motion import (
+    PERIOD_S,
+    REST,
+    Drift,
+    HandState,
+    Waves,
+    angles_of,
+    base_pose,
+    smooth_step,
+    window,
+)
+
+ROUNDS = 5
+ROUND_S = PERIOD_S / ROUNDS
+BAR_RADIUS_M, BAR_LENGTH_M = 0.012, 0.18
+# Seconds since the beginning of a round, before its pace.
+LEAVE_S, ARRIVE_S, PRESSED_S, CLOSED_S = 0.8, 2.2, 2.7, 3.5
+LIFT_S, LIFTED_S, LOWER_S, LOWERED_S = 3.8, 4.8, 8.5, 9.5
+RELEASE_S, OPEN_S, FREE_S, BACK_S = 9.8, 10.4, 10.8, 11.8
+_STILL_S = 0.5  # in which the hand comes to stand still, and moves again
+_TURN_S, _TURN_FADE_S = 1.7, 0.3
+TURN_DEG = 25.0
+PACE = (0.92, 1.0)
+LIFT_M = (0.08, 0.12)
+PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
+UP_M = 0.035  # of the bar above the middle of the view
+COMES_M = np.array([0.015, 0.0, -0.13])  # from there, palm axes
+BEFORE_M = np.array([0.0, 0.022, 0.0])  # how far the palm stays off until it is pressed to the bar
+EXTENDED_DEG = 8.0
+SWAY_DEG, TURNING_DEG = np.array([4.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
+_OPEN = ((30, -8, 0), *((spread, 4, 5) for spread in SPREAD_DEG[1:]))
+
+
+class Grasp:
+    """Five grasps in 60 s. The state it holds is its script, fixed by the constructor.
+
+    Attributes:
+        pace: (ROUNDS,) by what the times of each round are multiplied.
+    """
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int, radius_m: float = BAR_RADIUS_M) -> None:
+        """Write the script, and close the hand round the bar once (some tenths of a second).
+
+        Args:
+            model: Whose limits and coupling hold.
+            centre_m: Place (3,) of the middle of the scene, rig frame [m].
+            seed: Same seed, same motion.
+            radius_m: Of the bar.
+        """
+        rng = np.random.default_rng([seed, 17])
+        self._model, self._radius_m = model, radius_m
+        self._drift, self._sway = Drift(rng), Waves(rng, 2)
+        place = rng.uniform(-1.0, 1.0, 3) * PLACE_M - np.array([0.0, UP_M, 0.0])
+        self._centre = np.asarray(centre_m, dtype=np.float64) + place
+        self._rest = np.array(REST, dtype=np.float64) + rng.normal(0.0, (1.0, 2.0, 3.0), (5, 3))
+        self._open = np.array(_OPEN, dtype=np.float64)
+        self._comes = COMES_M + rng.uniform(-0.01, 0.01, 3) * np.array([1.0, 0.0, 1.0])
+        self.pace = rng.uniform(*PACE, ROUNDS)
+        self._lift_m = rng.uniform(*LIFT_M, ROUNDS)
+        self._first = rng.integers(0, 2, ROUNDS)  # which of the two turns comes first
+        self._sign = rng.choice((-1.0, 1.0), (ROUNDS, 2))
+        self._grip_wobble = np.zeros((5, 4))
+        self._grip_wobble[:, 3] = rng.uniform(-0.5, 0.5, 5)
+        self._T_palm_object = bar_in_palm(model, radius_m)
+        self._grip = closed_round(model, self._T_palm_object, radius_m, self._grip_wobble)
+        self._T_grip = base_pose(model, self._centre, np.zeros(3), np.zeros(3))
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def round_at(self, t_s: float) -> tuple[int, float]:
+        """Which round it is at `t_s` [s], and how far in it the hand is, in seconds of a round at full length."""
+        t = max(t_s, 0.0) % PERIOD_S
+        k = min(int(t / ROUND_S), ROUNDS - 1)
+        return k, (t - k * ROUND_S) / float(self.pace[k])
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        k, s = self.round_at(t_s)
+        wobble, drift, drift_turn = self._drift.at(max(t_s, 0.0) % PERIOD_S)
+        near = _between(s, LEAVE_S, ARRIVE_S, FREE_S, BACK_S)
+        pressed = _between(s, ARRIVE_S - 0.1, PRESSED_S, OPEN_S - 0.1, FREE_S)
+        ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, FREE_S + 0.2, BACK_S)
+        closed = _between(s, PRESSED_S, CLOSED_S, RELEASE_S, OPEN_S)
+        lifted = _between(s, LIFT_S, LIFTED_S, LOWER_S, LOWERED_S)
+        posture = self._rest + ready * (self._open - self._rest) + closed * (self._grip - self._open)
+        angles = angles_of(self._model, posture, wobble + closed * (self._grip_wobble - wobble))
+        still = window(s, ARRIVE_S - 0.6, LIFT_S + _STILL_S, _STILL_S)
+        still += window(s, LOWERED_S - 0.6, FREE_S + _STILL_S, _STILL_S)
+        off = (1.0 - near) * self._comes + (1.0 - pressed) * BEFORE_M
+        shift = self._T_grip[:3, :3] @ (off * np.array([self._model.side_sign, 1.0, 1.0]))
+        shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
+        turn, swing = self._turning(k, s)
+        pose = base_pose(self._model, self._centre, shift, turn + (1.0 - still) * drift_turn)
+        held = CLOSED_S <= s < RELEASE_S
+        bar = (pose if held else self._T_grip) @ self._T_palm_object
+        bend = np.radians(SWAY_DEG * self._sway.at(t_s) + swing - near * np.array([EXTENDED_DEG, 0.0]))
+        return HandState(pose, angles, bend, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
+
+    def _turning(self, k: int, s: float) -> tuple[Float, Float]:
+        """How round `k` turns the palm about the rig's axes (3,) [rad], and bends the wrist by that (2,) [deg]."""
+        turn, swing = np.zeros(3), np.zeros(2)
+        for place in (0, 1):
+            start = LIFTED_S + 0.1 + place * _TURN_S
+            if not start < s < start + _TURN_S:
+                continue
+            which = int(self._first[k]) ^ place
+            inside = window(s, start, start + _TURN_S, _TURN_FADE_S)
+            swung = self._sign[k, place] * inside * np.sin(2.0 * np.pi * (s - start) / _TURN_S)
+            turn[(2, 0)[which]] = np.radians(TURN_DEG) * swung
+            swing[(1, 0)[which]] = TURNING_DEG[(1, 0)[which]] * swung
+        return turn, swing
+
+
+def _between(s: float, up: float, top: float, down: float, bottom: float) -> float:
+    """0 before `up`, 1 from `top` to `down`, 0 after `bottom`, smooth (C2)."""
+    return smooth_step((s - up) / (top - up)) * smooth_step((bottom - s) / (bottom - down))

@@ -1,0 +1,194 @@
+"""Motions that a marker rig and a wrist device see alike: what fusion is measured on, and mounting calibrated from.
+
+All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
+device sits on the forearm (`common.wrist_bend`; limits of the bend as flexion / deviation):
+
+    grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 8 degrees extended, +-8 / +-8 about that
+    both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
+    both-curl     all fingers curl slowly from straight to PIP 105 degrees and back; +-8 / +-5
+    both-travel   the hand goes to and fro at a peak of 1 m/s, its fingers slowly moving; +-8 / +-5
+    both-moves    10 s in which fingers bend one by one and together, the palm turns about all axes; +-25 / +-12
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import HandModel
+from common.sim.grasp import Grasp
+from common.sim.motion import (
+    FIST,
+    PEAK_SPEED_M_S,
+    PERIOD_S,
+    REST,
+    Drift,
+    HandMotion,
+    HandState,
+    Waves,
+    angles_of,
+    base_pose,
+    window,
+)
+from common.sim.poses import StudyPoses
+
+TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves")
+USUAL_BEND_DEG = np.array([8.0, 5.0])
+CURL_S, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 105.0, 0.54  # Kamper's ratio, row D8
+_CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
+_CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
+_THUMB_DEG = np.array([[14.0, -6.0, 0.0], [6.0, 26.0, 26.0]])  # open, closed
+CURL_TURN_DEG = 14.0
+TRAVEL_S, TRAVEL_FADE_S = 6.0, 0.6
+TRAVEL_HZ = (1.3, 1.8)
+MOVES_S = 10.0
+MOVES_TURN_DEG = np.array([26.0, 24.0, 30.0])
+MOVES_BEND_DEG = np.array([25.0, 12.0])
+MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
+
+
+def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
+    """The motion of that name (`TOGETHER`) about a place (3,) [m], rig frame; None: there is no such.
+
+    The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the bend of
+    the wrist and the shifts are the same.
+    """
+    if name == "grasp":
+        return Grasp(model, centre_m, seed)
+    if name == "both-poses":
+        return Bent(StudyPoses(model, centre_m, seed), seed)
+    if name == "both-curl":
+        return Bent(Curls(model, centre_m, seed), seed)
+    if name == "both-travel":
+        return Bent(Travel(model, centre_m, seed), seed)
+    if name == "both-moves":
+        return Moves(model, centre_m, seed)
+    return None
+
+
+class Bent:
+    """A motion, and a wrist that bends as in normal use while it goes on. It holds which way, from its seed."""
+
+    def __init__(self, motion: HandMotion, seed: int) -> None:
+        """Of a motion with the usual period."""
+        self._motion = motion
+        self._waves = Waves(np.random.default_rng([seed, 19]), 2, motion.period_s)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return self._motion.period_s
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        bend = np.radians(USUAL_BEND_DEG) * self._waves.at(max(t_s, 0.0))
+        return replace(self._motion.at(t_s), bend_rad=bend)
+
+
+class Curls:
+    """All fingers curl and stretch, six times a minute, while the palm slowly turns. It holds its script."""
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
+        rng = np.random.default_rng([seed, 23])
+        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
+        self._drift, self._turn = Drift(rng), Waves(rng, 3)
+        self._most = CURL_PIP_DEG * (1.0 - rng.uniform(0.0, 0.06, 4))
+        self._ratio = MCP_PER_PIP * (1.0 + rng.normal(0.0, 0.06, 4))
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % PERIOD_S
+        share = 0.5 - 0.5 * np.cos(2.0 * np.pi * t / CURL_S - _CURL_LAG_RAD)
+        pip = share[1:] * self._most
+        posture = np.empty((5, 3))
+        posture[0] = _THUMB_DEG[0] + share[0] * (_THUMB_DEG[1] - _THUMB_DEG[0])
+        posture[1:, 0] = _CURL_SPREAD_DEG[1:] * (1.0 - share[1:])
+        posture[1:, 1], posture[1:, 2] = self._ratio * pip, pip
+        wobble, shift, turn = self._drift.at(t)
+        turn = turn + np.radians(CURL_TURN_DEG) * self._turn.at(t)
+        return HandState(
+            base_pose(self._model, self._centre, shift, turn), angles_of(self._model, posture, wobble)
+        )
+
+
+class Travel:
+    """The hand goes to and fro, ten ways a minute, and its fingers move slowly. It holds its script."""
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
+        rng = np.random.default_rng([seed, 29])
+        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
+        self._drift, self._bend = Drift(rng), Waves(rng, 5)
+        count = round(PERIOD_S / TRAVEL_S)
+        way = np.array([1.0, 0.0, 0.0]) + rng.uniform(-1.0, 1.0, (count, 3)) * np.array([0.2, 0.4, 0.6])
+        self._way = way / np.linalg.norm(way, axis=1, keepdims=True)
+        self._rate_hz = rng.uniform(*TRAVEL_HZ, count)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % PERIOD_S
+        k = min(int(t / TRAVEL_S), len(self._way) - 1)
+        s, rate = t - k * TRAVEL_S, 2.0 * np.pi * float(self._rate_hz[k])
+        size = window(s, 0.0, TRAVEL_S, TRAVEL_FADE_S) * 0.98 * PEAK_SPEED_M_S / rate
+        wobble, shift, turn = self._drift.at(t)
+        share = 0.35 + 0.35 * self._bend.at(t)
+        rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
+        posture = rest + share[:, None] * (fist - rest)
+        shift = shift + size * np.sin(rate * s) * self._way[k]
+        return HandState(
+            base_pose(self._model, self._centre, shift, turn), angles_of(self._model, posture, wobble)
+        )
+
+
+class Moves:
+    """Ten seconds of everything that a mounting shows itself in. It holds its script, fixed by the constructor."""
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        """Of a hand about a place (3,) [m]; the same seed, the same motion."""
+        rng = np.random.default_rng([seed, 31])
+        self._model, self._centre = model, np.asarray(centre_m, dtype=np.float64)
+        self._drift = Drift(rng, MOVES_S)
+        self._order = rng.permutation(5)
+        self._depth = rng.uniform(0.75, 0.95, 5)
+        # Turns, shifts, bends: each a wave of its own that closes over the period.
+        self._cycles = np.concatenate(
+            [rng.permutation([3, 4, 5]), rng.permutation([2, 3, 4]), rng.permutation([4, 5])]
+        )
+        self._phase = rng.uniform(0.0, 2.0 * np.pi, 8)
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return MOVES_S
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % MOVES_S
+        share = np.empty(5)
+        for place, finger in enumerate(self._order):
+            start = 0.3 + 0.8 * place
+            share[finger] = window(t, start, start + 1.1, 0.5)
+        together = window(t, 4.9, 9.7, 0.5) * 0.5 * (1.0 - np.cos(2.0 * np.pi * (t - 4.9) * 3.0 / 4.8))
+        share = self._depth * np.maximum(share + together, 0.0)
+        wave = np.sin(2.0 * np.pi * self._cycles * t / MOVES_S + self._phase)
+        rest, fist = np.array(REST, dtype=np.float64), np.array(FIST, dtype=np.float64)
+        posture = rest + share[:, None] * (fist - rest)
+        wobble, shift, turn = self._drift.at(t)
+        pose = base_pose(
+            self._model,
+            self._centre,
+            shift + MOVES_SHIFT_M * wave[3:6],
+            turn + np.radians(MOVES_TURN_DEG) * wave[:3],
+        )
+        return HandState(pose, angles_of(self._model, posture, wobble), np.radians(MOVES_BEND_DEG) * wave[6:])
