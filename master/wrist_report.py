@@ -8,6 +8,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.frame_recording import Illumination
 from common.geometry import quaternion_to_matrix
+from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.scene import WristTruth as WristInstant
@@ -46,7 +47,7 @@ def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, fl
     true_up = np.empty((len(rows), 3))
     for k, row in enumerate(rows):
         t_s = (int(poses.t_ns[row]) - epoch_ns) * 1e-9
-        true_up[k] = up @ scene.motion.at(t_s).T_rig_palm[:3, :3]
+        true_up[k] = up @ OnForearm(scene.motion).at(t_s).T_rig_palm[:3, :3]
     said_up = quaternion_to_matrix(poses.palm_world_wxyz[rows])[:, 2]
     off_rad: Float = np.arccos(np.clip((true_up * said_up).sum(axis=1), -1.0, 1.0))
     return {"forearm_tilt_deg": round(float(np.degrees(np.sqrt((off_rad**2).mean()))), 4)}

@@ -19,6 +19,7 @@ from common.geometry import quaternion_to_matrix, unskew
 from common.messages import ImuSample
 from common.sim.motion import HandMotion
 from common.sim.scene import Scene
+from common.sim.wrist.motion import OnForearm
 from common.sim.wrist.scene import WristScene
 
 GRAVITY_M_S2 = 9.81
@@ -74,7 +75,7 @@ class SimulatedImu:
 
     @classmethod
     def of(cls, scene: Scene | WristScene) -> "SimulatedImu":
-        """The IMU of a scene's rig.
+        """The IMU of a scene's rig: on the palm before markers, on the forearm in a wrist device.
 
         Raises:
             CalibrationError: The rig has none, or it is not known how that is mounted.
@@ -83,7 +84,8 @@ class SimulatedImu:
             raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to simulate")
         if not scene.rig.imu.placed:
             raise CalibrationError(f"rig {scene.rig.name!r}: {_UNPLACED}")
-        return cls(scene.motion, scene.rig.imu, scene.seed)
+        motion = OnForearm(scene.motion) if isinstance(scene, WristScene) else scene.motion
+        return cls(motion, scene.rig.imu, scene.seed)
 
     def around(self, start_s: float, stop_s: float, zero_ns: int = 0) -> Iterator[ImuSample]:
         """All samples of a span of scene time [s], and before it as long as a filter takes to settle.

@@ -10,8 +10,9 @@ import pytest
 from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.frame_recording import Illumination
-from common.geometry import axis_rotation, rigid
+from common.geometry import axis_rotation, quaternion_to_matrix, rigid
 from common.sim.held import Cylinder
+from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
 from common.sim.wrist.flesh import THING_GROUP
 from common.sim.wrist.light import SKIN_AT_M, Leds
@@ -151,3 +152,24 @@ def test_the_round_ends_hold_as_much_as_flat_ones_and_a_disc_is_refused() -> Non
     np.testing.assert_allclose(axis / length, (T_camera_rig @ ACROSS)[:3, 2], atol=1e-12)
     with pytest.raises(ValueError, match="shorter than its width"):
         bodies_of([Cylinder(ACROSS, 0.05, 0.02, False)], T_camera_rig)
+
+
+def test_an_imu_beside_the_camera_feels_the_forearm_and_not_the_palm() -> None:
+    @dataclass(frozen=True)
+    class Nodding:
+        """The palm stands in the room while the wrist bends by 0.5 rad/s: it is the forearm that turns."""
+
+        period_s: float = 60.0
+
+        def at(self, t_s: float) -> HandState:
+            return replace(SCENE.motion.at(0.0), bend_rad=np.array([0.5 * (t_s - 1.0), 0.0]))
+
+    imu = RIG.imu
+    assert imu is not None
+    assert imu.q_palm_imu is not None
+    sensor = SimulatedImu.of(replace(SCENE, motion=Nodding()))
+    half = SimulatedImu.of(replace(SCENE, motion=Doing(Nodding()))).sample(120, 1.0, 0)
+    turned = sensor.sample(120, 1.0, 0).gyro_rad_s - half.gyro_rad_s
+    # R_rig_forearm = R_rig_palm R_x(-bend): the forearm turns about the palm's x, the other way.
+    expected = quaternion_to_matrix(np.array(imu.q_palm_imu)).T @ np.array([-0.5, 0.0, 0.0])
+    np.testing.assert_allclose(turned, expected, atol=0.02)  # its scale is off by 1 %

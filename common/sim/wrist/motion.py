@@ -1,13 +1,17 @@
 """How the fingers move before the wrist camera: guided curls, study poses, spreads, and a minute of everything.
 
 A motion of stations goes from posture to posture (C2), holds each for a while and drifts all the time, as a hand in
-the air does. The palm pose of a state is that of the forearm in the room; the palm never moves in the camera's frame,
-since the device is strapped to the wrist.
+the air does. The wrist stays straight in all of them: the palm pose of a state is that of the forearm in the room, and
+the palm never moves in the camera's frame, since the device is strapped to the forearm. Of motions in which the wrist
+bends, `OnForearm` is what the device feels.
 """
+
+from dataclasses import replace
 
 import numpy as np
 
 from common.arrays import Float
+from common.geometry import rigid
 from common.hand_model import HandModel
 from common.sim.motion import (
     FIST,
@@ -15,11 +19,13 @@ from common.sim.motion import (
     POSES,
     REST,
     Drift,
+    HandMotion,
     HandState,
     angles_of,
     base_pose,
     smooth_step,
 )
+from common.wrist_bend import STRAIGHT, forearm_palm
 
 MOVE_S = 0.8  # at most: the way from one posture to the next
 CURL_S = 10.0  # there and back
@@ -175,6 +181,29 @@ class GuidedWearer:
         angles[0] = self._open + fist * (self._closed - self._open)
         angles[1:] = self._flat + wobble + bend * self._bent + fist * self._fist
         return HandState(_forearm(self._model, t, np.zeros(3), np.zeros(3)), angles)
+
+
+class OnForearm:
+    """A motion as the forearm makes it: where the palm would be if the wrist was straight. It holds the motion."""
+
+    def __init__(self, motion: HandMotion) -> None:
+        """Of a hand."""
+        self._motion = motion
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return self._motion.period_s
+
+    def at(self, t_s: float) -> HandState:
+        """Forearm and fingers at time `t_s` [s]; before 0 the pose of 0."""
+        state = self._motion.at(t_s)
+        if not state.bend_rad.any():
+            return state
+        back = rigid(
+            forearm_palm(state.bend_rad).T, np.zeros(3)
+        )  # both frames have their origin in the wrist
+        return replace(state, T_rig_palm=state.T_rig_palm @ back, bend_rad=STRAIGHT)
 
 
 def wrist_motion(name: str, model: HandModel, seed: int) -> Stations | GuidedCurl | GuidedWearer | None:
