@@ -36,9 +36,10 @@ from master.options import (
     Calibration,
     KeyFile,
     Rig,
+    Rigs,
     address,
 )
-from master.rig import RigSetup, load_hand, load_setup
+from master.rig import RigSetup, load_hand, load_setup, load_setups
 from master.solve import solve
 from master.stopping import stop_on_signals
 from master.study.command import evaluate_app
@@ -62,7 +63,7 @@ def phalanx_master() -> None:
 
 @app.command()
 def run(
-    rig: Rig = "desk",
+    rig: Rigs,
     calibration: Calibration = CALIB_JSON,
     hand: Hand = None,
     beacon: Beacon = HERE_BEACON,
@@ -72,22 +73,29 @@ def run(
     start_timeout_s: Annotated[
         float, typer.Option(help="How long the first camera waits for the others.")
     ] = 5.0,
-    poses: Annotated[Path | None, typer.Option(help="Write every pose to this .npz.")] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(help="Write every pose to this .npz; of a second hand beside it, with its name."),
+    ] = None,
     summary: Annotated[Path | None, typer.Option(help="Write the figures of the run to this .json.")] = None,
 ) -> None:
     """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file.
 
-    The files of rig, cameras and hand are followed: what changes there is used at once.
+    Several rigs of one hand are one hand: cameras that watch its markers and the device on its wrist are solved
+    together. Rigs of two hands are two hands, each published under its own name. The files of rigs, cameras and hands
+    are followed: what changes there is used at once.
 
     Examples:
 
       phalanx-master run --rig desk
 
-      phalanx-master run --rig wrist
+      phalanx-master run --rig desk --rig wrist
+
+      phalanx-master run --rig desk --rig wrist-left
 
       phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
     """
-    setup = load_setup(calibration, rig, hand)
+    setups = load_setups(calibration, rig, hand)
     settings = LiveSettings(
         address(beacon, "--beacon"),
         address(bind, "--bind"),
@@ -95,9 +103,9 @@ def run(
         start_timeout_s,
         poses,
         summary,
-        RigFiles(calibration, rig, hand),
+        RigFiles(calibration, tuple(rig), hand),
     )
-    run_live(setup, rig_key(os.environ, key_file), settings, stop_on_signals(), _say)
+    run_live(setups, rig_key(os.environ, key_file), settings, stop_on_signals(), _say)
 
 
 @app.command(name="solve")

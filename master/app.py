@@ -2,13 +2,11 @@
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from math import nan
 from typing import Protocol, TypeVar
 
 import msgspec
 import numpy as np
 
-from common.arrays import Float
 from common.clock import Clock
 from common.messages import Detections, Health, ImuSample
 from master.outputs.sink import Sink
@@ -33,14 +31,14 @@ class Source(Protocol[SeenT_co]):
 
 
 class Solver(Protocol[SeenT_contra]):
-    """What makes poses of detections; the pipeline of a rig, or a `LivePipeline`."""
+    """What makes poses of detections: the hands of a master."""
 
     def push(self, message: SeenT_contra) -> list[SolvedPose]:
-        """Take one camera's detections; return the poses they complete, oldest first."""
+        """Take one camera's detections; return the poses they complete, of each hand oldest first."""
         ...
 
-    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU says of its own orientation (4,)."""
+    def push_sample(self, sample: ImuSample) -> None:
+        """Take what an IMU measured."""
         ...
 
 
@@ -76,7 +74,7 @@ class RunFigures:
 
 def run(
     source: Source[SeenT],
-    pipeline: Solver[SeenT],
+    hands: Solver[SeenT],
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,
@@ -89,10 +87,10 @@ def run(
         if message is None:
             continue
         if isinstance(message, ImuSample):
-            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
+            hands.push_sample(message)
             continue
         figures.rates.push(message)
-        for solved in pipeline.push(message):
+        for solved in hands.push(message):
             now = clock.now_ns()
             pose = msgspec.structs.replace(solved.pose, latency_ns=now - solved.ready_t_ns)
             for sink in sinks:

@@ -3,7 +3,7 @@
 import gc
 import secrets
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +14,11 @@ from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
+from master.hands import Hands
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
-from master.outputs.files import PosesFile
+from master.outputs.files import PosesFiles
 from master.outputs.sink import Sink
 from master.rig import RigSetup
 from master.stages import StageTimes
@@ -38,9 +39,9 @@ class LiveSettings:
         bind: Own UDP address and port for data (0: any).
         bus: Endpoint on which the zenoh bus listens, for example tcp/127.0.0.1:47802.
         start_timeout_s: How long the first slave waits for the others.
-        poses: Where to write poses.npz, or None.
+        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name.
         summary: Where to write the summary, or None.
-        files: Where the setup was read: what changes there is used at once. None: the setup stays as it is.
+        files: Where the setups were read: what changes there is used at once. None: they stay as they are.
     """
 
     beacon: tuple[str, int]
@@ -53,12 +54,16 @@ class LiveSettings:
 
 
 def run_live(
-    setup: RigSetup, key: bytes, settings: LiveSettings, stop: threading.Event, say: Callable[[str], None]
+    setups: Sequence[RigSetup],
+    key: bytes,
+    settings: LiveSettings,
+    stop: threading.Event,
+    say: Callable[[str], None],
 ) -> dict[str, object]:
     """Track until `stop` is set.
 
     Args:
-        setup: Rig, cameras, hand.
+        setups: Of each hand its rigs, cameras and model.
         key: Rig key.
         settings: Addresses and files.
         stop: Set by a signal handler, or by the command "stop" on the bus.
@@ -73,38 +78,32 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    pipeline = LivePipeline(setup, stages)
-    tuning = None if settings.files is None else RigTuning(settings.files, setup, pipeline, say)
+    pipelines = [LivePipeline(setup, stages) for setup in setups]
+    hands = Hands(setups, pipelines)
+    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say)
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
         stack.callback(bus.close)
-        ingest = Ingest(
-            setup.rig.cameras,
-            key,
-            clock,
-            settings.beacon,
-            settings.bind,
-            settings.bus,
-            settings.start_timeout_s,
-            imus=setup.imus,
-            wrists=setup.wrist_cameras,
-        )
+        ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
         sinks: list[Sink] = [BusSink(bus)]
         if settings.poses is not None:
-            sinks.append(PosesFile(settings.poses, setup.hand.profile.name, len(setup.markers)))
+            counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+            sinks.append(PosesFiles(settings.poses, counts))
         for sink in sinks:
             stack.callback(sink.close)
-        watch = TimeWatch(setup)
+        watch = TimeWatch(setups)
+        odd = [OddWatch(setup.rig.cameras) for setup in setups]
+        watched = list(zip(odd, pipelines, strict=True))
         reporter = _Reporter(
-            setup.rig.cameras, clock, bus, ingest, pipeline, tuning, watch, figures, stop, say
+            cameras_of(setups), clock, bus, ingest, hands, watched, tuning, watch, figures, stop, say
         )
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        run(ingest, pipeline, sinks, clock, figures, stop, watch.push)
+        run(ingest, hands, sinks, clock, figures, stop, watch.push)
         stop.set()
         thread.join(_JOIN_S)
         summary: dict[str, object] = {
@@ -121,6 +120,30 @@ def run_live(
     return summary
 
 
+def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All cameras, each once: some watch two hands."""
+    return tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
+
+
+def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: LiveSettings) -> Ingest:
+    """Where all cameras and IMUs of these hands are heard.
+
+    Raises:
+        BusError: The address cannot be bound, or the beacon's is no IPv4 address.
+    """
+    return Ingest(
+        cameras_of(setups),
+        key,
+        clock,
+        settings.beacon,
+        settings.bind,
+        settings.bus,
+        settings.start_timeout_s,
+        imus=tuple(name for setup in setups for name in setup.imus),
+        wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
+    )
+
+
 class _Reporter:
     """Tells how the master is: on the bus, to whoever asks there, and a line for each change.
 
@@ -133,7 +156,8 @@ class _Reporter:
         clock: Clock,
         bus: Bus,
         ingest: Ingest,
-        pipeline: LivePipeline,
+        hands: Hands,
+        odd: Sequence[tuple[OddWatch, LivePipeline]],
         tuning: RigTuning | None,
         watch: TimeWatch,
         figures: RunFigures,
@@ -143,8 +167,8 @@ class _Reporter:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self._session = secrets.randbits(63)
         self._cameras, self._clock, self._bus = cameras, clock, bus
-        self._ingest, self._pipeline, self._figures = ingest, pipeline, figures
-        self._tuning, self._watch, self._odd = tuning, watch, OddWatch(cameras)
+        self._ingest, self._hands, self._figures = ingest, hands, figures
+        self._tuning, self._watch, self._odd = tuning, watch, odd
         self._stop, self._say = stop, say
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
@@ -154,7 +178,7 @@ class _Reporter:
         events = self._ingest.counts.items()
         told = {name: number for name, number in events if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._pipeline.counts) | told | changes
+        counts = dict(self._hands.counts) | told | changes
         times = self._watch.gauges(self._ingest.clock_of)
         return health(self._session, self._clock, self._figures, counts, times)
 
@@ -181,8 +205,9 @@ class _Reporter:
         while not self._stop.wait(_REPORT_S):
             if self._tuning is not None:
                 self._tuning.look()
-                self._watch.follow(self._tuning.setup)
-            lines = self._watch.look() + self._odd.look(self._pipeline.counts)
+                self._watch.follow(self._tuning.setups)
+            lines = self._watch.look()
+            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
             self._bus.publish("health", MASTER, self.health())
             heard = self._ingest.connected
             if heard != connected:

@@ -9,6 +9,15 @@ from common.datagram import Address
 from common.errors import PhalanxError
 
 Rig = Annotated[str, typer.Option(help="Rig: a file of CALIBRATION/rigs, without .json.")]
+Rigs = Annotated[
+    list[str],
+    typer.Option(
+        "--rig",
+        default_factory=lambda: ["desk"],
+        show_default="desk",
+        help="Rig: a file of CALIBRATION/rigs, without .json; once for each that runs.",
+    ),
+]
 Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and hands/.")]
 KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
 BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]

@@ -1,52 +1,57 @@
 """Other geometry, depth model, filter or hand while the master tracks: a new pipeline takes the old one's place.
 
+Each hand has a pipeline, and only those change whose files did.
+
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
 it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
 """
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
-from math import nan
+from math import ceil, nan
 from pathlib import Path
 
 from common.arrays import Float
-from common.errors import CalibrationError, PhalanxError
+from common.errors import PhalanxError
 from common.messages import Detections
 from common.watching import WatchedFiles
 from master.ik.tracker import HandTracker
-from master.rig import Pipeline, RigSetup, load_setup, pipeline_of
+from master.needs_restart import refuse_other_hands, refuse_restart
+from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
 from master.stereo.pipeline import SolvedPose, Stage
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (6 Hz at rest) has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
-_NEEDS_RESTART = ("width_px", "height_px", "frame_rate_hz")
 
 
 @dataclass(frozen=True, slots=True)
 class RigFiles:
-    """Where a setup was read: the arguments of `load_setup`."""
+    """Where setups were read: the arguments of `load_setups`."""
 
     calibration: Path
-    rig: str
+    rigs: tuple[str, ...]
     hand: Path | None = None
 
-    def load(self) -> RigSetup:
+    def load(self) -> tuple[RigSetup, ...]:
         """Read the files as they are now.
 
         Raises:
-            CalibrationError: As `load_setup`.
+            CalibrationError: As `load_setups`.
         """
-        return load_setup(self.calibration, self.rig, self.hand)
+        return load_setups(self.calibration, self.rigs, self.hand)
 
-    def paths(self, setup: RigSetup) -> tuple[Path, ...]:
-        """All files that `setup` was read from."""
-        cameras = [self.calibration / "cameras" / f"{name}.json" for name in setup.rig.cameras]
-        hand = self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json"
-        return (self.calibration / "rigs" / f"{self.rig}.json", *cameras, hand)
+    def paths(self, setups: Sequence[RigSetup]) -> tuple[Path, ...]:
+        """All files that `setups` were read from."""
+        rigs = [self.calibration / "rigs" / f"{name}.json" for name in self.rigs]
+        cameras = [
+            self.calibration / "cameras" / f"{name}.json" for setup in setups for name in setup.camera_names
+        ]
+        hands = [self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json" for setup in setups]
+        return tuple(dict.fromkeys([*rigs, *cameras, *hands]))
 
 
 class _WhenOpen:
@@ -60,8 +65,20 @@ class _WhenOpen:
         return self._stage(name) if self.open else nullcontext()
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """What an IMU said of its orientation: the arguments of `Pipeline.push_orientation`."""
+
+    t_ns: int
+    orientation_wxyz: Float
+    heading_sigma_rad: float
+
+
 class LivePipeline:
-    """The pipeline in use. Holds it, its setup, the last messages, and the one that is to take over with the next."""
+    """The pipeline of one hand in use.
+
+    Holds it, its setup, what it was told last, and the one that is to take over with the next message.
+    """
 
     def __init__(self, setup: RigSetup, stage: Stage) -> None:
         """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use.
@@ -73,9 +90,9 @@ class LivePipeline:
         self._setup: RigSetup = setup
         self._tracker = _new_tracker(setup)
         self._now = pipeline_of(setup, stage, tracker=self._tracker)
-        cameras = len(setup.rig.cameras)
-        self._close = _CLOSE_FRAMES * cameras
-        self._recent: deque[tuple[int, Detections]] = deque(maxlen=_WARM_FRAMES * cameras)
+        per_frame = _told_per_frame(setup)
+        self._close = _CLOSE_FRAMES * per_frame
+        self._recent: deque[tuple[int, Detections | _Turn]] = deque(maxlen=_WARM_FRAMES * per_frame)
         self._number = 0
         self._last_ns = -(2**63)
         # And the number of the last message it has seen. One thread fills it, another empties it.
@@ -96,7 +113,9 @@ class LivePipeline:
         return solved
 
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
-        """Take what the IMU says of its orientation (4,); a pipeline that takes over begins without."""
+        """Take what the hand's IMU says of its orientation (4,)."""
+        self._number += 1
+        self._recent.append((self._number, _Turn(t_ns, orientation_wxyz, heading_sigma_rad)))
         self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
 
     def change(self, setup: RigSetup) -> None:
@@ -105,6 +124,14 @@ class LivePipeline:
         Raises:
             CalibrationError: The depth model does not fit the rig; nothing has changed.
         """
+        self.prepare(setup)()
+
+    def prepare(self, setup: RigSetup) -> Callable[[], None]:
+        """Build a pipeline of `setup`; what is returned shows it the last messages and lets it take over.
+
+        Raises:
+            CalibrationError: As `change`.
+        """
         stage = _WhenOpen(self._stage)
         if self._tracker is not None and _hand(setup) == _hand(self._setup):
             setup = replace(setup, hand=self._setup.hand)
@@ -112,49 +139,63 @@ class LivePipeline:
         else:
             tracker = _new_tracker(setup)
         new = pipeline_of(setup, stage, tracker=tracker)
+
+        def take() -> None:
+            shown = self._warm(new)
+            stage.open = True
+            self._setup, self._tracker = setup, tracker
+            self._next.append((new, shown))
+
+        return take
+
+    def _warm(self, new: Pipeline) -> int:
+        """Show it the last messages; the number of the last one."""
         shown = 0
         for _ in range(_ROUNDS):  # while these are solved, more come
-            waiting = [(number, message) for number, message in list(self._recent) if number > shown]
-            for number, message in waiting:
-                new.push(message)
+            waiting = [(number, told) for number, told in list(self._recent) if number > shown]
+            for number, told in waiting:
+                _show(new, told)
                 shown = number
             if len(waiting) <= self._close:
                 break
-        stage.open = True
-        self._setup, self._tracker = setup, tracker
-        self._next.append((new, shown))
+        return shown
 
     def _take_over(self, new: Pipeline, shown: int) -> list[SolvedPose]:
         """Show the new pipeline what it has not seen yet, and take its poses that are later than the last one."""
         old, self._now = self._now.counts, new
         new.counts.clear()
         new.counts.update(old)
-        missed = [message for number, message in self._recent if number > shown]
-        solved = [one for message in missed for one in new.push(message)]
+        missed = [told for number, told in self._recent if number > shown]
+        solved = [one for told in missed for one in _show(new, told)]
         later = [one for one in solved if one.pose.t_ns > self._last_ns]
         new.counts["poses"] -= len(solved) - len(later)
         return later
 
 
 class RigTuning:
-    """Follows the files of a rig. Holds the setup in use, and how often a change was applied and refused.
+    """Follows the files of all rigs. Holds the setups in use, and how often a change was applied and refused.
 
     Its methods are called on several threads and take turns.
     """
 
     def __init__(
-        self, files: RigFiles, setup: RigSetup, pipeline: LivePipeline, say: Callable[[str], None]
+        self,
+        files: RigFiles,
+        setups: Sequence[RigSetup],
+        pipelines: Sequence[LivePipeline],
+        say: Callable[[str], None],
     ) -> None:
-        """Follow `files`, which say `setup`, and change `pipeline`; `say` is told one line for each change."""
-        self._files, self._setup, self._pipeline, self._say = files, setup, pipeline, say
+        """Follow `files`, which say `setups`, and change `pipelines`; `say` is told one line for each change."""
+        self._files, self._say = files, say
+        self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._watched = WatchedFiles()
         self._turn = threading.Lock()
         self._applied = self._refused = 0
 
     @property
-    def setup(self) -> RigSetup:
-        """The setup in use."""
-        return self._setup
+    def setups(self) -> tuple[RigSetup, ...]:
+        """The setups in use."""
+        return self._setups
 
     def counts(self) -> dict[str, int]:
         """`reload.applied`, `reload.refused`."""
@@ -162,7 +203,7 @@ class RigTuning:
 
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
-        if not self._watched.changed(self._files.paths(self._setup)):
+        if not self._watched.changed(self._files.paths(self._setups)):
             return
         try:
             self.reload()
@@ -170,29 +211,51 @@ class RigTuning:
             self._say(f"changed files are not used: {error}")
 
     def reload(self) -> None:
-        """Use the files as they are now.
+        """Use the files as they are now, those of all hands or none.
 
         Raises:
             CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
         """
         with self._turn:
             try:
-                setup = self._files.load()
-                if _content(setup) == _content(self._setup):
-                    return
-                _refuse_restart(self._setup, setup)
-                self._pipeline.change(setup)
+                setups = self._files.load()
+                refuse_other_hands(self._setups, setups)
+                both = zip(self._setups, setups, self._pipelines, strict=True)
+                changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
+                for old, new, _ in changed:
+                    refuse_restart(old, new)
+                switches = [line.prepare(new) for _, new, line in changed]
             except PhalanxError:
                 self._refused += 1
                 raise
-            self._setup = setup
+            if not changed:
+                return
+            for switch in switches:
+                switch()
+            self._setups = setups
             self._applied += 1
         self._say("changed files are in use")
 
 
+def _told_per_frame(setup: RigSetup) -> int:
+    """How many messages of all cameras and of the IMU come with each frame of the slowest camera, about."""
+    slowest_hz = min(camera.frame_rate_hz for camera in setup.cameras.values())
+    imus = [rig.imu for rig in (setup.rig, setup.wrist_rig) if rig is not None and rig.imu is not None]
+    samples = max((imu.rate_hz for imu in imus), default=0.0) / slowest_hz
+    return len(setup.camera_names) + ceil(samples)
+
+
+def _show(pipeline: Pipeline, told: Detections | _Turn) -> list[SolvedPose]:
+    """Tell it what came; the poses that completes."""
+    if isinstance(told, _Turn):
+        pipeline.push_orientation(told.t_ns, told.orientation_wxyz, told.heading_sigma_rad)
+        return []
+    return pipeline.push(told)
+
+
 def _new_tracker(setup: RigSetup) -> HandTracker | None:
-    """The tracker of the hand's markers; a wrist device has none."""
-    return HandTracker(setup.hand, setup.hand_markers) if setup.wrist is None else None
+    """The tracker of the hand's markers; a wrist device alone has none."""
+    return HandTracker(setup.hand, setup.hand_markers) if setup.has_markers else None
 
 
 def _hand(setup: RigSetup) -> tuple[object, ...]:
@@ -200,42 +263,4 @@ def _hand(setup: RigSetup) -> tuple[object, ...]:
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:
-    return setup.rig, setup.cameras, setup.hand.profile
-
-
-def _refuse_restart(old: RigSetup, new: RigSetup) -> None:
-    """Refuse what slaves, files and viewers were started with.
-
-    Raises:
-        CalibrationError: With the key, and what to restart.
-    """
-    where = f"rig {new.rig.name!r}"
-    if old.rig.kind != new.rig.kind:
-        raise CalibrationError(
-            f"{where}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all processes of the"
-            " rig"
-        )
-    for key in ("cameras", "markers"):
-        was, now = getattr(old.rig, key), getattr(new.rig, key)
-        if was != now:
-            raise CalibrationError(
-                f"{where}: {key}: {', '.join(was)} cannot become {', '.join(now)} while it runs: restart all "
-                "processes of the rig"
-            )
-    if old.hand.profile.name != new.hand.profile.name:
-        raise CalibrationError(
-            f"{where}: hand: {old.hand.profile.name} cannot become {new.hand.profile.name} while it runs: restart "
-            "the master"
-        )
-    if old.imus != new.imus:
-        raise CalibrationError(
-            f"{where}: imu.name: {', '.join(old.imus) or 'none'} cannot become {', '.join(new.imus) or 'none'} while "
-            "it runs: restart the master"
-        )
-    for name, camera in new.cameras.items():
-        for key in _NEEDS_RESTART:
-            was, now = getattr(old.cameras[name], key), getattr(camera, key)
-            if was != now:
-                raise CalibrationError(
-                    f"camera {name!r}: {key}: {was} cannot become {now} while it runs: restart all processes of the rig"
-                )
+    return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows

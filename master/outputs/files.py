@@ -7,6 +7,8 @@ its name complete or not at all.
 """
 
 import tempfile
+from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -96,6 +98,48 @@ class PosesFile:
         except OSError:
             # Closing flushes what a full disk refused before; that error was already raised.
             return
+
+
+class PosesFiles:
+    """A `Sink` that becomes a poses.npz for each hand: the first at the path itself, others beside it."""
+
+    def __init__(self, path: Path, marker_counts: Mapping[str, int]) -> None:
+        """Open the spools; `marker_counts`: name of the hand profile -> M.
+
+        Raises:
+            RecordingError: The folder is missing or read-only.
+        """
+        first = next(iter(marker_counts))
+        self._files = {
+            hand: PosesFile(path if hand == first else path_of_hand(path, hand), hand, count)
+            for hand, count in marker_counts.items()
+        }
+
+    def write(self, pose: HandPose) -> None:
+        """Append one row to the file of its hand.
+
+        Raises:
+            RecordingError: Disk full; the hand's file is given up.
+            ValueError: A hand that the files were not opened for, or another marker count, or they are closed.
+        """
+        if pose.hand not in self._files:
+            raise ValueError(f"a pose of {pose.hand!r} does not fit, opened for {', '.join(self._files)}")
+        self._files[pose.hand].write(pose)
+
+    def close(self) -> None:
+        """Write each .npz.
+
+        Raises:
+            RecordingError: Disk full or folder gone; no part of a file is left.
+        """
+        with ExitStack() as all_of_them:
+            for file in self._files.values():
+                all_of_them.callback(file.close)
+
+
+def path_of_hand(path: Path, hand: str) -> Path:
+    """Where the poses of another hand than the first stand: poses.npz -> poses-HAND.npz."""
+    return path.with_name(f"{path.stem}-{hand}{path.suffix}")
 
 
 def save_poses(path: Path, poses: Poses) -> None:

@@ -12,8 +12,9 @@ from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_m
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections
 from master.app import RunFigures, health, run
+from master.hands import Hands
 from master.live import cameras_line
-from master.rig import build_pipeline
+from master.rig import RigSetup, pipeline_of
 from master.stages import StageTimes
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
@@ -54,6 +55,10 @@ class Collector:
         raise AssertionError("the loop does not own its sinks")
 
 
+def hands_of(*setups: RigSetup) -> Hands:
+    return Hands(setups, [pipeline_of(setup, StageTimes()) for setup in setups])
+
+
 @pytest.fixture(scope="module")
 def short_run() -> SyntheticRun:
     return synthetic_run(6)
@@ -67,7 +72,7 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     ]
     source = ScriptedSource(script, stop)
     clock.t_ns = short_run.messages[-1].t_ns + 3_000_000
-    run(source, build_pipeline(short_run.setup, StageTimes()), sinks, clock, figures, stop)
+    run(source, hands_of(short_run.setup), sinks, clock, figures, stop)
     assert figures.poses == len(sinks[0].poses) >= 5
     assert [p.t_ns for p in sinks[0].poses] == [p.t_ns for p in sinks[1].poses]
     last = sinks[0].poses[-1]
@@ -90,11 +95,11 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     samples = [turned(t_ns, off) for t_ns in range(first, last, 8_000_000)]
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
-    pipeline, watched = build_pipeline(setup, StageTimes()), list[MarkerDetections]()
-    run(ScriptedSource([*script], stop), pipeline, [sink], ScriptedClock(), figures, stop, watched.append)
+    hands, watched = hands_of(setup), list[MarkerDetections]()
+    run(ScriptedSource([*script], stop), hands, [sink], ScriptedClock(), figures, stop, watched.append)
     assert watched == short_run.messages
     assert set(figures.rates.camera_hz) == {"left", "right"}
-    assert pipeline.counts["orientation.used"] == len(sink.poses) >= 5
+    assert hands.counts["orientation.used"] == len(sink.poses) >= 5
     for pose in sink.poses:  # so narrow a belief outweighs the markers: where it is wrong, the palm follows
         truth = off @ hand_at(pose.t_ns * 1e-9).rotation[WRIST]
         found = quaternion_to_matrix(pose.orientation_wxyz[WRIST])
@@ -102,9 +107,10 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
 
 
 def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
-    stop, pipeline = threading.Event(), build_pipeline(short_run.setup, StageTimes())
-    run(ScriptedSource([turned(0, np.eye(3))], stop), pipeline, [], ScriptedClock(), RunFigures(), stop)
-    assert pipeline.counts == {"orientation.unplaced": 1}
+    unplaced = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=ImuCalibration()))
+    stop, hands = threading.Event(), hands_of(unplaced)
+    run(ScriptedSource([turned(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
+    assert hands.counts == {"orientation.unplaced": 1}
 
 
 def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:
@@ -112,7 +118,7 @@ def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:
     stop.set()
     sink = Collector()
     source = ScriptedSource(list(short_run.messages), stop)
-    run(source, build_pipeline(short_run.setup, StageTimes()), [sink], ScriptedClock(), RunFigures(), stop)
+    run(source, hands_of(short_run.setup), [sink], ScriptedClock(), RunFigures(), stop)
     assert sink.poses == []
 
 

@@ -33,7 +33,7 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
     setup = load_setup(root / "calib_json", "desk")
     lines: list[str] = []
     stop = threading.Event()
-    master = threading.Thread(target=run_live, args=(setup, key, settings, stop, lines.append))
+    master = threading.Thread(target=run_live, args=((setup,), key, settings, stop, lines.append))
     master.start()
     clock = SystemClock()
     left, right = (Uplink(name, key, clock, beacon, "127.0.0.1") for name in ("left", "right"))

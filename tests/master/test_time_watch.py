@@ -55,7 +55,7 @@ def stepping(phase_ms: float, seconds: float, ppm: float = 0.0) -> list[MarkerDe
 
 @pytest.mark.parametrize("motion", [scenes.sideways, scenes.natural])
 def test_a_stamp_that_lies_is_named_once_with_what_to_do(motion: Callable[[int], Motion]) -> None:
-    lines = watched(TimeWatch(setup_of()), messages_of(motion, 8.0))
+    lines = watched(TimeWatch([setup_of()]), messages_of(motion, 8.0))
     warnings = [line for line in lines if "stamps" in line]
     assert len(warnings) == 1
     assert "camera right: its frames are " in warnings[0]
@@ -65,19 +65,21 @@ def test_a_stamp_that_lies_is_named_once_with_what_to_do(motion: Callable[[int],
 
 @pytest.mark.parametrize("motion", [scenes.sideways, scenes.natural, scenes.circling, scenes.resting])
 def test_true_stamps_are_never_named(motion: Callable[[int], Motion]) -> None:
-    assert not [line for line in watched(TimeWatch(setup_of()), messages_of(motion, 0.0)) if "stamps" in line]
+    assert not [
+        line for line in watched(TimeWatch([setup_of()]), messages_of(motion, 0.0)) if "stamps" in line
+    ]
 
 
 def test_an_offset_of_the_rig_file_is_taken_into_account_and_followed() -> None:
     messages = messages_of(scenes.natural, 8.0)
     corrected = setup_of(stamp_offset_us={"right": 8000.0})
-    assert not [line for line in watched(TimeWatch(corrected), messages) if "stamps" in line]
-    watch = TimeWatch(setup_of())
+    assert not [line for line in watched(TimeWatch([corrected]), messages) if "stamps" in line]
+    watch = TimeWatch([setup_of()])
     for message in messages:
         watch.push(message)
     watch.look()
     assert watch.gauges(lambda _name: None)["right.residual_offset_us"] > 7000.0
-    watch.follow(corrected)
+    watch.follow([corrected])
     for message in messages:
         watch.push(message)
     watch.look()
@@ -86,7 +88,7 @@ def test_an_offset_of_the_rig_file_is_taken_into_account_and_followed() -> None:
 
 def test_gauges_tell_of_clocks_phases_and_residuals_and_fit_a_report() -> None:
     long = "camera-" + "x" * 57
-    watch = TimeWatch(setup_of(cameras=("left", "right", long)))
+    watch = TimeWatch([setup_of(cameras=("left", "right", long))])
     estimate = ClockEstimate(t_ns=S, offset_ns=-7 * S, drift_ppm=12.3456, sigma_ns=3_000.0, bound_ns=100_000)
     for message in messages_of(scenes.natural, 0.0):
         watch.push(message)
@@ -105,14 +107,14 @@ def test_gauges_tell_of_clocks_phases_and_residuals_and_fit_a_report() -> None:
 
 
 def test_cameras_in_step_and_out_of_it_are_told_on_change_only() -> None:
-    lines = watched(TimeWatch(setup_of()), stepping(0.04, 30.0))
+    lines = watched(TimeWatch([setup_of()]), stepping(0.04, 30.0))
     assert len(lines) == 1
     assert "camera right: in step with left, +0.04 ms" in lines[0]
-    lines = watched(TimeWatch(setup_of()), stepping(5.0, 30.0))
+    lines = watched(TimeWatch([setup_of()]), stepping(5.0, 30.0))
     assert len(lines) == 1
     assert "camera right: free of left, +5.00 ms" in lines[0]
     drifting = stepping(-0.2, 60.0, ppm=20.0)  # leaves the band after 35 s
-    lines = watched(TimeWatch(setup_of()), drifting)
+    lines = watched(TimeWatch([setup_of()]), drifting)
     assert [line.split(",")[0] for line in lines] == [
         "camera right: in step with left",
         "camera right: free of left",

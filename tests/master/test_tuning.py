@@ -135,7 +135,7 @@ def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:
     save(folder / "hands/made-right.json", RIGHT.profile)
     for name in ("left", "right"):
         save(folder / f"cameras/{name}.json", camera_file(name))
-    return RigFiles(folder, "bench")
+    return RigFiles(folder, ("bench",))
 
 
 class Told:
@@ -144,9 +144,9 @@ class Told:
     def __init__(self, folder: Path) -> None:
         self.files = tree(folder)
         self.lines: list[str] = []
-        setup = self.files.load()
+        [setup] = self.files.load()
         self.pipeline = LivePipeline(setup, StageTimes())
-        self.tuning = RigTuning(self.files, setup, self.pipeline, self.lines.append)
+        self.tuning = RigTuning(self.files, [setup], [self.pipeline], self.lines.append)
         self.rig_path = folder / "rigs/bench.json"
 
     @property
@@ -256,7 +256,7 @@ class Master:
             self.files,
         )
         self.lines: list[str] = []
-        args = (setup, key, settings, stop, self.lines.append)
+        args = ((setup,), key, settings, stop, self.lines.append)
         self.thread = threading.Thread(target=run_live, args=args)
         self.thread.start()
         self.bus = ZenohBus(None, endpoint)

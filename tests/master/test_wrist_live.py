@@ -83,7 +83,7 @@ def running(setup: RigSetup, out: Path, files: RigFiles | None = None) -> Genera
         ("127.255.255.255", beacon), ("127.0.0.1", 0), bus, 2.0, out / "poses.npz", out / "live.json", files
     )
     stop, lines = threading.Event(), list[str]()
-    master = threading.Thread(target=run_live, args=(setup, key, settings, stop, lines.append))
+    master = threading.Thread(target=run_live, args=((setup,), key, settings, stop, lines.append))
     master.start()
     camera = Uplink("wrist", key, SystemClock(), beacon, "127.0.0.1")
     asker = ZenohBus(None, bus)
@@ -123,7 +123,7 @@ def test_a_master_tracks_a_wrist_device_and_says_how_it_is(root: Path, tmp_path:
 
 def test_a_changed_palm_pose_is_used_while_it_tracks(tree: Path, tmp_path: Path) -> None:
     setup = load_setup(tree, "wrist")
-    with running(setup, tmp_path, RigFiles(tree, "wrist")) as run:
+    with running(setup, tmp_path, RigFiles(tree, ("wrist",))) as run:
         run.send(20)
         save(tree / "rigs" / "wrist.json", raised(setup.rig, 0.005))
         run.ask("reload")
@@ -139,7 +139,7 @@ def test_a_changed_palm_pose_is_used_while_it_tracks(tree: Path, tmp_path: Path)
 def test_a_rig_does_not_become_one_of_another_kind(root: Path, tree: Path) -> None:
     setup = load_setup(tree, "wrist")
     pipeline = LivePipeline(setup, StageTimes())
-    tuning = RigTuning(RigFiles(tree, "wrist"), setup, pipeline, lambda _line: None)
+    tuning = RigTuning(RigFiles(tree, ("wrist",)), [setup], [pipeline], lambda _line: None)
     desk = load(root / "calib_json" / "rigs" / "desk.json", RigCalibration)
     save(tree / "rigs" / "wrist.json", msgspec.structs.replace(desk, name="wrist"))
     for name in desk.cameras:
@@ -153,8 +153,8 @@ def test_a_rig_does_not_become_one_of_another_kind(root: Path, tree: Path) -> No
 def test_a_rig_without_its_laser_plane_is_refused_and_the_old_one_stays(tree: Path) -> None:
     setup = load_setup(tree, "wrist")
     pipeline = LivePipeline(setup, StageTimes())
-    tuning = RigTuning(RigFiles(tree, "wrist"), setup, pipeline, lambda _line: None)
+    tuning = RigTuning(RigFiles(tree, ("wrist",)), [setup], [pipeline], lambda _line: None)
     save(tree / "rigs" / "wrist.json", msgspec.structs.replace(setup.rig, laser_plane=None))
     with pytest.raises(CalibrationError, match="laser_plane is missing"):
         tuning.reload()
-    assert tuning.setup is setup
+    assert tuning.setups == (setup,)
