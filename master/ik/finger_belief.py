@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Code, Float
 from master.ik.parameters import HandParameters
 
 _FREEDOM = 4.0
@@ -31,11 +31,13 @@ class FingerBelief:
         angles_rad: (5, 4); a finger of which nothing is known has NaN.
         information: (5, 4, 4) [1/rad^2], what that is worth, without habits; zeros where nothing is known.
         told: (5,) fingers that are seen now, well enough to say how they are bent.
+        level: (5,) `Level` codes: what they are told from.
     """
 
     angles_rad: Float
     information: Float
     told: Bool
+    level: Code
 
     @property
     def fingers(self) -> frozenset[int]:

@@ -22,7 +22,7 @@ Beside that the covariance is the solution's. Filtering takes noise away and add
 """
 
 from dataclasses import dataclass, replace
-from math import atan2
+from math import atan2, exp
 
 import numpy as np
 
@@ -34,7 +34,8 @@ from master.ik.part_filter import PartFilter
 from master.ik.tracker import TrackedHand
 
 LEAD_OVER_S = 0.1
-_STEEPEST = 1.5  # slope of the fading where it is steepest
+_EASE_S = 0.04  # in which the last of what is led at a given speed fades
+_NOTHING_M = 1e-5
 _ELSEWHERE_M = 5e-3
 _FORGET_S = 0.5  # after this long without a hand the next one begins anew
 _PLACE, _TURN, _ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
@@ -52,7 +53,7 @@ class _Shown:
         values: (26,) [m] the filtered signals.
         rotation: (3, 3) palm to rig, as filtered.
         offset: (26,) [m] what was shown less what was solved, when each part was last seen again.
-        since_ns, takes_s: (6,) when that was, and how long [s] it fades.
+        since_ns: (6,) when that was.
         until_ns: When nothing is left of any.
     """
 
@@ -63,24 +64,29 @@ class _Shown:
     rotation: Float
     offset: Float
     since_ns: Int
-    takes_s: Float
     until_ns: int
 
-    def leap(self, t_ns: int, parts: Bool, solved: Float, lead_m_s: float) -> None:
-        """Parts (6,) are seen again, or otherwise, at signals (26,)."""
+    def leap(self, t_ns: int, parts: Bool, solved: Float) -> None:
+        """Parts (6,) are seen again, or by another sensor, at signals (26,)."""
         self.offset = np.where(parts[_PARTS], self.values - solved, self.offset)
-        size_m = np.bincount(_PARTS, np.abs(self.offset))
-        takes_s = np.maximum(LEAD_OVER_S, _STEEPEST * size_m / lead_m_s)
         self.since_ns = np.where(parts, t_ns, self.since_ns)
-        self.takes_s = np.where(parts, takes_s, self.takes_s)
-        self.until_ns = int((self.since_ns + np.rint(1e9 * self.takes_s).astype(np.int64)).max())
+        self.until_ns = t_ns + round(LEAD_OVER_S * 1e9)
 
     def left(self, t_ns: int) -> Float | None:
         """What is left of the leaps (26,) [m]; None: nothing."""
         if t_ns >= self.until_ns:
             return None
-        x = np.minimum((t_ns - self.since_ns) * 1e-9 / self.takes_s, 1.0)
+        x = np.minimum((t_ns - self.since_ns) * (1e-9 / LEAD_OVER_S), 1.0)
         return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[_PARTS]  # smooth at both ends
+
+    def led(self, dt_s: float, lead_m_s: float) -> Float | None:
+        """The same where parts are led no faster than a speed [m/s]: a leap upon a leap goes on from what is left."""
+        size_m = np.bincount(_PARTS, np.abs(self.offset))
+        if size_m.max() < _NOTHING_M:
+            return None
+        slow = 1.0 - lead_m_s * dt_s / np.maximum(size_m, _NOTHING_M)
+        self.offset = self.offset * np.maximum(slow, exp(-dt_s / _EASE_S))[_PARTS]
+        return self.offset
 
 
 class HandFilter:
@@ -136,8 +142,8 @@ class HandFilter:
                 seen if gap_s > LEAD_OVER_S else seen & (rests != shown.rests)
             )  # without frames, nothing was seen
             if again.any():
-                shown.leap(t_ns, again, self._signals(solution, shown), self._lead_m_s or np.inf)
-        left = shown.left(t_ns)
+                shown.leap(t_ns, again, self._signals(solution, shown))
+        left = shown.left(t_ns) if self._lead_m_s is None else shown.led(gap_s, self._lead_m_s)
         signals = self._signals(solution, shown)
         if left is not None:
             signals += left
@@ -163,8 +169,7 @@ class HandFilter:
     def _begin(self, t_ns: int, solution: HandSolution, rests: Int) -> _Shown:
         smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
-        nothing, soon = np.zeros(26), np.full(6, LEAD_OVER_S)
-        return _Shown(smooth, t_ns, rests, nothing, rotation, nothing, never, soon, t_ns)
+        return _Shown(smooth, t_ns, rests, np.zeros(26), rotation, np.zeros(26), never, t_ns)
 
     def _signals(self, solution: HandSolution, shown: _Shown) -> Float:
         """What is filtered (26,) [m]."""

@@ -12,7 +12,7 @@ from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector, skew, unskew
 
 _EYE = np.eye(3)
-_SURE_RAD = np.radians(15.0)  # all axes together: better known than this, it says how the palm lies
+_SURE_RAD = np.radians(15.0)  # about every axis: better known than this, it says how the palm lies
 _SMALL_RAD = 1e-4  # below it a rotation vector is taken as that long in the derivative
 
 
@@ -53,7 +53,7 @@ class Orientation:
     @property
     def sure(self) -> bool:
         """Whether it is known about every axis; an IMU without heading is not."""
-        return float(np.trace(self.cov_rad2)) < _SURE_RAD**2
+        return float(np.linalg.eigvalsh(self.cov_rad2)[-1]) < _SURE_RAD**2
 
     def add_to(self, R: Float, gradient: Float, normal: Float) -> Float:
         """As `Facing.add_to`."""

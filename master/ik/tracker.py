@@ -45,7 +45,8 @@ class TrackedHand:
     Attributes:
         solution: The hand; None: nothing was solved yet.
         valid, tracked, source: (26,) as of `HandPose`.
-        rests: (6,) what thumb ... little and the palm rest on now: the sum of `ON_MARKERS` and `ON_OTHERS`.
+        rests: (6,) what thumb ... little and the palm rest on now: `ON_MARKERS` plus `ON_OTHERS` by the level of the
+            finger, or one of the two for the palm.
     """
 
     solution: HandSolution | None
@@ -294,7 +295,7 @@ class HandTracker:
         rests[5] = palm_rests
         if fingers is not None:
             # Where a finger is rests on where the palm is; how it is bent does not.
-            rests[:5] += ON_OTHERS * fingers.told
+            rests[:5] += ON_OTHERS * np.where(fingers.told, fingers.level, 0)
             chains = CHAINS[fingers.told]
             source[chains] = Source.WRIST
             tracked[chains] = tells_palm
