@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.arrays import Bool
 from common.sim.scenes import scene_by_name
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
@@ -67,6 +68,17 @@ def _joint_mm(poses: Poses, scene: str, rig: str, epoch_ns: int) -> float:
     return float(1e3 * np.linalg.norm(poses.position_m - truth, axis=2)[:, 1:].mean())
 
 
+def _lost_while_seen(poses: Poses) -> Bool:
+    """Poses (T,) after the first valid one that are not valid, though a marker was measured 0.4 s before or later.
+
+    A hand is held for 0.5 s: whatever it does is wrong here, and no machine is too busy to do it right.
+    """
+    seen = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0
+    last_ns = np.maximum.accumulate(np.where(seen, poses.t_ns, 0))
+    valid = poses.valid.all(axis=1)
+    return ~valid & np.logical_or.accumulate(valid) & (poses.t_ns - last_ns < 400_000_000)
+
+
 def _gone(pids: dict[str, int]) -> bool:
     return not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
@@ -95,48 +107,67 @@ def test_demo_tracks_scores_and_leaves_its_results(tmp_path: Path) -> None:
     assert _gone(_pids(lines[0]))
 
 
+def _new_child(demo: subprocess.Popen[str], old: dict[str, int]) -> int:
+    """The process that was started since the first ones."""
+    children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
+    (new,) = {int(pid) for pid in children} - set(old.values())
+    return new
+
+
+def _held_up_ns(pid: int) -> int:
+    """How long [ns] a process could have run and another one had the core."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+
+
 @pytest.mark.parametrize("victim", ["right", "master"])
 def test_a_killed_process_is_back_within_two_seconds_and_nobody_else_is_touched(
     victim: str, tmp_path: Path
 ) -> None:
-    demo = _demo(tmp_path, 7.0)
+    ready = {"right": "right: ready", "master": "listening on"}[victim]
+    demo = _demo(tmp_path, 60.0)
     heard: list[str] = []
-    began_s, started_s, killed_ns = time.monotonic(), 0.0, 0
+    killed_ns = held_up_ns = 0
     pids: dict[str, int] = {}
     for line in _lines(demo):
         heard.append(line)
         pids = pids or _pids(line)
-        if " of 7 s" in line and not started_s:
-            started_s = time.monotonic() - began_s
-        if "2 of 7 s" in line and not killed_ns:
+        if "2 of 60 s" in line and not killed_ns:
             killed_ns = time.monotonic_ns()
             os.kill(pids[victim], signal.SIGKILL)
+        if f"{victim} ended with code -9: started again" in line:
+            pid, log = _new_child(demo, pids), tmp_path / f"{victim}.log"
+            while log.read_text().count(ready) < 2 and demo.poll() is None:
+                held_up_ns = _held_up_ns(pid)
+                time.sleep(0.02)
+            time.sleep(3.0)
+            demo.send_signal(signal.SIGINT)
     assert demo.wait(60) == 0, "\n".join(heard)
-    assert any(f"{victim} ended with code -9: started again" in line for line in heard)
     assert json.loads((tmp_path / "summary.json").read_text())["restarts"] == {victim: 1}
     poses = load_poses(tmp_path / "poses.npz")
     measured = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0  # two cameras contributed again
     after = poses.t_ns[(poses.t_ns > killed_ns + 300_000_000) & measured]
     assert len(after) > 5  # it goes on; how fast is up to the machine
-    # Two seconds are the promise; a loaded test machine gets one more to start a Python process, or half of what
-    # it took to start them all (4 s with two idle cores).
-    assert (after[0] - killed_ns) * 1e-9 < max(6.0, 0.5 * started_s)
+    # Two seconds are the promise, and a loaded machine gets one more. What it waited for a core is not its own.
+    assert (after[0] - killed_ns - held_up_ns) * 1e-9 < 3.0
 
 
 def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_path: Path) -> None:
     demo = _demo(tmp_path, 8.0, "--rig", "desk4", "--scene", "poses")
     heard: list[str] = []
-    killed_ns = epoch_ns = 0
+    killed_ns = epoch_ns = tracking = 0
     pids: dict[str, int] = {}
     for line in _lines(demo):
         heard.append(line)
         pids = pids or _pids(line)
-        if "3 of 8 s" in line and not killed_ns:
+        if rate := re.search(r" of 8 s +(\d+) poses/s", line):
+            tracking += int(rate[1]) >= 20  # for so many seconds; a busy machine is given more of them
+        if tracking >= 3 and not killed_ns:
             epoch_ns = _epoch_ns(pids["left"])
             killed_ns = time.monotonic_ns()
             for name in ("left2", "right2"):
                 os.kill(pids[name], signal.SIGKILL)
     assert demo.wait(90) == 0, "\n".join(heard)
+    assert killed_ns, "\n".join(heard)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"left2": 1, "right2": 1}
     # From the stamps, so it does not matter how many frames a busy machine had no time for.
@@ -144,16 +175,17 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     assert summary["camera_hz"] == pytest.approx(rates, rel=2e-3)
     assert summary["marker_mm"] < 4.0
     poses = load_poses(tmp_path / "poses.npz")
+    assert not _lost_while_seen(poses).any()
     # How long a pair is gone, and fingers unseen, depends on how busy the machine is: all joints only until then.
     together = poses.rows(0, int(np.searchsorted(poses.t_ns, killed_ns)))
-    assert together.valid[len(together) // 2 :].all()
+    assert together.valid[-1].all()
     assert _joint_mm(together.rows(len(together) // 4, len(together)), "poses", "desk4", epoch_ns) < 4.0
-    alone = (poses.t_ns > killed_ns) & (
-        poses.t_ns < killed_ns + 500_000_000
-    )  # a process needs longer to be back
-    assert alone.any()
-    assert poses.valid[alone].all()
-    assert poses.valid[len(poses) // 2 :].all()
+    # A process needs longer than this to be back: whatever is measured is measured by the other pair.
+    alone = (poses.t_ns > killed_ns) & (poses.t_ns < killed_ns + 500_000_000)
+    measured = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0
+    assert (alone & measured).any()
+    assert poses.valid[alone & measured].all()
+    assert poses.valid[-1].all()
     assert _gone(pids)
 
 
