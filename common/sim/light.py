@@ -30,6 +30,7 @@ MORE_PAINT_LINEAR_RGB = {
 }
 SKIN_LINEAR_RGB = (0.700, 0.410, 0.255)
 SLEEVE_LINEAR_RGB = (0.235, 0.195, 0.165)
+THING_LINEAR_RGB = (0.045, 0.043, 0.041)  # matt and dark, so that it is nobody's marker
 CARD_LINEAR_RGB = (0.030, 0.030, 0.034)
 DESK_LINEAR_RGB = (0.128, 0.117, 0.105)
 

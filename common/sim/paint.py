@@ -88,6 +88,7 @@ class Painter:
             nearer += [
                 *([palm] if hidden[c] else []),
                 *self._sleeve_before(snapshot, caps[c], float(centre[c, 2])),
+                *_things_before(snapshot, snapshot.uv[cap.centre], float(centre[c, 2])),
                 *cards,
             ]
             cut = view.own_finger(snapshot, c)
@@ -101,6 +102,7 @@ class Painter:
             before = self._skin_before(snapshot, uv.mean(axis=0)[None], depth, *at)[0]
             nearer = [*_phalanges(snapshot, before), *([] if view.shows_back(snapshot) else [palm]), *cards]
             nearer += self._sleeve_before(snapshot, shape, float(depth[0]))
+            nearer += _things_before(snapshot, uv.mean(axis=0), float(depth[0]))
             cover = raster.cover(shape, None, nearer, self._moments(shape), self._size)
             painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
         return sorted(painted, key=lambda item: item.marker)
@@ -223,3 +225,8 @@ def _phalanges(snapshot: Snapshot, chosen: Bool) -> list[Shape]:
         )
         for k in np.flatnonzero(chosen)
     ]
+
+
+def _things_before(snapshot: Snapshot, uv: Float, depth_m: float) -> list[Shape]:
+    """Outlines of the things that pass before a marker at that pixel (2,) and depth."""
+    return [thing.shape for thing in snapshot.things if float(thing.depth(uv)) < depth_m]

@@ -1,6 +1,6 @@
 """Scene -> camera image: hand, paint, desk, card, blur and noise, with the truth of what each marker shows.
 
-Order of drawing: desk; finger parts and palm from far to near, each as nested discs that make it look round;
+Order of drawing: desk; finger parts, palm and things from far to near, each as nested outlines that make it look round;
 sleeve (first where the camera looks into it); motion blur; card; markers (see `paint`); lens blur; the light, where
 it is not the calibrated one; noise.
 
@@ -21,6 +21,7 @@ from common.sim.paint import MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
 from common.sim.surface import CAPSULES, PALM_HULL, WEB_HULL
+from common.sim.things import SeenThing
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 from common.srgb import relit_bytes
 
@@ -47,6 +48,7 @@ class Renderer:
         self._painter = Painter(self._view)
         self._skin = light.shades(light.SKIN_LINEAR_RGB, gloss=0.01)
         self._sleeve = light.shades(light.SLEEVE_LINEAR_RGB)
+        self._thing = light.shades(light.THING_LINEAR_RGB)
         self._light = scene.light
         self._gains_bgr = np.ones(3)
         self._card = light.face_shade(light.CARD_LINEAR_RGB, 0.8)
@@ -106,7 +108,8 @@ class Renderer:
         corners = raster.fixed(snapshot.outlines[:PHALANGES])
         depth = snapshot.points[:, 2]
         palm_depth = float(depth[list(PALM_HULL)].mean())
-        parts: list[tuple[float, tuple[int, ...]]] = [(palm_depth, ())]
+        parts: list[tuple[float, tuple[int, ...] | SeenThing]] = [(palm_depth, ())]
+        parts += [(float(thing.ends_depth.mean()), thing) for thing in snapshot.things]
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
             grown = part[0] in ROOTS
@@ -118,6 +121,9 @@ class Renderer:
             self._draw_sleeve(image, snapshot)
         raster.fill(image, raster.fixed(snapshot.cuff_uv[0]), self._card)  # the dark inside of the sleeve
         for _, part in sorted(parts, key=lambda item: -item[0]):
+            if isinstance(part, SeenThing):
+                self._draw_thing(image, part)
+                continue
             for layer in range(LAYERS):
                 shapes = [corners[k, layer] for k in part] if part else [hull[layer] for hull in palm]
                 if not part and layer >= ROUND_LAYER:
@@ -126,6 +132,12 @@ class Renderer:
                     raster.fill(image, shape, self._skin[layer])
         if not behind:
             self._draw_sleeve(image, snapshot)
+
+    def _draw_thing(self, image: Image, thing: SeenThing) -> None:
+        for outline, colour in zip(thing.layers, self._thing, strict=True):
+            raster.fill(image, raster.fixed(outline), colour)
+        face, cosine = thing.face
+        raster.fill(image, raster.fixed(face), light.face_shade(light.THING_LINEAR_RGB, cosine))
 
     def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
         for layer in range(LAYERS):
@@ -138,6 +150,7 @@ class Renderer:
             snapshot.discs_uv[:, 0] - spread,
             snapshot.discs_uv[:, 0] + spread,
             *(c.corners for c in cards),
+            *(thing.layers[0] for thing in snapshot.things),
         ]
         points = np.vstack(corners)
         x0, y0 = np.clip(np.floor(points.min(axis=0)), 0, np.array(self._size) - 1).astype(int)

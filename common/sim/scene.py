@@ -13,8 +13,9 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.hand_model import HandJoints, HandModel
+from common.sim.held import Cylinder
 from common.sim.illuminant import LightCourse
-from common.sim.motion import HandMotion, ScriptedMotion
+from common.sim.motion import HandMotion, HandState, ScriptedMotion
 
 STANDARD_SEED = 7
 HAND_DEPTH_M = 0.47
@@ -33,6 +34,8 @@ class SceneTruth:
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
         markers_m: (M, 3) centroids of the painted surfaces [m], rig frame.
+        bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
+        things: What stands about, or is held.
     """
 
     t_s: float
@@ -40,6 +43,8 @@ class SceneTruth:
     angles_rad: Float
     joints: HandJoints
     markers_m: Float
+    bend_rad: Float
+    things: tuple[Cylinder, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,11 +171,16 @@ class Scene:
         state = self.motion.at(t_s)
         joints = self.model.forward(state.T_rig_palm, state.angles_rad)
         markers = self.model.marker_points(joints, self.rig.markers)
-        return SceneTruth(t_s, state.T_rig_palm, state.angles_rad, joints, markers)
+        return SceneTruth(
+            t_s, state.T_rig_palm, state.angles_rad, joints, markers, state.bend_rad, state.things
+        )
 
     def joints(self, times_s: tuple[float, ...]) -> HandJoints:
         """Joints at several instants at once, stacked along the first axis."""
-        states = [self.motion.at(t) for t in times_s]
+        return self.joints_of(tuple(self.motion.at(t) for t in times_s))
+
+    def joints_of(self, states: tuple[HandState, ...]) -> HandJoints:
+        """Joints of several states at once, stacked along the first axis."""
         return self.model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
         )

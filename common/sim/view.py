@@ -15,6 +15,7 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
 from common.sim import raster
+from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
 from common.sim.raster import Shape
 from common.sim.scene import Scene
@@ -31,12 +32,12 @@ from common.sim.surface import (
     unit,
     unit_circle,
 )
+from common.sim.things import LAYER_SINES, SeenThing, seen, tube_rims
 
 NEAREST_M = 0.05
 FURTHEST_PX = 4000.0
 INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
-LAYER_SINES = np.sqrt(1.0 - LAYER_COSINES**2)
 PHALANGES = len(CAPSULES)
 
 
@@ -55,6 +56,7 @@ class Snapshot:
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
         shine_uv: (C, 2) [px] where the paint mirrors the lamp.
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
+        things: What the hand takes, before it is drawn or hides anything.
     """
 
     points: Float
@@ -69,6 +71,7 @@ class Snapshot:
     from_behind: Bool
     shine_uv: Float
     cuff_uv: Float
+    things: tuple[SeenThing, ...]
 
 
 class View:
@@ -127,7 +130,7 @@ class View:
 
     def snapshot(self, t_s: float) -> Snapshot:
         """Geometry of the frame whose row 0 is exposed around `t_s` [s]."""
-        points, uv, speed_uv, when = self._moments(t_s)
+        points, uv, speed_uv, when, things = self._moments(t_s)
         body = points[self._bodies]
         lit = body[:, None] + (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
         size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
@@ -159,6 +162,7 @@ class View:
             from_behind=((centre - base) * base).sum(axis=1) > 0.0,
             shine_uv=shine_uv,
             cuff_uv=cuff_uv,
+            things=self._things(t_s, things),
         )
 
     def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
@@ -216,12 +220,13 @@ class View:
             shapes.append(Shape(uv, (ahead - uv).mean(axis=0) * 1e3))
         return tuple(shapes)
 
-    def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float]:
-        """Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,)."""
+    def _moments(self, t_s: float) -> tuple[Float, Float, Float, Float, tuple[Cylinder, ...]]:
+        """Key points (K, 3), their pixels and speeds (K, 2), and their moments (K,); things in the middle of them."""
         readout_s = self.optics.height_px * self.row_s
         t_middle = t_s + 0.5 * readout_s
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
-        joints = self.scene.joints((t_middle - h, t_middle, t_middle + h))
+        states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
+        joints = self.scene.joints_of(states)
         before, now, after = transform(self.T_camera_rig, self.surface.key_points(joints))
         slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
@@ -233,16 +238,23 @@ class View:
         speed = slope + (when - t_middle)[:, None] * bend
         z = np.maximum(points[:, 2:], NEAREST_M)
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
-        return points, self.project(points), speed_uv, when
+        return points, self.project(points), speed_uv, when, states[1].things
+
+    def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
+        """Each thing at the moment of the row of its middle; `things` is where they are halfway through the frame."""
+        views: list[SeenThing] = []
+        for k, thing in enumerate(things):
+            middle = transform(self.T_camera_rig, thing.T_rig_object[:3, 3])
+            when = t_s + float(self.project(middle)[1]) * self.row_s
+            now, later = (self.scene.motion.at(t).things[k] for t in (when, when + 1e-3))
+            views.append(seen(now, later, 1e-3, self.T_camera_rig, self.to_light, self.circle, self.project))
+        return tuple(views)
 
     def _cuff(self, points: Float) -> Float:
         """Front edges (LAYERS, n, 3) of the sleeve's shading, the first the sleeve's own edge."""
         start, end = points[SLEEVE_SPHERES[0]], points[SLEEVE_SPHERES[1]]
-        axis = unit(start - end)
         radius = float(self.surface.radius_m[SLEEVE_SPHERES[0]])
-        across = self.to_light - (self.to_light @ axis) * axis
-        centre = start + radius * LAYER_COSINES[:, None] * across
-        return centre[:, None] + rim(np.broadcast_to(axis, (LAYERS, 3)), radius * LAYER_SINES, self.circle)
+        return tube_rims(start, unit(start - end), radius, self.to_light, self.circle)
 
     def _project_all(self, parts: tuple[Float, ...]) -> list[Float]:
         """Project arrays of points (..., 3) in one call."""
