@@ -4,18 +4,22 @@ The form is that of every recording (recording.json, frames.csv, PNG files); the
 of rendered recordings: truth.npz, truth_meta.json.
 """
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
-from common.arrays import Float
+from common.arrays import Float, Image
 from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest
 from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import CHAINS, FINGERS, WEBXR_JOINTS, HandModel
 from common.imu_recording import write_imu
+from common.npz import write_npz
 from common.sim.imu import SimulatedImu
 from common.sim.light import paint
 from common.sim.paint import MarkerView
@@ -31,6 +35,19 @@ ANGLE_NAMES = (
 )
 
 
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+class TakenFrame(NamedTuple):
+    """A frame as its camera delivers it: counter, stamp [ns], what lit it, picture."""
+
+    camera: str
+    seq: int
+    t_ns: int
+    lit: Illumination
+    image: Image
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
     """Truth of one row: every camera's view and its time of row 0 [s], and the scene at the reference time."""
@@ -38,6 +55,105 @@ class _Row:
     views: tuple[MarkerView, ...]
     t_row0: tuple[float, ...]
     reference: SceneTruth
+    bend_rad: Float
+
+
+class SceneTake:
+    """What the cameras of a rig take of a scene, and its exact truth. It holds the truth of the frames taken so far.
+
+    Cameras run as the scene's timing says, all stamped on one clock. The reference time of a row is the middle
+    of the exposure of the centre row of the rig's first camera.
+    """
+
+    def __init__(self, scene: Scene, seconds: float, start_s: float = 0.0) -> None:
+        """Prepare what draws.
+
+        Args:
+            scene: What to render.
+            seconds: How long [s]; at least one frame of each camera is taken.
+            start_s: Scene time of the first frame [s].
+
+        Raises:
+            ValueError: The cameras differ in frame rate.
+        """
+        self._scene, self._start_s = scene, start_s
+        names, self._period_s = scene.rig.cameras, _period_s(scene)
+        self.count = max(round(seconds / self._period_s), 1)
+        self._renderers = [Renderer(scene, name) for name in names]
+        self._offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
+        lead = scene.cameras[names[0]]
+        self._centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
+        self._rows: list[_Row] = []
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Scene times [s] of the first camera's first frame and of the last frame of all."""
+        return self._start_s, self._start_s + (self.count - 1) * self._period_s + max(self._offsets)
+
+    def manifest(self, continuous: bool = True) -> Manifest:
+        """What is rendered; the clicks are the exact centroids in the first frame of each camera."""
+        scene = self._scene
+        clicks: dict[str, dict[str, tuple[float, float]]] = {}
+        for name, renderer, offset in zip(scene.rig.cameras, self._renderers, self._offsets, strict=True):
+            uv = renderer.observe(self._start_s + offset)[1].uv
+            seen = (
+                (marker, at)
+                for marker, at in zip(scene.rig.markers, uv, strict=True)
+                if np.isfinite(at).all()
+            )
+            clicks[name] = {marker: (float(at[0]), float(at[1])) for marker, at in seen}
+        return Manifest(
+            version=1,
+            kind="markers",
+            cameras={name: scene.cameras[name] for name in scene.rig.cameras},
+            rig=scene.rig,
+            clicks=clicks,
+            continuous=continuous,
+            note=f"rendered scene, seed {scene.seed}",
+        )
+
+    def frames(self) -> Iterator[TakenFrame]:
+        """All frames, row by row."""
+        scene = self._scene
+        for k in range(self.count):
+            times = tuple(self._start_s + k * self._period_s + offset for offset in self._offsets)
+            views: list[MarkerView] = []
+            for name, renderer, t in zip(scene.rig.cameras, self._renderers, times, strict=True):
+                image, view = renderer.observe(t)
+                views.append(view)
+                yield TakenFrame(name, k, FIRST_NS + round(t * 1e9), Illumination.NONE, image)
+            at_s = times[0] + self._centre_s
+            self._rows.append(_Row(tuple(views), times, scene.truth(at_s), scene.motion.at(at_s).bend_rad))
+
+    def truth(self) -> Arrays:
+        """One row per frame of each camera."""
+        rows, truths = self._rows, [row.reference for row in self._rows]
+        return {
+            "uv": np.array([[view.uv for view in row.views] for row in rows]),
+            "frac": np.array([[view.visible for view in row.views] for row in rows]),
+            "px": np.array([[view.area for view in row.views] for row in rows]),
+            "t_cap": np.array([[view.t_s for view in row.views] for row in rows]),
+            "t_row0": np.array([row.t_row0 for row in rows]),
+            "t_ref": np.array([truth.t_s for truth in truths]),
+            "paint_centroid": np.array([truth.markers_m for truth in truths]),
+            "joints": np.array([truth.joints.position_m[1:] for truth in truths]),
+            "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
+            "T_palm": np.array([truth.T_rig_palm for truth in truths]),
+            "bend": np.array([row.bend_rad for row in rows]),
+        }
+
+    def meta(self) -> dict[str, object]:
+        """What the columns of the truth are."""
+        scene = self._scene
+        return {
+            "scene": "stereo",
+            "frames": len(self._rows),
+            "markers": scene.rig.markers,
+            "joints": WEBXR_JOINTS,
+            "angles": ANGLE_NAMES,
+            "seed": scene.seed,
+            "paint_reflectance_linear_srgb": {name: paint(name) for name in scene.rig.markers},
+        }
 
 
 def record_scene(
@@ -50,9 +166,6 @@ def record_scene(
     imu: bool = False,
 ) -> int:
     """Render `seconds` of a scene with every camera of its rig; return the number of frames per camera.
-
-    Cameras run as the scene's timing says, all stamped on one clock. The reference time of a row is the middle
-    of the exposure of the centre row of the rig's first camera.
 
     Args:
         folder: New or empty.
@@ -67,37 +180,40 @@ def record_scene(
         RecordingError: The folder holds something already, or cannot be written.
         ValueError: The cameras differ in frame rate.
     """
-    names, period = scene.rig.cameras, _period_s(scene)
-    count = max(round(seconds / period), 1)
     sensor = SimulatedImu.of(scene) if imu else None
-    renderers = [Renderer(scene, name) for name in names]
-    offsets = [scene.timing(name).start_offset_ns * 1e-9 for name in names]
-    lead = scene.cameras[names[0]]
-    centre_s = 0.5 * (lead.height_px - 1) * lead.row_time_us * 1e-6
-    first = [
-        renderer.observe(start_s + offset)[1] for renderer, offset in zip(renderers, offsets, strict=True)
-    ]
-    writer = RecordingWriter(folder, _manifest(scene, first, continuous))
-    rows: list[_Row] = []
+    take = SceneTake(scene, seconds, start_s)
+    write_frames(folder, take.manifest(continuous), take.frames())
+    if sensor is not None:
+        write_imu(folder, sensor.around(*take.span_s, FIRST_NS))
+    write_truth(folder, take.truth(), take.meta())
+    return take.count
+
+
+def write_frames(folder: Path, manifest: Manifest, frames: Iterable[TakenFrame]) -> None:
+    """Write a recording without its truth, frames in the order in which they come.
+
+    Raises:
+        RecordingError: The folder holds something already, or cannot be written.
+    """
+    writer = RecordingWriter(folder, manifest)
     try:
-        for k in range(count):
-            times = tuple(start_s + k * period + offset for offset in offsets)
-            views: list[MarkerView] = []
-            for name, renderer, t in zip(names, renderers, times, strict=True):
-                image, view = renderer.observe(t)
-                t_ns = FIRST_NS + round(t * 1e9)
-                writer.add(name, k, t_ns, Illumination.NONE, encode_png(image))
-                views.append(view)
-            rows.append(_Row(tuple(views), times, scene.truth(times[0] + centre_s)))
+        for frame in frames:
+            writer.add(frame.camera, frame.seq, frame.t_ns, frame.lit, encode_png(frame.image))
     finally:
         writer.close()
-    if sensor is not None:
-        write_imu(folder, sensor.around(rows[0].t_row0[0], max(rows[-1].t_row0), FIRST_NS))
+
+
+def write_truth(folder: Path, truth: Arrays, meta: dict[str, object]) -> None:
+    """Write truth.npz and truth_meta.json.
+
+    Raises:
+        RecordingError: They cannot be written.
+    """
     try:
-        _write_truth(folder, scene, rows)
+        write_npz(folder / TRUTH, truth)
+        (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
     except OSError as error:
         raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
-    return count
 
 
 def _period_s(scene: Scene) -> float:
@@ -106,54 +222,6 @@ def _period_s(scene: Scene) -> float:
     if len(rates) != 1:
         raise ValueError(f"frame_rate_hz of the cameras differ: {sorted(rates)}")
     return 1.0 / rates.pop()
-
-
-def _manifest(scene: Scene, first: list[MarkerView], continuous: bool) -> Manifest:
-    """What was rendered; the clicks are the exact centroids in the first frame of each camera."""
-    clicks = {
-        name: {
-            marker: (float(uv[0]), float(uv[1]))
-            for marker, uv in zip(scene.rig.markers, view.uv, strict=True)
-            if np.isfinite(uv).all()
-        }
-        for name, view in zip(scene.rig.cameras, first, strict=True)
-    }
-    return Manifest(
-        version=1,
-        kind="markers",
-        cameras={name: scene.cameras[name] for name in scene.rig.cameras},
-        rig=scene.rig,
-        clicks=clicks,
-        continuous=continuous,
-        note=f"rendered scene, seed {scene.seed}",
-    )
-
-
-def _write_truth(folder: Path, scene: Scene, rows: list[_Row]) -> None:
-    truths = [row.reference for row in rows]
-    np.savez(
-        folder / TRUTH,
-        uv=np.array([[view.uv for view in row.views] for row in rows]),
-        frac=np.array([[view.visible for view in row.views] for row in rows]),
-        px=np.array([[view.area for view in row.views] for row in rows]),
-        t_cap=np.array([[view.t_s for view in row.views] for row in rows]),
-        t_row0=np.array([row.t_row0 for row in rows]),
-        t_ref=np.array([truth.t_s for truth in truths]),
-        paint_centroid=np.array([truth.markers_m for truth in truths]),
-        joints=np.array([truth.joints.position_m[1:] for truth in truths]),
-        angles=np.array([named_angles(scene.model, truth.angles_rad) for truth in truths]),
-        T_palm=np.array([truth.T_rig_palm for truth in truths]),
-    )
-    meta = {
-        "scene": "stereo",
-        "frames": len(rows),
-        "markers": scene.rig.markers,
-        "joints": WEBXR_JOINTS,
-        "angles": ANGLE_NAMES,
-        "seed": scene.seed,
-        "paint_reflectance_linear_srgb": {name: paint(name) for name in scene.rig.markers},
-    }
-    (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))
 
 
 def named_angles(model: HandModel, angles_rad: Float) -> Float:

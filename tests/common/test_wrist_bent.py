@@ -14,6 +14,8 @@ from common.geometry import axis_rotation, quaternion_to_matrix, rigid
 from common.sim.held import Cylinder
 from common.sim.imu import SimulatedImu
 from common.sim.motion import HandMotion, HandState
+from common.sim.scenes import scene_by_name
+from common.sim.together import TOGETHER
 from common.sim.wrist.flesh import THING_GROUP
 from common.sim.wrist.light import SKIN_AT_M, Leds
 from common.sim.wrist.render import WristRenderer
@@ -26,6 +28,8 @@ CALIB = Path(__file__).resolve().parents[2] / "calib_json"
 CAMERAS = {"wrist": load(CALIB / "cameras/wrist.json", CameraCalibration)}
 RIG = load(CALIB / "rigs/wrist.json", RigCalibration)
 HAND = load(CALIB / "hands/default-right.json", HandProfile)
+DESK = load(CALIB / "rigs/desk.json", RigCalibration)
+DESK_CAMERAS = {name: load(CALIB / f"cameras/{name}.json", CameraCalibration) for name in DESK.cameras}
 SCENE = WristScene.by_name("poses@dark", RIG, CAMERAS, HAND, 5)
 BEND = np.radians([-18.0, 7.0])
 LASER, LED = Illumination.LASER, Illumination.LED
@@ -173,3 +177,26 @@ def test_an_imu_beside_the_camera_feels_the_forearm_and_not_the_palm() -> None:
     # R_rig_forearm = R_rig_palm R_x(-bend): the forearm turns about the palm's x, the other way.
     expected = quaternion_to_matrix(np.array(imu.q_palm_imu)).T @ np.array([-0.5, 0.0, 0.0])
     np.testing.assert_allclose(turned, expected, atol=0.02)  # its scale is off by 1 %
+
+
+@pytest.mark.parametrize("name", TOGETHER)
+def test_what_marker_rigs_see_at_the_same_time_is_found_by_name(name: str) -> None:
+    shown = WristScene.by_name(f"{name}@dark", RIG, CAMERAS, HAND, 7)
+    seen = scene_by_name(name, DESK, DESK_CAMERAS, HAND, 7)
+    assert shown.ambient == "dark"
+    assert shown.period_s == seen.period_s
+    for t_s in (0.9, 5.3):
+        ours, theirs = shown.motion.at(t_s), seen.motion.at(t_s)
+        np.testing.assert_array_equal(ours.angles_rad, theirs.angles_rad)
+        np.testing.assert_array_equal(ours.bend_rad, theirs.bend_rad)
+        assert len(ours.things) == len(theirs.things) == int(name == "grasp")
+    assert np.degrees(np.abs([shown.truth(t).bend_rad for t in (0.9, 2.1, 5.3)])).max() > 1.0
+
+
+def test_a_closed_hand_keeps_lines_and_tips_in_sight_beyond_the_bar_it_holds() -> None:
+    shown = WristScene.by_name("grasp", RIG, CAMERAS, HAND, 7)
+    held = [t for t in np.arange(0.0, 12.0, 0.2).tolist() if shown.motion.at(t).things[0].held]
+    truths = [shown.truth(t) for t in held]
+    assert len(truths) > 20
+    assert np.mean([truth.laser_len_vis[2:6] > 0.002 for truth in truths]) > 0.8
+    assert np.mean([truth.tip_visible[1:] for truth in truths]) > 0.8

@@ -4,20 +4,25 @@ The form is that of every recording of a wrist device: strobed triples in the or
 with one row per triple, under the keys of rendered recordings.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-import msgspec
 import numpy as np
 
 from common.calibration import RigCalibration
-from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest
-from common.frame_writing import RecordingWriter, encode_png
 from common.hand_model import FINGERS, WEBXR_JOINTS
-from common.sim.record import ANGLE_NAMES, FIRST_NS, TRUTH, TRUTH_META, named_angles
+from common.sim.record import (
+    ANGLE_NAMES,
+    FIRST_NS,
+    Arrays,
+    TakenFrame,
+    named_angles,
+    write_frames,
+    write_truth,
+)
 from common.sim.wrist.flesh import GROUPS
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
@@ -84,80 +89,112 @@ def record_wrist(
     Raises:
         RecordingError: The folder holds something already, or cannot be written.
     """
-    name = scene.rig.cameras[0]
-    period = 1.0 / scene.cameras[name].frame_rate_hz
-    count = len(poses_s) or max(round(seconds / (3.0 * period)), 1)
-    times = [poses_s[k // 3] if poses_s else start_s + k * period for k in range(3 * count)]
-    shots = [Shot(k, FIRST_NS + round(k * period * 1e9), t, ORDER[k % 3]) for k, t in enumerate(times)]
-    manifest = Manifest(
-        version=1,
-        kind="wrist",
-        cameras={name: scene.cameras[name]},
-        rig=rig or scene.rig,
-        continuous=not poses_s,
-        note=f"rendered wrist scene, {scene.ambient} light, seed {scene.seed}",
-    )
-    renderer = WristRenderer(scene, name, step)
-    writer = RecordingWriter(folder, manifest)
-    try:
-        for shot, (seq, t_ns) in _stamped(shots if faults is None else faults(shots), period):
-            writer.add(name, seq, t_ns, shot.lit, encode_png(renderer.render(shot.t_s, shot.lit)))
-    finally:
-        writer.close()
-    try:
-        _write_truth(folder, scene, shots)
-    except OSError as error:
-        raise RecordingError(f"{folder}: cannot write: {error.strerror}") from error
-    return count
+    take = WristTake(scene, seconds, start_s=start_s, poses_s=poses_s, faults=faults, step=step)
+    write_frames(folder, take.manifest(rig), take.frames())
+    write_truth(folder, take.truth(), take.meta())
+    return take.count
 
 
-def _stamped(shots: list[Shot], period_s: float) -> list[tuple[Shot, tuple[int, int]]]:
-    """Shots with number and stamp [ns] of their delivery: what is lost leaves a gap, what comes twice takes a frame."""
-    out: list[tuple[Shot, tuple[int, int]]] = []
+class WristTake:
+    """What the camera of a wrist device takes of a scene, and its exact truth. It holds what is to be taken."""
+
+    def __init__(
+        self,
+        scene: WristScene,
+        seconds: float = 0.0,
+        *,
+        start_s: float = 0.0,
+        poses_s: Sequence[float] = (),
+        faults: Callable[[list[Shot]], list[Shot]] | None = None,
+        step: int = 1,
+        first_ns: int = FIRST_NS,
+    ) -> None:
+        """As `record_wrist`; `first_ns` is the stamp of the first frame."""
+        self._scene, self._step, self._first_ns = scene, step, first_ns
+        self._name = scene.rig.cameras[0]
+        self._period_s = 1.0 / scene.cameras[self._name].frame_rate_hz
+        self.count = len(poses_s) or max(round(seconds / (3.0 * self._period_s)), 1)
+        self._continuous, self._faults = not poses_s, faults
+        times = [poses_s[k // 3] if poses_s else start_s + k * self._period_s for k in range(3 * self.count)]
+        self._shots = [Shot(k, self._stamp(k), t, ORDER[k % 3]) for k, t in enumerate(times)]
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Scene times [s] of the first and the last frame."""
+        return self._shots[0].t_s, self._shots[-1].t_s
+
+    def manifest(self, rig: RigCalibration | None = None) -> Manifest:
+        """What is rendered, by a device of which is known what `rig` says; None: the truth."""
+        scene = self._scene
+        return Manifest(
+            version=1,
+            kind="wrist",
+            cameras={self._name: scene.cameras[self._name]},
+            rig=rig or scene.rig,
+            continuous=self._continuous,
+            note=f"rendered wrist scene, {scene.ambient} light, seed {scene.seed}",
+        )
+
+    def frames(self) -> Iterator[TakenFrame]:
+        """All frames that are delivered."""
+        renderer = WristRenderer(self._scene, self._name, self._step)
+        shots = self._shots if self._faults is None else self._faults(self._shots)
+        for shot, seq in _numbered(shots):
+            yield TakenFrame(self._name, seq, self._stamp(seq), shot.lit, renderer.render(shot.t_s, shot.lit))
+
+    def truth(self) -> Arrays:
+        """One row per triple: the hand and the line at its laser frame, the finger tips at its LED frame."""
+        scene = self._scene
+        lasers, leds = self._shots[1::3], self._shots[2::3]
+        at_laser = [scene.truth(shot.t_s) for shot in lasers]
+        at_led = [
+            before if led.t_s == laser.t_s else scene.truth(led.t_s)
+            for before, laser, led in zip(at_laser, lasers, leds, strict=True)
+        ]
+        return {
+            "t_ns": np.array([shot.t_ns for shot in lasers]),
+            "ambient": np.array([scene.ambient] * len(lasers)),
+            "angles": np.array([named_angles(scene.model, truth.angles_rad) for truth in at_laser]),
+            "joints": np.array([truth.joints.position_m[1:] for truth in at_laser]),
+            "bend": np.array([truth.bend_rad for truth in at_laser]),
+            "laser_uv": np.array([truth.laser_uv for truth in at_laser]),
+            "laser_pt": np.array([truth.laser_pt for truth in at_laser]),
+            "laser_xyz": np.array([truth.laser_xyz for truth in at_laser]),
+            "laser_len_vis": np.array([truth.laser_len_vis for truth in at_laser]),
+            "laser_len_lit": np.array([truth.laser_len_lit for truth in at_laser]),
+            "laser_seg": np.array([truth.laser_seg for truth in at_laser]),
+            "tip_xyz": np.array([truth.tip_xyz for truth in at_led]),
+            "tip_uv": np.array([truth.tip_uv for truth in at_led]),
+            "tip_visible": np.array([truth.tip_visible for truth in at_led]),
+        }
+
+    def meta(self) -> dict[str, object]:
+        """What the columns of the truth are."""
+        scene = self._scene
+        return {
+            "scene": "wrist",
+            "side": scene.model.profile.side,
+            "frames": self.count,
+            "groups": GROUPS,
+            "fingers": FINGERS,
+            "joints": WEBXR_JOINTS,
+            "angles": ANGLE_NAMES,
+            "ambient": scene.ambient,
+            "seed": scene.seed,
+            "note": "angles, joints and laser at the laser frame, finger tips at the LED frame of each triple",
+        }
+
+    def _stamp(self, seq: int) -> int:
+        return self._first_ns + round(seq * self._period_s * 1e9)
+
+
+def _numbered(shots: list[Shot]) -> list[tuple[Shot, int]]:
+    """Shots with the number of their delivery: what is lost leaves a gap, what comes twice takes a frame."""
+    out: list[tuple[Shot, int]] = []
     more = 0
     last: int | None = None
     for shot, own in zip(shots, sorted(shot.seq for shot in shots), strict=True):
         more += own == last
         last = own
-        out.append((shot, (own + more, FIRST_NS + round((own + more) * period_s * 1e9))))
+        out.append((shot, own + more))
     return out
-
-
-def _write_truth(folder: Path, scene: WristScene, shots: list[Shot]) -> None:
-    """One row per triple: the hand and the line at its laser frame, the finger tips at its LED frame."""
-    lasers, leds = shots[1::3], shots[2::3]
-    at_laser = [scene.truth(shot.t_s) for shot in lasers]
-    at_led = [
-        before if led.t_s == laser.t_s else scene.truth(led.t_s)
-        for before, laser, led in zip(at_laser, lasers, leds, strict=True)
-    ]
-
-    np.savez(
-        folder / TRUTH,
-        t_ns=np.array([shot.t_ns for shot in lasers]),
-        ambient=np.array([scene.ambient] * len(lasers)),
-        angles=np.array([named_angles(scene.model, truth.angles_rad) for truth in at_laser]),
-        joints=np.array([truth.joints.position_m[1:] for truth in at_laser]),
-        laser_uv=np.array([truth.laser_uv for truth in at_laser]),
-        laser_pt=np.array([truth.laser_pt for truth in at_laser]),
-        laser_xyz=np.array([truth.laser_xyz for truth in at_laser]),
-        laser_len_vis=np.array([truth.laser_len_vis for truth in at_laser]),
-        laser_len_lit=np.array([truth.laser_len_lit for truth in at_laser]),
-        laser_seg=np.array([truth.laser_seg for truth in at_laser]),
-        tip_xyz=np.array([truth.tip_xyz for truth in at_led]),
-        tip_uv=np.array([truth.tip_uv for truth in at_led]),
-        tip_visible=np.array([truth.tip_visible for truth in at_led]),
-    )
-    meta = {
-        "scene": "wrist",
-        "side": scene.model.profile.side,
-        "frames": len(lasers),
-        "groups": GROUPS,
-        "fingers": FINGERS,
-        "joints": WEBXR_JOINTS,
-        "angles": ANGLE_NAMES,
-        "ambient": scene.ambient,
-        "seed": scene.seed,
-        "note": "angles, joints and laser at the laser frame, finger tips at the LED frame of each triple",
-    }
-    (folder / TRUTH_META).write_bytes(msgspec.json.format(msgspec.json.encode(meta), indent=1))

@@ -15,6 +15,7 @@ from common.hand_model import WRIST, HandJoints, HandModel
 from common.round_cones import Cones
 from common.sim.motion import HandMotion, HandState
 from common.sim.scene import STANDARD_SEED, CameraTiming
+from common.sim.together import TOGETHER, together_motion
 from common.sim.wrist.flesh import Flesh
 from common.sim.wrist.laser import LaserSheet, LineTruth
 from common.sim.wrist.motion import wrist_motion
@@ -25,7 +26,7 @@ Ambient = Literal["dark", "indoor", "bright", "sun"]
 TIP_WITHIN_M = 0.003  # of its own finger before a tip: it lies 12 degrees behind the edge of a round tip
 AMBIENTS: tuple[Ambient, ...] = get_args(Ambient)
 MOTIONS = ("standard", "curl", "wearer", "poses", "spread")
-WRIST_NAMES = f"{' | '.join(MOTIONS)}, each with @{' | @'.join(AMBIENTS)}"
+WRIST_NAMES = f"{' | '.join((*MOTIONS, *TOGETHER))}, each with @{' | @'.join(AMBIENTS)}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,14 +126,14 @@ class WristScene:
         hand: HandProfile,
         seed: int = STANDARD_SEED,
     ) -> "WristScene":
-        """The scene called MOTION or MOTION@AMBIENT.
+        """The scene called MOTION or MOTION@AMBIENT; a motion of `TOGETHER` is also that of a marker rig.
 
         Raises:
             PhalanxError: No such motion or light; a rig, camera or hand that does not fit.
         """
         moves, _, ambient = name.partition("@")
         model = HandModel.of(hand)
-        motion = wrist_motion(moves, model, seed)
+        motion = wrist_motion(moves, model, seed) or together_motion(moves, model, np.zeros(3), seed)
         if motion is None or (ambient or "indoor") not in AMBIENTS:
             raise PhalanxError(f"scene {name!r}: for a wrist rig there are {WRIST_NAMES}")
         return cls(rig, cameras, model, motion, cast(Ambient, ambient or "indoor"), seed)
