@@ -3,7 +3,7 @@
 The motion's exact rates and forces, and on top of them the errors of a part, an LSM6DSO if none is named. The
 accelerometer's zero is off by as much as the rig's file says that the tilt may be: gravity then points elsewhere, and
 no filter can know better. Zeros and scale are the same for a whole recording; the gyroscope's zero wanders a little, as
-in a part that warms up.
+in a part that warms up. That of a wrist device sits on the forearm, at the wrist joint (`OnForearm`).
 """
 
 from collections.abc import Iterator
@@ -53,6 +53,12 @@ class SimulatedImu:
         self, motion: HandMotion, imu: ImuCalibration, seed: int, part: InertialPart = LSM6DSO
     ) -> None:
         """Draw the errors of one recording.
+
+        Args:
+            motion: Of what it is mounted on, as a palm's (`OnForearm` for a forearm).
+            imu: How it is mounted.
+            seed: Same seed, same errors.
+            part: Which sensor.
 
         Raises:
             CalibrationError: The rig's file does not say how the IMU is mounted, or how its world lies to the rig.
