@@ -34,6 +34,7 @@ ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 HEADING = 2
 _SIZE = 12
 _TILT, _HABIT, _MOTION, _RATE, _ERROR = slice(2), slice(3, 5), slice(5, 7), slice(7, 9), slice(9, 12)
+_ANGLES = slice(7)
 _TILT_S = 5.0
 _HABIT_RAD, _HABIT_S = np.radians([10.0, 7.0]), 20.0  # flexion, deviation
 _MOTION_RAD, _PACE_1_S = np.radians([10.0, 9.0]), 3.0
@@ -44,7 +45,7 @@ _FRESH, _STAYING, _STAYS_S = (
 )  # shares of the markers' covariance: new in each frame, and staying
 _BEYOND = 16.27  # chi square, three degrees, 99.9 %
 _FLICK_RAD_S, _FLICK_RAD = 5.0, radians(20.0)  # faster than usual, but wrists can; and how far that may go
-_STEPS, _NEAR_RAD = 4, 1e-3
+_STEPS, _NEAR_RAD = 4, 0.02
 _EYE, _UP = np.eye(3), np.array([0.0, 0.0, 1.0])
 _BEND = np.zeros((2, _SIZE))  # habit and motion
 _BEND[:, _HABIT] = _BEND[:, _MOTION] = np.eye(2)
@@ -129,25 +130,25 @@ class ForearmState:
 
     def told(self, seen: "SeenPalm") -> "ForearmState":
         """What a palm leaves of it: an iterated Kalman update (Bell, Cathey 1993), its covariance in Joseph's form."""
-        state, off = self, np.zeros(_SIZE)
+        before = np.zeros(_SIZE)
+        off, gain, slope = self._corrected(seen, before)
         for _ in range(_STEPS):
-            missing, slope = seen.against(state)
-            before, off = off, self._gain(slope, seen.fresh) @ (missing + slope @ off)
-            state = ForearmState(self.rig_world, self.usual, self.mean + off, self.cov)
-            if np.abs(off - before).max() < _NEAR_RAD:
+            if np.abs(off - before)[_ANGLES].max() < _NEAR_RAD:
                 break
-        _, slope = seen.against(state)
-        gain = self._gain(slope, seen.fresh)
+            before = off
+            off, gain, slope = self._corrected(seen, before)
         left = np.eye(_SIZE) - gain @ slope
         cov = left @ self.cov @ left.T + gain @ seen.fresh @ gain.T
-        state.mean[HEADING] = remainder(state.mean[HEADING], 2.0 * pi)
-        return ForearmState(self.rig_world, self.usual, state.mean, 0.5 * (cov + cov.T))
+        mean = self.mean + off
+        mean[HEADING] = remainder(mean[HEADING], 2.0 * pi)
+        return ForearmState(self.rig_world, self.usual, mean, 0.5 * (cov + cov.T))
 
-    def _gain(self, slope: Float, fresh: Float) -> Float:
-        """Kalman's gain (12, 3) of an observation with this derivative (3, 12)."""
-        crossed: Float = slope @ self.cov
-        gain: Float = np.linalg.solve(crossed @ slope.T + fresh, crossed)
-        return gain.T
+    def _corrected(self, seen: "SeenPalm", off: Float) -> tuple[Float, Float, Float]:
+        """The correction (12,) of the mean, Kalman's gain (12, 3) and the slope (3, 12), linear about mean + `off`."""
+        missing, slope = seen.against(ForearmState(self.rig_world, self.usual, self.mean + off, self.cov))
+        crossed = slope @ self.cov
+        gain = np.linalg.solve(crossed @ slope.T + seen.fresh, crossed).T.astype(np.float64, copy=False)
+        return gain @ (missing + slope @ off), gain, slope
 
     def flicked(self, step_s: float) -> "ForearmState":
         """The same after a motion of the wrist that is quicker than usual."""

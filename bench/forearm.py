@@ -1,0 +1,225 @@
+"""The palm by an IMU on the forearm while markers tell, and after: heading, bend, orientation; exact truth.
+
+An arm turns and moves about all axes, and its wrist goes from posture to posture, within half a second, and wavers
+between. The raw samples of a simulated IMU go through the filter of its slave; its world lies anywhere. Palms by
+markers come at 60 Hz for ten seconds, with a standard deviation of 1 to 5 degrees per axis; then none come for five.
+Their error is plain noise, or one that stays for a second or two, as that of rendered hands does.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import atan2, pi, radians, remainder
+from time import perf_counter_ns
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from bench.imu import Gestures
+from bench.row import Row
+from common.arrays import Float
+from common.calibration import ImuCalibration
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rigid, rotation_vector_to_matrix
+from common.imu_fusion import OrientationFilter
+from common.messages import ImuSample
+from common.sim.imu import SimulatedImu
+from common.sim.motion import HandState, smooth_step
+from common.wrist_bend import STRAIGHT, forearm_palm
+from master.fusion.forearm import Forearm
+
+# Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
+_WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)
+IMU = ImuCalibration(q_palm_imu=(0.5, 0.5, -0.5, 0.5), q_rig_world=_WORLD, heading_drift_rad_s=radians(1.0))
+_SEEDS = range(201, 217)
+_REST_S, _TOLD_S, _GONE_S, _ROUNDS, _SETTLED_S = 3.0, 10.0, 5.0, 3, 3.0
+_AFTER_S = (0.0, 0.5, 1.0, 2.0, 5.0)
+_FRAME_S = 1.0 / 60.0
+_REGION = np.array([3.841, 5.991, 7.815])  # chi square, 95 %: heading, bend, palm
+Kind = Literal["plain", "staying"]
+KINDS: tuple[Kind, ...] = ("plain", "staying")
+
+
+class BentWrist:
+    """A wrist that goes from one posture to the next, and wavers. Pure in time: holds its script."""
+
+    def __init__(self, seed: int) -> None:
+        """Postures about a habit of its own, each kept for a while."""
+        rng = np.random.default_rng([seed, 6])
+        self._habit = np.radians(rng.normal(size=2) * [9.0, 6.0])
+        self._begin_s = np.cumsum(rng.uniform(0.4, 2.0, 200))
+        self._move_s = rng.uniform(0.3, 0.6, 200)
+        self._posture = np.radians(rng.normal(size=(201, 2)) * [9.0, 7.0])
+        self._rate = 2.0 * pi * rng.uniform(0.2, 1.5, (3, 2))
+        self._phase = rng.uniform(0.0, 2.0 * pi, (3, 2))
+
+    def at(self, t_s: float) -> Float:
+        """The bend (2,) [rad]."""
+        k = int(np.searchsorted(self._begin_s, t_s))
+        share = 1.0 if k == 0 else smooth_step((t_s - self._begin_s[k - 1]) / self._move_s[k])
+        before = self._posture[max(k - 1, 0)]
+        waver = radians(2.0) * np.sin(self._rate * t_s + self._phase).sum(axis=0)
+        return self._habit + before + share * (self._posture[k] - before) + waver
+
+
+class ToldPalm:
+    """Palms by markers: the truth and an error. Holds the error of this recording."""
+
+    def __init__(self, seed: int, kind: Kind) -> None:
+        """An error of 1 to 5 degrees per axis."""
+        self._rng = np.random.default_rng([seed, 7])
+        turn = rotation_vector_to_matrix(self._rng.normal(size=3))
+        self._root = turn * np.radians(self._rng.uniform(1.0, 5.0, 3))
+        self._new = 1.0 if kind == "plain" else 1.0 - np.exp(-_FRAME_S / 1.0)
+        self._slow = self._fast = self._rng.normal(size=3)
+
+    def of(self, palm: Float) -> tuple[Float, Float]:
+        """What is told of a palm (3, 3), and the covariance of that (3, 3) [rad^2], rig axes."""
+        if self._new == 1.0:
+            error = self._rng.normal(size=3)
+        else:
+            self._slow = self._slow * (1.0 - self._new) + np.sqrt(
+                self._new * (2.0 - self._new)
+            ) * self._rng.normal(size=3)
+            error = self._slow
+        return rotation_vector_to_matrix(self._root @ error) @ palm, self._root @ self._root.T
+
+
+class TurnedArm(Gestures):
+    """Those gestures of a forearm that lies any way. Pure in time: holds how."""
+
+    def __init__(self, seed: int) -> None:
+        """Rest first, as a wearer is asked to."""
+        super().__init__(seed, _REST_S)
+        self._lies = rotation_vector_to_matrix(np.random.default_rng([seed, 8]).normal(size=3))
+
+    def at(self, t_s: float) -> HandState:
+        """The forearm's pose, as that of the palm: the IMU is simulated on what is straight."""
+        return HandState(rigid(self._lies, np.zeros(3)) @ super().at(t_s).T_rig_palm, np.zeros((5, 4)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """One recording: who moves how, and the samples of its IMU with the filter's orientation."""
+
+    seed: int
+    forearm: TurnedArm
+    wrist: BentWrist
+    samples: list[ImuSample]
+
+    @classmethod
+    def of(cls, seed: int, imu: ImuCalibration, seconds: float) -> "Arm":
+        """Simulate."""
+        forearm, fusion = TurnedArm(seed), OrientationFilter(imu.rate_hz)
+        samples = [fusion.push(one) for one in SimulatedImu(forearm, imu, seed).around(0.0, seconds)]
+        return cls(seed, forearm, BentWrist(seed), samples)
+
+    def lies(self, t_s: float) -> Float:
+        """The forearm (3, 3) in the rig."""
+        return self.forearm.at(t_s).T_rig_palm[:3, :3]
+
+    def palm(self, t_s: float) -> Float:
+        """The palm (3, 3) in the rig."""
+        return self.lies(t_s) @ forearm_palm(self.wrist.at(t_s))
+
+    def heading(self, sample: ImuSample) -> float:
+        """The heading [rad] of the filter's world against the rig, at a sample."""
+        world = (
+            quaternion_to_matrix(sample.orientation_wxyz) @ quaternion_to_matrix(np.array(IMU.q_palm_imu)).T
+        )
+        off = quaternion_to_matrix(np.array(_WORLD)).T @ self.lies(sample.seq / IMU.rate_hz) @ world.T
+        return atan2(off[1, 0] - off[0, 1], off[0, 0] + off[1, 1])
+
+
+class Moment(NamedTuple):
+    """What was believed at one instant, against the truth.
+
+    Attributes:
+        after_s: Since markers told last; 0: they tell.
+        off_deg: (5,) errors: heading, bend, palm; bend if it is believed as it was, bend if it is believed straight.
+            Each is the length of its vector.
+        surprise: (3,) squares of the first three in sigmas.
+    """
+
+    after_s: float
+    off_deg: Float
+    surprise: Float
+
+
+def moments(arm: Arm, kind: Kind) -> Iterator[Moment]:
+    """Play a recording; before every palm that is told, and at the given times after the last one, look."""
+    forearm, told, last = Forearm(IMU), ToldPalm(arm.seed, kind), STRAIGHT
+    frame = 0
+    for sample in arm.samples:
+        forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
+        t_s = sample.seq / IMU.rate_hz
+        if sample.seq % 2 == 0 or t_s < _REST_S:
+            continue
+        since_s = (t_s - _REST_S) % (_TOLD_S + _GONE_S)
+        frame += 1
+        looked = [s for s in _AFTER_S[1:] if abs(since_s - _TOLD_S - s + 0.02) < 0.5 * _FRAME_S]
+        if since_s > _SETTLED_S and since_s <= _TOLD_S and frame % 15 == 0:
+            looked = [0.0]
+        if looked:
+            yield _moment(arm, forearm, sample, looked[0], last)
+        if since_s <= _TOLD_S:
+            seen, cov = told.of(arm.palm(t_s))
+            forearm.saw(sample.t_ns, seen, cov)
+            last, _ = forearm.bend_at(sample.t_ns)
+
+
+def _moment(arm: Arm, forearm: Forearm, sample: ImuSample, after_s: float, last: Float) -> Moment:
+    t_s = sample.seq / IMU.rate_hz
+    found = forearm.palm_at(sample.t_ns)
+    bend, cov = forearm.bend_at(sample.t_ns)
+    if found is None:
+        return Moment(after_s, np.full(5, 180.0), np.full(3, np.inf))
+    truth = arm.wrist.at(t_s)
+    heading = remainder(forearm.heading_rad - arm.heading(sample), 2.0 * pi)
+    bent = bend - truth
+    palm = matrix_to_rotation_vector(arm.palm(t_s) @ found.rotation.T)
+    surprise = (
+        (heading / forearm.heading_sigma_rad) ** 2,
+        bent @ np.linalg.solve(cov, bent),
+        palm @ found.information @ palm,
+    )
+    off = [float(np.linalg.norm(one)) for one in (heading, bent, palm, last - truth, truth)]
+    return Moment(after_s, np.degrees(off), np.array(surprise))
+
+
+def rows() -> Iterator[Row]:
+    """Measure; one row per figure."""
+    seconds = _REST_S + _ROUNDS * (_TOLD_S + _GONE_S)
+    arms = [Arm.of(seed, IMU, seconds) for seed in _SEEDS]
+    for kind in KINDS:
+        found = [one for arm in arms for one in moments(arm, kind)]
+        for after_s in _AFTER_S:
+            group = [one for one in found if one.after_s == after_s]
+            off = _rms(np.array([one.off_deg for one in group]))
+            inside = 100.0 * (np.array([one.surprise for one in group]) < _REGION).mean(axis=0)
+            when = "told" if after_s == 0.0 else f"{after_s:g} s after"
+            notes = "", f"; kept as it was {off[3]:.1f}, believed straight {off[4]:.1f}", ""
+            for k, what in enumerate(("heading", "bend", "palm")):
+                note = f"{inside[k]:.0f} % of {len(group)} inside 95 %{notes[k]}"
+                yield Row(f"{kind} error, {when}: {what}", float(off[k]), "deg rms", note)
+    yield _cost(arms[0])
+
+
+def _cost(arm: Arm) -> Row:
+    """Microseconds that a palm by markers costs."""
+    forearm, told = Forearm(IMU), ToldPalm(arm.seed, "plain")
+    spent: list[float] = []
+    for sample in arm.samples[:1200]:
+        forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
+        seen, cov = told.of(arm.palm(sample.seq / IMU.rate_hz))
+        start = perf_counter_ns()
+        forearm.saw(sample.t_ns, seen, cov)
+        spent.append((perf_counter_ns() - start) * 1e-3)
+    return Row(
+        "cost of a palm",
+        float(np.median(spent)),
+        "us",
+        f"{60e-4 * np.median(spent):.1f} % of a core at 60 Hz",
+    )
+
+
+def _rms(values: Float) -> Float:
+    return np.sqrt(np.mean(np.square(values), axis=0))
