@@ -1,8 +1,10 @@
-"""Join recordings of single cameras, and of the IMU, made side by side, into one recording of the rig.
+"""Join recordings of single cameras, and of the IMU, made side by side, into one recording of all of them.
 
-Every camera is recorded by a process of its own, into a folder of its own. Their times can be compared as they are
-when they are on one clock: one start of one machine. Between machines only the wall clocks say how the clocks lie
-to each other, as well as something (NTP, PTP) keeps those together; so that is done only on request.
+Every camera is recorded by a process of its own, into a folder of its own. Cameras of one rig become a recording of
+that rig; those of several rigs, such as marker cameras and the wrist device of one hand, one of all rigs. Their times
+can be compared as they are when they are on one clock: one start of one machine. Between machines only the wall clocks
+say how the clocks lie to each other, as well as something (NTP, PTP) keeps those together; so that is done only on
+request.
 """
 
 import shutil
@@ -11,8 +13,9 @@ from pathlib import Path
 
 import msgspec
 
+from common.calibration import RigCalibration
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, FrameRow, RecordedClock, open_recording
+from common.frame_recording import FrameRecording, FrameRow, Manifest, RecordedClock, open_recording
 from common.frame_writing import RecordingWriter, refuse_occupied
 from common.imu_recording import IMU, read_imu, write_imu
 from common.messages import ImuSample
@@ -32,7 +35,7 @@ def join_recordings(
     Times are on the clock of the first. The file of a camera is that of the recording which has its frames.
 
     Args:
-        folders: Recordings of the same rig, each with frames of other cameras.
+        folders: Recordings of one rig or of several, each with frames of other cameras.
         output: New or empty folder.
         by_wall_clock: Trust the wall clocks where the clocks differ.
         progress: Called with frames done and frames in all.
@@ -43,20 +46,13 @@ def join_recordings(
     refuse_occupied(output)
     parts = [open_recording(folder) for folder in folders]
     first = parts[0]
-    for part in parts:
-        _check_alike(first, part)
-    owners = _owners(parts)
+    for k, part in enumerate(parts):
+        for before in parts[: k or 1]:
+            _check_alike(before, part)
     shifts_ns = [_shift_ns(first, part, by_wall_clock) for part in parts]
     _check_overlap(parts, shifts_ns)
     samples = _imu(parts, shifts_ns)
-    manifest = msgspec.structs.replace(
-        first.manifest,
-        cameras={name: owners.get(name, first).manifest.cameras[name] for name in first.manifest.cameras},
-        clicks={
-            name: part.manifest.clicks[name] for name, part in owners.items() if name in part.manifest.clicks
-        },
-        note="; ".join(dict.fromkeys(part.manifest.note for part in parts if part.manifest.note)),
-    )
+    manifest, owners = _manifest(parts)
     frames = sorted(
         (
             (row.t_ns + shift_ns, row, part.folder / row.file)
@@ -70,6 +66,33 @@ def join_recordings(
     if samples:
         write_imu(output, samples)
     return {name: len(part.frames_of(name)) for name, part in owners.items()}
+
+
+def _manifest(parts: Sequence[FrameRecording]) -> tuple[Manifest, dict[str, FrameRecording]]:
+    """What the joined recording says of itself, and which part has the frames of each camera."""
+    owners = _owners(parts)
+    cameras = {name: file for part in reversed(parts) for name, file in part.manifest.cameras.items()}
+    names = dict.fromkeys(name for part in parts for name in part.manifest.cameras)
+    rigs = {name: rig for part in parts for name, rig in _rigs(part).items()}
+    rig, *more = sorted(rigs.values(), key=lambda rig: rig.kind != "markers") or [None]
+    kinds = {part.manifest.kind for part in parts}
+    manifest = msgspec.structs.replace(
+        parts[0].manifest,
+        kind=kinds.pop() if len(kinds) == 1 else "both",
+        cameras={n: owners[n].manifest.cameras[n] if n in owners else cameras[n] for n in names},
+        rig=rig,
+        rigs=tuple(more),
+        clicks={
+            name: part.manifest.clicks[name] for name, part in owners.items() if name in part.manifest.clicks
+        },
+        note="; ".join(dict.fromkeys(part.manifest.note for part in parts if part.manifest.note)),
+    )
+    return manifest, {name: owners[name] for name in names if name in owners}
+
+
+def _rigs(part: FrameRecording) -> dict[str, RigCalibration]:
+    """Its rigs by name, the main one first."""
+    return {rig.name: rig for rig in (part.manifest.rig, *part.manifest.rigs) if rig is not None}
 
 
 def _imu(parts: Sequence[FrameRecording], shifts_ns: Sequence[int]) -> tuple[ImuSample, ...]:
@@ -109,25 +132,38 @@ def _check_alike(first: FrameRecording, other: FrameRecording) -> None:
         raise RecordingError(f"{other.folder / TRUTH}: a truth cannot be joined; move this file away")
     if not other.rows:
         raise RecordingError(f"{other.folder}/frames.csv: no frame in it")
-    ours, theirs = (msgspec.to_builtins(part.manifest) for part in (first, other))
-    for key in ("kind", "continuous", "rig", "rigs"):
-        if ours[key] == theirs[key]:
-            continue
-        inner = ""
-        if isinstance(ours[key], dict) and isinstance(theirs[key], dict):
-            inner = "." + next(k for k in ours[key] if ours[key][k] != theirs[key].get(k))
+    if first.manifest.continuous != other.manifest.continuous:
+        raise _differ(first, other, "continuous")
+    ours, theirs = _rigs(first), _rigs(other)
+    common = ours.keys() & theirs.keys()
+    for name in sorted(common):
+        one, two = (msgspec.to_builtins(rigs[name]) for rigs in (ours, theirs))
+        if one != two:
+            raise _differ(first, other, "rig." + next(key for key in one if one[key] != two.get(key)))
+    if ours.keys() == theirs.keys():
+        if first.manifest.kind != other.manifest.kind:
+            raise _differ(first, other, "kind")
+        if strange := other.manifest.cameras.keys() ^ first.manifest.cameras.keys():
+            raise RecordingError(
+                f"{other.folder}/recording.json: cameras: {min(strange)!r} is in only one of it and {first.folder}"
+            )
+        return
+    shared = {camera for name in common for camera in ours[name].cameras}
+    if twice := (first.manifest.cameras.keys() & other.manifest.cameras.keys()) - shared:
         raise RecordingError(
-            f"{other.folder}/recording.json: {key}{inner} differs from that of {first.folder}: "
-            f"cameras of one recording must be recorded with one calibration"
+            f"{other.folder}/recording.json: cameras: {min(twice)!r} is that of another rig in {first.folder}"
         )
-    if strange := other.manifest.cameras.keys() ^ first.manifest.cameras.keys():
-        raise RecordingError(
-            f"{other.folder}/recording.json: cameras: {min(strange)!r} is in only one of it and {first.folder}"
-        )
+
+
+def _differ(first: FrameRecording, other: FrameRecording, key: str) -> RecordingError:
+    return RecordingError(
+        f"{other.folder}/recording.json: {key} differs from that of {first.folder}: "
+        f"cameras of one recording must be recorded with one calibration"
+    )
 
 
 def _owners(parts: Sequence[FrameRecording]) -> dict[str, FrameRecording]:
-    """Camera -> the recording with its frames, in the order of the first manifest."""
+    """Camera -> the recording with its frames."""
     owners: dict[str, FrameRecording] = {}
     for part in parts:
         for camera in sorted({row.camera for row in part.rows}):
@@ -136,7 +172,7 @@ def _owners(parts: Sequence[FrameRecording]) -> dict[str, FrameRecording]:
                     f"{part.folder}: frames of camera {camera!r} are in {owners[camera].folder} as well"
                 )
             owners[camera] = part
-    return {name: owners[name] for name in parts[0].manifest.cameras if name in owners}
+    return owners
 
 
 def _shift_ns(first: FrameRecording, part: FrameRecording, by_wall_clock: bool) -> int:

@@ -30,6 +30,7 @@ RIG = RigCalibration(
     hand="default-right",
     T_rig_camera=dict.fromkeys(NAMES, POSE),
 )
+WRIST = RigCalibration(version=1, name="wrist", kind="wrist", cameras=("wrist",), hand="default-right")
 HERE = RecordedClock(id="here", wall_ahead_ns=1_700_000_000_000_000_000)
 THERE = RecordedClock(id="there", wall_ahead_ns=1_700_000_007_000_000_250)  # booted 7 s later than the other
 IMAGE = render(hand())
@@ -98,6 +99,36 @@ def test_joined_recordings_can_be_joined_again(tmp_path: Path) -> None:
     assert join_recordings([two, part(tmp_path, "top")], tmp_path / "three") == dict.fromkeys(NAMES, 3)
 
 
+def worn(folder: Path, first_ns: int = 1020) -> Path:
+    """A triple of a wrist device."""
+    wrist = msgspec.structs.replace(camera(), name="wrist")
+    manifest = Manifest(version=1, kind="wrist", cameras={"wrist": wrist}, rig=WRIST, clock=HERE)
+    writer = RecordingWriter(folder / "wrist", manifest)
+    for k, lit in enumerate((Illumination.AMBIENT, Illumination.LASER, Illumination.LED)):
+        writer.add("wrist", k, first_ns + 70 * k, lit, encode_png(IMAGE[..., 0]))
+    writer.close()
+    return folder / "wrist"
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1)])
+def test_marker_cameras_and_a_wrist_device_become_one_recording_of_both(
+    order: tuple[int, ...], tmp_path: Path
+) -> None:
+    parts = [part(tmp_path, "left"), part(tmp_path, "right", 1050), worn(tmp_path)]
+    join_recordings([parts[k] for k in order], tmp_path / "both")
+    joined = open_recording(tmp_path / "both")
+    assert joined.manifest.kind == "both"
+    assert (joined.manifest.rig, joined.manifest.rigs) == (RIG, (WRIST,))
+    assert set(joined.manifest.cameras) == {*NAMES, "wrist"}
+    stamps = [row.t_ns for row in joined.rows]
+    assert stamps == sorted(stamps)
+    assert [row.illumination.value for row in joined.frames_of("wrist")] == ["ambient", "laser", "led"]
+    # A camera that was late is joined to all the others.
+    counts = join_recordings([tmp_path / "both", part(tmp_path, "top")], tmp_path / "all")
+    assert counts == {**dict.fromkeys(NAMES, 3), "wrist": 3}
+    assert open_recording(tmp_path / "all").manifest.rigs == (WRIST,)
+
+
 def test_each_camera_brings_its_own_file_and_clicks(tmp_path: Path) -> None:
     darker = {n: msgspec.structs.replace(camera(), name=n, exposure_us=1000.0) for n in NAMES}
     clicks = {"left": {"thumb": (1.0, 2.0)}, "right": {"thumb": (3.0, 4.0)}}
@@ -152,6 +183,15 @@ def other_cameras(folder: Path) -> list[Path]:
     return [part(folder, "left"), part(folder, "right", cameras=more)]
 
 
+def camera_of_two_rigs(folder: Path) -> list[Path]:
+    other = msgspec.structs.replace(RIG, name="shelf")
+    return [part(folder, "left"), part(folder, "right", rig=other)]
+
+
+def other_kind(folder: Path) -> list[Path]:
+    return [part(folder, "left"), part(folder, "right", kind="both")]
+
+
 def no_clock(folder: Path) -> list[Path]:
     return [part(folder, "left"), part(folder, "right", clock=None)]
 
@@ -194,6 +234,8 @@ def not_there(folder: Path) -> list[Path]:
         (at_another_time, r"right begins 3\.000 s after the end of .*left: no moment"),
         (poses_and_motion, r"right/recording\.json: continuous differs"),
         (other_cameras, r"right/recording\.json: cameras: 'attic' is in only one"),
+        (camera_of_two_rigs, r"right/recording\.json: cameras: 'left' is that of another rig in .*left"),
+        (other_kind, r"right/recording\.json: kind differs"),
         (no_clock, r"right/recording\.json: clock: missing"),
         (no_frame, r"right/frames\.csv: no frame in it"),
         (with_more_than_frames, r"left/truth\.npz: a truth cannot be joined"),
