@@ -70,18 +70,23 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     note: str = ""
     clock: RecordedClock | None = None
 
+    @property
+    def all_rigs(self) -> tuple[RigCalibration, ...]:
+        """Every rig, those of markers first."""
+        rigs = [rig for rig in (self.rig, *self.rigs) if rig is not None]
+        return tuple(sorted(rigs, key=lambda rig: rig.kind != "markers"))
+
     def rig_named(self, name: str | None) -> RigCalibration:
         """The rig called `name`; None: the marker rig, or the wrist rig where there is no other.
 
         Raises:
             RecordingError: There is no such rig.
         """
-        rigs = [rig for rig in (self.rig, *self.rigs) if rig is not None]
-        wanted = [rig for rig in rigs if name in (None, rig.name)]
-        if not wanted:
-            known = ", ".join(rig.name for rig in rigs) or "none"
-            raise RecordingError(f"{MANIFEST}: no rig {name or ''!r}; it has {known}")
-        return min(wanted, key=lambda rig: rig.kind != "markers")
+        for rig in self.all_rigs:
+            if name in (None, rig.name):
+                return rig
+        known = ", ".join(rig.name for rig in self.all_rigs) or "none"
+        raise RecordingError(f"{MANIFEST}: no rig {name or ''!r}; it has {known}")
 
     def marker_rig(self) -> RigCalibration:
         """The marker rig of this recording.
@@ -100,8 +105,8 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         return self._rig_of("wrist")
 
     def _rig_of(self, kind: str) -> RigCalibration:
-        for rig in (self.rig, *self.rigs):
-            if rig is not None and rig.kind == kind:
+        for rig in self.all_rigs:
+            if rig.kind == kind:
                 return rig
         raise RecordingError(f"{MANIFEST}: no rig of kind {kind!r}")
 

@@ -14,9 +14,7 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
     ) from error
 
-from msgspec.structs import replace
-
-from common.errors import BusError, CalibrationError, PhalanxError
+from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
 from common.sim.scenes import NAMES, scene_by_name
@@ -39,8 +37,8 @@ from master.options import (
     Rigs,
     address,
 )
-from master.rig import RigSetup, load_hand, load_setup, load_setups
-from master.solve import solve
+from master.rig import load_setup, load_setups, setups_with_hands
+from master.solve import rigs_to_solve, solve_hands
 from master.stopping import stop_on_signals
 from master.study.command import evaluate_app
 from master.summary import read_summary, write_summary
@@ -50,6 +48,7 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 
 Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
 Level = Literal["fk", "ik", "auto"]
+Kind = Literal["markers", "wrist"]
 _TRY_AGAIN_S = 0.3
 
 
@@ -117,11 +116,14 @@ def solve_command(
         Path | None, typer.Option(help="Folder whose hands/ holds the rig's hand.")
     ] = None,
     hand: Hand = None,
-    rig_name: Annotated[
-        str | None,
+    rig_names: Annotated[
+        list[str] | None,
+        typer.Option("--rig", help="Rig of the recording; once for each that is to be solved; default: all."),
+    ] = None,
+    only: Annotated[
+        Kind | None,
         typer.Option(
-            "--rig",
-            help="Which rig of the recording; default: of markers, or the wrist device where that is all.",
+            help="Of a recording of both kinds: what the cameras, or what the wrist device tells alone."
         ),
     ] = None,
     level: Annotated[
@@ -134,21 +136,21 @@ def solve_command(
 ) -> None:
     """Solve recorded detections offline and deterministically: no clock, no network.
 
+    Cameras and wrist device of one hand make one poses.npz together. Of a second hand there is poses-HAND.npz.
+
     Examples:
 
       phalanx-master solve RECORDING --detections DIR --out DIR
 
+      phalanx-master solve GRASP --detections DIR --out DIR/markers --only markers
+
       phalanx-master solve CURL --detections DIR --out DIR --hand HAND.json --level fk
     """
     opened = open_recording(recording)
-    rig = opened.manifest.rig_named(rig_name)
-    if level is not None:
-        if rig.kind != "wrist":
-            raise CalibrationError(f"--level: rig {rig.name!r} is of markers; a wrist device has levels")
-        rig = replace(rig, level=level)
-    setup = RigSetup.of(rig, opened.manifest.cameras, load_hand(calibration, rig.hand, hand))
+    rigs = rigs_to_solve(opened.manifest, rig_names or [], only, level)
+    setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand)
     out.mkdir(parents=True, exist_ok=True)
-    solve(opened, setup, detections, out, lambda done, total: _progress("solving", done, total))
+    solve_hands(opened, setups, detections, out, lambda done, total: _progress("solving", done, total))
     _say(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")
 
 

@@ -243,14 +243,28 @@ def load_setups(
         CalibrationError: A file is missing, broken or contradicts another; as of `setups_of`.
     """
     rigs = [load(calibration / "rigs" / f"{name}.json", RigCalibration) for name in rig_names]
-    names = tuple(dict.fromkeys(name for rig in rigs for name in (rig.hand, *rig.other_hands)))
-    if hand_file is not None and len(names) > 1:
-        raise CalibrationError(f"--hand {hand_file}: is one hand; the rigs are of {', '.join(names)}")
     cameras = {
         name: load(calibration / "cameras" / f"{name}.json", CameraCalibration)
         for rig in rigs
         for name in rig.cameras
     }
+    return setups_with_hands(rigs, cameras, calibration, hand_file)
+
+
+def setups_with_hands(
+    rigs: Sequence[RigCalibration],
+    cameras: Mapping[str, CameraCalibration],
+    calibration: Path | None,
+    hand_file: Path | None,
+) -> tuple[RigSetup, ...]:
+    """As `setups_of`, each hand as `load_hand` finds it; `hand_file` is the hand of all rigs.
+
+    Raises:
+        CalibrationError: As of `setups_of` and `load_hand`; the rigs are of several hands and `hand_file` is one.
+    """
+    names = tuple(dict.fromkeys(name for rig in rigs for name in (rig.hand, *rig.other_hands)))
+    if hand_file is not None and len(names) > 1:
+        raise CalibrationError(f"--hand {hand_file}: is one hand; the rigs are of {', '.join(names)}")
     hands = {name: load_hand(calibration, name, hand_file) for name in names}
     return setups_of(rigs, cameras, hands.__getitem__)
 

@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Bool, Code, Float, Int
 from common.errors import RecordingError
 from common.hand_model import FINGER_JOINTS
 from common.npz import read_npz
 from master.outputs.poses import Poses
 
 _MATCH_NS = 1_000_000
+_FOLLOWS_NS = 100_000_000  # longer apart, two poses are no step
+_HAND_OVER_NS = 200_000_000
 _FINGER_OF_JOINT = np.full(26, -1)
 for _f, _joints in enumerate(FINGER_JOINTS):
     _FINGER_OF_JOINT[list(_joints)] = _f
@@ -96,6 +98,43 @@ def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, flo
     put(out, "pip_deg_visible", pip[solved][finger_clear[:, 1:][solved]], np.mean)
     out["frames_without_pose"] = float((~solved).sum())
     return out
+
+
+def score_hidden(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
+    """How good poses are where the cameras see nothing of a finger, and when what tells of it changes.
+
+    Returns:
+        joint_mm_hidden, pip_deg_hidden: Mean errors of fingers that are valid while their marker is at least half seen
+            by less than two cameras; hidden_invalid: share of hidden fingers that are not valid.
+        hand_over_step_mm: Largest step of a joint from pose to pose beyond its true step, within 0.2 s of a change of
+            any joint's source.
+        A score with nothing to average is left out.
+    """
+    rows, columns = _match(poses.t_ns, truth.t_ns)
+    found, exact = poses.position_m[rows][:, 1:], truth.joints_m[columns]
+    valid = poses.valid[rows][:, 1:] & np.isfinite(found).all(axis=2)
+    clear = (truth.visible[columns] >= 0.5).sum(axis=1) >= 2
+    hidden = ~_fingers_clear(clear, fingers)
+    of_finger = (_FINGER_OF_JOINT[1:] >= 0) & hidden[:, _FINGER_OF_JOINT[1:]]
+    out: dict[str, float] = {}
+    put(out, "joint_mm_hidden", 1e3 * np.linalg.norm(found - exact, axis=2)[of_finger & valid], np.mean)
+    told = np.stack([valid[:, [j - 1 for j in chain[1:]]].all(axis=1) for chain in FINGER_JOINTS[1:]], axis=1)
+    pip = np.degrees(np.abs(poses.angles_rad[rows][:, 1:, 2] - truth.pip_rad[columns]))
+    put(out, "pip_deg_hidden", pip[hidden[:, 1:] & told], np.mean)
+    put(out, "hidden_invalid", (~told)[hidden[:, 1:]].astype(np.float64), np.mean)
+    step = 1e3 * np.linalg.norm(np.diff(found, axis=0) - np.diff(exact, axis=0), axis=2)
+    t_ns = poses.t_ns[rows]
+    follows = (np.diff(t_ns) <= _FOLLOWS_NS)[:, None] & valid[1:] & valid[:-1]
+    near = _near_change(t_ns, poses.source[rows])
+    put(out, "hand_over_step_mm", step[follows & near[1:, None]], np.max)
+    return out
+
+
+def _near_change(t_ns: Int, source: Code) -> Bool:
+    """(N,) whether any joint has got another source within 0.2 s of each instant (N,), of sources (N, 26)."""
+    changed = t_ns[1:][(source[1:] != source[:-1]).any(axis=1)]
+    after = np.searchsorted(changed, t_ns - _HAND_OVER_NS)
+    return np.searchsorted(changed, t_ns + _HAND_OVER_NS, side="right") > after
 
 
 def put(out: dict[str, float], name: str, values: Float, reduce: Callable[[Float], object]) -> None:

@@ -4,6 +4,7 @@ Every strobed triple of the truth counts once, also one of which nothing was mad
 """
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +17,7 @@ from common.messages import FINGER_COUNT, Level, WristDetections
 from common.npz import read_npz
 from master.outputs.poses import Poses
 from master.score import put
+from master.wrist.setup import WristSetup
 
 GROUPS = ("palm", *FINGERS, "thenar")  # rows of the truth's laser line
 _OF_FINGERS = slice(1, 1 + FINGER_COUNT)
@@ -28,6 +30,7 @@ _STRAIGHT_RAD = np.radians(
     85.0
 )  # up to here the laser tells the flexion; from about 95 degrees its point stands still
 _MATCH_NS = 5_000_000  # less than half the time from one frame to the next
+_OF_WRIST = "wrist_"
 _LOG = logging.getLogger(__name__)
 
 
@@ -76,7 +79,8 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     """Truth of a rendered wrist recording; None where there is none.
 
     Its rows stand at its own `t_ns` where it has some; else there is one for each laser frame of `camera`. Where
-    frames were lost since, nobody can say which: there is none then, with a warning.
+    frames were lost since, nobody can say which: there is none then, with a warning. In a recording of both kinds its
+    keys begin with `wrist_`.
 
     Raises:
         RecordingError: truth.npz is broken, or lacks an array.
@@ -85,6 +89,10 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     if not path.exists():
         return None
     data = read_npz(path)
+    if recording.manifest.kind == "both":
+        data = {
+            name.removeprefix(_OF_WRIST): array for name, array in data.items() if name.startswith(_OF_WRIST)
+        }
     rows = [row.t_ns for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
     if "t_ns" not in data and "laser_pt" in data and len(data["laser_pt"]) != len(rows):
         _LOG.warning(
@@ -149,6 +157,22 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
 def triples_missed(poses: Poses, truth: WristTruth) -> int:
     """Triples of a recording without a pose."""
     return int((rows_at(truth.t_ns, poses.t_ns) < 0).sum())
+
+
+def score_triples(
+    setup: WristSetup, messages: Sequence[WristDetections], truth: WristTruth
+) -> dict[str, float]:
+    """Errors of the laser points of triples, whatever hand is made of them.
+
+    Returns:
+        triples: How many there are; triples_missed: how many of the truth's are missing. Of the laser points as
+        `score_wrist`.
+    """
+    at_ns = np.array([message.t_ns for message in messages], np.int64)
+    uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
+    row = rows_at(truth.t_ns, at_ns)
+    counted = {"triples": float(len(messages)), "triples_missed": float((row < 0).sum())}
+    return counted | _score_laser(at_rows(setup.on_plane(uv), row), truth)
 
 
 def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, float]:

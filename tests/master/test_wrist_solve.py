@@ -268,7 +268,7 @@ def test_a_recording_of_both_kinds_is_solved_rig_by_rig(setup: RigSetup) -> None
     assert both.rig_named("wrist") is setup.rig
     alone = Manifest(version=1, kind="wrist", cameras=setup.cameras, rig=setup.rig)
     assert alone.rig_named(None) is setup.rig
-    with pytest.raises(RecordingError, match="no rig 'third'; it has wrist, bench"):
+    with pytest.raises(RecordingError, match="no rig 'third'; it has bench, wrist"):
         both.rig_named("third")
     with pytest.raises(RecordingError, match="it has none"):
         Manifest(version=1, kind="both", cameras={}).rig_named(None)
