@@ -1,7 +1,7 @@
 """How good poses are against exact truth: errors, doubt, bits and steps, for one pipeline and against another."""
 
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -27,6 +27,7 @@ class Sighted:
     Attributes:
         cameras: (N, M) marker cameras that have each marker in sight; none while that stream is away.
         worn: (N, 5) whether the wrist device has laser line or tip of each finger in sight.
+        hidden: (N, 5) whether fewer than two cameras have the finger's marker in sight, were no stream away.
         oriented: (N,) whether an IMU tells of the palm.
         strapped: Whether there are no markers: the palm is then where the device's strap has it, and nowhere else.
         hand_over: (N, 5) whether what is in sight of the finger changed within half a second.
@@ -34,6 +35,7 @@ class Sighted:
 
     cameras: Int
     worn: Bool
+    hidden: Bool
     oriented: Bool
     strapped: bool
     hand_over: Bool
@@ -56,7 +58,10 @@ class Sighted:
         total = np.concatenate([np.zeros((1, by.shape[1]), np.int64), np.cumsum(changed, axis=0)])
         first, last = (np.searchsorted(t_s, t_s + way * HAND_OVER_S) for way in (-1.0, 1.0))
         near = total[last] > total[first]
-        return cls(cameras, worn, oriented, not solved.markers, near[:, :_FINGERS] | near[:, _FINGERS:])
+        hidden = shown.sight.cameras_of(t_s, ABOUT_S)[:, :_FINGERS] < 2
+        return cls(
+            cameras, worn, hidden, oriented, not solved.markers, near[:, :_FINGERS] | near[:, _FINGERS:]
+        )
 
     @property
     def observed(self) -> Bool:
@@ -80,8 +85,10 @@ class Figures:
 
     Attributes:
         joint_mm: Mean error of all valid joints.
+        fingers_mm: Of those beyond the knuckles, were the palm where it truly is.
         pip_deg: Mean error of the PIP of thumb (its MCP) ... little, where valid.
         four_deg: The same of the four fingers together.
+        hidden_deg: The same while the finger's marker is in sight of fewer than two cameras.
         valid, tracked: Shares of joints.
         inside, inside_hand_over: Share of valid joints in their 95 % region; of those of fingers near a hand-over.
         step_mm: Largest step beyond the truth's own; over_step: steps of a pose's worst joint above 5 mm, per minute.
@@ -91,8 +98,10 @@ class Figures:
     """
 
     joint_mm: float
+    fingers_mm: float
     pip_deg: tuple[float, ...]
     four_deg: float
+    hidden_deg: float
     valid: float
     tracked: float
     inside: float
@@ -118,8 +127,10 @@ class Figures:
         worst = _most(steps)
         return cls(
             joint_mm=_mean(off),
+            fingers_mm=_mean(solved.fingers_mm),
             pip_deg=tuple(_mean(pip[:, f]) for f in range(_FINGERS)),
             four_deg=_mean(pip[:, 1:]),
+            hidden_deg=_mean(np.where(sighted.hidden, pip, np.nan)[:, 1:]),
             valid=float(solved.poses.valid[:, 1:].mean()),
             tracked=float(tracked[:, 1:].mean()),
             inside=_inside(surprise),
@@ -131,6 +142,14 @@ class Figures:
             off=float(far.sum()) / bits,
             hz=(len(solved.t_s) - 1) / span_s,
         )
+
+
+class Ratios(NamedTuple):
+    """Mean error of the fused hand by that of a sensor alone: joints, fingers in a true palm, PIP of four fingers."""
+
+    joints: float
+    fingers: float
+    pip: float
 
 
 def _mean(values: Float) -> float:
@@ -148,20 +167,24 @@ def _most(steps_mm: Float) -> Float:
     return np.nan_to_num(steps_mm, nan=0.0).max(axis=1, initial=0.0)
 
 
-def ratios(fused: Solved, alone: Solved) -> tuple[float, float]:
-    """Error of the fused hand by that of one sensor alone: joints, and PIP of the four fingers.
-
-    Each over the joints, fingers and instants that both call valid.
-    """
+def ratios(fused: Solved, alone: Solved) -> Ratios:
+    """Over the joints, fingers and instants that both call valid."""
     place = np.clip(np.searchsorted(fused.poses.t_ns, alone.poses.t_ns), 1, len(fused.t_s) - 1)
     before = fused.poses.t_ns[place] - alone.poses.t_ns > alone.poses.t_ns - fused.poses.t_ns[place - 1]
     place = place - before
     near = np.abs(fused.poses.t_ns[place] - alone.poses.t_ns) <= _TOGETHER_NS
-    out: list[float] = []
-    for ours, theirs in (
-        (fused.off_mm[place], alone.off_mm),
-        (fused.pip_deg[place, 1:], alone.pip_deg[:, 1:]),
-    ):
-        both = np.isfinite(ours) & np.isfinite(theirs) & near[:, None]
-        out.append(float(ours[both].mean() / theirs[both].mean()) if both.any() else float("nan"))
-    return out[0], out[1]
+    return Ratios(
+        *(
+            _ratio(np.where(near[:, None], ours[place], np.nan), theirs)
+            for ours, theirs in (
+                (fused.off_mm, alone.off_mm),
+                (fused.fingers_mm, alone.fingers_mm),
+                (fused.pip_deg[:, 1:], alone.pip_deg[:, 1:]),
+            )
+        )
+    )
+
+
+def _ratio(ours: Float, theirs: Float) -> float:
+    both = np.isfinite(ours) & np.isfinite(theirs)
+    return float(ours[both].mean() / theirs[both].mean()) if both.any() else float("nan")

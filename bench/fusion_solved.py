@@ -29,9 +29,10 @@ class Solved:
     """What a pipeline made of a scene, in the rig frame, and the truth at the same N instants.
 
     Attributes:
-        poses: As published, but a wrist device's hand put into the rig.
+        poses: As published, but a hand that only a wrist device knows put where it truly is.
         t_s: (N,) scene times [s].
         truth_m: (N, 26, 3) joints [m].
+        placed_m: (N, 26, 3) joints of the poses, were the palm where it truly is [m].
         truth_rad: (N, 5, 4) angles.
         markers, wrist: Which sensors the pipeline has; the IMU comes with the wrist device.
     """
@@ -39,6 +40,7 @@ class Solved:
     poses: Poses
     t_s: Float
     truth_m: Float
+    placed_m: Float
     truth_rad: Float
     markers: bool
     wrist: bool
@@ -52,15 +54,28 @@ class Solved:
         states = [both.scene.motion.at(t) for t in t_s.tolist()]
         angles = np.array([state.angles_rad for state in states])
         truth = both.scene.model.forward(np.array([state.T_rig_palm for state in states]), angles)
-        if not setup.markers:
-            found = _placed(found, truth.position_m[:, WRIST], truth.rotation[:, WRIST])
-        return cls(found, t_s, truth.position_m, angles, bool(setup.markers), setup.wrist is not None)
+        placed = _placed(found, truth.position_m[:, WRIST], truth.rotation[:, WRIST])
+        return cls(
+            poses=found if setup.markers else placed,
+            t_s=t_s,
+            truth_m=truth.position_m,
+            placed_m=placed.position_m,
+            truth_rad=angles,
+            markers=bool(setup.markers),
+            wrist=setup.wrist is not None,
+        )
 
     @property
     def off_mm(self) -> Float:
         """(N, 25) errors of all joints but the palm's [mm]; NaN where not valid."""
         off = 1e3 * np.linalg.norm(self.poses.position_m - self.truth_m, axis=2)
         return np.where(self.poses.valid, off, np.nan)[:, 1:]
+
+    @property
+    def fingers_mm(self) -> Float:
+        """(N, 15) errors of the joints beyond the knuckles, were the palm where it truly is [mm]; NaN: not valid."""
+        off = 1e3 * np.linalg.norm(self.placed_m - self.truth_m, axis=2)
+        return np.where(self.poses.valid, off, np.nan)[:, CHAINS[:, 1:].ravel()]
 
     @property
     def pip_deg(self) -> Float:
@@ -88,7 +103,7 @@ class Solved:
 
 
 def _placed(found: Poses, wrist_m: Float, wrist_rotation: Float) -> Poses:
-    """A wrist device's hand with the wrist joint there (N, 3) and turned so (N, 3, 3)."""
+    """A hand with the wrist joint there (N, 3) and turned so (N, 3, 3)."""
     own = quaternion_to_matrix(found.orientation_wxyz[:, WRIST])
     turn = wrist_rotation @ np.swapaxes(own, 1, 2)
     beyond = found.position_m - found.position_m[:, WRIST, None]
