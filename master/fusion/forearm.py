@@ -27,12 +27,14 @@ from master.wrist.palm_world import NO_WORLD, PalmWorld
 _LOST_RAD = 1.0  # a heading less sure than this may point anywhere
 _WALK2, _MOST2 = np.radians([0.2, 5.0]) ** 2  # [rad^2/s] a heading walks at least and, unless evenly, at most
 _CONTRARY_NS, _CONTRARY = 500_000_000, 5  # what contradicts for so long, and so often, is right
+_LEAD, _BEHIND = 10.0, -1.0  # logarithm of how much likelier a rival has to be, and when it gives up
+_RIVAL_NS = 10_000_000_000  # or after such a time
 _RESTARTED_S = 0.25  # an IMU that begins anew is silent for longer, until it knows where up is
 _CLOCK_NS = -1_000_000_000  # what is so much older than the last is not late: a clock was set back
 
 
 class Forearm:
-    """Push machine. Holds the samples of an IMU, tilt, heading and bend as of the last palm, and who contradicted it.
+    """Push machine. Holds the samples of an IMU, tilt, heading and bend as of the last palm, and what contradicts them.
 
     Attributes:
         counts: `forearm.seen`, palms that were taken; left out: `forearm.missing` (no rotation, or no covariance),
@@ -57,6 +59,8 @@ class Forearm:
         self._drift_rad = 0.0
         self._sample_ns, self._sample_drift_rad = 0, nan
         self._contrary_ns: list[int] = []
+        self._rival: ForearmState | None = None
+        self._rival_ns, self._lead = 0, 0.0
 
     @property
     def heading_rad(self) -> float:
@@ -83,6 +87,11 @@ class Forearm:
 
     def palm_at(self, t_ns: int) -> Orientation | None:
         """The palm at an instant, rig frame; None: no sample is near, or the heading may be anywhere."""
+        both = self.palm_and_bend_at(t_ns)
+        return None if both is None else both[0]
+
+    def palm_and_bend_at(self, t_ns: int) -> tuple[Orientation, Float] | None:
+        """The same, and the covariance (3, 2) [rad^2] of its turn, in rig axes, with the bend."""
         found = self._world.samples.between(t_ns)
         if found is None:
             return None
@@ -91,7 +100,7 @@ class Forearm:
             return None
         rotation, slope = state.palm(self._forearm(found))
         turned = (TURN_RAD_S * found.away_s) ** 2 * np.eye(3)
-        return Orientation(rotation, slope @ state.cov @ slope.T + turned)
+        return Orientation(rotation, slope @ state.cov @ slope.T + turned), slope @ state.with_bend
 
     def bend_at(self, t_ns: int) -> tuple[Float, Float]:
         """The bend (2,) [rad] at an instant, and its covariance (2, 2)."""
@@ -132,22 +141,43 @@ class Forearm:
     def _take(self, t_ns: int, found: Between, seen: SeenPalm) -> None:
         """Learn from a palm, or leave it out."""
         since_s = self._since_s(t_ns)
-        state = self._state.after(since_s, self._walked_rad2(t_ns, found))
+        walked_rad2 = self._walked_rad2(t_ns, found)
+        state = self._state.after(since_s, walked_rad2)
         contrary = self._contrary_ns
-        if len(contrary) >= _CONTRARY and abs(t_ns - contrary[0]) > _CONTRARY_NS:
+        anew = len(contrary) >= _CONTRARY and abs(t_ns - contrary[0]) > _CONTRARY_NS
+        if anew:
             state = state.anew()
         if state.heading_sigma_rad > _LOST_RAD:
             self.counts["forearm.begun"] += 1
-            state = state.lost().towards(seen)
-        elif seen.surprises(state):
+            state, self._rival = state.lost().towards(seen), None
+        likely, density = seen.likely(state)
+        if not (likely or anew):
             state = state.flicked(since_s)
-            if seen.surprises(state):
-                self.counts["forearm.outlier"] += 1
-                contrary.append(t_ns)
-                return
+            likely, density = seen.likely(state)
+        if not (likely or anew):
+            self.counts["forearm.outlier"] += 1
+            contrary.append(t_ns)
+            return
         self.counts["forearm.seen"] += 1
         contrary.clear()
+        rival = None if self._rival is None else self._rival.after(since_s, walked_rad2)
         self._state, self._t_ns, self._drift_rad = state.told(seen), t_ns, found.drift_rad
+        self._challenge(t_ns, rival, seen, density)
+
+    def _challenge(self, t_ns: int, rival: ForearmState | None, seen: SeenPalm, density: float) -> None:
+        """Let a rival that began lately, with any heading, take over where it foretells the palms far better.
+
+        What a small jump of the heading does looks like a bend at first (generalised likelihood ratio: Willsky, Jones
+        1976). While there is none a rival leads by e^n no more often than once in e^n (Ville's inequality).
+        """
+        if rival is None or self._lead < _BEHIND or abs(t_ns - self._rival_ns) > _RIVAL_NS:
+            self._rival, self._rival_ns, self._lead = self._state.anew().towards(seen).told(seen), t_ns, 0.0
+            return
+        self._lead += seen.likely(rival)[1] - density
+        self._rival = rival.told(seen)
+        if self._lead > _LEAD:
+            self.counts["forearm.begun"] += 1
+            self._state, self._rival = self._rival, None
 
     def _forearm(self, found: Between) -> Float:
         """The forearm (3, 3) in the IMU's world."""

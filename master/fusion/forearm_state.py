@@ -89,6 +89,11 @@ class ForearmState:
         return _BEND @ self.cov @ _BEND.T
 
     @property
+    def with_bend(self) -> Float:
+        """Covariance (12, 2) of the state with flexion and deviation."""
+        return self.cov @ _BEND.T
+
+    @property
     def heading_sigma_rad(self) -> float:
         """Standard deviation of the heading."""
         return sqrt(self.cov[HEADING, HEADING])
@@ -187,10 +192,12 @@ class SeenPalm:
         slope[:, _ERROR] = self.root
         return matrix_to_rotation_vector(self.rotation @ palm.T) - self.root @ state.mean[_ERROR], slope
 
-    def surprises(self, state: ForearmState) -> bool:
-        """Whether a state has it beyond what is likely."""
+    def likely(self, state: ForearmState) -> tuple[bool, float]:
+        """Whether a state makes this palm no outlier, and the logarithm of its density, less a constant."""
         off, slope = self.against(state)
-        return float(off @ np.linalg.solve(slope @ state.cov @ slope.T + self.fresh, off)) > _BEYOND
+        cov = slope @ state.cov @ slope.T + self.fresh
+        square = float(off @ np.linalg.solve(cov, off))
+        return square < _BEYOND, -0.5 * (square + float(np.linalg.slogdet(cov)[1]))
 
 
 def bend_axes(bend_rad: Float) -> Float:

@@ -1,7 +1,7 @@
 """One hand from marker cameras, a wrist device and its IMU: not a switch between them but one fit.
 
 `FusedPipeline` is a push machine without clock, socket or thread. Every pose is the marker line's (`master.stereo`),
-with two beliefs more in its fit:
+with one belief more in its fit (`master.ik.sensed_hand`), of two parts that share the doubt of the wrist's bend:
 
 - the fingers' angles as the wrist device has them, each with its covariance (`finger_track`),
 - the palm's turn as the IMU on the forearm has it, through wrist and heading that are learnt while markers tell the
@@ -19,17 +19,14 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float
-from common.geometry import (
-    matrix_to_rotation_vector,
-    rotation_vector_to_matrix,
-)
+from common.geometry import rotation_vector_to_matrix
 from common.messages import Detections, HandPose, WristDetections
 from common.wrist_bend import STRAIGHT
 from master.fusion.finger_track import REACH_NS, FingerTrack
 from master.fusion.forearm import Forearm
-from master.ik.finger_belief import FingerBelief
 from master.ik.hand import HandSolution
-from master.ik.palm import Orientation
+from master.ik.parameters import HandParameters
+from master.ik.sensed_hand import SensedFree, SensedHand
 from master.ik.tracker import TrackedHand
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.wrist.fingers import SeenFingers, WristFingers
@@ -37,7 +34,11 @@ from master.wrist.setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no instant came, the device's triples lead
 _TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do not teach how the palm lies
+_FARTHEST_RAD = np.radians(30.0)  # that the other sensors turned it, and it is still but a step
 _WIDE_BEND = np.radians(15.0) ** 2 * np.eye(2)
+_NO_COMMON = np.zeros((3, 2))
+_NO_ANGLES, _NO_COV, _NO_SLOPE = np.full((5, 4), nan), np.tile(np.eye(4), (5, 1, 1)), np.zeros((5, 4, 2))
+_NONE_TOLD, _NO_LEVEL = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
 
 
 class WristSide:
@@ -47,9 +48,9 @@ class WristSide:
         seen: The last triple.
     """
 
-    def __init__(self, wrist: WristFingers, forearm: Forearm | None) -> None:
+    def __init__(self, wrist: WristFingers, forearm: Forearm | None, parameters: HandParameters) -> None:
         """Join device and forearm; None: the device has no IMU, or it is not known how that is mounted."""
-        self._wrist, self.forearm = wrist, forearm
+        self._wrist, self.forearm, self._parameters = wrist, forearm, parameters
         self._track = FingerTrack(wrist.habits)
         self.seen: SeenFingers | None = None
 
@@ -63,14 +64,15 @@ class WristSide:
             CalibrationError: Its tables cannot be made, or its IMU's world is not placed in the rig.
         """
         wrist = WristFingers(setup, counts, continuous=continuous, stage=stage)
-        return cls(wrist, None if setup.imu is None or not setup.imu.placed else Forearm(setup.imu, counts))
+        forearm = None if setup.imu is None or not setup.imu.placed else Forearm(setup.imu, counts)
+        return cls(wrist, forearm, HandParameters.of(setup.model))
 
     def push(self, message: WristDetections) -> SeenFingers | None:
         """Take a triple; None: it is late."""
-        bend, cov = self.bend(message.t_ns)
+        bend, _cov = self.bend(message.t_ns)
         seen = self._wrist.push(message, bend)
         if seen is not None:
-            self._track.push(seen, cov)
+            self._track.push(seen, bend)
             self.seen = seen
         return seen
 
@@ -78,39 +80,65 @@ class WristSide:
         """Bend of the wrist (2,) and its covariance (2, 2)."""
         return (STRAIGHT, _WIDE_BEND) if self.forearm is None else self.forearm.bend_at(t_ns)
 
-    def palm(self, t_ns: int) -> Orientation | None:
-        """As `OtherSensors.palm`."""
-        return None if self.forearm is None else self.forearm.palm_at(t_ns)
+    def at(self, t_ns: int) -> SensedHand | None:
+        """As `OtherSensors.at`."""
+        fingers = self._track.at(t_ns)
+        turned = None if self.forearm is None else self.forearm.palm_and_bend_at(t_ns)
+        if fingers is None and turned is None:
+            return None
+        bend, cov = self.bend(t_ns)
+        palm, palm_bend = (None, _NO_COMMON) if turned is None else turned
+        if fingers is None:
+            return SensedHand(_NO_ANGLES, _NO_COV, _NONE_TOLD, _NO_LEVEL, _NO_SLOPE, cov, palm, palm_bend)
+        slope = fingers.by_bend
+        return SensedHand(
+            fingers.angles_rad + slope @ (bend - fingers.bend_rad),
+            fingers.own_cov_rad2,
+            fingers.told,
+            fingers.level,
+            slope,
+            cov,
+            palm,
+            palm_bend,
+        )
 
-    def fingers(self, t_ns: int) -> FingerBelief | None:
-        """As `OtherSensors.fingers`."""
-        return self._track.at(t_ns)
-
-    def solved(self, t_ns: int, hand: TrackedHand, palm: Orientation | None) -> None:
+    def solved(self, t_ns: int, hand: TrackedHand, told: SensedHand | None) -> None:
         """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from it."""
         if self.forearm is None or hand.solution is None:
             return
-        told = palm_alone(hand.solution, palm)
-        if told is not None:
-            self.forearm.saw(t_ns, *told)
+        palm = palm_alone(
+            hand.solution, None if told is None else told.of(self._parameters), self._parameters
+        )
+        if palm is not None:
+            self.forearm.saw(t_ns, *palm)
 
 
-def palm_alone(hand: HandSolution, palm: Orientation | None) -> tuple[Float, Float] | None:
+def palm_alone(
+    hand: HandSolution, told: SensedFree | None, parameters: HandParameters
+) -> tuple[Float, Float] | None:
     """The palm's rotation (3, 3) and covariance (3, 3) [rad^2] as markers alone tell them; None: they hardly do.
 
-    In a least-squares fit information adds up: what the orientation `palm` added to the turn is taken out again.
+    In a least-squares fit information adds up, and at its solution the pulls of all that is known cancel: what other
+    sensors `told` is taken out of both again.
     """
-    rotation, information = hand.T_rig_palm[:3, :3], np.asarray(np.linalg.inv(hand.alone[:3, :3]), np.float64)
-    if palm is not None:
-        off = matrix_to_rotation_vector(rotation @ palm.rotation.T)
-        information = information - palm.information
-        if np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
+    rotation = hand.T_rig_palm[:3, :3]
+    if told is None:
+        cov = hand.alone[:3, :3]
+    else:
+        size = len(hand.alone)
+        pull, added = np.zeros(size), np.zeros((size, size))
+        told.add_to(rotation, parameters.of_angles(hand.angles_rad), pull, added)
+        information = np.asarray(np.linalg.inv(hand.alone), np.float64) - added
+        if np.linalg.eigvalsh(information)[0] <= 0.0:
             return None
-        turn = np.asarray(np.linalg.solve(information, palm.information @ off), np.float64)
-        rotation = rotation_vector_to_matrix(turn) @ rotation
-    elif np.linalg.eigvalsh(information)[0] < _TELLS_RAD**-2:
+        cov = np.linalg.inv(information)
+        step = (cov @ pull)[:3]
+        if float(step @ step) > _FARTHEST_RAD**2:
+            return None
+        rotation, cov = rotation_vector_to_matrix(step) @ rotation, cov[:3, :3]
+    if np.linalg.eigvalsh(cov)[-1] > _TELLS_RAD**2:
         return None
-    return rotation, np.asarray(np.linalg.inv(information), np.float64)
+    return rotation, np.asarray(cov, np.float64)
 
 
 class FusedPipeline:
@@ -167,7 +195,7 @@ class FusedPipeline:
         if seen is not None and abs(t_ns - seen.t_ns) <= REACH_NS:
             changes["laser_m"], changes["level"] = seen.laser_m, seen.found.level
             changes["ambiguous"] = seen.found.ambiguous
-        belief = None if pose.valid.any() else side.fingers(t_ns)
+        belief = None if pose.valid.any() else side.at(t_ns)
         if belief is not None:
             changes["angles_rad"] = belief.angles_rad
         return msgspec.structs.replace(pose, **changes)

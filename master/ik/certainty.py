@@ -11,6 +11,8 @@ claimed widths as one observation more (a prior of unit information: Kass, Wasse
 
     covariance = s^2 (J' J + normal)^-1,   s^2 = max(1, (1 + chi^2) / (1 + f)),   f = 3 N - 6 + (2 if the back is seen)
 
+and 3 for each finger that another sensor tells.
+
 A good fit makes nothing surer than it was claimed. The misfit tells of what markers contradict, and most of what is
 unsure, such as the palm's turn about the one marker on its back or a finger that is hidden, leaves none.
 
@@ -41,7 +43,8 @@ def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -
     normal = found.linear.normal - problem.believed
     normal.flat[:: len(normal) + 1] += anywhere(problem.parameters)
     normal[6:, 6:] += habits.normal
-    free = max(3 * len(problem.points_m) - 6 + (0 if problem.facing is None else 2), 0)
+    told = 0 if problem.others is None else len(problem.others.belief.fingers)
+    free = max(3 * (len(problem.points_m) + told) - 6 + (0 if problem.facing is None else 2), 0)
     scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), 1.0)
     return np.asarray(scale * np.linalg.inv(normal), np.float64)
 

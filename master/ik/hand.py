@@ -16,12 +16,12 @@ from common.arrays import Bool, Float
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
 from master.ik.attached import Attached
-from master.ik.finger_belief import FingerBelief
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
 from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
+from master.ik.sensed_hand import SensedHand
 
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction
@@ -84,7 +84,7 @@ class _Told:
     enough: float
     near: HandSolution | None
     orientation: Orientation | None
-    fingers: FingerBelief | None
+    others: SensedHand | None
 
 
 class HandSolver:
@@ -123,7 +123,7 @@ class HandSolver:
         near: HandSolution | None = None,
         orientation: Orientation | None = None,
         age_s: Float | None = None,
-        fingers: FingerBelief | None = None,
+        others: SensedHand | None = None,
     ) -> HandSolution | None:
         """Fit the hand to its markers, and to what other sensors say of palm and fingers.
 
@@ -142,18 +142,20 @@ class HandSolver:
                 begin at a natural posture.
             orientation: The palm's orientation as an IMU has it; None: not known.
             age_s: (6,) [s] how long ago each finger, and the palm, was told of what `last` says; None: `dt_s`.
-            fingers: The fingers' angles as another sensor has them; None: there is none.
+            others: Palm and fingers as other sensors have them, in place of `orientation`; None: there are none.
 
         Returns:
             The solution, or None where there is no last frame and too few markers: three that are not in
             one line, two where `facing` is known and not along theirs, or one where the orientation is known.
         """
         seen = seen_markers(points_m, cov_m2)
+        if others is not None:
+            orientation = others.palm
         if last is None and not _determined(points_m[seen], facing, orientation):
             return None
         shown = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
-        if fingers is not None:
-            shown |= fingers.fingers
+        if others is not None:
+            shown |= others.fingers
         age_s = np.full(6, dt_s) if age_s is None else age_s
         told = _Told(
             points_m,
@@ -168,7 +170,7 @@ class HandSolver:
             enough,
             near,
             orientation,
-            fingers,
+            others,
         )
         # A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
         like = frozenset(f for f in (2, 3) if hidden is None and f not in shown and {f - 1, f + 1} <= shown)
@@ -181,9 +183,6 @@ class HandSolver:
         habits = self._habits(told, like)
         # Where a hidden finger was held is a memory, not what this instant tells.
         alone = habits if told.hidden is None else self._priors[frozenset()]
-        if told.fingers is not None:
-            rows = told.fingers.rows(self.parameters)
-            habits, alone = habits.and_joint(*rows), alone.and_joint(*rows)
         problem = self._problem(told, habits)
         last, near, points = told.last, told.near, told.points_m
         if last is not None:
@@ -211,7 +210,8 @@ class HandSolver:
             if last is None
             else PalmPrior(last.T_rig_palm, self.priors.palm_weight(float(told.age_s[5]))),
             None if told.facing is None else Facing(told.facing, 1.0 / self.priors.facing),
-            told.orientation,
+            told.orientation if told.others is None else None,
+            None if told.others is None else told.others.of(self.parameters),
         )
 
     def _explains(self, found: HandSolution, problem: HandProblem, told: _Told) -> bool:
@@ -246,20 +246,20 @@ class HandSolver:
     def _seed_near(self, hand: HandSolution, told: _Told) -> tuple[Float, Float]:
         known = np.isin(self.parameters.free // 4, list(told.shown))
         x = np.where(known, self.parameters.of_angles(hand.angles_rad), self._natural)
-        return hand.T_rig_palm[None], self._as_told(x[None], told.fingers)
+        return hand.T_rig_palm[None], self._as_told(x[None], told.others)
 
-    def _as_told(self, x: Float, fingers: FingerBelief | None) -> Float:
+    def _as_told(self, x: Float, others: SensedHand | None) -> Float:
         """Free angles (S, n) with those of fingers that another sensor tells."""
-        if fingers is None or not fingers.told.any():
+        if others is None or not others.told.any():
             return x
-        known = np.isin(self.parameters.free // 4, list(fingers.fingers))
-        return np.where(known, self.parameters.of_angles(np.nan_to_num(fingers.angles_rad)), x)
+        known = np.isin(self.parameters.free // 4, list(others.fingers))
+        return np.where(known, self.parameters.of_angles(np.nan_to_num(others.angles_rad)), x)
 
     def _seeds(self, points: Float, told: _Told) -> tuple[Float, Float]:
         """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
         seen, facing = told.seen, told.facing
         weight = np.where(self._attached.on_finger[seen, 0], 1.0, 3.0)
-        postures, shapes_m = self._as_told(self._postures, told.fingers), self._shapes_m
+        postures, shapes_m = self._as_told(self._postures, told.others), self._shapes_m
         if postures is not self._postures:
             shapes_m = self._attached.place(self.model.chains(self.parameters.angles(postures)))
         observed, expected = points[seen], shapes_m[:, seen]

@@ -17,6 +17,7 @@ from master.ik.attached import Attached
 from master.ik.palm import Facing, Orientation, PalmPrior
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
+from master.ik.sensed_hand import SensedFree
 from master.ik.within import mean_within
 
 MAX_ITERATIONS = 25
@@ -71,6 +72,7 @@ class HandProblem:
         palm: Belief about the palm, or None.
         facing: Belief about the side it shows, or None.
         orientation: The palm's orientation as measured otherwise, or None.
+        others: What other sensors say of palm and fingers, or None.
         believed: (..., 6 + n, 6 + n) normal matrix of what is believed of angles and palm; axes as those of `prior`.
     """
 
@@ -83,6 +85,7 @@ class HandProblem:
     palm: PalmPrior | None
     facing: Facing | None
     orientation: Orientation | None = None
+    others: SensedFree | None = None
     believed: Float = field(init=False)
 
     def __post_init__(self) -> None:
@@ -101,7 +104,9 @@ class HandProblem:
         """The same markers seen elsewhere (N, 3) [m], and nothing believed of the hand."""
         size = len(self.parameters.free)
         nothing = AnglePrior(np.zeros((size, size)), np.zeros(size), np.zeros(()), np.zeros(()))
-        return replace(self, points_m=points_m, prior=nothing, palm=None, facing=None, orientation=None)
+        return replace(
+            self, points_m=points_m, prior=nothing, palm=None, facing=None, orientation=None, others=None
+        )
 
     def place(self, T_rig_palm: Float, x: Float) -> Float:
         """Where the markers (..., N, 3) [m] of hands (..., 4, 4), (..., n) are, rig frame."""
@@ -190,6 +195,8 @@ class HandProblem:
             cost = cost + self.facing.add_to(R, gradient, normal)
         if self.orientation is not None:
             cost = cost + self.orientation.add_to(R, gradient, normal)
+        if self.others is not None:
+            cost = cost + self.others.add_to(R, x, gradient, normal)
         if self.palm is not None:
             cost = cost + self.palm.add_to(T_rig_palm, gradient)
         return Linear(cost, gradient, normal)

@@ -58,7 +58,7 @@ class Orientation:
     def add_to(self, R: Float, gradient: Float, normal: Float) -> Float:
         """As `Facing.add_to`."""
         off = matrix_to_rotation_vector(R @ self.rotation.T)
-        J = _turn_of_vector(off)
+        J = turn_of_vector(off)
         weighed = off @ self.information
         gradient[..., :3] += (weighed[..., None, :] @ J)[..., 0, :]
         normal[..., :3, :3] += np.swapaxes(J, -1, -2) @ (self.information @ J)
@@ -89,7 +89,7 @@ class PalmPrior:
         return self.weight * np.concatenate([turned, T[..., :3, 3] - self.T_rig_palm[:3, 3]], axis=-1)
 
 
-def _turn_of_vector(vector: Float) -> Float:
+def turn_of_vector(vector: Float) -> Float:
     """Derivatives (..., 3, 3) of rotation vectors (..., 3) by a small turn in front of them.
 
     The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).

@@ -136,10 +136,6 @@ class AnglePrior:
         constant = self.constant + 0.5 * float(pull @ mean)
         return AnglePrior(normal, self.pull + pull, constant, self.log_density)
 
-    def and_joint(self, normal: Float, pull: Float, constant: float) -> "AnglePrior":
-        """With a belief about many angles added: half a sum of squares, in the form of this one, (n, n) and (n,)."""
-        return AnglePrior(self.normal + normal, self.pull + pull, self.constant + constant, self.log_density)
-
     def of_hypothesis(self, which: Int | int) -> "AnglePrior":
         """That of one hypothesis, or of several (S,), one for each search."""
         return AnglePrior(self.normal[which], self.pull[which], self.constant[which], self.log_density[which])

@@ -21,12 +21,12 @@ from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
 from common.messages import HandPose, Source
 from master.ik.arcs import Arcs
 from master.ik.doubt import JointDoubt
-from master.ik.finger_belief import FingerBelief
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
 from master.ik.priors import Priors
+from master.ik.sensed_hand import SensedHand
 from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
@@ -121,7 +121,7 @@ class HandTracker:
         towards_cameras: Float,
         measured: Bool | None = None,
         orientation: Orientation | None = None,
-        fingers: FingerBelief | None = None,
+        others: SensedHand | None = None,
     ) -> TrackedHand:
         """Solve one instant.
 
@@ -132,14 +132,16 @@ class HandTracker:
             towards_cameras: (3,) unit vector from the working volume to the cameras, rig frame.
             measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
             orientation: The palm's orientation as an IMU has it; None: not known.
-            fingers: The fingers' angles as a wrist device has them; None: it says nothing.
+            others: Palm and fingers as other sensors have them, in place of `orientation`; None: there are none.
         """
         seen = seen_markers(points_m, cov_m2)
+        if others is not None:
+            orientation = others.palm
         palm_rests = self._palm_rests(seen, orientation)
         tells_palm = palm_rests > 0
         told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
-        if fingers is not None:
-            told[:5] |= fingers.told
+        if others is not None:
+            told[:5] |= others.told
         last, dt_s = self.recent(t_ns)
         if last is None:
             self._forget()
@@ -150,24 +152,24 @@ class HandTracker:
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, known)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
         age_s = self._ages_s(t_ns, dt_s, told)
-        solution = self._solve(points_m, cov_m2, last, dt_s, held, facing, orientation, age_s, fingers)
+        solution = self._solve(points_m, cov_m2, last, dt_s, held, facing, orientation, age_s, others)
         if solution is not None and last is not None:
-            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation, fingers)
+            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation, others)
             if fresh is not None:
                 solution, last = fresh, None  # the leap was no motion
                 self._forget()
         if solution is not None:
             solution = self._refine(
-                solution, points_m, cov_m2, frozenset() if fingers is None else fingers.fingers
+                solution, points_m, cov_m2, frozenset() if others is None else others.fingers
             )
             cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
             solution = replace(solution, cov_m2=cov)
             if last is not None:
                 self._memory.moved(last.angles_rad, solution.angles_rad, dt_s)
-        if seen.any() or (fingers is not None and fingers.told.any() and self._knows_place()):
+        if seen.any() or (others is not None and others.told.any() and self._knows_place()):
             self._seen_ns = t_ns
         placed = seen if measured is None else seen & measured
-        bits = self._bits(t_ns, solution, seen, placed, fingers, palm_rests, held=hidden is not None)
+        bits = self._bits(t_ns, solution, seen, placed, others, palm_rests, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
         return bits
@@ -182,19 +184,19 @@ class HandTracker:
         facing: Float | None,
         orientation: Orientation | None,
         age_s: Float,
-        fingers: FingerBelief | None,
+        others: SensedHand | None,
     ) -> HandSolution | None:
         """The fit; once more where markers contradict what is told of a finger, which counts less then."""
 
-        def fit(told: FingerBelief | None) -> HandSolution | None:
+        def fit(told: SensedHand | None) -> HandSolution | None:
             return self._solver.solve(
-                points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s, fingers=told
+                points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s, others=told
             )
 
-        found = fit(fingers)
-        if found is None or fingers is None:
+        found = fit(others)
+        if found is None or others is None:
             return found
-        weighed = fingers.weighed(found.angles_rad)
+        weighed = others.weighed(found.angles_rad)
         return found if weighed is None else fit(weighed)
 
     def _knows_place(self) -> bool:
@@ -221,7 +223,7 @@ class HandTracker:
         hidden: tuple[Float, Float] | None,
         facing: Float | None,
         orientation: Orientation | None,
-        fingers: FingerBelief | None,
+        others: SensedHand | None,
     ) -> HandSolution | None:
         """The hand without the last pose, which may have led into the wrong valley; None: `found` is no worse.
 
@@ -231,7 +233,7 @@ class HandTracker:
         if worst_m <= _BAD_FIT_M:
             return None
         fresh = self._solver.solve(
-            points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation, fingers=fingers
+            points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation, others=others
         )
         if fresh is None or self._unexplained_m(fresh, points_m, cov_m2) >= 0.5 * worst_m:
             return None
@@ -272,7 +274,7 @@ class HandTracker:
         solution: HandSolution | None,
         seen: Bool,
         placed: Bool,
-        fingers: FingerBelief | None,
+        others: SensedHand | None,
         palm_rests: int,
         *,
         held: bool,
@@ -293,10 +295,10 @@ class HandTracker:
             source[palm] = Source.SOLVED
         on_finger = self._finger >= 0
         rests[5] = palm_rests
-        if fingers is not None:
+        if others is not None:
             # Where a finger is rests on where the palm is; how it is bent does not.
-            rests[:5] += ON_OTHERS * np.where(fingers.told, fingers.level, 0)
-            chains = CHAINS[fingers.told]
+            rests[:5] += ON_OTHERS * np.where(others.told, others.level, 0)
+            chains = CHAINS[others.told]
             source[chains] = Source.WRIST
             tracked[chains] = tells_palm
         for f in self._finger[seen & on_finger]:

@@ -20,11 +20,10 @@ from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections
 from master.filters import PointFilter
-from master.ik.finger_belief import FingerBelief
 from master.ik.hand import HandSolution
 from master.ik.hand_filter import HandFilter
 from master.ik.orientation import OrientationTrack
-from master.ik.palm import Orientation
+from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
@@ -45,16 +44,12 @@ _NAME = 64  # characters of a name in `Health`
 class OtherSensors(Protocol):
     """What watches the same hand beside the cameras: a wrist device and its IMU (`master.fusion`)."""
 
-    def palm(self, t_ns: int) -> Orientation | None:
-        """The palm's orientation at an instant, rig frame; None: not known."""
+    def at(self, t_ns: int) -> SensedHand | None:
+        """What they say of the hand at an instant; None: nothing."""
         ...
 
-    def fingers(self, t_ns: int) -> FingerBelief | None:
-        """The fingers' angles at an instant; None: nothing is known."""
-        ...
-
-    def solved(self, t_ns: int, hand: TrackedHand, palm: Orientation | None) -> None:
-        """Learn from the hand as it was solved, with that orientation among what it was solved from."""
+    def solved(self, t_ns: int, hand: TrackedHand, told: SensedHand | None) -> None:
+        """Learn from the hand as it was solved, with that among what it was solved from."""
         ...
 
 
@@ -191,15 +186,12 @@ class MarkerPipeline:
             aims = self._with_rays(instant, raw, cov + found.repeated, last, age_s)
             measured = np.isfinite(raw[self._on_hand, 0])
             turned = None if self._orientation is None else self._orientation.at(instant.t_ns, near)
-            fingers = None
-            if self._others is not None:
-                turned = turned or self._others.palm(instant.t_ns)
-                fingers = self._others.fingers(instant.t_ns)
+            told = None if self._others is None else self._others.at(instant.t_ns)
             hand = self._tracker.push(
-                instant.t_ns, *aims, self._towards(raw, instant), measured, turned, fingers
+                instant.t_ns, *aims, self._towards(raw, instant), measured, turned, told
             )
             if self._others is not None:
-                self._others.solved(instant.t_ns, hand, turned)
+                self._others.solved(instant.t_ns, hand, told)
             if self._steady is not None:
                 hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand])
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)

@@ -1,0 +1,140 @@
+"""What other sensors than markers say of a hand: the palm's turn and the fingers' angles, in one covariance.
+
+A device on the forearm tells how fingers are bent (its camera) and how the palm is turned (its IMU), and both through a
+wrist that bends: if the bend is other than believed, the palm is turned and all fingers seem bent by it. So their
+errors are no five or six of their own. With r the turn from the believed palm (3) and the angles less the believed
+ones (20), S their own covariances, b the bend and J = dr/db,
+
+    cost = r' (S + J cov(b) J')^-1 r / 2
+
+which joins the markers and habits in the same normal equations (`master.ik.hand_problem`): no sensor is switched on or
+off, and a bend that all fingers suggest alike is none of theirs.
+
+A sensor that errs once in a while (a false fingertip) must not win by being narrow. A finger whose angles by the fit
+are farther from the believed ones than their covariance allows counts less: its own covariance grows by
+(N + chi square) / (N + 4), the inverse weight of Student's t with N = 4 degrees of freedom (Lange, Little, Taylor 1989,
+"Robust statistical modeling using the t distribution").
+"""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float
+from common.geometry import matrix_to_rotation_vector
+from master.ik.palm import Orientation, turn_of_vector
+from master.ik.parameters import HandParameters
+
+_ANGLES, _TURN = 4, 3
+_FREEDOM = 4.0
+_SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is weighed down
+_ALL = _TURN + 5 * _ANGLES
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensedHand:
+    """Palm and fingers at one instant as other sensors have them.
+
+    Attributes:
+        angles_rad: (5, 4); a finger of which nothing is known has NaN.
+        own_cov_rad2: (5, 4, 4) of the fingers, without what the bend does to all of them.
+        told: (5,) fingers that are seen now, well enough to say how they are bent.
+        level: (5,) `Level` codes: what they are told from.
+        by_bend: (5, 4, 2) how the angles change with the bend [rad/rad].
+        bend_cov_rad2: (2, 2).
+        palm: How the palm is turned, its covariance with what the bend is in it; None: not known.
+        palm_bend_rad2: (3, 2) covariance of that turn, in rig axes, with the bend.
+        information: (23, 23) [1/rad^2] of turn and angles.
+    """
+
+    angles_rad: Float
+    own_cov_rad2: Float
+    told: Bool
+    level: Code
+    by_bend: Float
+    bend_cov_rad2: Float
+    palm: Orientation | None
+    palm_bend_rad2: Float
+    information: Float = field(init=False)
+
+    def __post_init__(self) -> None:
+        cov = np.zeros((_ALL, _ALL))
+        for f in range(5):
+            own = slice(_TURN + _ANGLES * f, _TURN + _ANGLES * (f + 1))
+            cov[own, own] = self.own_cov_rad2[f]
+        slope = self.by_bend.reshape(-1, 2)
+        cov[_TURN:, _TURN:] += slope @ self.bend_cov_rad2 @ slope.T
+        if self.palm is not None:
+            cov[:_TURN, :_TURN] = self.palm.cov_rad2
+            cov[:_TURN, _TURN:] = self.palm_bend_rad2 @ slope.T
+            cov[_TURN:, :_TURN] = cov[:_TURN, _TURN:].T
+        known = np.concatenate([np.full(_TURN, self.palm is not None), np.repeat(self.known, _ANGLES)])
+        at = np.ix_(known, known)
+        information = np.zeros((_ALL, _ALL))
+        information[at] = np.linalg.inv(cov[at])
+        object.__setattr__(self, "information", information)
+
+    @property
+    def known(self) -> Bool:
+        """(5,) fingers of which something is said."""
+        return np.isfinite(self.angles_rad[:, 0])
+
+    @property
+    def fingers(self) -> frozenset[int]:
+        """Those that are told."""
+        return frozenset(np.flatnonzero(self.told).tolist())
+
+    def weighed(self, angles_rad: Float) -> "SensedHand | None":
+        """The belief with fingers counting less that a hand of angles (5, 4) contradicts; None: it contradicts none."""
+        off = np.where(self.known[:, None], angles_rad - self.angles_rad, 0.0)
+        cov = self.own_cov_rad2 + self.by_bend @ self.bend_cov_rad2 @ np.swapaxes(self.by_bend, 1, 2)
+        cov = np.where(self.known[:, None, None], cov, np.eye(_ANGLES))
+        surprise = np.vecdot(off, np.linalg.solve(cov, off[..., None])[..., 0])
+        if not (surprise > _SURPRISED).any():
+            return None
+        grown = np.where(surprise > _SURPRISED, (_FREEDOM + surprise) / (_FREEDOM + _ANGLES), 1.0)
+        return replace(self, own_cov_rad2=self.own_cov_rad2 * grown[:, None, None])
+
+    def of(self, parameters: HandParameters) -> "SensedFree":
+        """The same about a palm and free angles."""
+        y = np.where(self.known[:, None], self.angles_rad, 0.0)
+        x = parameters.of_angles(y)
+        by_free = parameters.by_angles(x)
+        # Of an abduction that narrows this is the line that touches there.
+        means = y.reshape(-1) + by_free @ x - parameters.angles(x).reshape(-1)
+        return SensedFree(self, by_free, means)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensedFree:
+    """A belief in the free angles of one hand: angles are `by_free` (20, n) x, believed to be `means` (20,)."""
+
+    belief: SensedHand
+    by_free: Float
+    means: Float
+
+    def add_to(self, R: Float, x: Float, gradient: Float, normal: Float) -> Float:
+        """The cost (...) of rotations (..., 3, 3) and free angles (..., n).
+
+        Adds to gradients (..., 6 + n) and normal matrices (..., 6 + n, 6 + n).
+        """
+        W, by_free, palm = self.belief.information, self.by_free, self.belief.palm
+        r = np.zeros((*x.shape[:-1], _ALL))
+        r[..., _TURN:] = x @ by_free.T - self.means
+        fingers = by_free.T @ W[_TURN:, _TURN:] @ by_free
+        normal[..., 6:, 6:] += fingers
+        if palm is not None:
+            off = matrix_to_rotation_vector(R @ palm.rotation.T)
+            J = turn_of_vector(off)
+            r[..., :_TURN] = off
+            turned = np.swapaxes(J, -1, -2)
+            normal[..., :3, :3] += turned @ W[:_TURN, :_TURN] @ J
+            crossed = turned @ (W[:_TURN, _TURN:] @ by_free)
+            normal[..., :3, 6:] += crossed
+            normal[..., 6:, :3] += np.swapaxes(crossed, -1, -2)
+            weighed = r @ W
+            gradient[..., :3] += (weighed[..., None, :_TURN] @ J)[..., 0, :]
+        else:
+            weighed = r @ W
+        gradient[..., 6:] += weighed[..., _TURN:] @ by_free
+        return 0.5 * np.vecdot(r, weighed)
