@@ -18,8 +18,8 @@ ASLANT = np.radians(15.0)  # further from the wrist on the side of the thumb
 FLESH_M = 0.0025  # over the metacarpals
 SPREAD_DEG = (0.0, 3.0, 0.0, -3.0, -6.0)
 _ALONG = np.linspace(0.0, 1.0, 13)  # where on a bone its distance is taken
-_MCP_DEG, _PIP_DEG = np.arange(10.0, 90.1, 1.0), np.arange(0.0, 110.1, 1.0)
-_THUMB_DEG = (np.arange(-10.0, 45.1, 5.0), np.arange(-15.0, 45.1, 2.5), np.arange(0.0, 60.1, 5.0))
+_MCP_DEG, _PIP_DEG = np.arange(10.0, 90.1, 1.0), np.arange(0.0, 110.1, 2.0)
+_THUMB_DEG = (np.arange(-10.0, 45.1, 5.0), np.arange(-15.0, 45.1, 2.5), np.arange(0.0, 55.1, 5.0))
 _NEAR, _TOUCHES_M, _PRESSED_M = 200, 0.0012, 0.0010
 
 

@@ -34,7 +34,7 @@ from common.sim.poses import StudyPoses
 
 TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves")
 USUAL_BEND_DEG = np.array([8.0, 5.0])
-CURL_S, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 105.0, 0.54  # Kamper's ratio, row D8
+CURL_S, STRAIGHT_DEG, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 4.0, 101.0, 0.54  # Kamper's ratio, row D8
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
 _CURL_SPREAD_DEG = np.array([8.0, 4.0, 0.0, -4.0, -8.0])
 _THUMB_DEG = np.array([[14.0, -6.0, 0.0], [6.0, 26.0, 26.0]])  # open, closed
@@ -109,7 +109,7 @@ class Curls:
         posture = np.empty((5, 3))
         posture[0] = _THUMB_DEG[0] + share[0] * (_THUMB_DEG[1] - _THUMB_DEG[0])
         posture[1:, 0] = _CURL_SPREAD_DEG[1:] * (1.0 - share[1:])
-        posture[1:, 1], posture[1:, 2] = self._ratio * pip, pip
+        posture[1:, 1], posture[1:, 2] = STRAIGHT_DEG + self._ratio * pip, STRAIGHT_DEG + pip
         wobble, shift, turn = self._drift.at(t)
         turn = turn + np.radians(CURL_TURN_DEG) * self._turn.at(t)
         return HandState(
