@@ -92,6 +92,13 @@ def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_look
     assert (one != other).mean() < 1e-3
 
 
+def test_a_palm_bent_out_of_the_picture_leaves_it_empty() -> None:
+    away = doing(np.array([-1.6, 0.0]))
+    assert not len(Skin(away, COARSE).palm(away.bodies_at(7.0)).seen.pixel)
+    assert WristRenderer(away, "wrist", COARSE).render(7.0, LED).max() < 12
+    assert np.isnan(away.truth(7.0).laser_uv).all()
+
+
 def test_a_thing_out_of_everybodys_way_changes_nothing() -> None:
     away = rigid(np.eye(3), np.array([0.0, 0.4, 0.0]))  # on the back of the hand
     shown = doing(thing=away)

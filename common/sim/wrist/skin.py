@@ -160,24 +160,24 @@ class Skin:
 
     def _smooth(self, palm: SkinView) -> SkinView:
         """Fill the gaps between the bones as flesh does: normals of the smoothed surface."""
+        if not len(palm.pixel):  # bent out of the picture
+            return palm
         width, height = self.size
         sigma = PALM_SMOOTH_PX / self._step
-        seen = np.zeros(width * height, dtype=np.float32)
-        seen[palm.pixel] = 1.0
-        weight = _blurred(seen, self.size, sigma)
-        cloud = np.zeros((width * height, 3), dtype=np.float32)
-        for k in range(3):
-            plane = np.zeros(width * height, dtype=np.float32)
-            plane[palm.pixel] = palm.normals[:, k]
-            cloud[:, k] = _blurred(plane, self.size, sigma) / np.maximum(weight, 1e-3)
-        normals = cloud[palm.pixel]
+        cloud = np.zeros((height, width, 4), dtype=np.float32)
+        cloud.reshape(-1, 4)[palm.pixel] = np.column_stack(
+            [palm.normals, np.ones(len(palm.pixel), np.float32)]
+        )
+        # Beyond the palm nothing is asked for: the blur need not go further than it reaches from there.
+        reach = int(4.0 * sigma) + 2
+        lines, columns = np.divmod(palm.pixel, width)
+        x0, y0, w, h = cv2.boundingRect(np.stack([columns, lines], axis=1).astype(np.int32))
+        box = np.s_[max(y0 - reach, 0) : y0 + h + reach, max(x0 - reach, 0) : x0 + w + reach]
+        cloud[box] = cv2.GaussianBlur(cloud[box], (0, 0), sigma)
+        smooth = cloud.reshape(-1, 4)[palm.pixel]
+        normals = smooth[:, :3] / np.maximum(smooth[:, 3:], 1e-3)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         return SkinView(palm.pixel, palm.points, normals, palm.albedo)
-
-
-def _blurred(values: Plane, size: tuple[int, int], sigma: float) -> Plane:
-    image = cv2.GaussianBlur(values.reshape(size[1], size[0]), (0, 0), sigma)
-    return np.asarray(image, dtype=np.float32).ravel()
 
 
 def _flat_field(scene: WristScene, rays: Float) -> Float:
