@@ -62,7 +62,7 @@ def _relay(out: Path) -> tuple[float, float]:
 
 
 def _settings(out: Path, seconds: float, master: str) -> DemoSettings:
-    return DemoSettings(seconds, True, out, _CALIBRATION, "desk", 7, master=master)
+    return DemoSettings(seconds, True, out, _CALIBRATION, ("desk",), 7, master=master)
 
 
 def _quiet(_line: str) -> None:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.demo import DemoError, DemoSettings, run_demo, stop_on_signals
+from deploy.demo import TOGETHER, DemoError, DemoSettings, run_demo, stop_on_signals
 from deploy.replay import ReplayError, ReplaySettings, run_replay
 
 _EXAMPLES = {
@@ -14,10 +14,14 @@ _EXAMPLES = {
   phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
   phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
+  phalanx demo --scene grasp                    both at once, while a hand closes round a bar: cameras lose its fingers
+  phalanx demo --scene grasp --rig desk         the same without the wrist device, to compare
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
   phalanx replay CURL --hand HAND.json --out out/curl       recorded frames of a wrist device
+  phalanx replay GRASP --out out/grasp          cameras and wrist device of one hand, solved together
+  phalanx replay GRASP --only markers --out out/grasp-markers    without what the wrist device tells, to compare
   phalanx replay CURL --hand HAND.json --level fk --out out/fk   its fingers from the laser alone, to compare
 """,
 }
@@ -38,6 +42,9 @@ _LABELS = {
     "joint_mm": ("joint error, all fingers", "mm"),
     "pip_deg_visible": ("PIP error, visible fingers", "deg"),
     "pip_deg": ("PIP error, all fingers", "deg"),
+    "joint_mm_hidden": ("joint error, fingers no two cameras see", "mm"),
+    "pip_deg_hidden": ("PIP error of those", "deg"),
+    "hand_over_step_mm": ("step when a sensor takes over", "mm"),
     "forearm_tilt_deg": ("forearm against the vertical, RMS", "deg"),
 }
 
@@ -56,12 +63,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
+    together = options.scene.partition("@")[0] in TOGETHER
+    rigs = options.rigs or (("desk", "wrist") if together else ("desk",))
     settings = DemoSettings(
         options.seconds,
         options.headless,
         options.out,
         options.calibration,
-        options.rig,
+        tuple(rigs),
         options.seed,
         options.scene,
         options.web,
@@ -76,7 +85,7 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     settings = ReplaySettings(
-        options.recording, options.out, options.calibration, options.hand, options.level
+        options.recording, options.out, options.calibration, options.hand, options.level, options.only
     )
     _finish(run_replay(settings, _say), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")
@@ -90,7 +99,7 @@ def _finish(summary: dict[str, object], file: Path | None) -> None:
     print()
     for key, (label, unit) in _LABELS.items():
         if key in summary:
-            print(f"  {label:30s} {summary[key]:>9} {unit}")
+            print(f"  {label:41s} {summary[key]:>9} {unit}")
 
 
 def _say(line: str) -> None:
@@ -112,8 +121,8 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser(
         "demo",
         help="everything on this machine, without hardware",
-        description="Starts a slave with a synthetic camera for each camera of the rig, one for its IMU where it has "
-        "one, the master and the viewer.",
+        description="Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU, one master "
+        "for all of them and the viewer.",
         epilog=_EXAMPLES["demo"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -133,22 +142,29 @@ def _parser() -> argparse.ArgumentParser:
         "--calibration", type=Path, default=_calibration(), metavar="DIR", help="default: %(default)s"
     )
     rig = demo.add_mutually_exclusive_group()
-    rig.add_argument("--rig", default="desk", help="default: %(default)s")
     rig.add_argument(
-        "--wrist", dest="rig", action="store_const", const="wrist", help="the wrist device: --rig wrist"
+        "--rig",
+        dest="rigs",
+        action="append",
+        metavar="NAME",
+        help="once for each that runs; default: desk, for scenes of both kinds desk and wrist",
+    )
+    rig.add_argument(
+        "--wrist", dest="rigs", action="store_const", const=["wrist"], help="the wrist device: --rig wrist"
     )
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
     demo.add_argument(
         "--scene",
         default="standard",
         help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz; of a wrist "
-        "device standard, curl, wearer, poses or spread, each with @dark, @indoor, @bright or @sun",
+        "device standard, curl, wearer, poses or spread; of both kinds of rig at once grasp, both-poses, both-curl, "
+        "both-travel or both-moves; the last two kinds each with @dark, @indoor, @bright or @sun",
     )
     replay = commands.add_parser(
         "replay",
         help="a recording of raw frames, offline",
-        description="Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand, "
-        "scores it where there is a truth.",
+        description="Detects markers, or fingers before a wrist device, in every camera's frames, solves the hand of "
+        "what all of them tell, scores it where there is a truth.",
         epilog=_EXAMPLES["replay"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -159,6 +175,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     replay.add_argument(
         "--hand", type=Path, metavar="FILE", help="hand profile; default: DIR/hands/<rig's hand>.json"
+    )
+    replay.add_argument(
+        "--only",
+        choices=("markers", "wrist"),
+        help="of a recording of both: what the cameras, or what the wrist device tells alone",
     )
     replay.add_argument(
         "--level",

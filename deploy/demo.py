@@ -1,4 +1,4 @@
-"""The demo: a slave for each camera of a rig and for its IMU, all synthetic, the master and the viewer, as processes
+"""The demo: a slave for each camera and each IMU of its rigs, all synthetic, the master and the viewer, as processes
 of this machine.
 
 Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The slaves' clocks
@@ -25,6 +25,13 @@ from deploy.process import Process
 _READY_S = 30.0
 _LEAD_NS = 4_000_000_000  # processes need about two seconds to be ready; the scene begins then
 _LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
+TOGETHER = (
+    "grasp",
+    "both-poses",
+    "both-curl",
+    "both-travel",
+    "both-moves",
+)  # seen by both kinds of rig alike
 
 
 class DemoError(Exception):
@@ -40,7 +47,7 @@ class DemoSettings:
         headless: No viewer. A picture and an .rrd are written in any case.
         out: Folder for logs and results.
         calibration: calib_json tree.
-        rig: Rig to simulate.
+        rigs: Rigs to simulate, which one master runs.
         seed: Seed of the scene.
         scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
@@ -51,7 +58,7 @@ class DemoSettings:
     headless: bool
     out: Path
     calibration: Path
-    rig: str
+    rigs: tuple[str, ...]
     seed: int
     scene: str = "standard"
     web: bool = False
@@ -140,17 +147,18 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
     beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
     bus = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
-    place = ["--rig", settings.rig, "--calibration", str(settings.calibration)]
+    tree = ["--calibration", str(settings.calibration)]
+    place = [*_options(settings.rigs), *tree]
     rows: list[tuple[str, list[str], dict[str, str]]] = []
-    scene = ["--scene", settings.scene, "--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
     link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
-    cameras, imus = _sensors(settings)
-    for index, name in enumerate([*cameras, *imus]):
+    played = ["--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
+    for index, sensor in enumerate(_sensors(settings)):
         clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index)]
-        sensor = ["imu", "--imu", "synthetic"] if name in imus else ["run", "--camera", "synthetic", *start]
-        command = [*sensor, "--name", name, *place, *scene, *clock, *link]
-        rows.append((name, [sys.executable, "-m", "slave", *command], key))
+        driver = ["imu", "--imu", "synthetic"] if sensor.imu else ["run", "--camera", "synthetic", *start]
+        who = ["--name", sensor.name, "--rig", sensor.rig, *tree, "--scene", sensor.scene]
+        command = [*driver, *who, *played, *clock, *link]
+        rows.append((sensor.name, [sys.executable, "-m", "slave", *command], key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
     rows.append(("master", [sys.executable, "-m", settings.master, "run", *place, *address, *files], key))
@@ -160,18 +168,74 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     return rows
 
 
-def _sensors(settings: DemoSettings) -> tuple[list[str], list[str]]:
-    """Names of the rig's cameras, and of its IMU where it has one whose mounting and world are known."""
-    path = settings.calibration / "rigs" / f"{settings.rig}.json"
+@dataclass(frozen=True, slots=True)
+class _Sensor:
+    """A camera or an IMU of a rig, and the scene that it senses."""
+
+    name: str
+    rig: str
+    scene: str
+    imu: bool = False
+
+
+def _sensors(settings: DemoSettings) -> list[_Sensor]:
+    """The cameras of all rigs, then each IMU whose mounting and world are known.
+
+    Raises:
+        DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each see another.
+    """
+    rigs = {name: _rig(settings.calibration, name) for name in settings.rigs}
+    if len(rigs) < len(settings.rigs):
+        raise DemoError(f"--rig {' --rig '.join(settings.rigs)}: a rig stands twice")
+    moves, _, light = settings.scene.partition("@")
+    hands = [rig.hand for rig in rigs.values()]
+    if len(set(hands)) < len(hands) and moves not in TOGETHER:
+        raise DemoError(
+            f"--scene {settings.scene}: rigs {', '.join(rigs)} see one hand together only in {', '.join(TOGETHER)}"
+        )
+    worn = any(rig.kind == "wrist" for rig in rigs.values())
+    cameras: list[_Sensor] = []
+    imus: list[_Sensor] = []
+    for name, rig in rigs.items():
+        # The light behind the @ is that of a wrist device; cameras that watch markers have their own.
+        scene = moves if light and worn and rig.kind == "markers" else settings.scene
+        cameras += [_Sensor(camera, name, scene) for camera in rig.cameras]
+        imus += [_Sensor(imu, name, scene, imu=True) for imu in rig.imus]
+    names = [sensor.name for sensor in (*cameras, *imus)]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise DemoError(
+            f"rigs {', '.join(rigs)}: {twice[0]!r} stands twice; every sensor has a name of its own"
+        )
+    return cameras + imus
+
+
+@dataclass(frozen=True, slots=True)
+class _Rig:
+    """A rig file, as far as it matters here."""
+
+    kind: str
+    hand: str
+    cameras: list[str]
+    imus: list[str]
+
+
+def _rig(calibration: Path, name: str) -> _Rig:
+    path = calibration / "rigs" / f"{name}.json"
     try:
         rig = json.loads(path.read_text())
         imu = cast(dict[str, object], rig.get("imu") or {})
         placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
-        return cast(list[str], rig["cameras"]), [str(imu.get("name", "imu"))] if placed else []
+        imus = [str(imu.get("name", "imu"))] if placed else []
+        return _Rig(str(rig.get("kind")), str(rig.get("hand")), cast(list[str], rig["cameras"]), imus)
     except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
         raise DemoError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
         ) from error
+
+
+def _options(rigs: tuple[str, ...]) -> list[str]:
+    """`--rig` for each."""
+    return [word for rig in rigs for word in ("--rig", rig)]
 
 
 def _free_port(kind: int) -> int:
@@ -260,7 +324,7 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
         raise DemoError(f"the master wrote no summary; its last line in {log}: {last}")
     say("comparing with the exact truth, drawing the hand ...")
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
-    place = ["--rig", settings.rig, "--calibration", str(settings.calibration), *scene]
+    place = [*_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
     command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
     # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.

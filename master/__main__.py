@@ -17,8 +17,8 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
 from common.errors import BusError, PhalanxError
 from common.frame_recording import open_recording
 from common.keys import rig_key
-from common.sim.scenes import NAMES, scene_by_name
-from common.sim.wrist.scene import WRIST_NAMES, WristScene
+from common.sim.scenes import NAMES
+from common.sim.wrist.scene import WRIST_NAMES
 from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
@@ -37,6 +37,7 @@ from master.options import (
     Rigs,
     address,
 )
+from master.outputs.files import path_of_hand
 from master.rig import load_setup, load_setups, setups_with_hands
 from master.solve import rigs_to_solve, solve_hands
 from master.stopping import stop_on_signals
@@ -205,29 +206,31 @@ def report(
         int, typer.Option(help="Scene time 0 on this machine's monotonic clock, in ns.")
     ],
     out: Annotated[Path, typer.Option(help="Folder for hand.png, run.rrd and summary.json.")],
+    rig: Rigs,
     scene: Annotated[str, typer.Option(help=f"Scene: {NAMES}; of a wrist rig: {WRIST_NAMES}.")] = "standard",
     seed: Annotated[int, typer.Option(help="Seed of the scene.")] = 7,
-    rig: Rig = "desk",
     calibration: Calibration = CALIB_JSON,
     summary: Annotated[Path | None, typer.Option(help="summary.json of the run, to be completed.")] = None,
 ) -> None:
     """Compare a simulated run with the exact truth of its scene; write figures, a picture and a Rerun file.
 
-    `phalanx demo` calls it at the end.
+    `phalanx demo` calls it at the end. Of a second hand the results are in a folder of its name below OUT.
 
     Examples:
 
       phalanx-master report --poses out/demo/poses.npz --scene-epoch-ns 123456789 --out out/demo
     """
-    from master.report import report_scene
+    from master.report import Played, report_scene
 
-    setup = load_setup(calibration, rig)
-    find = scene_by_name if setup.wrist is None else WristScene.by_name
-    played = find(scene, setup.rig, setup.cameras, setup.hand.profile, seed)
+    setups = load_setups(calibration, rig)
     figures = {} if summary is None else read_summary(summary)
-    out.mkdir(parents=True, exist_ok=True)
-    full = report_scene(poses, setup, played, scene_epoch_ns, out, figures, _progress)
-    write_summary(out / "summary.json", full)
+    for number, setup in enumerate(setups):
+        hand = setup.hand.profile.name
+        file, folder = (path_of_hand(poses, hand), out / hand) if number else (poses, out)
+        folder.mkdir(parents=True, exist_ok=True)
+        played = Played.of(setup, scene, seed)
+        full = report_scene(file, setup, played, scene_epoch_ns, folder, figures, _progress)
+        write_summary(folder / "summary.json", full)
 
 
 def main() -> None:

@@ -2,13 +2,17 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from common.arrays import Float, Image
+from common.errors import PhalanxError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
+from common.sim.scenes import scene_by_name
+from common.sim.together import TOGETHER
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import load_poses
@@ -18,13 +22,45 @@ from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
 from master.outputs.truth import PosesTruth
 from master.rig import RigSetup
-from master.score import Truth, score
+from master.score import Truth, score, score_hidden
 from master.solve import fingers_of
-from master.wrist_report import forearm_tilt, lit_view, wrist_images, wrist_truth_of
+from master.wrist_report import forearm_tilt, laser_scores, lit_view, wrist_images, wrist_truth_of
 from master.wrist_score import score_wrist
 
 _IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Played:
+    """What the synthetic sensors of one hand sensed.
+
+    Attributes:
+        shown: What cameras of markers saw, or None.
+        worn: What a wrist device saw, or None.
+    """
+
+    shown: Scene | None = None
+    worn: WristScene | None = None
+
+    @classmethod
+    def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
+        """The scene called `name`; with @LIGHT behind it that of a wrist device.
+
+        Raises:
+            PhalanxError: There is no such scene for this kind of rig, or it is not one motion for both kinds.
+        """
+        moves, hand = name.partition("@")[0], setup.hand.profile
+        if setup.wrist_rig is None:
+            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed))
+        worn = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
+        if not setup.has_markers:
+            return cls(None, worn)
+        if moves not in TOGETHER:
+            raise PhalanxError(
+                f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
+            )
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed), worn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,7 +76,7 @@ class _Judged:
 def report_scene(
     poses_file: Path,
     setup: RigSetup,
-    scene: Scene | WristScene,
+    played: Played,
     epoch_ns: int,
     out: Path,
     summary: dict[str, object],
@@ -50,8 +86,8 @@ def report_scene(
 
     Args:
         poses_file: poses.npz of the run.
-        setup: Rig, cameras, hand.
-        scene: What the synthetic cameras rendered; of the rig's kind.
+        setup: Rigs, cameras, hand.
+        played: What their synthetic sensors sensed.
         epoch_ns: Scene time 0 on the master's clock.
         out: Existing folder.
         summary: Figures of the run so far; drawn with the scores.
@@ -68,10 +104,7 @@ def report_scene(
     if len(poses) == 0:
         return summary
     row = best_row(poses)
-    if isinstance(scene, WristScene):
-        judged = _of_wrist(poses, row, setup, scene, epoch_ns, tell)
-    else:
-        judged = _of_markers(poses, setup, scene, epoch_ns, tell)
+    judged = _judge(poses, row, setup, played, epoch_ns, tell)
     full = summary | judged.scores
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
@@ -81,10 +114,28 @@ def report_scene(
     return full
 
 
+def _judge(
+    poses: Poses, row: int | None, setup: RigSetup, played: Played, epoch_ns: int, tell: Progress
+) -> _Judged:
+    """Against what was truly there, whichever sensors there are."""
+    if played.shown is None:
+        assert played.worn is not None, "one of the two there is"
+        return _of_wrist(poses, row, setup, played.worn, epoch_ns, tell)
+    judged = _of_markers(poses, setup, played.shown, epoch_ns, tell)
+    if played.worn is None:
+        return judged
+    worn = laser_scores(poses, played.worn, epoch_ns, tell)
+    images = chain(judged.images, wrist_images(poses, played.worn, epoch_ns, tell))
+    return _Judged(judged.scores | worn, judged.truth, images)
+
+
 def _of_markers(poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress) -> _Judged:
-    truth = truth_of(poses, scene, epoch_ns, tell)
+    truth, fingers = truth_of(poses, scene, epoch_ns, tell), fingers_of(setup)
+    scores = score(poses, truth, fingers)
+    if setup.wrist is not None:
+        scores |= score_hidden(poses, truth, fingers)
     return _Judged(
-        score(poses, truth, fingers_of(setup)),
+        scores,
         PosesTruth.of_webxr(truth.joints_m, truth.markers_m),
         _images(poses, scene, epoch_ns, tell),
     )
@@ -93,7 +144,7 @@ def _of_markers(poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell
 def _of_wrist(
     poses: Poses, row: int | None, setup: RigSetup, scene: WristScene, epoch_ns: int, tell: Progress
 ) -> _Judged:
-    truth = wrist_truth_of(poses, scene, epoch_ns, tell)
+    truth = wrist_truth_of(poses.t_ns, scene, epoch_ns, tell)
     frame = None
     if row is not None:
         renderer = WristRenderer(scene, scene.rig.cameras[0])

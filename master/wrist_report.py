@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
-from common.arrays import Float, Image
+from common.arrays import Float, Image, Int
 from common.frame_recording import Illumination
 from common.geometry import quaternion_to_matrix
 from common.sim.wrist.motion import OnForearm
@@ -13,21 +13,21 @@ from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from common.sim.wrist.scene import WristTruth as WristInstant
 from master.outputs.poses import Poses
-from master.wrist_score import WristTruth
+from master.wrist_score import WristTruth, score_laser
 
 _IMAGES_HZ = 2.0
 Progress = Callable[[str, int, int], None]
 
 
-def wrist_truth_of(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress) -> WristTruth:
-    """The scene at the instants of the poses; `epoch_ns` is scene time 0 on their clock."""
+def wrist_truth_of(t_ns: Int, scene: WristScene, epoch_ns: int, tell: Progress) -> WristTruth:
+    """The scene at the instants (N,) [ns] of poses; `epoch_ns` is scene time 0 on their clock."""
     now: list[WristInstant] = []
-    for row, t_ns in enumerate(poses.t_ns.tolist()):
-        now.append(scene.truth((t_ns - epoch_ns) * 1e-9))
+    for row, at_ns in enumerate(t_ns.tolist()):
+        now.append(scene.truth((at_ns - epoch_ns) * 1e-9))
         if row % 20 == 0:
-            tell("comparing with the truth", row, len(poses))
+            tell("comparing with the truth", row, len(t_ns))
     return WristTruth(
-        t_ns=poses.t_ns,
+        t_ns=t_ns,
         laser_m=np.array([one.laser_pt for one in now]),
         laser_seen_m=np.array([one.laser_len_vis for one in now]),
         tip_uv=np.array([one.tip_uv for one in now]),
@@ -35,6 +35,20 @@ def wrist_truth_of(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progres
         joints_m=np.array([one.joints.position_m[1:] for one in now]),
         pip_rad=np.array([one.angles_rad[:, 2] for one in now]),
     )
+
+
+def laser_scores(poses: Poses, scene: WristScene, epoch_ns: int, tell: Progress) -> dict[str, float]:
+    """Errors of the laser points, as `score_wrist` has them, of poses that also other sensors tell of.
+
+    Such a pose carries the points of the last triple. Each triple counts once, at the first pose after it.
+    """
+    point = poses.laser_m.reshape(len(poses), -1)
+    told = np.asarray(np.isfinite(point).any(axis=1))
+    told[1:] &= (np.nan_to_num(point[1:]) != np.nan_to_num(point[:-1])).any(axis=1)
+    if not told.any():
+        return {}
+    truth = wrist_truth_of(poses.t_ns[told], scene, epoch_ns, tell)
+    return score_laser(poses.laser_m[told], truth)
 
 
 def forearm_tilt(poses: Poses, scene: WristScene, epoch_ns: int) -> dict[str, float]:

@@ -136,7 +136,7 @@ def score_wrist(poses: Poses, truth: WristTruth) -> dict[str, float]:
         frames_without_pose: Poses of which nothing is valid.
     """
     row = rows_at(truth.t_ns, poses.t_ns)
-    out = _score_laser(at_rows(poses.laser_m, row), truth) | _score_both(poses, row, truth)
+    out = score_laser(at_rows(poses.laser_m, row), truth) | _score_both(poses, row, truth)
     there = row >= 0
     found = row[there]
     error = np.degrees(poses.angles_rad[found][:, 1:, 2] - truth.pip_rad[there, 1:])
@@ -172,7 +172,7 @@ def score_triples(
     uv = np.array([message.laser_uv for message in messages]).reshape(-1, FINGER_COUNT, 2)
     row = rows_at(truth.t_ns, at_ns)
     counted = {"triples": float(len(messages)), "triples_missed": float((row < 0).sum())}
-    return counted | _score_laser(at_rows(setup.on_plane(uv), row), truth)
+    return counted | score_laser(at_rows(setup.on_plane(uv), row), truth)
 
 
 def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, float]:
@@ -197,8 +197,8 @@ def score_tips(messages: list[WristDetections], truth: WristTruth) -> dict[str, 
     return out
 
 
-def _score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
-    """What became of the laser points (N, 5, 3) of all triples."""
+def score_laser(found: Float, truth: WristTruth) -> dict[str, float]:
+    """What became of the laser points (N, 5, 3) of all triples, as in `score_wrist`."""
     to_groups = 1e3 * np.linalg.norm(found[:, :, None] - truth.laser_m[:, None], axis=3)
     own = np.stack([to_groups[:, f, 1 + f] for f in range(FINGER_COUNT)], axis=1)
     reported = np.isfinite(found).all(axis=2)

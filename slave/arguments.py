@@ -25,6 +25,8 @@ HELP = {
         without hardware: renders the standard scene in real time
   phalanx-slave run --name wrist --rig wrist --camera synthetic --bind 127.0.0.1 --key-file rig.key
         the camera of a wrist device, docs/wrist.md
+  phalanx-slave run --name wrist --rig wrist --camera synthetic --scene grasp --scene-epoch-ns N --key-file rig.key
+        the same hand as cameras of rig desk with the same scene, seed and epoch: what they lose it still sees
   phalanx-slave run --name left --rig desk --camera picamera2 --colours none --key-file rig.key
         before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
@@ -70,6 +72,8 @@ HELP = {
         """\
   phalanx-slave join recordings/wave-left recordings/wave-right -o recordings/wave
         one recording of all cameras, for `phalanx replay` and the calibrations
+  phalanx-slave join recordings/grasp-left recordings/grasp-right recordings/grasp-wrist -o recordings/grasp
+        of marker cameras and a wrist device: one of kind both
 """,
     ),
     "detect": (
@@ -94,6 +98,7 @@ HELP = {
 }
 CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
 BEACON_PORT = 47800
+BOTH = "grasp | both-poses | both-curl | both-travel | both-moves"  # the same motion for both kinds of rig
 
 
 def parser() -> argparse.ArgumentParser:
@@ -178,6 +183,12 @@ def _record(record: argparse.ArgumentParser) -> None:
         const="synthetic",
         metavar="DRIVER",
         help=f"what the rig's IMU says, too, as imu.csv: {opening.REAL}; without a driver, that of a synthetic camera",
+    )
+    record.add_argument(
+        "--every-frame",
+        action="store_true",
+        help="a synthetic camera does not keep time but draws every frame, however long that takes; all cameras of one "
+        "scene need the same --scene-epoch-ns",
     )
     record.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
     record.add_argument(
@@ -290,8 +301,8 @@ def _simulated(add: Callable[..., argparse.Action]) -> None:
         "--scene",
         default="standard",
         metavar="NAME",
-        help="standard | lights | poses | hand-routine | leap:FILE.npz | board; before a wrist device "
-        "standard | curl | wearer | poses | spread, each with @dark | @indoor | @bright | @sun, or board",
+        help=f"standard | lights | poses | hand-routine | leap:FILE.npz | {BOTH} | board; before a wrist device "
+        f"standard | curl | wearer | poses | spread | {BOTH}, each with @dark | @indoor | @bright | @sun, or board",
     )
     add("--seed", type=int, default=7)
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")

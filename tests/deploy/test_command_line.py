@@ -7,7 +7,9 @@ import pytest
 
 from common.sim.scene import APART_PPM, LATE_NS
 from common.sim.scenes import NAMES
+from common.sim.together import TOGETHER
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
+from deploy import __main__ as command_line
 from deploy import demo, replay
 from deploy.__main__ import main
 from slave.arguments import parser
@@ -58,9 +60,10 @@ def test_a_recording_of_no_known_kind_is_refused_by_name(
     assert says in capsys.readouterr().err
 
 
-def test_of_both_kinds_each_rig_is_replayed_with_results_of_its_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def steps_of_replay(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, **changes: object
+) -> list[tuple[str, ...]]:
+    """The commands that replay a recording of both kinds into folder/out."""
     steps: list[tuple[str, ...]] = []
 
     def step(module: str, *arguments: str) -> None:
@@ -71,21 +74,36 @@ def test_of_both_kinds_each_rig_is_replayed_with_results_of_its_own(
     monkeypatch.setattr(replay, "_step", step)
     wrist = {"name": "w", "kind": "wrist", "cameras": ["palm"]}
     markers = {"name": "d", "kind": "markers", "cameras": ["left", "right"]}
-    (tmp_path / "recording.json").write_text(json.dumps({"rigs": [wrist, markers]}))
-    (tmp_path / "hand.json").write_text("{}")
-    out = tmp_path / "out"
-    settings = replay.ReplaySettings(tmp_path, out, None, tmp_path / "hand.json", "fk")
-    assert replay.run_replay(settings, lambda _line: None) == {"poses": 3}
+    (folder / "recording.json").write_text(json.dumps({"rigs": [wrist, markers]}))
+    (folder / "hand.json").write_text("{}")
+    values: dict[str, object] = {"calibration": None, "hand": folder / "hand.json"}
+    settings = replay.ReplaySettings(folder, folder / "out", **(values | changes))  # type: ignore[arg-type]
+    assert replay.run_replay(settings, lambda _line: None) == {"poses": len(steps)}
+    return steps
+
+
+def test_both_kinds_are_detected_camera_by_camera_and_solved_together(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = steps_of_replay(tmp_path, monkeypatch, level="fk")
     assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == [
         "left",
         "right",
         "palm",
     ]
-    assert ["--hand" in step for step in steps] == [False, False, True, True, True]  # markers know no hand
-    assert ["--level" in step for step in steps] == [False, False, False, False, True]  # nor levels
-    assert [step[step.index("--rig") + 1] for step in steps if "solve" in step] == ["d", "w"]
-    assert steps[3][-1] == str(out / "wrist/detections_palm.npz")
-    assert steps[4][-1] == str(out / "wrist")
+    assert ["--hand" in step for step in steps] == [False, False, True, True]  # markers know no hand
+    assert ["--level" in step for step in steps] == [False, False, False, True]
+    assert steps[2][-1] == str(tmp_path / "out/detections_palm.npz")
+    assert steps[3][-4:] == ("--detections", str(tmp_path / "out"), "--out", str(tmp_path / "out"))
+
+
+@pytest.mark.parametrize(("only", "cameras"), [("markers", ["left", "right"]), ("wrist", ["palm"])])
+def test_one_stream_of_both_can_be_replayed_alone(
+    only: str, cameras: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps = steps_of_replay(tmp_path, monkeypatch, only=only)
+    assert [step[step.index("--camera") + 1] for step in steps if "detect" in step] == cameras
+    assert steps[-1][steps[-1].index("--only") + 1] == only
 
 
 def test_the_wrist_device_is_a_rig_like_any_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -168,9 +186,13 @@ def test_a_length_that_is_none_is_refused(seconds: str, capsys: pytest.CaptureFi
     assert " _" not in capsys.readouterr().err, "no name of a function"
 
 
-def rows(rig: str, calibration: Path, out: Path) -> dict[str, list[str]]:
+def rows(
+    rigs: str | tuple[str, ...], calibration: Path, out: Path, scene: str = "standard"
+) -> dict[str, list[str]]:
     """Process -> its command line, in the order of the table."""
-    settings = demo.DemoSettings(1.0, True, out, calibration, rig, 7, "standard")
+    settings = demo.DemoSettings(
+        1.0, True, out, calibration, (rigs,) if isinstance(rigs, str) else rigs, 7, scene
+    )
     return {name: command for name, command, _ in demo._table(settings, 10**12)}
 
 
@@ -201,7 +223,63 @@ def test_a_rig_whose_imu_is_none_is_named(tmp_path: Path) -> None:
         rows("odd", tmp_path, tmp_path)
 
 
+def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path: Path) -> None:
+    table = rows(("desk", "wrist"), ROOT / "calib_json", tmp_path, "grasp@dark")
+    assert list(table) == ["left", "right", "wrist", "imu", "master"]
+    slaves = {name: parser().parse_args(table[name][3:]) for name in list(table)[:-1]}
+    assert [one.rig for one in slaves.values()] == ["desk", "desk", "wrist", "wrist"]
+    # The light is the wrist device's.
+    assert [one.scene for one in slaves.values()] == ["grasp", "grasp", "grasp@dark", "grasp@dark"]
+    master = table["master"]
+    assert [master[k + 1] for k, word in enumerate(master) if word == "--rig"] == ["desk", "wrist"]
+
+
+@pytest.mark.parametrize(
+    ("rigs", "scene", "says"),
+    [
+        (("desk", "wrist"), "standard", "desk, wrist see one hand together only in grasp, both-poses"),
+        (("desk", "desk"), "grasp", "a rig stands twice"),
+        (("desk", "desk4"), "grasp", "'left' stands twice"),
+    ],
+)
+def test_rigs_that_cannot_be_played_together_are_refused(
+    rigs: tuple[str, ...], scene: str, says: str, tmp_path: Path
+) -> None:
+    with pytest.raises(demo.DemoError, match=says):
+        rows(rigs, ROOT / "calib_json", tmp_path, scene)
+
+
+def test_two_hands_are_played_each_by_its_own_scene(tmp_path: Path) -> None:
+    table = rows(("desk", "wrist-left"), ROOT / "calib_json", tmp_path)
+    assert list(table) == ["left", "right", "wrist", "imu", "master"]
+
+
+@pytest.mark.parametrize(
+    ("words", "rigs"),
+    [
+        ([], ("desk",)),
+        (["--scene", "grasp@dark"], ("desk", "wrist")),
+        (["--scene", "grasp", "--rig", "desk"], ("desk",)),
+        (["--wrist", "--scene", "grasp"], ("wrist",)),
+    ],
+)
+def test_a_scene_of_both_kinds_is_played_before_both(
+    words: list[str], rigs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[demo.DemoSettings] = []
+
+    def run(settings: demo.DemoSettings, *_rest: object) -> dict[str, object]:
+        ran.append(settings)
+        return {}
+
+    monkeypatch.setattr(command_line, "run_demo", run)
+    monkeypatch.setattr(command_line, "stop_on_signals", lambda: None)
+    assert main(["demo", "--headless", *words]) == 0
+    assert ran[0].rigs == rigs
+
+
 def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:
-    # The launcher imports nothing of what it starts, so the two numbers stand twice.
+    # The launcher imports nothing of what it starts, so these stand twice.
+    assert demo.TOGETHER == TOGETHER
     assert demo._LATE_MS * 1e6 == LATE_NS
     assert demo._APART_PPM == APART_PPM

@@ -11,7 +11,7 @@ from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_m
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import save_poses
-from master.report import report_scene
+from master.report import Played, report_scene
 from master.rig import RigSetup
 from master.wrist_report import forearm_tilt, lit_view
 from tests.master.test_outputs_rerun import rows_of
@@ -59,7 +59,7 @@ def test_a_run_is_scored_at_the_times_of_its_poses(
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        scene,
+        Played(worn=scene),
         epoch_ns,
         tmp_path,
         {"poses_per_s": 30.0},
@@ -88,7 +88,7 @@ def test_a_run_without_a_pose_keeps_its_figures(setup: RigSetup, scene: WristSce
     full = report_scene(
         tmp_path / "poses.npz",
         setup,
-        scene,
+        Played(worn=scene),
         after_ns,
         tmp_path,
         {"poses": 0},
