@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -173,12 +174,13 @@ def _source(
         return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
     if kind == "synthetic" and not folder:
         from slave.cameras.synthetic import SyntheticCamera
-        from slave.simulated import scene_of
+        from slave.simulated import FrameClock, scene_of
 
         scene = scene_of(options.calibration, rig, options.scene, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
-        return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock, lights=lights)
+        sleep = true_clock.sleep if isinstance(true_clock, FrameClock) else time.sleep
+        return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock, sleep, lights)
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 
@@ -210,13 +212,20 @@ def _record(options: argparse.Namespace) -> int:
     from common.frame_writing import refuse_occupied
     from slave.progress import Length, ProgressDisplay
     from slave.recorder import Recorder, clock_of, feed
-    from slave.simulated import add_imu, imu_of
+    from slave.simulated import FrameClock, add_imu, imu_of
 
     rig, camera = _calibration(options)
     files = {n: options.calibration / "cameras" / f"{n}.json" for n in rig.cameras}
-    true_clock = SystemClock()
+    true_clock: Clock = SystemClock()
+    if options.scene_epoch_ns is None:
+        options.scene_epoch_ns = true_clock.now_ns()
+    if options.every_frame:
+        if options.camera != "synthetic":
+            raise CameraError(f"--every-frame: only a synthetic camera can wait, not {options.camera}")
+        true_clock = FrameClock(options.scene_epoch_ns)
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
-    skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
+    skewed = " as frames are drawn" if options.every_frame else ""
+    skewed += f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
     skewed += f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else ""
     manifest = Manifest(
         version=1,
@@ -227,8 +236,6 @@ def _record(options: argparse.Namespace) -> int:
         clock=clock_of(clock, skewed),
     )
     refuse_occupied(options.output)  # before a camera is opened
-    if options.scene_epoch_ns is None:
-        options.scene_epoch_ns = true_clock.now_ns()
     scene = (options.calibration, rig, options.scene, options.seed)
     imu = imu_of(str(options.camera), *scene) if options.imu == "synthetic" else None
     display = ProgressDisplay(options.name, sys.stderr)

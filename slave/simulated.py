@@ -1,4 +1,5 @@
-"""What a simulated sensor beside this slave senses: the scene before its camera, and the IMU on the hand in it."""
+"""What a simulated sensor beside this slave senses: the scene before its camera, and the IMU on the hand in it; and the
+time of a scene that waits for whoever draws it."""
 
 from pathlib import Path
 
@@ -14,6 +15,22 @@ from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
 from common.sim.scenes import view_by_name
 from common.sim.wrist.scene import WristScene
+
+
+class FrameClock:
+    """The time of a scene that waits: it goes on only where somebody sleeps in it. Holds the time."""
+
+    def __init__(self, start_ns: int) -> None:
+        """Begin at a time [ns]."""
+        self._now_ns = start_ns
+
+    def now_ns(self) -> int:
+        """Return the time [ns]."""
+        return self._now_ns
+
+    def sleep(self, seconds: float) -> None:
+        """Let so many seconds be over."""
+        self._now_ns += round(seconds * 1e9)
 
 
 def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:
