@@ -91,6 +91,7 @@ class HandTracker:
         self._last_ns = 0
         self._seen_ns: int | None = None
         self._told_ns: Int = np.full(6, _NEVER_NS)
+        self._oriented: Orientation | None = None
         self._forget()
 
     def fresh(self) -> "HandTracker":
@@ -98,7 +99,7 @@ class HandTracker:
         other = copy(self)
         other._solver = HandSolver(self.model, self.markers, self._solver.priors)
         other.last, other._last_ns, other._seen_ns = None, 0, None
-        other._told_ns = np.full(6, _NEVER_NS)
+        other._told_ns, other._oriented = np.full(6, _NEVER_NS), None
         other._forget()
         return other
 
@@ -145,6 +146,8 @@ class HandTracker:
         last, dt_s = self.recent(t_ns)
         if last is None:
             self._forget()
+        before = None if last is None else self._turned(last, orientation)
+        self._oriented = orientation
         facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None
         if last is not None:
@@ -152,7 +155,7 @@ class HandTracker:
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, known)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
         age_s = self._ages_s(t_ns, dt_s, told)
-        solution = self._solve(points_m, cov_m2, last, dt_s, held, facing, orientation, age_s, others)
+        solution = self._solve(points_m, cov_m2, before, dt_s, held, facing, orientation, age_s, others)
         if solution is not None and last is not None:
             fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation, others)
             if fresh is not None:
@@ -198,6 +201,15 @@ class HandTracker:
             return found
         weighed = others.weighed(found.angles_rad)
         return found if weighed is None else fit(weighed)
+
+    def _turned(self, last: HandSolution, orientation: Orientation | None) -> HandSolution:
+        """The last hand turned as its orientation says it has turned since: of that it is surer than of itself."""
+        then = self._oriented
+        if orientation is None or then is None:
+            return last
+        T = last.T_rig_palm.copy()
+        T[:3, :3] = orientation.rotation @ then.rotation.T @ T[:3, :3]
+        return replace(last, T_rig_palm=T)
 
     def _knows_place(self) -> bool:
         """Whether it is still known where the hand is, when nothing but its fingers is told."""
