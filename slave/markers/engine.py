@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from common.arrays import Image
+from slave.engines import engine_of
 from slave.markers.blobs import SCALE, Blob, find_blobs
 from slave.markers.centroid import Measured, measure
 from slave.markers.classify import Codes, ColourTable
@@ -15,7 +16,6 @@ ScanBlobs: TypeAlias = Callable[
 Measure: TypeAlias = Callable[
     [Image, ColourTable, Sequence[int], Sequence[Blob], Sequence[bool]], list[Measured | None]
 ]
-ENGINES = ("numpy", "numba")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,16 +50,11 @@ NUMPY = Engine(scan_blobs, measure, _nothing)
 
 
 def engine_named(name: str) -> Engine:
-    """The engine of a name of `ENGINES`.
+    """The engine of a name; raises what `engine_of` raises."""
+    return engine_of(name, NUMPY, _numba)
 
-    Raises:
-        PhalanxError: numba is asked for and not installed; the text says how to install it.
-        ValueError: No such name.
-    """
-    if name == "numpy":
-        return NUMPY
-    if name == "numba":
-        from slave.markers.fast import NUMBA  # an optional package: only who asks for it loads it
 
-        return NUMBA
-    raise ValueError(f"engine {name!r}, not one of {', '.join(ENGINES)}")
+def _numba() -> Engine:
+    from slave.markers.fast import NUMBA
+
+    return NUMBA

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 from common.arrays import Bool, Image, Int
+from slave.engines import engine_of
 from slave.wrist.corridors import Float32
 from slave.wrist.paths import least_paths
 from slave.wrist.pieces import Pieces, measure
@@ -38,16 +39,11 @@ NUMPY = Engine(energy, least_paths, lines, measure)
 
 
 def engine_named(name: str) -> Engine:
-    """The engine of a name, "numpy" or "numba".
+    """The engine of a name; raises what `engine_of` raises."""
+    return engine_of(name, NUMPY, _numba)
 
-    Raises:
-        PhalanxError: numba is asked for and not installed; the text says how to install it.
-        ValueError: No such name.
-    """
-    if name == "numpy":
-        return NUMPY
-    if name == "numba":
-        from slave.wrist.fast import NUMBA  # an optional package: only who asks for it loads it
 
-        return NUMBA
-    raise ValueError(f"engine {name!r}, not numpy or numba")
+def _numba() -> Engine:
+    from slave.wrist.fast import NUMBA
+
+    return NUMBA

@@ -21,6 +21,15 @@ def staged(kind: type[Guard] = Guard, watch: bool = False) -> tuple[Guard, Noted
     return kind(lights, LIMITS, clock, watch), lights, clock
 
 
+def flash(guard: Guard, clock: SetClock, times: int, pulse_ns: int) -> None:
+    """The LEDs, allowed and ended every time, a millisecond apart."""
+    for _ in range(times):
+        assert guard.begin(LED, pulse_ns)
+        clock.t_ns += pulse_ns
+        guard.end()
+        clock.t_ns += MS
+
+
 def misuse(kind: type[Guard]) -> list[str]:
     """What a guard lets happen that it must not; empty: it bites."""
     wrong: list[str] = []
@@ -102,11 +111,7 @@ def test_what_is_refused_and_what_the_watchdog_ends_is_counted() -> None:
 
 def test_duty_is_free_again_when_its_second_is_over() -> None:
     guard, _, clock = staged()
-    for _ in range(20):
-        assert guard.begin(LED, 5 * MS)
-        clock.t_ns += 5 * MS
-        guard.end()
-        clock.t_ns += MS
+    flash(guard, clock, 20, 5 * MS)
     assert not guard.begin(LED, MS)
     assert guard.begin(LASER, MS)  # each light has its own
     guard.end()
@@ -116,11 +121,7 @@ def test_duty_is_free_again_when_its_second_is_over() -> None:
 
 def test_a_pulse_that_is_not_ended_uses_up_no_more_than_its_duty() -> None:
     guard, lights, clock = staged()
-    for _ in range(24):
-        assert guard.begin(LED, 4 * MS)
-        clock.t_ns += 4 * MS
-        guard.end()
-        clock.t_ns += MS
+    flash(guard, clock, 24, 4 * MS)
     assert guard.begin(LED, 3 * MS)  # 4 ms are left
     assert guard.look() == pytest.approx(0.004)
     clock.t_ns += 4 * MS
