@@ -28,6 +28,7 @@ SECTIONS = {
     "joint_certainty": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
     "hidden_fingers": "Flexion and PIP of a finger without a marker, with its neighbours; baseline: alone",
     "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
+    "forearm": "Palm by an IMU on the forearm, with markers and without: heading, bend; simulated, exact truth",
     "imu": "Orientation by rates and forces; truth: BROAD (PHALANX_DATASETS), simulated arms; baseline: imufusion",
     "master": "The master above the bus; and 16 cameras over sealed UDP",
     "sync": "Depth of a hand at 1 m/s from unsynchronised cameras, by rate, offset, motion; baseline: uncorrected",

@@ -150,10 +150,11 @@ class Forearm:
         if state.heading_sigma_rad > _LOST_RAD:
             self.counts["forearm.begun"] += 1
             state, self._rival = state.lost().towards(seen), None
-        likely, density = seen.likely(state)
+        misfit = seen.against(state)
+        likely, density = seen.likely(state, misfit)
         if not (likely or anew):
             state = state.flicked(since_s)
-            likely, density = seen.likely(state)
+            likely, density = seen.likely(state, misfit)
         if not (likely or anew):
             self.counts["forearm.outlier"] += 1
             contrary.append(t_ns)
@@ -161,7 +162,7 @@ class Forearm:
         self.counts["forearm.seen"] += 1
         contrary.clear()
         rival = None if self._rival is None else self._rival.after(since_s, walked_rad2)
-        self._state, self._t_ns, self._drift_rad = state.told(seen), t_ns, found.drift_rad
+        self._state, self._t_ns, self._drift_rad = state.told(seen, misfit), t_ns, found.drift_rad
         self._challenge(t_ns, rival, seen, density)
 
     def _challenge(self, t_ns: int, rival: ForearmState | None, seen: SeenPalm, density: float) -> None:
@@ -171,10 +172,12 @@ class Forearm:
         1976). While there is none a rival leads by e^n no more often than once in e^n (Ville's inequality).
         """
         if rival is None or self._lead < _BEHIND or abs(t_ns - self._rival_ns) > _RIVAL_NS:
-            self._rival, self._rival_ns, self._lead = self._state.anew().towards(seen).told(seen), t_ns, 0.0
+            rival = self._state.anew().towards(seen)
+            self._rival, self._rival_ns, self._lead = rival.told(seen, seen.against(rival)), t_ns, 0.0
             return
-        self._lead += seen.likely(rival)[1] - density
-        self._rival = rival.told(seen)
+        misfit = seen.against(rival)
+        self._lead += seen.likely(rival, misfit)[1] - density
+        self._rival = rival.told(seen, misfit)
         if self._lead > _LEAD:
             self.counts["forearm.begun"] += 1
             self._state, self._rival = self._rival, None

@@ -23,6 +23,7 @@ the covariance keeps what one has to do with the other. By itself
 
 from dataclasses import dataclass
 from math import atan2, exp, pi, radians, remainder, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -133,27 +134,29 @@ class ForearmState:
         mean[HEADING] = atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
         return ForearmState(self.rig_world, self.usual, mean, self.cov)
 
-    def told(self, seen: "SeenPalm") -> "ForearmState":
-        """What a palm leaves of it: an iterated Kalman update (Bell, Cathey 1993), its covariance in Joseph's form."""
+    def told(self, seen: "SeenPalm", misfit: "Misfit") -> "ForearmState":
+        """What a palm, and its misfit to this state, leave of it: an iterated Kalman update (Bell, Cathey 1993)."""
         before = np.zeros(_SIZE)
-        off, gain, slope = self._corrected(seen, before)
+        off, gain = self._corrected(seen, misfit, before)
         for _ in range(_STEPS):
             if np.abs(off - before)[_ANGLES].max() < _NEAR_RAD:
                 break
             before = off
-            off, gain, slope = self._corrected(seen, before)
-        left = np.eye(_SIZE) - gain @ slope
+            misfit = seen.against(ForearmState(self.rig_world, self.usual, self.mean + off, self.cov))
+            off, gain = self._corrected(seen, misfit, before)
+        left = np.eye(_SIZE) - gain @ misfit.slope
         cov = left @ self.cov @ left.T + gain @ seen.fresh @ gain.T
         mean = self.mean + off
         mean[HEADING] = remainder(mean[HEADING], 2.0 * pi)
         return ForearmState(self.rig_world, self.usual, mean, 0.5 * (cov + cov.T))
 
-    def _corrected(self, seen: "SeenPalm", off: Float) -> tuple[Float, Float, Float]:
-        """The correction (12,) of the mean, Kalman's gain (12, 3) and the slope (3, 12), linear about mean + `off`."""
-        missing, slope = seen.against(ForearmState(self.rig_world, self.usual, self.mean + off, self.cov))
-        crossed = slope @ self.cov
-        gain = np.linalg.solve(crossed @ slope.T + seen.fresh, crossed).T.astype(np.float64, copy=False)
-        return gain @ (missing + slope @ off), gain, slope
+    def _corrected(self, seen: "SeenPalm", misfit: "Misfit", off: Float) -> tuple[Float, Float]:
+        """The correction (12,) of the mean and Kalman's gain (12, 3), by a misfit that is linear about mean + `off`."""
+        crossed = misfit.slope @ self.cov
+        gain = np.linalg.solve(crossed @ misfit.slope.T + seen.fresh, crossed).T.astype(
+            np.float64, copy=False
+        )
+        return gain @ (misfit.off_rad + misfit.slope @ off), gain
 
     def flicked(self, step_s: float) -> "ForearmState":
         """The same after a motion of the wrist that is quicker than usual."""
@@ -161,6 +164,13 @@ class ForearmState:
         bent = min(_FLICK_RAD_S * abs(step_s), _FLICK_RAD) ** 2
         cov[_MOTION, _MOTION] += bent * np.eye(2)
         return ForearmState(self.rig_world, self.usual, self.mean, cov)
+
+
+class Misfit(NamedTuple):
+    """The turn (3,) [rad], rig axes, from a state's palm to one that is seen; its derivative (3, 12) by the state."""
+
+    off_rad: Float
+    slope: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,17 +196,17 @@ class SeenPalm:
         root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
         return cls(rotation, world_forearm, root, _FRESH * cov_rad2)
 
-    def against(self, state: ForearmState) -> tuple[Float, Float]:
-        """The turn (3,) [rad], rig axes, from a state's palm to this one, and its derivative (3, 12) by the state."""
+    def against(self, state: ForearmState) -> Misfit:
+        """What it lacks to be as a state has it."""
         palm, slope = state.palm(self.world_forearm)
         slope[:, _ERROR] = self.root
-        return matrix_to_rotation_vector(self.rotation @ palm.T) - self.root @ state.mean[_ERROR], slope
+        off = matrix_to_rotation_vector(self.rotation @ palm.T) - self.root @ state.mean[_ERROR]
+        return Misfit(off, slope)
 
-    def likely(self, state: ForearmState) -> tuple[bool, float]:
+    def likely(self, state: ForearmState, misfit: Misfit) -> tuple[bool, float]:
         """Whether a state makes this palm no outlier, and the logarithm of its density, less a constant."""
-        off, slope = self.against(state)
-        cov = slope @ state.cov @ slope.T + self.fresh
-        square = float(off @ np.linalg.solve(cov, off))
+        cov = misfit.slope @ state.cov @ misfit.slope.T + self.fresh
+        square = float(misfit.off_rad @ np.linalg.solve(cov, misfit.off_rad))
         return square < _BEYOND, -0.5 * (square + float(np.linalg.slogdet(cov)[1]))
 
 

@@ -123,15 +123,16 @@ def test_two_steps_are_one_and_doubt_ends_at_what_is_usual(
 
 
 def test_heading_and_bend_are_learnt_from_palms_that_come_late() -> None:
-    for seed in range(4):
+    for seed in range(2):
         arm, forearm = Arm(2.0 - seed, seed), Forearm(IMU)
-        played(forearm, arm, range(0, 10_000))
+        played(forearm, arm, range(0, 8_000))
         assert heading_off_deg(forearm, arm) < 2.0
+        assert forearm.counts["forearm.begun"] == 1
         assert heading_off_deg(forearm, arm) < 3.0 * np.degrees(forearm.heading_sigma_rad)
-        bend, cov = forearm.bend_at(9_976 * MS)
-        assert np.degrees(np.abs(bend - arm.bend(9_976))).max() < 2.5
+        bend, cov = forearm.bend_at(7_976 * MS)
+        assert np.degrees(np.abs(bend - arm.bend(7_976))).max() < 2.5
         assert sigmas_deg(cov).max() < 5.0
-        assert degrees(at(forearm, 9_984).rotation, arm.palm(9_984)) < 2.0
+        assert degrees(at(forearm, 7_984).rotation, arm.palm(7_984)) < 2.0
 
 
 def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_neither_alone() -> None:
@@ -171,16 +172,16 @@ def test_without_markers_the_bend_is_believed_less_and_less_and_the_heading_stay
     arm, forearm = Arm(), Forearm(IMU)
     played(forearm, arm, range(0, 8_000))
     learnt = forearm.heading_rad
-    played(forearm, arm, range(8_000, 18_000), seen=False)
-    times = (8_000, 8_200, 8_500, 9_000, 10_000, 17_900)
+    played(forearm, arm, range(8_000, 14_000), seen=False)
+    times = (8_000, 8_200, 8_500, 9_000, 10_000, 13_900)
     sigma = np.array([sigmas_deg(forearm.bend_at(t * MS)[1]) for t in times])
     assert (np.diff(sigma, axis=0) > 0.0).all()
     assert sigma[-1, 0] < 14.2  # of any wrist
     assert sigma[-1, 1] < 11.5
-    early, late = (forearm.bend_at(t * MS)[0] for t in (8_200, 17_900))
+    early, late = (forearm.bend_at(t * MS)[0] for t in (8_200, 13_900))
     assert np.abs(late).max() < np.abs(early).max()
     assert forearm.heading_rad == learnt
-    found = at(forearm, 17_900)
+    found = at(forearm, 13_900)
     assert 10.0 < np.degrees(np.sqrt(np.trace(found.cov_rad2))) < 20.0
     assert np.linalg.eigvalsh(found.cov_rad2).min() > 0.0
 
@@ -200,14 +201,15 @@ def test_what_is_no_palm_is_left_out_and_counted() -> None:
     np.testing.assert_array_equal(at(forearm, 3_984).rotation, before)
 
 
-@pytest.mark.parametrize("jump_deg", [180.0, -120.0, 100.0])
+@pytest.mark.parametrize("jump_deg", [180.0, -100.0, 50.0, -20.0])
 def test_a_heading_that_jumps_is_learnt_anew(jump_deg: float) -> None:
     arm, forearm = Arm(), Forearm(IMU)
     played(forearm, arm, range(0, 4_000))
     arm.heading_rad += radians(jump_deg)
-    played(forearm, arm, range(4_000, 12_000))
-    assert heading_off_deg(forearm, arm) < 4.0
-    assert degrees(at(forearm, 11_984).rotation, arm.palm(11_984)) < 3.0
+    played(forearm, arm, range(4_000, 7_200))
+    assert heading_off_deg(forearm, arm) < 3.0 * np.degrees(forearm.heading_sigma_rad) < 15.0
+    assert degrees(at(forearm, 7_184).rotation, arm.palm(7_184)) < 3.0
+    assert forearm.counts["forearm.begun"] == 2
 
 
 def test_an_imu_that_begins_anew_has_no_heading_until_a_palm_is_seen() -> None:
@@ -217,7 +219,7 @@ def test_an_imu_that_begins_anew_has_no_heading_until_a_palm_is_seen() -> None:
     arm.heading_rad -= 0.5  # too little to be seen as a jump
     played(forearm, arm, range(6_000, 6_096), seen=False, drift=0.001)
     assert forearm.palm_at(6_090 * MS) is None
-    played(forearm, arm, range(6_096, 16_000), drift=0.001)
+    played(forearm, arm, range(6_096, 10_000), drift=0.001)
     assert heading_off_deg(forearm, arm) < 3.0
 
 
@@ -283,7 +285,8 @@ def held(rng: np.random.Generator) -> Iterator[bool]:
             break
         exact = SeenPalm.of(palm, COV, world_forearm)
         error = rotation_vector_to_matrix(exact.root @ truth.mean[9:] + drawn(rng, exact.fresh))
-        believed = believed.told(SeenPalm.of(error @ palm, COV, world_forearm))
+        seen = SeenPalm.of(error @ palm, COV, world_forearm)
+        believed = believed.told(seen, seen.against(believed))
     expected, slope = believed.palm(world_forearm)
     off = matrix_to_rotation_vector(palm @ expected.T)
     yield bool(off @ np.linalg.solve(slope @ believed.cov @ slope.T, off) < 7.815)
