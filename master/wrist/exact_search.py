@@ -11,7 +11,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.wrist.candidates import Found, apart, joined
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
-from master.wrist.pose_table import PoseTable
+from master.wrist.pose_table import Forward
 
 NOTHING = 1e-9  # of energy: what rounding leaves of it, and 1e-4 degrees or less
 _STEPS = 24
@@ -32,7 +32,7 @@ _STALLED = 1e3  # of damping: steps are then of no length
 class ExactSearch:
     """Follows poses of one hand before one device down to where they explain what was seen best. Holds no state."""
 
-    def __init__(self, poses: FingerPoses, table: PoseTable) -> None:
+    def __init__(self, poses: FingerPoses, table: Forward) -> None:
         self._poses, self._table = poses, table
 
     def __call__(self, found: Found, wanted: Bool, seen: Float, white: Float) -> Found:

@@ -8,6 +8,7 @@ MCP and IP are closed together, in shares of their ranges as in `NaturalCurve`.
 What is seen are four numbers: where the laser meets the finger (2, on its plane), and its tip in the image (2).
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import transform
 from common.hand_limits import ABDUCTION, FLEXION
+from common.hand_model import Chains
 from master.wrist.fingertip import Fingertips
 from master.wrist.forward import ASIDE_RAD, BEYOND_RAD, DIP, PIP, NaturalCurve
 from master.wrist.laser_cut import LaserCut
@@ -60,6 +62,17 @@ class FingerPoses:
         self.low[:, ABDUCTION], self.high[:, ABDUCTION] = -aside, aside
         self._dip = self._curve.slope[:, DIP], self._curve.base_rad[:, DIP], limits[:, DIP].T
 
+    def bent(self, setup: WristSetup) -> "FingerPoses":
+        """The same hand before another palm pose."""
+        other = copy(self)
+        other._setup, other._cut = setup, self._cut.bent(setup)
+        return other
+
+    @property
+    def curve(self) -> NaturalCurve:
+        """How fingers bend naturally."""
+        return self._curve
+
     @property
     def dip_per_pip(self) -> Float:
         """(5,) how far the last joint bends with the one before."""
@@ -78,9 +91,23 @@ class FingerPoses:
         out[..., DIP] = np.clip(base + slope * x[..., PIP], low, high)
         return out
 
+    def angles_of(self, x: Float, finger: Int) -> tuple[Float, Float]:
+        """Angles (N, 4) [rad] of unknowns (N, 3) of fingers (N,), and how the last joint follows the PIP there (N,)."""
+        slope, base, limits = self._dip
+        dip = base[finger] + slope[finger] * x[:, PIP]
+        low, high = limits[:, finger]
+        free = (dip > low) & (dip < high)
+        return np.concatenate([x, np.clip(dip, low, high)[:, None]], axis=1), np.where(
+            free, slope[finger], 0.0
+        )
+
     def tips(self, angles_rad: Float) -> Float:
         """Tips (..., 5, 3) [m], camera frame, of angles (..., 5, 4)."""
-        return transform(self._setup.T_camera_palm, self._tips.points(self._setup.model.chains(angles_rad)))
+        return transform(self._setup.T_camera_palm, self.tips_in_palm(angles_rad))
+
+    def tips_in_palm(self, angles_rad: Float) -> Float:
+        """Tips (..., 5, 3) [m], palm frame, of angles (..., 5, 4)."""
+        return self._tips.points(self._setup.model.chains(angles_rad))
 
     def views(self, x: Float, wanted: Bool, cut: LaserCut | None = None) -> Views:
         """What is seen of some of the fingers with unknowns (N, 5, 3): the `wanted` (N, 5); NaN of the others."""
@@ -96,17 +123,22 @@ class FingerPoses:
         seen[..., 2:] = tips[..., :2] / tips[..., 2:]
         return Views(seen, length)
 
-    def of_fingers(self, x: Float, finger: Int) -> tuple[Float, Float]:
+    def of_fingers(self, x: Float, finger: Int, cut: LaserCut | None = None) -> tuple[Float, Float]:
         """What is seen (N, 4) of poses (N, 3) of fingers (N,), each its own, and the lengths of the lines (N,) [px]."""
-        rank = np.empty(len(x), np.int64)
-        for f in range(5):
-            of = finger == f
-            rank[of] = np.arange(np.count_nonzero(of))
+        rank = _ranks(finger)
         rows = int(rank.max(initial=-1)) + 1
         grid, wanted = np.zeros((rows, 5, UNKNOWNS)), np.zeros((rows, 5), np.bool_)
         grid[rank, finger], wanted[rank, finger] = x, True
-        views = self.views(grid, wanted)
+        views = self.views(grid, wanted, cut)
         return views.seen[rank, finger], views.length_px[rank, finger]
+
+    def chains(self, angles_rad: Float, finger: Int) -> Chains:
+        """The joints (N, 4, ...), palm frame, of angles (N, 4) of fingers (N,), each its own."""
+        rank = _ranks(finger)
+        grid = np.zeros((int(rank.max(initial=-1)) + 1, 5, 4))
+        grid[rank, finger] = angles_rad
+        chains = self._setup.model.chains(grid)
+        return Chains(chains.position_m[rank, finger], chains.rotation[rank, finger])
 
     def tips_shown(self, x: Float) -> Bool:
         """Whether the camera sees the tips (N, 5) of unknowns (N, 5, 3), or these lie just behind a finger's edge."""
@@ -120,3 +152,12 @@ class FingerPoses:
             first = first_hits(np.zeros(3), rays, spheres[:, f], self._skin.radius_m[f])
             out[:, f] = first.min(axis=(1, 2)) > away[:, f] - BEHIND_M
         return out
+
+
+def _ranks(finger: Int) -> Int:
+    """Of rows of fingers (N,) the how manieth of its finger each is (N,)."""
+    rank = np.empty(len(finger), np.int64)
+    for f in range(5):
+        of = finger == f
+        rank[of] = np.arange(np.count_nonzero(of))
+    return rank

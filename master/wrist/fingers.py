@@ -24,7 +24,11 @@ from common.wrist_bend import STRAIGHT
 from master.filters import OneEuroParameters, PointFilter
 from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
+from master.wrist.bend_slope import BendSlope
+from master.wrist.bent import BentView, BentWrist
+from master.wrist.bent_closing import closings
 from master.wrist.cubic import CubicLaw
+from master.wrist.finger_poses import FingerPoses
 from master.wrist.forward import ForwardTable
 from master.wrist.inverse import InverseModel
 from master.wrist.invert import Inverse
@@ -32,10 +36,12 @@ from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_poi
 from master.wrist.levels import Levels, Sighting
 from master.wrist.light_unit import LightUnit
 from master.wrist.setup import WristSetup
+from master.wrist.sight import SightNoise
 
 FORGET_S = 0.5
 _LINGERS_S = 0.5  # a hand at work has another pose after that: sooner, poses tell the same of the light
 NEVER_NS = -(2**62)
+_NO_TIPS = np.full((5, 2), np.nan), np.full(5, np.nan)
 _AWAY_M = 0.1  # of fingertips from the camera, where a filter must know millimetres
 
 
@@ -83,10 +89,13 @@ class WristFingers:
         self.counts = counts
         self._setup, self._stage, self._continuous = setup, stage, continuous
         self._axes = PlaneAxes.of(setup)
+        poses = FingerPoses(setup) if model is None else model.poses
+        self._bent = BentWrist(setup, poses)
         self.inverse = Inverse(ForwardTable.of(setup)) if inverse is None else inverse
         table = self.inverse.table
         self._believe = AngleBelief(setup, table)
         self._cubic = CubicLaw(setup, table) if setup.cubic else None
+        self._slope = BendSlope(SightNoise(setup), self._believe.habits, poses.dip_per_pip)
         self._levels = None if setup.level == "fk" else Levels(setup, model or InverseModel(setup))
         self._smooth, self._smooth_tips = (
             _point_filter(setup, self._axes) if continuous else None for _ in range(2)
@@ -124,34 +133,44 @@ class WristFingers:
             )
             self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("angles"):
-            found = self._angles_of(t_ns, message, points)
+            found, by_bend = self._angles_of(t_ns, message, points, bend_rad)
         seen = np.isfinite(found.angles_rad[:, 0])
         self._angles[seen], self._seen_ns[seen] = found.angles_rad[seen], t_ns
         self._count("past", found.past)
         self._count("off", found.off)
         self._count("ambiguous", found.ambiguous)
-        return SeenFingers(t_ns, found, points.point_m, np.zeros((5, 4, 2)))
+        return SeenFingers(t_ns, found, points.point_m, by_bend)
 
-    def _angles_of(self, t_ns: int, message: WristDetections, points: LaserPoints) -> FingerAngles:
-        """What laser and tips say of the fingers."""
+    def _angles_of(
+        self, t_ns: int, message: WristDetections, points: LaserPoints, bend_rad: Float
+    ) -> tuple[FingerAngles, Float]:
+        """What laser and tips say of the fingers, and how it changes with the bend (5, 4, 2)."""
         point = points.point_m
         if self._smooth is not None:
             point = self._smooth.push(t_ns, point, points.cov_m2)
         flat, cov = self._axes.flat(point), self._axes.flat_cov(points.cov_m2)
-        closed = self.inverse(flat)
+        view = self._bent.at(bend_rad) if bend_rad.any() else None
+        closed = self.inverse(flat) if view is None else closings(view, self.inverse.table, flat)
         if self._cubic is not None:
             closed = self._cubic(flat, closed)
-        natural = self._believe(closed, cov, point[:, 2], message.laser_px)
-        if self._levels is None:
-            return natural
-        tip, sigma_px = self._tips(t_ns, message)
+        found = self._believe(closed, cov, point[:, 2], message.laser_px)
+        tip, sigma_px = _NO_TIPS if self._levels is None else self._tips(t_ns, message)
         sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px, message.tip_depth)
+        if self._levels is not None:
+            found = self._by_level(self._levels, t_ns, found, sight, view)
+        at = (view or self._bent.at(bend_rad)).crossings(np.nan_to_num(found.angles_rad), np.arange(5))
+        return found, self._slope(at, found, sight)
+
+    def _by_level(
+        self, levels: Levels, t_ns: int, natural: FingerAngles, sight: Sighting, view: BentView | None
+    ) -> FingerAngles:
+        """What laser and tips say together."""
         fresh = self._continuous & (1e-9 * (t_ns - self._seen_ns) <= FORGET_S)
         last = np.where(fresh[:, None], self._angles, np.nan)
         gone_s = 1e-9 * (t_ns - self._told_ns)
         news = -np.expm1(-gone_s / _LINGERS_S) if self._continuous else 1.0
         self._told_ns = t_ns
-        found, refused = self._levels(natural, sight, last, self._light, float(news))
+        found, refused = levels(natural, sight, last, self._light, float(news), view)
         self._count("tip_refused", refused)
         self._count("ik", found.level == Level.IK)
         return found

@@ -21,6 +21,7 @@ An unknown at the end of its range stays there while the energy falls towards th
 1982).
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +31,7 @@ from master.wrist.candidates import MINIMA, Found, apart
 from master.wrist.exact_search import ExactSearch
 from master.wrist.finger_poses import SEEN, FingerPoses
 from master.wrist.forward import PIP
-from master.wrist.pose_table import PoseTable
+from master.wrist.pose_table import Forward, PoseTable
 from master.wrist.setup import WristSetup
 
 _PROFILE_STEPS, _TABLE_STEPS, _EXACT_STEPS = 2, 2, 3
@@ -67,9 +68,15 @@ class InverseModel:
 
     def __init__(self, setup: WristSetup) -> None:
         self.poses = FingerPoses(setup)
-        self.table = PoseTable(setup, self.poses)
+        self.table: Forward = PoseTable(setup, self.poses)
         self._search = ExactSearch(self.poses, self.table)
         self._loose = 12.0 / (self.poses.high - self.poses.low) ** 2  # (5, 3): anywhere within the range
+
+    def bent(self, poses: FingerPoses, table: Forward) -> "InverseModel":
+        """The same hand before another palm pose."""
+        other = copy(self)
+        other.poses, other.table, other._search = poses, table, ExactSearch(poses, table)
+        return other
 
     def __call__(self, seen: Float, cov: Float, coarse_rad: Float | None = None) -> Minima:
         """The minima.

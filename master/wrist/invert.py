@@ -18,7 +18,7 @@ _LONGEST = np.array([8.0, 2.0])  # rows and columns that one step may go
 _OUTSIDE = np.array([30.0, 2.0])  # rows and columns beyond the table that are still told apart
 _GRID_M = 1.5e-3
 _AROUND_M = 0.02  # beyond all points of the branch
-_PAST_M = 2e-3  # nearer to the device than the end of its branch by more than this, a point is past it
+PAST_M = 2e-3  # nearer to the device than the end of its branch by more than this, a point is past it
 _CORNERS = np.array([[0, 0], [0, 1], [1, 0], [1, 1]])
 
 
@@ -66,7 +66,7 @@ class Inverse:
         nodes = (self._first + cell[:, 0] * self._shape[:, 1] + cell[:, 1])[:, None] + self._offset
         value = (weight[:, None] @ self._values[nodes])[:, 0]
         value[~seen, :2] = np.nan
-        past = value[:, 3] > _PAST_M
+        past = value[:, 3] > PAST_M
         past &= np.isfinite(value[:, 0])
         by_angles = value[:, 5:].reshape(5, 2, 4)
         return Closed(value[:, 0], value[:, 1], by_angles, value[:, 2], value[:, 4], past)

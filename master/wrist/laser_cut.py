@@ -10,6 +10,7 @@ skin with the root of its angle. Where the line goes out of the camera's sight, 
 seen and the first that is not counts by share: as far as the edge of the phalanx that hides the rest, or of its own.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,12 @@ class LaserCut:
     def __init__(self, setup: WristSetup, rays: int = RAYS) -> None:
         self._setup, self._skin, self._axes = setup, Skin.of(setup.model), PlaneAxes.of(setup)
         self._nodes = -_INSIDE * np.cos(np.pi * np.arange(rays) / (rays - 1))
+
+    def bent(self, setup: WristSetup) -> "LaserCut":
+        """The same hand before another palm pose of this device."""
+        other = copy(self)
+        other._setup = setup
+        return other
 
     def __call__(self, angles_rad: Float) -> tuple[Float, Float, Float]:
         """Laser points (5, C, A, 2) [m] of angles (C, A, 5, 4), and where on the finger they lie.

@@ -29,14 +29,15 @@ from common.arrays import Bool, Float, Int
 from common.messages import Level
 from master.ik.priors import Priors
 from master.wrist.belief import FingerAngles
-from master.wrist.finger_poses import SEEN, UNKNOWNS
+from master.wrist.bent import BentView
+from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
 from master.wrist.forward import DIP, PIP
 from master.wrist.inverse import InverseModel, Minima
 from master.wrist.light_unit import LightUnit
 from master.wrist.pose_table import SHAPE
 from master.wrist.setup import WristSetup
 from master.wrist.sight import HARDLY, SightNoise
-from master.wrist.valley import Valley, Valleys
+from master.wrist.valley import RATIOS, STIFF_RAD, Valley, Valleys
 
 _REFUSED = 9.0
 _AS_GOOD = 3.84  # chi-square of one degree of freedom, 95 %: poses whose misfits differ by less explain alike
@@ -45,10 +46,6 @@ _PASS = 0.4  # of the lower top that a density falls below between two parts
 _OTHER = 0.05  # of all belief: less than this is no other part
 _GOES_ON_RAD = np.radians(20.0)  # by which a PIP may have moved since the finger was last seen
 _CONTRADICTED = 0.01  # less probable than this, a natural hand is none
-_RATIOS = 0.5 * (
-    0.84 - 2.0 / 3.0
-)  # the papers' DIP per PIP lie by this to both sides of their middle (row I12)
-_STIFF_RAD = np.radians(1.0)
 _FLESH_RAD = np.radians(2.5)  # 2 mm of a tip that is not quite where the hand file has it, over two bones
 _CLEARLY_RAD, _INSIDE_PX = np.radians(10.0), 20.0  # by which a tip is in sight that is hardly ever missed
 _SHOWN = np.log(10.0)  # of ten tips that the model says are seen nine are found
@@ -82,13 +79,19 @@ class Levels:
 
     def __init__(self, setup: WristSetup, model: InverseModel, priors: Priors | None = None) -> None:
         priors = priors or Priors()
-        self._model, self._poses, self._table, self._hand = model, model.poses, model.table, setup.model
-        self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, model.table, priors)
+        self._model, self._hand = model, setup.model
+        self._sight, self._valleys = SightNoise(setup), Valleys(model.poses, priors)
         self._alone, self._optics = setup.level == "ik", setup.optics
         self._share = np.log([priors.natural_share, *2 * [0.5 * (1.0 - priors.natural_share)]])
 
     def __call__(
-        self, natural: FingerAngles, sight: Sighting, last_rad: Float, unit: LightUnit, news: float = 1.0
+        self,
+        natural: FingerAngles,
+        sight: Sighting,
+        last_rad: Float,
+        unit: LightUnit,
+        news: float = 1.0,
+        view: BentView | None = None,
     ) -> tuple[FingerAngles, Bool]:
         """Angles of fingers, and whose tip was refused (5,).
 
@@ -98,31 +101,33 @@ class Levels:
             last_rad: (5, 4) the fingers' last angles; NaN where those are too old.
             unit: What is known of the unit of `sight.tip_depth`; it is told more.
             news: How far this pose is from the last one: 1 where they are unrelated.
+            view: What is seen at the bend of the wrist; None: it is straight.
         """
+        model = self._model if view is None else self._model.bent(view.poses, view)
         seen = np.concatenate([sight.laser_m, sight.tip], axis=1)
         both: Bool = np.isfinite(seen.sum(axis=1))
-        nodes, energy = self._table.candidates(np.where(both[:, None], seen, 0.0))
+        nodes, energy = model.table.candidates(np.where(both[:, None], seen, 0.0))
         nodes[~(np.isfinite(energy) & both[:, None])] = np.nan
         noise = self._noise(sight, both)
-        valley = self._valleys(nodes, np.where(both[:, None], seen, np.nan), noise)
+        valley = self._valleys(model.poses, model.table, nodes, np.where(both[:, None], seen, np.nan), noise)
         believed = both & (valley.misfit.min(axis=1) < _REFUSED)
         mixed, habit = self._mixed(valley, believed)
         x = np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)
-        depth_m = self._poses.tips(self._poses.angles(x))[..., 2].T
+        depth_m = model.poses.tips(model.poses.angles(x))[..., 2].T
         log = mixed + unit.push(
             np.where(believed, sight.tip_depth, np.nan), depth_m, _probable(mixed, believed), news
         )
         least = None
         if self._alone:
             coarse_rad = self._sight.turn_rad(sight.tip_sigma_px, sight.distance_m)
-            minima = self._model(np.where(believed[:, None], seen, np.nan), noise, coarse_rad)
+            minima = model(np.where(believed[:, None], seen, np.nan), noise, coarse_rad)
             least = _least(minima, valley, log, last_rad)
         found, at = self._angles(valley, log, believed, last_rad, least)
         shown = self._sight.shown(valley.length_px[np.arange(5), at], sight.laser_px)
         solved = believed & (shown >= HARDLY)
-        kept = natural if habit > _CONTRADICTED else self._free(natural, sight, solved)
+        kept = natural if habit > _CONTRADICTED else self._free(model, natural, sight, solved)
         if not self._alone:
-            hidden = self._should_show(kept, np.isnan(sight.tip[:, 0]))
+            hidden = self._should_show(model.poses, kept, np.isnan(sight.tip[:, 0]))
             kept = replace(kept, told=kept.told & ~hidden, off=kept.off | hidden)
         kept = replace(kept, angles_rad=kept.angles_rad.copy(), cov_rad2=kept.cov_rad2.copy())
         kept.angles_rad[solved], kept.cov_rad2[solved] = found.angles_rad[solved], found.cov_rad2[solved]
@@ -156,7 +161,7 @@ class Levels:
         hands = of_all - np.logaddexp.reduce(of_all)
         return np.logaddexp.reduce(hands[:, None, None] + valley.log), float(np.exp(hands[0]))
 
-    def _should_show(self, natural: FingerAngles, unseen: Bool) -> Bool:
+    def _should_show(self, poses: FingerPoses, natural: FingerAngles, unseen: Bool) -> Bool:
         """Fingers (5,) whose tip is not seen though habit has it in sight and other fingers show theirs.
 
         They are bent otherwise, or something hides the tip.
@@ -168,26 +173,30 @@ class Levels:
         x = np.nan_to_num(natural.angles_rad[:, :UNKNOWNS]) + np.array([-1.0, 0.0, 1.0])[
             :, None, None
         ] * np.array([0.0, 0.0, _CLEARLY_RAD])
-        tips = self._poses.tips(self._poses.angles(x))
+        tips = poses.tips(poses.angles(x))
         uv = self._optics.project(tips)
         size = np.array([self._optics.width_px, self._optics.height_px])
         inside = ((uv > _INSIDE_PX) & (uv < size - _INSIDE_PX)).all(axis=-1)
-        return asked & (inside & self._poses.tips_shown(x)).all(axis=0)
+        return asked & (inside & poses.tips_shown(x)).all(axis=0)
 
-    def _free(self, natural: FingerAngles, sight: Sighting, solved: Bool) -> FingerAngles:
+    def _free(
+        self, model: InverseModel, natural: FingerAngles, sight: Sighting, solved: Bool
+    ) -> FingerAngles:
         """Fingers of a hand that is not natural, of which the laser point alone is known: what is possible."""
         point = np.isfinite(sight.laser_m[:, 0]) & np.isfinite(natural.angles_rad[:, 0]) & ~solved
         if not point.any():
             return natural
         start = np.repeat(natural.angles_rad[:, None, :UNKNOWNS], SHAPE[PIP], axis=1)
-        start[..., PIP] = self._table.first[:, None, PIP] + self._table.step[:, None, PIP] * np.arange(
+        start[..., PIP] = model.table.first[:, None, PIP] + model.table.step[:, None, PIP] * np.arange(
             SHAPE[PIP]
         )
         start[~point] = np.nan
         nobody = np.zeros(5, np.bool_)
-        valley = self._valleys(start, sight.laser_m, self._noise(sight, nobody)[:, :2, :2])
+        valley = self._valleys(
+            model.poses, model.table, start, sight.laser_m, self._noise(sight, nobody)[:, :2, :2]
+        )
         log = np.logaddexp(valley.log[1], valley.log[2])
-        log[self._poses.tips_shown(np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)).T] -= _SHOWN
+        log[model.poses.tips_shown(np.swapaxes(np.nan_to_num(valley.x_rad), 0, 1)).T] -= _SHOWN
         found, _ = self._angles(valley, log, point, np.full((5, 4), np.nan))
         point &= valley.misfit.min(axis=1) < _REFUSED
         angles, cov = natural.angles_rad.copy(), natural.cov_rad2.copy()
@@ -217,7 +226,7 @@ class Levels:
         away = x - chosen[:, None]
         cov = np.swapaxes(away, 1, 2) @ (p[..., None] * away)
         cov[:, :2, :2] += (p[..., None, None] * np.nan_to_num(valley.side_rad2)).sum(axis=1)
-        cov[:, range(UNKNOWNS), range(UNKNOWNS)] += _STIFF_RAD**2
+        cov[:, range(UNKNOWNS), range(UNKNOWNS)] += STIFF_RAD**2
         cov[:, PIP, PIP] += _FLESH_RAD**2
         other = (p * (np.abs(away[..., PIP]) > _APART_RAD)).sum(axis=1) > _OTHER
         ambiguous = known & ((parted & other) | twice)
@@ -227,11 +236,11 @@ class Levels:
         """Four angles of three unknowns (5, 3)."""
         by = np.zeros((5, 4, UNKNOWNS))
         by[:, range(UNKNOWNS), range(UNKNOWNS)] = 1.0
-        by[:, DIP, PIP] = self._poses.dip_per_pip
+        by[:, DIP, PIP] = self._model.poses.dip_per_pip
         whole = by @ cov @ np.swapaxes(by, 1, 2)
-        loose = max(self._hand.dip_spread_rad, _STIFF_RAD)
-        whole[:, DIP, DIP] += loose**2 + (_RATIOS * x[:, PIP]) ** 2
-        angles = self._hand.clamp(self._poses.angles(x))
+        loose = max(self._hand.dip_spread_rad, STIFF_RAD)
+        whole[:, DIP, DIP] += loose**2 + (RATIOS * x[:, PIP]) ** 2
+        angles = self._hand.clamp(self._model.poses.angles(x))
         level = np.where(solved, np.uint8(Level.IK), np.uint8(Level.NONE))
         no = np.zeros(5, np.bool_)
         return FingerAngles(angles, whole, solved, no, no, level, ambiguous)

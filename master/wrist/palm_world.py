@@ -42,7 +42,7 @@ class PalmWorld:
         """
         self._imu, self._imu_palm = imu, turn_of("q_palm_imu", imu.q_palm_imu).T
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self.samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
+        self.samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
 
     def push(self, t_ns: int, wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world, and how far its heading has drifted if told."""

@@ -6,6 +6,8 @@ weight, and much more than the noise. So the weights are constants of the table,
 squares, is one product of matrices:  sum w (y - o)^2 = sum w y^2 - 2 (w y) o + w o^2.
 """
 
+from typing import Protocol
+
 import numpy as np
 import numpy.typing as npt
 
@@ -26,15 +28,50 @@ _CORNERS = np.array(np.unravel_index(np.arange(8), (2, 2, 2))).T  # (8, 3)
 _LAST_CELL = np.array(SHAPE) - 2.0
 
 
+class Forward(Protocol):
+    """What is seen of every finger in any of its poses, from a table or in closed form. As of `PoseTable`."""
+
+    first: Float
+    step: Float
+    met: Bool
+    exact: bool
+
+    def candidates(self, seen: Float) -> tuple[Float, Float]:
+        """Poses that may explain what was seen, one for each PIP."""
+        ...
+
+    def starts(self, seen: Float, finger: int, count: int) -> Float:
+        """More of them, of one finger."""
+        ...
+
+    def views(self, x: Float, finger: Int) -> tuple[Float, Float, Float]:
+        """What is seen of poses, its derivatives, and the length of the line."""
+        ...
+
+    def points(self, x: Float, finger: Int) -> Float:
+        """Laser points alone."""
+        ...
+
+    def mended(self, x: Float, finger: Int) -> "Forward":
+        """The same, as exact as a valley asks for at these poses."""
+        ...
+
+    def doubt(self, x: Float, finger: Int) -> Float:
+        """By how much the laser points may be wrong, twice."""
+        ...
+
+
 class PoseTable:
     """The table of one device and hand. What it holds was prepared by the constructor, which takes about a second.
 
     Attributes:
         first, step: (5, 3) [rad] the lowest node, and from node to node.
         met: (5,) whether the laser meets the finger in any pose.
+        exact: It is as exact as a valley asks for.
     """
 
     def __init__(self, setup: WristSetup, poses: FingerPoses) -> None:
+        self.exact = True
         self.first = poses.low
         self.step = (poses.high - poses.low) / (np.array(SHAPE) - 1.0)
         cut = LaserCut(setup, _RAYS)
@@ -117,6 +154,14 @@ class PoseTable:
         found[:, :SEEN] += (towards @ by_step.reshape(-1, 8 * UNKNOWNS, SEEN))[:, 0]
         J = found[:, SEEN + 1 :].reshape(-1, UNKNOWNS, SEEN) / step[..., None]
         return found[:, :SEEN], np.swapaxes(J, 1, 2), found[:, SEEN]
+
+    def points(self, x: Float, finger: Int) -> Float:
+        """Laser points (N, 2) [m] alone."""
+        return self.views(x, finger)[0][:, :2]
+
+    def mended(self, x: Float, finger: Int) -> "PoseTable":
+        """Itself: for what is read along a valley a table is exact enough."""
+        return self
 
     def doubt(self, x: Float, finger: Int) -> Float:
         """How far the corners of a cell differ in what they say of the laser point (N, 2) [m] of poses (N, 3).

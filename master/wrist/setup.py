@@ -1,6 +1,6 @@
 """What the master knows of one wrist device before the first message: device and hand, its laser, how to read it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -8,6 +8,7 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import CameraCalibration, FilterCalibration, ImuCalibration, RigCalibration, Volume
 from common.hand_model import FINGERS, HandModel
+from common.wrist_bend import forearm_palm
 from common.wrist_calibration import FingerLine
 from common.wrist_device import WristDevice
 
@@ -65,3 +66,9 @@ class WristSetup(WristDevice):
             late_ns=round(1e3 * rig.stamp_offset_us.get(camera.name, 0.0)),
             imu=rig.imu if rig.imu is not None and rig.imu.q_palm_imu is not None else None,
         )
+
+    def bent(self, bend_rad: Float) -> "WristSetup":
+        """The same before the palm of a wrist that is bent by (2,) [rad] (`common.wrist_bend`)."""
+        T = self.T_camera_palm.copy()
+        T[:3, :3] = T[:3, :3] @ forearm_palm(bend_rad)
+        return replace(self, T_camera_palm=T)

@@ -27,15 +27,17 @@ from common.hand_limits import ABDUCTION, FLEXION
 from master.ik.priors import FreeHand, Priors
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
 from master.wrist.forward import DIP, PIP
-from master.wrist.pose_table import PoseTable
+from master.wrist.pose_table import Forward
 
 _FINE = 4  # steps of the density from node to node
 _STEPS = 4
+_ROUGH_STEPS, _MENDED_STEPS = 2, 2  # before the laser's cut is asked, and after it
+_HOPELESS = 60.0  # it is not asked of poses whose misfit is worse than the best by so much
 _FARTHEST_RAD = np.radians(15.0)  # of one step
-_RATIOS = 0.5 * (
+RATIOS = 0.5 * (
     0.84 - 2.0 / 3.0
 )  # the papers' DIP per PIP lie by this to both sides of their middle (row I12)
-_STIFF_RAD = np.radians(1.0)
+STIFF_RAD = np.radians(1.0)
 _LOOSE = 1e-2
 _STRAIGHT_RAD = np.radians(10.0)  # by which stretched fingers are bent
 _NUDGE_RAD = np.radians(2.0)
@@ -74,8 +76,8 @@ class Valley:
 class Valleys:
     """Finds them for one device and hand. What it holds was prepared by the constructor."""
 
-    def __init__(self, poses: FingerPoses, table: PoseTable, priors: Priors) -> None:
-        self._poses, self._table = poses, table
+    def __init__(self, poses: FingerPoses, priors: Priors) -> None:
+        self._low, self._high = poses.low, poses.high
         free = priors.free or FreeHand()
         self._range = 12.0 / (poses.high - poses.low)[:, None, :2] ** 2
         slope, base = poses.habit
@@ -86,10 +88,11 @@ class Valleys:
         self._stray = np.full((5, 1), priors.natural_flexion)
         self._stray[0] = priors.thumb
 
-    def __call__(self, start_rad: Float, seen: Float, R: Float) -> Valley:
+    def __call__(self, poses: FingerPoses, table: Forward, start_rad: Float, seen: Float, R: Float) -> Valley:
         """Valleys.
 
         Args:
+            poses, table: What is seen of the fingers, at the bend of their wrist.
             start_rad: (5, P, 3) poses at the PIP of the table's nodes; NaN: of this one nothing is to be said.
             seen: (5, M) the first M numbers that were seen: 4, or 2 where no tip was.
             R: (5, M, M) their covariance, finite.
@@ -98,21 +101,35 @@ class Valleys:
         finger, node = np.nonzero(np.isfinite(start_rad[..., 0]) & np.isfinite(seen.sum(axis=1))[:, None])
         x = start_rad[finger, node]
         side = np.array([ABDUCTION, FLEXION])
-        low, high = self._poses.low[finger][:, side], self._poses.high[finger][:, side]
+        low, high = self._low[finger][:, side], self._high[finger][:, side]
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(R)), np.float64)[finger]
-        for _ in range(_STEPS):
-            y, J, _ = self._table.views(x, finger)
-            to, _ = self._to(white, seen[finger] - y[:, :numbers], J[:, :numbers, :2], finger)
-            x = x.copy()
-            x[:, side] = np.clip(x[:, side] + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high)
-        y, J, length_px = self._table.views(x, finger)
+
+        def stepped(x: Float, by: Forward) -> Float:
+            y, J, _ = by.views(x, finger)
+            to, _ = self._to(white, np.nan_to_num(seen[finger] - y[:, :numbers]), J[:, :numbers, :2], finger)
+            out = x.copy()
+            out[:, side] = np.clip(x[:, side] + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high)
+            return out
+
+        for _ in range(_STEPS if table.exact else _ROUGH_STEPS):
+            x = stepped(x, table)
+        if not table.exact:
+            y, _, _ = table.views(x, finger)
+            off = (white @ np.nan_to_num(seen[finger] - y[:, :numbers])[..., None])[..., 0]
+            near = _near(np.vecdot(off, off), finger)
+            finger, node = finger[near], node[near]
+            x, white, low, high = x[near], white[near], low[near], high[near]
+            table = table.mended(x, finger)
+            for _ in range(_MENDED_STEPS):
+                x = stepped(x, table)
+        y, J, length_px = table.views(x, finger)
         # What a DIP that is not where the coupling has it does to the laser point.
         wide = R[finger].copy()
         moved = np.zeros((len(x), numbers))
-        dip = np.hypot(_STIFF_RAD, _RATIOS * x[:, PIP])
-        moved[:, :2] = self._jump(x, finger, y) * np.hypot(_STIFF_RAD, _RATIOS * x[:, PIP])[:, None]
+        dip = np.hypot(STIFF_RAD, RATIOS * x[:, PIP])[:, None]
+        moved[:, :2] = np.nan_to_num(self._jump(table, x, finger, y)) * dip
         if numbers == SEEN:
-            moved[:, 2:] = self._by_dip(x, finger) * dip[:, None]
+            moved[:, 2:] = _by_dip(poses, x, finger) * dip
         wide += moved[:, :, None] * moved[:, None]
         root = np.linalg.cholesky(wide)
         white = np.asarray(np.linalg.inv(root), np.float64)
@@ -121,27 +138,16 @@ class Valleys:
         log_R = np.log(np.einsum("nii->ni", root)).sum(axis=1)
         return self._fine(start_rad.shape[1], finger, node, (x, off, S, log_R, length_px))
 
-    def _jump(self, x: Float, finger: Int, y: Float) -> Float:
+    def _jump(self, table: Forward, x: Float, finger: Int, y: Float) -> Float:
         """How the laser point moves with the PIP alone (N, 2) [m/rad], over a node to both sides."""
-        step = self._table.step[finger, PIP]
-        low, high = self._poses.low[finger, PIP], self._poses.high[finger, PIP]
+        step = table.step[finger, PIP]
+        low, high = self._low[finger, PIP], self._high[finger, PIP]
         ends: list[Float] = []
         for sign in (-1.0, 1.0):
             near = x.copy()
             near[:, PIP] = np.clip(x[:, PIP] + sign * step, low, high)
-            ends.append(np.abs(self._table.views(near, finger)[0][:, :2] - y[:, :2]))
+            ends.append(np.abs(table.points(near, finger) - y[:, :2]))
         return np.maximum(ends[0], ends[1]) / step[:, None]
-
-    def _by_dip(self, x: Float, finger: Int) -> Float:
-        """How tips move with the DIP alone (N, 2) [1/rad]."""
-        order = np.arange(len(x))
-        many = np.zeros((len(x), 5, UNKNOWNS))
-        many[order, finger] = x
-        angles = self._poses.angles(many)
-        before = self._poses.tips(angles)[order, finger]
-        angles[..., DIP] += _NUDGE_RAD
-        after = self._poses.tips(angles)[order, finger]
-        return (after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]) / _NUDGE_RAD
 
     def _to(self, white: Float, off: Float, J: Float, finger: Int) -> tuple[Float, Float]:
         slope = white @ J
@@ -172,7 +178,7 @@ class Valleys:
         det = np.maximum(S[..., 0, 0] * S[..., 1, 1] - S[..., 0, 1] ** 2, 1e-30)
         log = -0.5 * misfit - rows[..., -2] + 0.5 * np.log(det)
         log = np.nan_to_num(log, nan=-np.inf, neginf=-np.inf)
-        step = np.log(self._table.step[:, None, PIP] / _FINE)
+        step = np.log((self._high - self._low)[:, None, PIP] / (nodes - 1.0) / _FINE)
         hands = np.stack([log + step + habit for habit in self._habits(x, S)])
         return Valley(x, S, rows[..., -1], misfit, log, hands)
 
@@ -191,3 +197,22 @@ class Valleys:
 
 def _normal(off: Float, sigma: Float) -> Float:
     return -0.5 * (off / sigma) ** 2 - np.log(sigma * np.sqrt(2.0 * np.pi))
+
+
+def _near(misfit: Float, finger: Int) -> Int:
+    """Which of poses (N,) of fingers (N,) are not hopeless."""
+    least = np.full(5, np.inf)
+    np.minimum.at(least, finger, misfit)
+    return np.flatnonzero(misfit < least[finger] + _HOPELESS)
+
+
+def _by_dip(poses: FingerPoses, x: Float, finger: Int) -> Float:
+    """How tips move with the DIP alone (N, 2) [1/rad]."""
+    order = np.arange(len(x))
+    many = np.zeros((len(x), 5, UNKNOWNS))
+    many[order, finger] = x
+    angles = poses.angles(many)
+    before = poses.tips(angles)[order, finger]
+    angles[..., DIP] += _NUDGE_RAD
+    after = poses.tips(angles)[order, finger]
+    return (after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]) / _NUDGE_RAD

@@ -1,0 +1,55 @@
+"""How the angles that light tells of fingers change with the bend of the wrist that they are told for.
+
+What is seen stays, and its model moves: with G how it moves with the angles, B with the bend, R how sure it is and H
+what else is believed of the angles, the least of  (y - f)' R^-1 (y - f) + a' H a  goes by
+
+    da / db = -(G' R^-1 G + H)^-1 G' R^-1 B
+"""
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.messages import Level
+from master.wrist.belief import FingerAngles
+from master.wrist.finger_poses import SEEN
+from master.wrist.forward import DIP, PIP
+from master.wrist.levels import Sighting
+from master.wrist.ridge import Crossings
+from master.wrist.sight import SightNoise
+
+_ANYWHERE_RAD = np.radians(35.0)  # joints of hands at work, about their mean
+_COUPLED_RAD = np.radians(5.0)  # of the last joint about its coupling, where a tip was seen
+
+
+class BendSlope:
+    """Of one device and hand. What it holds was prepared by the constructor."""
+
+    def __init__(self, noise: SightNoise, habits: Float, dip_per_pip: Float) -> None:
+        """Join the parts.
+
+        Args:
+            noise: Of what is seen.
+            habits: (5, 4, 4) information [1/rad^2] of fingers whose laser point alone is known.
+            dip_per_pip: (5,) how far the last joint bends with the one before.
+        """
+        self._noise, anywhere = noise, np.eye(4) / _ANYWHERE_RAD**2
+        self._by_habit: Float = habits + anywhere
+        row = np.zeros((5, 4))
+        row[:, PIP], row[:, DIP] = -dip_per_pip, 1.0
+        self._loose: Float = anywhere + row[:, :, None] * row[:, None] / _COUPLED_RAD**2
+
+    def __call__(self, at: Crossings, found: FingerAngles, sight: Sighting) -> Float:
+        """Derivatives (5, 4, 2) of the angles that were found; `at`: what is seen there. 0: nothing is known."""
+        both: Bool = found.level == Level.IK
+        told = np.isfinite(found.angles_rad[:, 0]) & np.isfinite(sight.laser_m[:, 0])
+        whole = np.ones(5)
+        weight = np.zeros((5, SEEN, SEEN))
+        laser = self._noise.laser_m2(sight.laser_cov_m2, sight.distance_m, whole, whole)
+        laser[found.past, 1, 1] = 1.0  # along, such a point says nothing
+        weight[told, :2, :2] = np.linalg.inv(laser[told])
+        both &= told
+        tip = self._noise.tip(sight.tip_sigma_px, sight.distance_m)
+        weight[both, 2:, 2:] = np.linalg.inv(tip[both])
+        pull = np.swapaxes(at.by_angles, 1, 2) @ weight
+        H = pull @ at.by_angles + np.where(both[:, None, None], self._loose, self._by_habit)
+        return -np.asarray(np.linalg.solve(H, pull @ at.by_bend), np.float64)
