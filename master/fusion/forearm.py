@@ -5,8 +5,11 @@ where up is in the rig; the heading about it is nobody's until markers have told
 is that of `master.fusion.forearm_state`; here is what comes and goes: samples, palms, sessions and clocks.
 
 While nobody sees the palm, the bend goes back to its habit, as far as that is known, and its doubt grows to that of
-wrists in general; the heading drifts. Nothing is switched. A palm that is quite unlikely is left out; if what
-comes contradicts for long, the heading has jumped, and everything is learnt anew.
+wrists in general; the heading drifts. Nothing is switched. A palm that is quite unlikely is left out.
+
+An IMU that restarts lies in a new world. Mostly it tells so: silent for a while, it begins to count its drift again. If
+not, palms that contradict for long say it, where the heading jumped by much. Where by little, that looks like a bend:
+so a rival that began lately, with any heading, learns beside, and takes over once it foretells the palms far better.
 """
 
 from collections import Counter
