@@ -33,12 +33,11 @@ from master.options import (
     BusEnd,
     Calibration,
     KeyFile,
-    Rig,
     Rigs,
     address,
 )
 from master.outputs.files import path_of_hand
-from master.rig import load_setup, load_setups, setups_with_hands
+from master.rig import load_setups, setups_with_hands
 from master.solve import rigs_to_solve, solve_hands
 from master.stopping import stop_on_signals
 from master.study.command import evaluate_app
@@ -157,7 +156,7 @@ def solve_command(
 
 @app.command()
 def view(
-    rig: Rig = "desk",
+    rig: Rigs,
     calibration: Calibration = CALIB_JSON,
     hand: Hand = None,
     bus: BusEnd = HERE_BUS,
@@ -173,11 +172,15 @@ def view(
 
       phalanx-master view --rig desk
 
+      phalanx-master view --rig desk --rig wrist
+
+      phalanx-master view --rig desk --rig wrist
+
       phalanx-master view --rig desk --bus tcp/192.168.1.2:47802 --web
     """
     from master.outputs.rerun import run_viewer
 
-    setup = load_setup(calibration, rig, hand)
+    setups = load_setups(calibration, rig, hand)
     stop = stop_on_signals()
     connection = _bus_of_master(bus, stop)
     if connection is None:
@@ -186,9 +189,7 @@ def view(
         mode = "save" if save is not None else "web" if web else "spawn"
         run_viewer(
             connection,
-            setup.rig,
-            setup.cameras,
-            setup.hand,
+            setups,
             mode=mode,
             path=save,
             stop=stop,

@@ -110,7 +110,7 @@ def report_scene(
     tell("drawing the hand", 0, 1)
     picture, truth = out / "hand.png", judged.truth
     draw_summary(picture, poses, setup.rig, setup.hand, figures, truth, row, judged.wrist)
-    write_rrd(out / "run.rrd", poses, setup.rig, setup.cameras, setup.hand, truth=truth, images=judged.images)
+    write_rrd(out / "run.rrd", poses, setup, truth=truth, images=judged.images)
     return full
 
 

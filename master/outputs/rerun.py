@@ -10,7 +10,7 @@ import logging
 import os
 import tempfile
 import threading
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,8 @@ import rerun as rr
 
 from common.arrays import Image
 from common.bus import Bus, Subscription
-from common.calibration import CameraCalibration, RigCalibration
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
-from common.hand_model import HandModel
 from common.messages import Detections, HandPose, Health, Message, Preview
 from common.streams import MASTER
 from master.outputs.poses import Poses
@@ -32,6 +30,7 @@ from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
+from master.rig import RigSetup
 
 Mode = Literal["spawn", "web", "save"]
 
@@ -71,9 +70,7 @@ class _Feeds:
 
 def run_viewer(
     bus: Bus,
-    rig: RigCalibration,
-    cameras: Mapping[str, CameraCalibration],
-    hand: HandModel,
+    setups: Sequence[RigSetup],
     *,
     mode: Mode,
     path: Path | None,
@@ -85,7 +82,7 @@ def run_viewer(
 
     Args:
         bus: Where hands, health and previews are published and the cameras can be asked; left open.
-        rig, cameras, hand: What is tracked; `cameras` by name, with intrinsics.
+        setups: What watches each hand.
         mode: "spawn" a window, serve the "web" viewer on 127.0.0.1, or "save" an .rrd.
         path: The .rrd of mode "save"; None otherwise.
         stop: Set from another thread or a signal handler.
@@ -107,9 +104,9 @@ def run_viewer(
         feeds = _Feeds.of(bus)
         stack.callback(feeds.close)
         recording, alive = stack.enter_context(_opened(mode, path, web_port, on_ready))
-        recording.send_blueprint(blueprint(rig, _rate_hz(cameras), live=mode != "save", with_truth=False))
-        scene = RerunScene(recording, rig, cameras, hand)
-        asker = PreviewAsker(bus, rig.cameras)
+        recording.send_blueprint(blueprint(setups, live=mode != "save", with_truth=False))
+        scene = RerunScene(recording, setups)
+        asker = PreviewAsker(bus, tuple(dict.fromkeys(name for one in setups for name in one.camera_names)))
         stack.callback(asker.close)
         return _pump(scene, recording, feeds, lambda: alive() and not stop.is_set())
 
@@ -117,9 +114,7 @@ def run_viewer(
 def write_rrd(
     path: Path,
     poses: Poses,
-    rig: RigCalibration,
-    cameras: Mapping[str, CameraCalibration],
-    hand: HandModel,
+    setup: RigSetup,
     detections: Mapping[str, Iterable[Detections]] | None = None,
     truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
@@ -129,7 +124,7 @@ def write_rrd(
     Args:
         path: The file; replaced only by a complete one.
         poses: The run.
-        rig, cameras, hand: What was tracked.
+        setup: What watched the hand.
         detections: Camera -> its frames in the order of time, on the clock of the poses.
         truth: Row by row with `poses`.
         images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
@@ -138,8 +133,8 @@ def write_rrd(
         RecordingError: The file cannot be written; nothing half written is left.
     """
     with _saved(path) as recording:
-        recording.send_blueprint(blueprint(rig, _rate_hz(cameras), live=False, with_truth=truth is not None))
-        scene = RerunScene(recording, rig, cameras, hand)
+        recording.send_blueprint(blueprint([setup], live=False, with_truth=truth is not None))
+        scene = RerunScene(recording, [setup])
         for start in range(0, len(poses), _ROWS_A_CHUNK):
             stop = min(start + _ROWS_A_CHUNK, len(poses))
             scene.log_poses(poses.rows(start, stop), truth.rows(start, stop) if truth is not None else None)
@@ -182,11 +177,6 @@ def _waiting(feed: Subscription, kind: type[_Kind]) -> list[_Kind]:
         if isinstance(message, kind):
             received.append(message)
     return received
-
-
-def _rate_hz(cameras: Mapping[str, CameraCalibration]) -> float:
-    """Frame rate of the fastest camera."""
-    return max((camera.frame_rate_hz for camera in cameras.values()), default=0.0)
 
 
 def _drain(hands: Subscription) -> list[HandPose]:

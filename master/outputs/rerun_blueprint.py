@@ -1,12 +1,14 @@
 """How the viewer is laid out when it opens: the scene on the left, cameras below it, plots on the right."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from common.calibration import RigCalibration
 from common.messages import Source
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
+from master.rig import RigSetup
 
 TIMELINE = "capture"
 WORLD = "world"
@@ -17,6 +19,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     ("Latency [ms]", "plots/latency_ms", (0.0, 60.0), False),
     (_RATE, "plots/rate_hz", None, False),
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
+    ("Bend of the wrist [deg]", "plots/wrist_bend_deg", None, True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
     ("Joints tracked; markers, or laser points, seen", "plots/seen", (0.0, 30.0), True),
@@ -38,21 +41,25 @@ def camera_path(camera: str) -> str:
     return rr.new_entity_path([WORLD, "cameras", camera])
 
 
-def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bool) -> rrb.Blueprint:
-    """The saved layout for `rig`; plots follow the last 10 s of a live run and show all of a recorded one.
+def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rrb.Blueprint:
+    """The saved layout; plots follow the last 10 s of a live run and show all of a recorded one.
 
     Args:
-        rig: Names the cameras.
-        rate_hz: Of the fastest camera; sets the range of that plot.
+        setups: What watches each hand.
         live: The data streams in.
         with_truth: There is a truth to show errors against.
     """
+    cameras = {name: camera for setup in setups for name, camera in setup.cameras.items()}
+    rate_hz = max(camera.frame_rate_hz for camera in cameras.values())  # of the fastest
+    with_markers = any(setup.has_markers for setup in setups)
+    with_bend = any(setup.has_markers and setup.wrist is not None for setup in setups)
+    hidden = [f"- {WORLD}/hand/{setup.hand.profile.name}/uncertainty" for setup in setups]
     span = rrb.VisibleTimeRange(
         TIMELINE,
         start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_PLOT_SPAN_S),
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
-    position, target = (_WRIST_EYE_M, _WRIST_TARGET_M) if rig.kind == "wrist" else (_eye_of(rig), _TARGET_M)
+    position, target = (_eye_of(setups), _TARGET_M) if with_markers else (_WRIST_EYE_M, _WRIST_TARGET_M)
     eye = rrb.EyeControls3D(position=position, look_target=target, eye_up=(0.0, -1.0, 0.0))
     scene = rrb.Spatial3DView(
         origin="/",  # above the world: a wrist device's is turned as the forearm is held
@@ -62,17 +69,18 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=eye,
     )
-    cameras = [
+    views = [
         rrb.Spatial2DView(
             origin=camera_path(name),
-            contents=["$origin/**", f"{WORLD}/hand/**", f"- {WORLD}/hand/{rig.hand}/uncertainty"],
+            contents=["$origin/**", f"{WORLD}/hand/**", *hidden],
             name=f"Camera {name}",
             background=_BACKGROUND,
         )
-        for name in rig.cameras
+        for name in cameras
     ]
-    left_out = {"plots/jitter_mm"} if rig.kind == "wrist" else set[str]()
-    left_out |= set() if with_truth else {"plots/error_mm"}
+    left_out = {name for name, there in (
+        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend)
+    ) if not there}  # fmt: skip
     rows = [
         (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
         for n, p, r, several in _PLOTS
@@ -93,7 +101,7 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
-                scene, rrb.Grid(*cameras, grid_columns=min(len(cameras), _CAMERAS_A_ROW)), row_shares=[3, 2]
+                scene, rrb.Grid(*views, grid_columns=min(len(views), _CAMERAS_A_ROW)), row_shares=[3, 2]
             ),
             rrb.Vertical(tabs, *plots[:-_TABS], row_shares=[1.5] + [1] * (len(plots) - _TABS)),
             column_shares=[3, 2],
@@ -104,10 +112,11 @@ def blueprint(rig: RigCalibration, rate_hz: float, *, live: bool, with_truth: bo
     )
 
 
-def _eye_of(rig: RigCalibration) -> tuple[float, float, float]:
-    """Where the scene is looked at from [m], so that every camera of the rig is in the picture."""
+def _eye_of(setups: Sequence[RigSetup]) -> tuple[float, float, float]:
+    """Where the scene is looked at from [m], so that every camera that stands still is in the picture."""
     target, eye = np.array(_TARGET_M), np.array(_EYE_M)
-    reach = max(float(np.linalg.norm(rig.camera_pose(name)[:3, 3] - target)) for name in rig.cameras)
+    models = [model for setup in setups if setup.has_markers for model in setup.models.values()]
+    reach = max(float(np.linalg.norm(model.centre - target)) for model in models)
     if reach > _BESIDE_M:
         eye = target + 1.5 * reach * (eye - target) / np.linalg.norm(eye - target)
     x, y, z = (float(value) for value in eye)
@@ -124,6 +133,8 @@ def legend() -> str:
         + "\n- **red joint**: an angle is at its limit\n- **thin grey hand**: the truth, where it is known\n"
         "- of a wrist device: **red fan**: its laser; **points in it**: where that meets each finger; **yellow, grey "
         "lines**: sights of the camera to these points, and to the tips that are tracked\n"
+        "- **pink bar behind the wrist**: the forearm that wears the device, beside cameras of markers; **pink ring**: "
+        "where its end is at 2 sigma of the wrist's bend\n"
         "- **small dim / large bright markers**: before / after the filter\n"
         "- **ellipsoids**: 2 sigma of the finger tips, where that is less than 3 cm\n"
         "- **grey box**: the volume that the rig states; outside it, accuracy was not tested\n"

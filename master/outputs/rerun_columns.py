@@ -60,6 +60,16 @@ class Columns:
         )
         self.send(path, t_ns, columns, shown.sum(axis=1))
 
+    def lines(self, path: str, t_ns: Int, strips: Float, colour: int, radius_m: float) -> None:
+        """One line a row through its points (T, K, 3); none where one of them is NaN."""
+        shown = np.asarray(seen(strips).all(axis=1))
+        columns = rr.LineStrips3D.columns(
+            strips=list(strips[shown]),
+            radii=np.full(shown.sum(), radius_m),
+            colors=np.full(shown.sum(), colour, np.uint32),
+        )
+        self.send(path, t_ns, columns, np.asarray(shown, np.int64))
+
     def scalars(self, path: str, t_ns: Int, values: Float) -> None:
         """One number a row; NaN is sent as such: the viewer breaks the line there, and would bridge a missing row."""
         self.send(path, t_ns, rr.Scalars.columns(scalars=values), None)

@@ -13,19 +13,22 @@ style.
     world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips, up to 3 cm
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
-    world/laser, ...                     of a wrist device, in place of the markers: see `rerun_wrist`
+    world/laser, ...                     of a wrist device, alone or beside the markers: see `rerun_wrist`
     world/truth/skeleton, markers        where a truth is known
-    plots/...                            latency, rate, jitter, error, PIP angles, counts, health
+    plots/...                            latency, rate, jitter, error, PIP angles, bend of the wrist, counts, health
+
+Of several hands the first has these paths; markers, truth and plots of another carry its name behind their group
+(`world/markers/HAND/raw`, `plots/pip_deg/HAND/index`).
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
 from common.arrays import Bool, Float, Image, Int
-from common.calibration import CameraCalibration, RigCalibration, Volume
+from common.calibration import Volume
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_limits import FLEXION
@@ -39,7 +42,7 @@ from master.outputs.rerun_columns import PIXEL_CENTRE, Columns, seen
 from master.outputs.rerun_images import CameraImages
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
-from master.wrist.setup import WristSetup
+from master.rig import RigSetup
 
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (WRIST, 7, 12, 17, 22, WRIST))
 _STRIP_SOURCE = (*TIPS.tolist(), WRIST)
@@ -56,42 +59,47 @@ _FRUSTUM_M, _FRUSTUM_LINE_M, _AXES_M = 0.06, 0.0004, 0.01
 
 
 class RerunScene:
-    """Logs one rig and its hands to `recording`, which belongs to the caller."""
+    """Logs what watches each hand, and the hands, to `recording`, which belongs to the caller."""
 
-    def __init__(
-        self,
-        recording: rr.RecordingStream,
-        rig: RigCalibration,
-        cameras: Mapping[str, CameraCalibration],
-        hand: HandModel,
-    ) -> None:
+    def __init__(self, recording: rr.RecordingStream, setups: Sequence[RigSetup]) -> None:
         """Log what never changes: frames, frusta, names and colours of plots.
 
-        Raises:
-            CalibrationError: A camera of the rig has no intrinsics, or a wrist device no laser plane or palm pose.
+        Args:
+            recording: Where it goes.
+            setups: One for each hand; cameras that several of them have are shown once.
         """
         self._rec, self._rows = recording, Columns(recording)
-        self._markers = () if rig.kind == "wrist" else rig.markers
-        self._hand = hand
-        self._models = {name: CameraModel.of(cameras[name], rig.camera_pose(name)) for name in rig.cameras}
+        self._first = setups[0]
+        self._setups = {setup.hand.profile.name: setup for setup in setups}
+        self._models = {name: model for setup in setups for name, model in setup.models.items()}
+        self._devices: dict[str, WristLayer] = {}
         self._recent_ns: Int = np.empty(0, np.int64)
         self._styled: set[str] = set()
-        self._images = CameraImages(recording, self._models)
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
         recording.log("about", rr.TextDocument(legend(), media_type="text/markdown"), static=True)
-        if rig.volume is not None:
-            self._log_volume(rig.volume)
+        if self._first.rig.volume is not None:
+            self._log_volume(self._first.rig.volume)
         for name, model in self._models.items():
             self._log_camera(name, model)
-        self._wrist = None
-        if rig.kind == "wrist":
-            name = rig.cameras[0]
-            setup = WristSetup.of(rig, cameras[name], hand)
-            self._wrist = WristLayer(recording, name, self._models[name], setup, fan_rays(rig, setup))
-        for i, name in enumerate(self._markers):
-            self._rows.name(f"plots/jitter_mm/{name}", name, series_rgb(i))
-        for i, name in enumerate(FINGERS):
-            self._rows.name(f"plots/pip_deg/{name}", name, series_rgb(i))
+        worn = {
+            name: setup.wrist.optics
+            for setup in setups
+            if setup.wrist is not None
+            for name in setup.wrist_cameras
+        }
+        for name in worn.keys() - self._models.keys():
+            self._log_lens(name, worn[name])  # beside markers; where it is changes
+        self._images = CameraImages(recording, self._models | worn)
+        for hand, setup in self._setups.items():
+            if setup.wrist is not None and setup.wrist_rig is not None:
+                spread, in_rig = fan_rays(setup.wrist_rig, setup.wrist), setup.has_markers
+                camera = setup.wrist_rig.cameras[0]
+                self._devices[hand] = WristLayer(recording, camera, setup.wrist, spread, in_rig=in_rig)
+            group = self._group(hand)
+            for i, name in enumerate(setup.markers):
+                self._rows.name(f"plots/jitter_mm{group}/{name}", name, series_rgb(i))
+            for i, name in enumerate(FINGERS):
+                self._rows.name(f"plots/pip_deg{group}/{name}", name, series_rgb(i))
 
     @property
     def last_t_ns(self) -> int | None:
@@ -102,27 +110,28 @@ class RerunScene:
         """Log a batch of poses of one hand, in the order of time, and their truth row by row."""
         if not len(poses):
             return
-        root = rr.new_entity_path([WORLD, "hand", poses.hand])
-        self._log_hand(root, poses)
-        if self._wrist is not None:
-            self._wrist.log_poses(poses)
-        else:
-            self._log_markers(poses)
-        self._log_plots(poses)
+        setup = self._setups.get(poses.hand, self._first)
+        self._log_hand(rr.new_entity_path([WORLD, "hand", poses.hand]), poses, setup.hand)
+        if (device := self._devices.get(setup.hand.profile.name)) is not None:
+            device.log_poses(poses)
+        if setup.has_markers:
+            self._log_markers(poses, setup)
+        self._log_plots(poses, setup)
         if truth is not None:
             self._log_truth(poses, truth)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""
         frames = list(detections)
-        if self._wrist is not None and frames:
-            self._wrist.log_detections([frame for frame in frames if isinstance(frame, WristDetections)])
-            return
+        triples = [frame for frame in frames if isinstance(frame, WristDetections)]
+        for hand, device in self._devices.items():
+            if triples and triples[0].camera in self._setups[hand].wrist_cameras:
+                device.log_detections(triples)
         markers = [frame for frame in frames if isinstance(frame, MarkerDetections)]
         if not markers:
             return
         uv = np.array([frame.uv for frame in markers])
-        colours = np.broadcast_to(self._marker_colours(uv.shape[1]), uv.shape[:2])
+        colours = np.broadcast_to(_marker_colours(uv.shape[1]), uv.shape[:2])
         t_ns = np.array([frame.t_ns for frame in markers], np.int64)
         self._rows.pixels(f"{camera_path(markers[0].camera)}/detections", t_ns, uv, colours, _DETECTED_PX)
 
@@ -147,7 +156,12 @@ class RerunScene:
         self._rec.log(f"{WORLD}/volume", box, static=True)
 
     def _log_camera(self, name: str, model: CameraModel) -> None:
-        pose, path = model.T_rig_camera, camera_path(name)
+        pose = model.T_rig_camera
+        place = rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+        self._rec.log(camera_path(name), place, static=True)
+        self._log_lens(name, model)
+
+    def _log_lens(self, name: str, model: CameraModel) -> None:
         matrix = model.matrix.copy()
         matrix[:2, 2] += PIXEL_CENTRE
         pinhole = rr.Pinhole(
@@ -158,15 +172,13 @@ class RerunScene:
             color=TRUTH_RGB,
             line_width=_FRUSTUM_LINE_M,
         )
-        self._rec.log(
-            path,
-            rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
-            rr.TransformAxes3D(_AXES_M),
-            pinhole,
-            static=True,
-        )
+        self._rec.log(camera_path(name), rr.TransformAxes3D(_AXES_M), pinhole, static=True)
 
-    def _log_hand(self, root: str, poses: Poses) -> None:
+    def _group(self, hand: str) -> str:
+        """What stands behind a group's path for the entities of a hand."""
+        return "" if hand == self._first.hand.profile.name else rr.new_entity_path([hand])
+
+    def _log_hand(self, root: str, poses: Poses, hand: HandModel) -> None:
         valid, at = poses.valid, poses.position_m
         shown = np.stack([valid[:, list(strip)].all(axis=1) for strip in _STRIPS], axis=1)
         palette = pack([SOURCE_RGB[source] for source in Source])
@@ -183,20 +195,10 @@ class RerunScene:
         colours = np.where(poses.tracked, colours, dim(colours))
         radii = (poses.radius_m * _JOINT_SHOWN)[valid]
         self._rows.points(f"{root}/joints", poses.t_ns, at, valid, colours, radii)
-        limit = self._at_limit(poses.angles_rad) & valid
+        limit = _at_limit(poses.angles_rad, hand) & valid
         red = np.full(limit.shape, pack([LIMIT_RGB])[0])
         self._rows.points(f"{root}/at_limit", poses.t_ns, at, limit, red, (poses.radius_m * 0.55)[limit])
         self._log_uncertainty(f"{root}/uncertainty", poses)
-
-    def _at_limit(self, angles_rad: Float) -> Bool:
-        """Joints (T, 26) one of whose angles has reached its limit; a fixed angle does not count."""
-        low, high = self._hand.limits_at(angles_rad[..., FLEXION])
-        reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
-        reached &= high - low > 2 * _AT_LIMIT_RAD
-        joints = np.zeros((len(angles_rad), 26), np.bool_)
-        for finger, angle in np.ndindex(5, 4):
-            joints[:, _HINGE_OF_ANGLE[finger, angle]] |= reached[:, finger, angle]
-        return joints
 
     def _log_uncertainty(self, path: str, poses: Poses) -> None:
         cov = poses.cov_m2[:, TIPS]
@@ -218,46 +220,51 @@ class RerunScene:
             self._styled.add(path)
         self._rows.send(path, poses.t_ns, ellipsoids, known.sum(axis=1))
 
-    def _log_markers(self, poses: Poses) -> None:
-        colours = np.broadcast_to(self._marker_colours(poses.marker_count), poses.markers_m.shape[:2])
+    def _log_markers(self, poses: Poses, setup: RigSetup) -> None:
+        group = self._group(poses.hand)
+        colours = np.broadcast_to(_marker_colours(poses.marker_count), poses.markers_m.shape[:2])
         for name, at, radius in (("raw", poses.markers_raw_m, 0.0025), ("filtered", poses.markers_m, 0.004)):
             tint = dim(colours) if name == "raw" else colours
-            self._rows.points(f"{WORLD}/markers/{name}", poses.t_ns, at, seen(at), tint, radius)
+            self._rows.points(f"{WORLD}/markers{group}/{name}", poses.t_ns, at, seen(at), tint, radius)
         raw = poses.markers_raw_m
-        for name, model in self._models.items():
+        for name, model in setup.models.items():
             path = rr.new_entity_path([WORLD, "rays", name])
-            self._rows.rays(path, poses.t_ns, model.centre, raw, int(pack([RAY_RGB], alpha=110)[0]))
+            self._rows.rays(
+                f"{path}{group}", poses.t_ns, model.centre, raw, int(pack([RAY_RGB], alpha=110)[0])
+            )
             uv = model.project(raw)
-            self._rows.pixels(f"{camera_path(name)}/markers", poses.t_ns, uv, colours, _MARKER_PX)
+            self._rows.pixels(f"{camera_path(name)}/markers{group}", poses.t_ns, uv, colours, _MARKER_PX)
 
-    def _log_plots(self, poses: Poses) -> None:
-        t = poses.t_ns
+    def _log_plots(self, poses: Poses, setup: RigSetup) -> None:
+        t, group = poses.t_ns, self._group(poses.hand)
         if poses.latency_ns.any():  # all zero: an offline run, which has none
-            self._rows.scalars("plots/latency_ms", t, poses.latency_ns.astype(np.float64) * 1e-6)
-        self._rows.scalars("plots/rate_hz", t, self._rate_hz(t))
+            self._rows.scalars(f"plots/latency_ms{group}", t, poses.latency_ns.astype(np.float64) * 1e-6)
+        self._rows.scalars(f"plots/rate_hz{group}", t, self._rate_hz(t))
         step = distance_m(poses.markers_raw_m, poses.markers_m) * 1e3
         for m in range(poses.marker_count):
-            name = self._markers[m] if m < len(self._markers) else f"marker-{m}"
-            self._rows.scalars(rr.new_entity_path(["plots", "jitter_mm", name]), t, step[:, m])
+            name = setup.markers[m] if m < len(setup.markers) else f"marker-{m}"
+            self._rows.scalars(f"plots/jitter_mm{group}{rr.new_entity_path([name])}", t, step[:, m])
         for f, name in enumerate(FINGERS):
-            self._rows.scalars(f"plots/pip_deg/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
-        self._rows.scalars("plots/seen/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64))
-        if self._wrist is None:
+            self._rows.scalars(f"plots/pip_deg{group}/{name}", t, np.rad2deg(poses.angles_rad[:, f, _PIP]))
+        self._rows.scalars(
+            f"plots/seen{group}/joints_tracked", t, poses.tracked.sum(axis=1).astype(np.float64)
+        )
+        if setup.has_markers:
             markers = seen(poses.markers_raw_m).sum(axis=1)
-            self._rows.scalars("plots/seen/markers", t, markers.astype(np.float64))
+            self._rows.scalars(f"plots/seen{group}/markers", t, markers.astype(np.float64))
 
     def _log_truth(self, poses: Poses, truth: PosesTruth) -> None:
-        t, at = poses.t_ns, truth.joints_m
+        t, at, group = poses.t_ns, truth.joints_m, self._group(poses.hand)
         known = np.stack([np.isfinite(at[:, list(strip)]).all(axis=(1, 2)) for strip in _STRIPS], axis=1)
         strips = _strips(at, known)
         grey = np.full(len(strips), pack([TRUTH_RGB])[0])
         columns = rr.LineStrips3D.columns(strips=strips, colors=grey, radii=np.full(len(strips), 0.0008))
-        self._rows.send(f"{WORLD}/truth/skeleton", t, columns, known.sum(axis=1))
+        self._rows.send(f"{WORLD}/truth{group}/skeleton", t, columns, known.sum(axis=1))
         name, points = ("markers", truth.markers_m) if truth.laser_m is None else ("laser", truth.laser_m)
         grey = np.full(points.shape[:2], pack([TRUTH_RGB])[0])
-        self._rows.points(f"{WORLD}/truth/{name}", t, points, seen(points), grey, 0.002)
+        self._rows.points(f"{WORLD}/truth{group}/{name}", t, points, seen(points), grey, 0.002)
         for name, error in truth.errors_m(poses).items():
-            self._rows.scalars(f"plots/error_mm/{name}", t, mean_known(error) * 1e3)
+            self._rows.scalars(f"plots/error_mm{group}/{name}", t, mean_known(error) * 1e3)
 
     def _rate_hz(self, t_ns: Int) -> Float:
         """Poses per second (T,) over the second that ends at each row; NaN for the very first."""
@@ -268,8 +275,20 @@ class RerunScene:
         self._recent_ns = times[times > times[-1] - 1_000_000_000]
         return np.divide(rows - first, span, out=np.full(len(rows), np.nan), where=span > 0)
 
-    def _marker_colours(self, count: int) -> npt.NDArray[np.uint32]:
-        return pack([series_rgb(i) for i in range(count)])
+
+def _marker_colours(count: int) -> npt.NDArray[np.uint32]:
+    return pack([series_rgb(i) for i in range(count)])
+
+
+def _at_limit(angles_rad: Float, hand: HandModel) -> Bool:
+    """Joints (T, 26) one of whose angles has reached its limit; a fixed angle does not count."""
+    low, high = hand.limits_at(angles_rad[..., FLEXION])
+    reached = (angles_rad <= low + _AT_LIMIT_RAD) | (angles_rad >= high - _AT_LIMIT_RAD)
+    reached &= high - low > 2 * _AT_LIMIT_RAD
+    joints = np.zeros((len(angles_rad), 26), np.bool_)
+    for finger, angle in np.ndindex(5, 4):
+        joints[:, _HINGE_OF_ANGLE[finger, angle]] |= reached[:, finger, angle]
+    return joints
 
 
 def _strips(at: Float, shown: Bool) -> list[Float]:

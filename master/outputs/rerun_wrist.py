@@ -1,11 +1,19 @@
 """What a wrist device adds to the viewer's scene: the fan of its laser, where that meets each finger, and its sights.
 
-world                                the whole device, turned as the forearm is held, up is up; where an IMU tells it
+world                                a device alone: all of it, turned as the forearm is held, up is up; where an IMU
+                                     tells it
 world/laser/fan                      the laser's light, as far as the rig says where it goes
 world/laser/points                   where it meets each finger, in the finger's colour
 world/rays/CAM/laser, /tips          from the camera to those points, and to the tips that are tracked
 world/cameras/CAM/laser              the same points as this camera should see them
 world/cameras/CAM/detections/...     laser, tips: as it saw them, where that is known
+
+Beside marker cameras the same entities stand in the rig frame: `world/laser`, `world/rays/CAM` and `world/cameras/CAM`
+move with the device, which the solved palm and the wrist's bend place (`device_place`). Added are
+
+world/hand/HAND/forearm              from the wrist towards the elbow
+world/hand/HAND/forearm_doubt        a ring: where its far end is at 2 sigma of the bend
+plots/wrist_bend_deg/...             flexion and deviation
 """
 
 from collections.abc import Sequence
@@ -14,18 +22,19 @@ import numpy as np
 import rerun as rr
 
 from common.arrays import Float
-from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import TIPS
-from common.messages import FINGER_COUNT, WristDetections
+from common.messages import FINGER_COUNT, Source, WristDetections
+from master.outputs.device_place import DevicePlace
 from master.outputs.laser_fan import LASER_RGB, fan
-from master.outputs.palette import RAY_RGB, TRUTH_RGB, pack, series_rgb
+from master.outputs.palette import RAY_RGB, SOURCE_RGB, TRUTH_RGB, pack, series_rgb
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path
 from master.outputs.rerun_columns import Columns, seen
 from master.wrist.setup import WristSetup
 
-_FAN_LINE_M = 0.0003
+_FAN_LINE_M, _FOREARM_M = 0.0003, 0.0025
+_BENDS = ("flexion", "deviation")
 _POINT_M = 0.0025
 _UPRIGHT = 0.98  # cosine of 11 degrees off the vertical
 _DETECTED_PX, _POINT_PX = 4.0, 3.0
@@ -36,13 +45,22 @@ class WristLayer:
     """Logs one wrist device to a recording that belongs to the caller; holds which way the first pose looked."""
 
     def __init__(
-        self, recording: rr.RecordingStream, camera: str, model: CameraModel, setup: WristSetup, spread: Float
+        self, recording: rr.RecordingStream, camera: str, setup: WristSetup, spread: Float, *, in_rig: bool
     ) -> None:
-        """Log the laser's fan; `spread` are its rays' directions (K, 3), see `fan_rays`."""
-        self._rows = Columns(recording)
-        self._palm_camera = setup.T_camera_palm[:3, :3].T
+        """Log what never changes.
+
+        Args:
+            recording: Where it goes.
+            camera: The device's camera.
+            setup: The device.
+            spread: Directions (K, 3) of its light, see `fan_rays`.
+            in_rig: Poses are in the frame of a rig of markers, not of its camera.
+        """
+        self._rows, self._setup, self._in_rig = Columns(recording), setup, in_rig
         self._level_world: Float | None = None
-        self._camera, self._model = camera, model
+        self._camera, self._model = camera, setup.optics
+        for i, name in enumerate(_BENDS if in_rig else ()):
+            self._rows.name(f"plots/wrist_bend_deg/{name}", name, series_rgb(i))
         lines = fan(setup.laser_m, spread)
         recording.log(
             f"{WORLD}/laser/fan",
@@ -52,25 +70,54 @@ class WristLayer:
 
     def log_poses(self, poses: Poses) -> None:
         """Log laser points, sights and how the forearm is held, of a batch of poses."""
-        self._log_held(poses)
-        t, points = poses.t_ns, poses.laser_m
+        t, points, tips = poses.t_ns, poses.laser_m, poses.position_m[:, TIPS]
+        if self._in_rig:
+            place = DevicePlace.of(poses, self._setup.model)
+            T = place.cameras(self._setup.T_camera_palm)
+            self._log_placed(poses, place, T)
+            points = np.where(np.isfinite(T[:, :1, 3:]), points, np.nan)  # of a lost hand nobody knows where
+            tips = (tips - T[:, None, :3, 3]) @ T[:, :3, :3]
+        else:
+            self._log_held(poses)
         colours = np.broadcast_to(pack(_FINGER_RGB), points.shape[:2])
         self._rows.points(f"{WORLD}/laser/points", t, points, seen(points), colours, _POINT_M)
         rays, centre = rr.new_entity_path([WORLD, "rays", self._camera]), self._model.centre
         self._rows.rays(f"{rays}/laser", t, centre, points, int(pack([RAY_RGB], alpha=150)[0]))
-        tips = np.where(poses.tracked[:, TIPS, None], poses.position_m[:, TIPS], np.nan)
+        tips = np.where(poses.tracked[:, TIPS, None], tips, np.nan)
         self._rows.rays(f"{rays}/tips", t, centre, tips, int(pack([TRUTH_RGB], alpha=90)[0]))
         self._rows.pixels(
             f"{camera_path(self._camera)}/laser", t, self._model.project(points), colours, _POINT_PX
         )
         self._rows.scalars("plots/seen/laser_points", t, seen(points).sum(axis=1).astype(np.float64))
 
+    def _log_placed(self, poses: Poses, place: DevicePlace, T_rig_camera: Float) -> None:
+        """Move the device to where the forearm is, and draw that."""
+        known = np.flatnonzero(np.isfinite(T_rig_camera).all(axis=(1, 2)))
+        if len(known):
+            xyzw = np.roll(matrix_to_quaternion(T_rig_camera[known, :3, :3]), -1, axis=-1)
+            for path in (
+                camera_path(self._camera),
+                f"{WORLD}/laser",
+                rr.new_entity_path([WORLD, "rays", self._camera]),
+            ):
+                columns = rr.Transform3D.columns(translation=T_rig_camera[known, :3, 3], quaternion=xyzw)
+                self._rows.send(path, poses.t_ns[known], columns, None)
+        root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
+        colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
+        arms = np.stack([place.wrist_m, place.elbow_m()], axis=1)
+        self._rows.lines(f"{root}/forearm", t, arms, colour, _FOREARM_M)
+        self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(), colour, _FAN_LINE_M)
+        for i, name in enumerate(_BENDS):
+            self._rows.scalars(f"plots/wrist_bend_deg/{name}", t, np.degrees(place.bend_rad[:, i]))
+
     def _log_held(self, poses: Poses) -> None:
         """Turn the scene: down, y, is down; what the camera looked along at first, z, stays ahead."""
         known = np.flatnonzero(np.isfinite(poses.palm_world_wxyz).all(axis=1))
         if not len(known):
             return
-        world_camera = quaternion_to_matrix(poses.palm_world_wxyz[known]) @ self._palm_camera
+        world_camera = (
+            quaternion_to_matrix(poses.palm_world_wxyz[known]) @ self._setup.T_camera_palm[:3, :3].T
+        )
         if self._level_world is None:
             self._level_world = _level(world_camera[0])
         turned = matrix_to_quaternion(self._level_world @ world_camera)

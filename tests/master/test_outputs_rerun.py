@@ -23,6 +23,7 @@ from master.outputs.rerun import run_viewer, write_rrd
 from master.outputs.rerun_process import ViewerProcess, viewer_arguments
 from master.outputs.rerun_scene import RerunScene
 from master.outputs.truth import PosesTruth
+from master.rig import RigSetup
 from tests.hand_helpers import detections
 
 MODEL = HandModel.of(generated_profile("test-hand", "right"))
@@ -51,6 +52,7 @@ CAMERAS = {
     )
     for name in RIG.cameras
 }
+SETUP = RigSetup.of(RIG, CAMERAS, MODEL)
 STEP_NS = 16_666_667
 
 
@@ -126,7 +128,7 @@ def test_a_run_written_as_rrd_is_all_there(tmp_path: Path) -> None:
     poses = Poses.of(moving_hand(6))
     seen = [detections("left", i, int(t), np.full((6, 2), 100.0 + i)) for i, t in enumerate(poses.t_ns)]
     frames = [("right", int(t), np.full((48, 64, 3), 90, np.uint8)) for t in poses.t_ns]
-    write_rrd(path, poses, RIG, CAMERAS, MODEL, {"left": seen}, truth_of(poses, 0.004), frames)
+    write_rrd(path, poses, SETUP, {"left": seen}, truth_of(poses, 0.004), frames)
     rows = rows_of(path)
     for entity in ("skeleton", "joints", "at_limit", "uncertainty"):
         assert rows[f"/world/hand/test-hand/{entity}"] == 6
@@ -148,7 +150,7 @@ def test_a_run_written_as_rrd_is_all_there(tmp_path: Path) -> None:
 def test_rows_hold_what_the_poses_say_at_their_exact_times(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     poses = Poses.of(moving_hand(6))
-    write_rrd(path, poses, RIG, CAMERAS, MODEL, None, truth_of(poses, 0.004))
+    write_rrd(path, poses, SETUP, None, truth_of(poses, 0.004))
     times, joints = column(path, "/world/hand/test-hand/joints", "positions")
     assert times == poses.t_ns.tolist()
     assert [len(row) for row in joints] == [26, 26, 26, 26, 21, 26]  # an invalid joint is not shown
@@ -177,7 +179,7 @@ def test_a_joint_at_its_limit_is_marked_and_one_inside_is_not(tmp_path: Path) ->
     angles[:, 0] = 0.05
     angles[1, 2] = MODEL.limits_rad[1, 2, 1]
     bent = replace(pose, angles_rad=angles)
-    write_rrd(tmp_path / "run.rrd", Poses.of([bent]), RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "run.rrd", Poses.of([bent]), SETUP)
     _, at = column(tmp_path / "run.rrd", "/world/hand/test-hand/at_limit", "positions")
     assert len(at[0]) == 1
     pip = JOINTS.index("index-finger-phalanx-intermediate")
@@ -191,7 +193,7 @@ def test_a_spread_is_at_its_limit_earlier_in_a_fist(tmp_path: Path) -> None:
     flat = fist.copy()
     flat[1, 1] = 0.1
     poses = Poses.of([replace(pose, angles_rad=angles) for angles in (fist, flat)])
-    write_rrd(tmp_path / "run.rrd", poses, RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "run.rrd", poses, SETUP)
     _, at = column(tmp_path / "run.rrd", "/world/hand/test-hand/at_limit", "positions")
     assert [len(frame) for frame in at] == [1, 0]
 
@@ -200,15 +202,15 @@ def test_an_offline_run_has_no_latency_plot_and_an_empty_run_is_a_valid_file(tmp
     pose = moving_hand(1)[0]
     offline = replace(pose, latency_ns=0)
     poses = Poses.of([offline])
-    write_rrd(tmp_path / "one.rrd", poses, RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "one.rrd", poses, SETUP)
     assert "/plots/latency_ms" not in rows_of(tmp_path / "one.rrd")
-    write_rrd(tmp_path / "none.rrd", poses.rows(0, 0), RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "none.rrd", poses.rows(0, 0), SETUP)
     # Only the recording's own properties and no pose.
     assert not [entity for entity in rows_of(tmp_path / "none.rrd") if entity.startswith("/world")]
 
 
 def test_images_are_limited_to_ten_a_second_for_each_camera() -> None:
-    scene = RerunScene(rr.RecordingStream("test"), RIG, CAMERAS, MODEL)
+    scene = RerunScene(rr.RecordingStream("test"), [SETUP])
     image = np.zeros((240, 320), np.uint8)
     jpeg = small_jpeg(320, 240)
     taken = [scene.log_image("left", image, t * 1_000_000) for t in range(0, 1000, 16)]
@@ -236,9 +238,7 @@ class Viewing:
         bus, path, cameras = self._args
         self.shown = run_viewer(
             bus,
-            RIG,
-            cameras,
-            MODEL,
+            [RigSetup.of(RIG, cameras, MODEL)],
             mode="save",
             path=path,
             stop=self.stop,
@@ -325,7 +325,7 @@ def test_without_a_pose_the_master_tells_the_time_and_without_a_master_nothing_i
 def test_a_small_image_fills_the_view_of_its_camera(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     poses = Poses.of(moving_hand(1))
-    write_rrd(path, poses, RIG, CAMERAS, MODEL, images=[("left", 0, small_jpeg(320, 120))])
+    write_rrd(path, poses, SETUP, images=[("left", 0, small_jpeg(320, 120))])
     chunks = [c for c in rr.chunk.RrdReader(path).stream() if c.entity_path == "/world/cameras/left/image"]
     table = next(c for c in chunks if c.is_static).to_record_batch()
     scale = next(name for name in table.schema.names if name.endswith("scale"))
@@ -335,7 +335,7 @@ def test_a_small_image_fills_the_view_of_its_camera(tmp_path: Path) -> None:
 def test_markers_stand_in_the_camera_view_where_a_pinhole_sees_them(tmp_path: Path) -> None:
     path = tmp_path / "run.rrd"
     poses = Poses.of(moving_hand(4))
-    write_rrd(path, poses, RIG, CAMERAS, MODEL)
+    write_rrd(path, poses, SETUP)
     _, right = column(path, "/world/cameras/right/markers", "positions")
     assert [len(row) for row in right] == [6, 6, 6, 5]
     x, y, z = (poses.markers_raw_m[0] - [0.075, 0.0, 0.0]).T
@@ -350,7 +350,7 @@ def test_an_uncertainty_larger_than_the_fingers_is_not_drawn(tmp_path: Path) -> 
     cov = pose.cov_m2.copy()
     cov[TIPS[1]] = np.diag([1e-6, 1e-6, 0.016**2])  # 2 sigma: 32 mm
     cov[TIPS[2]] = np.nan
-    write_rrd(tmp_path / "run.rrd", Poses.of([replace(pose, cov_m2=cov)]), RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "run.rrd", Poses.of([replace(pose, cov_m2=cov)]), SETUP)
     _, centres = column(tmp_path / "run.rrd", "/world/hand/test-hand/uncertainty", "centers")
     np.testing.assert_allclose(np.array(centres[0]), pose.position_m[TIPS[[0, 3, 4]]], atol=1e-6)
 
@@ -377,12 +377,12 @@ def test_two_hands_at_once_are_two_entities(tmp_path: Path) -> None:
 def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "run.rrd"
     with pytest.raises(RecordingError, match=r"run\.rrd: cannot write"):
-        write_rrd(path, Poses.of(moving_hand(1)), RIG, CAMERAS, MODEL)
+        write_rrd(path, Poses.of(moving_hand(1)), SETUP)
     bus = LoopbackBus()
     with pytest.raises(RecordingError, match=r"run\.rrd"):
-        run_viewer(bus, RIG, CAMERAS, MODEL, mode="save", path=path, stop=threading.Event())
+        run_viewer(bus, [SETUP], mode="save", path=path, stop=threading.Event())
     with pytest.raises(ValueError, match="mode 'save'"):
-        run_viewer(bus, RIG, CAMERAS, MODEL, mode="save", path=None, stop=threading.Event())
+        run_viewer(bus, [SETUP], mode="save", path=None, stop=threading.Event())
     bus.close()
 
 
@@ -395,7 +395,7 @@ def test_an_error_midway_leaves_the_older_file_as_it_was(tmp_path: Path) -> None
         raise RecordingError("frame 1 is broken")
 
     with pytest.raises(RecordingError, match="frame 1 is broken"):
-        write_rrd(path, Poses.of(moving_hand(2)), RIG, CAMERAS, MODEL, images=images())
+        write_rrd(path, Poses.of(moving_hand(2)), SETUP, images=images())
     assert path.read_bytes() == b"older"
     assert [p.name for p in tmp_path.iterdir()] == ["run.rrd"]
 
@@ -422,7 +422,7 @@ def test_a_viewer_whose_display_does_not_answer_is_an_error_also_when_it_began_t
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     bus = LoopbackBus()
     with pytest.raises(PhalanxError, match=r"viewer ended \(exit \d+\): .+--web or --save"):
-        run_viewer(bus, RIG, CAMERAS, MODEL, mode="spawn", path=None, stop=threading.Event())
+        run_viewer(bus, [SETUP], mode="spawn", path=None, stop=threading.Event())
     bus.close()
 
 
@@ -444,9 +444,7 @@ def test_the_web_viewer_takes_poses_is_closed_to_other_addresses_and_ends_on_sto
             bus.publish("hand", pose.hand, pose)
         stop.set()
 
-    shown = run_viewer(
-        bus, RIG, CAMERAS, MODEL, mode="web", path=None, stop=stop, web_port=port, on_ready=ready
-    )
+    shown = run_viewer(bus, [SETUP], mode="web", path=None, stop=stop, web_port=port, on_ready=ready)
     assert shown == 5
     assert told[0].startswith(f"http://127.0.0.1:{port}?url=")
     assert told[1:] == ["127.0.0.1 True", "127.0.0.2 True"]
@@ -469,7 +467,7 @@ def boxes_of(path: Path) -> list[list[float]]:
 def test_the_stated_volume_is_a_box_and_there_is_none_without(tmp_path: Path) -> None:
     poses = Poses.of(moving_hand(2))
     volume = Volume(low_m=(-0.2, -0.1, 0.4), high_m=(0.2, 0.3, 0.9))
-    write_rrd(tmp_path / "with.rrd", poses, replace(RIG, volume=volume), CAMERAS, MODEL)
-    write_rrd(tmp_path / "without.rrd", poses, RIG, CAMERAS, MODEL)
+    write_rrd(tmp_path / "with.rrd", poses, RigSetup.of(replace(RIG, volume=volume), CAMERAS, MODEL))
+    write_rrd(tmp_path / "without.rrd", poses, SETUP)
     np.testing.assert_allclose(boxes_of(tmp_path / "with.rrd"), [[0.2, 0.2, 0.25]], rtol=1e-6)
     assert boxes_of(tmp_path / "without.rrd") == []

@@ -76,9 +76,7 @@ def test_a_wrist_run_is_all_there(setup: RigSetup, truths: list[WristTruth], tmp
     poses = true_poses(setup, truths)
     seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
     frames = [(camera, int(t), np.full((48, 64), 90, np.uint8)) for t in poses.t_ns]
-    write_rrd(
-        path, poses, setup.rig, setup.cameras, setup.hand, {camera: seen}, ghost_of(poses, 0.002), frames
-    )
+    write_rrd(path, poses, setup, {camera: seen}, ghost_of(poses, 0.002), frames)
     rows, n = rows_of(path), len(truths)
     for entity in (
         f"hand/{setup.hand.profile.name}/skeleton",
@@ -108,7 +106,7 @@ def test_laser_points_stand_where_they_are_and_where_the_camera_saw_them(
     path, camera = tmp_path / "run.rrd", setup.rig.cameras[0]
     poses = true_poses(setup, truths)
     seen = [exact_triple(setup, now, k) for k, now in enumerate(truths)]
-    write_rrd(path, poses, setup.rig, setup.cameras, setup.hand, {camera: seen})
+    write_rrd(path, poses, setup, {camera: seen})
     _, points = column(path, "/world/laser/points", "positions")
     _, detected = column(path, f"/world/cameras/{camera}/detections/laser", "positions")
     for k, now in enumerate(truths):
@@ -151,7 +149,7 @@ def test_a_pose_of_which_nothing_is_known_can_be_drawn(
     path = tmp_path / "hand.png"
     draw_summary(path, poses, setup.rig, setup.hand, {}, None, None, WristPicture.of(setup))
     assert image_of(path).max() > 200
-    write_rrd(tmp_path / "run.rrd", poses, setup.rig, setup.cameras, setup.hand)
+    write_rrd(tmp_path / "run.rrd", poses, setup)
     _, points = column(tmp_path / "run.rrd", "/world/laser/points", "positions")
     assert not points[0]
     assert points[1]
@@ -161,14 +159,14 @@ def test_the_scene_is_turned_as_the_forearm_is_held(
     setup: RigSetup, truths: list[WristTruth], tmp_path: Path
 ) -> None:
     poses = true_poses(setup, truths)
-    write_rrd(tmp_path / "still.rrd", poses, setup.rig, setup.cameras, setup.hand)
+    write_rrd(tmp_path / "still.rrd", poses, setup)
     assert "/world" not in rows_of(tmp_path / "still.rrd")  # nobody tells how
     assert setup.wrist is not None
     camera_palm = setup.wrist.T_camera_palm[:3, :3]
     world_camera = [axis_rotation(2, 0.7) @ axis_rotation(0, -1.2 + 0.2 * k) for k in range(len(poses))]
     held = replace(poses, palm_world_wxyz=matrix_to_quaternion(np.array(world_camera) @ camera_palm))
     held.palm_world_wxyz[3] = np.nan
-    write_rrd(tmp_path / "held.rrd", held, setup.rig, setup.cameras, setup.hand)
+    write_rrd(tmp_path / "held.rrd", held, setup)
     times, said = column(tmp_path / "held.rrd", "/world", "Transform3D:quaternion")
     known = [k for k in range(len(poses)) if k != 3]
     assert times == poses.t_ns[known].tolist()

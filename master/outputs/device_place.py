@@ -1,0 +1,72 @@
+"""Where a wrist device is in the rig of markers: on the forearm, which the solved palm and the wrist's bend place.
+
+    R_rig_forearm = R_rig_palm R_forearm_palm^T,  T_rig_camera = [R_rig_forearm, wrist] T_camera_palm^-1
+
+with `T_camera_palm` of a straight wrist (`common.wrist_bend`). A bend that nobody tells counts as none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import invert, quaternion_to_matrix
+from common.hand_model import WRIST, HandModel
+from common.wrist_bend import forearm_palm
+from master.outputs.poses import Poses
+
+_FOREARM_M = 0.16
+_CORNERS = 24
+_ELBOW = np.array(
+    [0.0, 0.0, -1.0]
+)  # along the forearm, in its own axes: the fingers of a straight hand go along z
+_SIGMAS = 2.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DevicePlace:
+    """The forearm at T instants; NaN where the pose is not valid.
+
+    Attributes:
+        wrist_m: (T, 3) the wrist [m], rig frame.
+        R_rig_palm: (T, 3, 3).
+        R_rig_forearm: (T, 3, 3).
+        bend_rad, sigma_rad: (T, 2) flexion and deviation of the wrist, as the poses have them; NaN: nobody tells.
+    """
+
+    wrist_m: Float
+    R_rig_palm: Float
+    R_rig_forearm: Float
+    bend_rad: Float
+    sigma_rad: Float
+
+    @classmethod
+    def of(cls, poses: Poses, hand: HandModel) -> "DevicePlace":
+        """Of poses in the rig frame."""
+        known = poses.valid[:, WRIST] & np.isfinite(poses.orientation_wxyz[:, WRIST]).all(axis=1)
+        R = np.full((len(poses), 3, 3), np.nan)
+        R[known] = quaternion_to_matrix(poses.orientation_wxyz[known, WRIST]) @ hand.rest_rotation[WRIST].T
+        wrist_m = np.where(known[:, None], poses.position_m[:, WRIST], np.nan)
+        bend = np.nan_to_num(poses.wrist_bend_rad)
+        forearm = R @ np.swapaxes(forearm_palm(bend), 1, 2)
+        return cls(wrist_m, R, forearm, poses.wrist_bend_rad, poses.wrist_bend_sigma_rad)
+
+    def cameras(self, T_camera_palm: Float) -> Float:
+        """Poses (T, 4, 4) of the device's camera, camera -> rig, from its file's T_camera_palm (4, 4)."""
+        T_palm_camera = invert(T_camera_palm)
+        out = np.tile(np.eye(4), (len(self.wrist_m), 1, 1))
+        out[:, :3, :3] = self.R_rig_forearm @ T_palm_camera[:3, :3]
+        out[:, :3, 3] = self.R_rig_forearm @ T_palm_camera[:3, 3] + self.wrist_m
+        return out
+
+    def elbow_m(self) -> Float:
+        """Points (T, 3) [m] on the forearm, 16 cm from the wrist."""
+        return self.wrist_m + _FOREARM_M * (self.R_rig_forearm @ _ELBOW)
+
+    def doubt_m(self) -> Float:
+        """Rings (T, K, 3) [m] about `elbow_m`: where it is at 2 sigma of the bend; NaN where that is not known."""
+        turn = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+        around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        bends = self.bend_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
+        forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(bends), 2, 3)
+        return self.wrist_m[:, None] + _FOREARM_M * (forearm @ _ELBOW)
