@@ -132,6 +132,7 @@ class ImuCalibration(Part, frozen=True):
     `q_palm_imu`: quaternion wxyz, its axes -> palm frame. `q_rig_world`: its world, whose z axis is vertical -> rig
     frame. `orientation_sigma_rad`: per axis, of the tilt against the vertical. `heading_sigma_rad`: of the turn about
     the vertical, which drifts by `heading_drift_rad_s`; null: not known at all, as without a magnetometer.
+    `stamp_offset_us`: how much later its samples were taken than their stamps say.
     """
 
     name: Name = "imu"
@@ -141,6 +142,7 @@ class ImuCalibration(Part, frozen=True):
     orientation_sigma_rad: Positive = math.radians(2.0)
     heading_sigma_rad: Positive | None = None
     heading_drift_rad_s: NonNegative = 0.0
+    stamp_offset_us: Number = 0.0
 
     @property
     def placed(self) -> bool:

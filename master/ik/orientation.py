@@ -46,7 +46,7 @@ class OrientationTrack:
         self._rig_world = turn_of("q_rig_world", imu.q_rig_world)
         self._up = self._rig_world[:, 2]
         self.counts: Counter[str] = Counter() if counts is None else counts
-        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s)
+        self._samples = OrientationSamples(self.counts, imu.heading_drift_rad_s, imu.stamp_offset_us)
 
     def push(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         """Take one sample: quaternion (4,), IMU axes -> its world; see `OrientationSamples.push`."""

@@ -43,9 +43,15 @@ class OrientationSamples:
         counts: Samples left out: `orientation.missing`, `orientation.not_unit`, `orientation.late`.
     """
 
-    def __init__(self, counts: Counter[str], drift_rad_s: float) -> None:
-        """Begin without any, counting into `counts`; headings drift so fast where samples do not say how far."""
-        self.counts, self._drift_rad_s = counts, drift_rad_s
+    def __init__(self, counts: Counter[str], drift_rad_s: float, late_us: float = 0.0) -> None:
+        """Begin without any, counting into `counts`.
+
+        Args:
+            counts: What is left out, by reason.
+            drift_rad_s: How fast headings drift where samples do not say how far.
+            late_us: How much later samples were taken than their stamps say; added to these.
+        """
+        self.counts, self._drift_rad_s, self._late_ns = counts, drift_rad_s, round(1e3 * late_us)
         self._samples: deque[_Sample] = deque(maxlen=_KEPT)
         self._first_ns: int | None = None
 
@@ -59,6 +65,7 @@ class OrientationSamples:
         What is no rotation is left out. A sample long before the newest means that a clock was set back, or that the
         newest came from a time that is not yet: the others are forgotten.
         """
+        t_ns += self._late_ns
         length = float(np.linalg.norm(orientation_wxyz))
         if np.isnan(length):
             self.counts["orientation.missing"] += 1
