@@ -13,7 +13,8 @@ off, and a bend that all fingers suggest alike is none of theirs.
 A sensor that errs once in a while (a false fingertip) must not win by being narrow. A finger whose angles by the fit
 are farther from the believed ones than their covariance allows counts less: its own covariance grows by
 (N + chi square) / (N + 4), the inverse weight of Student's t with N = 4 degrees of freedom (Lange, Little, Taylor 1989,
-"Robust statistical modeling using the t distribution").
+"Robust statistical modeling using the t distribution"). What puts a fingertip where its marker, seen by two cameras, is
+not, is not taken at all: it is another thing, such as the edge of what the hand holds.
 """
 
 from dataclasses import dataclass, field, replace
@@ -22,6 +23,7 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float
 from common.geometry import matrix_to_rotation_vector
+from common.hand_model import CHAINS, HandModel
 from master.ik.palm import Orientation, turn_of_vector
 from master.ik.parameters import HandParameters
 
@@ -29,6 +31,9 @@ _ANGLES, _TURN = 4, 3
 _FREEDOM = 4.0
 _SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is weighed down
 _ALL = _TURN + 5 * _ANGLES
+_ELSEWHERE = 16.3  # chi square of three numbers, 1 in 1000
+_MOST_RAD = np.radians(25.0)  # more doubt of one angle than that moves a tip on no straight line
+_PALM_M = 8e-3  # about so well a palm is known from one moment to the next
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,6 +89,15 @@ class SensedHand:
         """Those that are told."""
         return frozenset(np.flatnonzero(self.told).tolist())
 
+    def without(self, fingers: Bool) -> "SensedHand":
+        """The same, but nothing of those fingers (5,)."""
+        return replace(
+            self,
+            angles_rad=np.where(fingers[:, None], np.nan, self.angles_rad),
+            told=self.told & ~fingers,
+            by_bend=np.where(fingers[:, None, None], 0.0, self.by_bend),
+        )
+
     def weighed(self, angles_rad: Float) -> "SensedHand | None":
         """The belief with fingers counting less that a hand of angles (5, 4) contradicts; None: it contradicts none."""
         off = np.where(self.known[:, None], angles_rad - self.angles_rad, 0.0)
@@ -103,6 +117,39 @@ class SensedHand:
         # Of an abduction that narrows this is the line that touches there.
         means = y.reshape(-1) + by_free @ x - parameters.angles(x).reshape(-1)
         return SensedFree(self, by_free, means)
+
+
+class MarkerCheck:
+    """Finds fingers that another sensor has elsewhere than their markers are; prepared for one hand and its markers."""
+
+    def __init__(self, model: HandModel, markers: tuple[str, ...]) -> None:
+        """Prepare.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self._model, self._markers = model, markers
+        fingers = [model.mount(name).finger for name in markers]
+        self._of_finger = np.array([fingers.index(f) if f in fingers else -1 for f in range(5)])
+
+    def __call__(self, sensed: SensedHand, T_rig_palm: Float, points_m: Float, cov_m2: Float) -> Bool:
+        """Fingers (5,) whose angles put their marker where it is not, however their doubt is taken.
+
+        Args:
+            sensed: What the sensor says.
+            T_rig_palm: (4, 4) where the palm is about now.
+            points_m, cov_m2: Markers (M, 3) [m] and their covariances (M, 3, 3); NaN: not seen.
+        """
+        chains = self._model.chains(self._model.clamp(np.nan_to_num(sensed.angles_rad)))
+        joints = self._model.joints(T_rig_palm, chains)
+        at, tip = self._of_finger, self._model.marker_points(joints, self._markers)
+        off = points_m[at] - tip[at]
+        arms = tip[at][:, None] - joints.position_m[CHAINS[:, [0, 0, 1, 2]]]
+        cov = sensed.own_cov_rad2 + sensed.by_bend @ sensed.bend_cov_rad2 @ np.swapaxes(sensed.by_bend, 1, 2)
+        variance = np.minimum(np.diagonal(cov, axis1=1, axis2=2), _MOST_RAD**2)
+        spread = (variance * np.vecdot(arms, arms)).sum(axis=1) + _PALM_M**2 + np.trace(cov_m2[at].T) / 3.0
+        wrong = np.vecdot(off, off) > _ELSEWHERE * spread  # NaN is not
+        return sensed.known & (at >= 0) & wrong
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -26,7 +26,7 @@ from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
 from master.ik.priors import Priors
-from master.ik.sensed_hand import SensedHand
+from master.ik.sensed_hand import MarkerCheck, SensedHand
 from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
@@ -83,6 +83,7 @@ class HandTracker:
         self.parameters = self._solver.parameters
         self._arcs = Arcs(model, self.parameters, markers)
         self._refine = FingerRefiner(model, markers)
+        self._elsewhere = MarkerCheck(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
         self._finger = np.array([-1 if m.finger is None else m.finger for m in mounts])
@@ -140,14 +141,17 @@ class HandTracker:
             orientation = others.palm
         palm_rests = self._palm_rests(seen, orientation)
         tells_palm = palm_rests > 0
-        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
-        if others is not None:
-            told[:5] |= others.told
         last, dt_s = self.recent(t_ns)
         if last is None:
             self._forget()
         before = None if last is None else self._turned(last, orientation)
         self._oriented = orientation
+        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
+        if others is not None:
+            if before is not None and seen.any():
+                wrong = self._elsewhere(others, before.T_rig_palm, points_m, cov_m2)
+                others = others.without(wrong) if wrong.any() else others
+            told[:5] |= others.told
         facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None
         if last is not None:
