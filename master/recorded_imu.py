@@ -32,7 +32,8 @@ def recorded_samples(recording: FrameRecording, setup: RigSetup) -> tuple[tuple[
     """
     imu = _imu_of(setup)
     if imu is None or not (imu.placed if setup.has_markers else imu.q_palm_imu is not None):
-        if (path := recording.folder / IMU).exists():
+        others = imu is None and any(rig.imu is not None for rig in recording.manifest.all_rigs)
+        if (path := recording.folder / IMU).exists() and not others:
             _LOG.warning("%s: not used: rig %r: %s", path, setup.rig.name, _UNPLACED)
         return (), setup
     samples = read_imu(recording.folder, imu.name)

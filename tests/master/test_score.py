@@ -7,9 +7,9 @@ import pytest
 
 from common.arrays import Float
 from common.errors import RecordingError
-from common.messages import HandPose
+from common.messages import HandPose, Source
 from master.outputs.poses import Poses
-from master.score import Truth, load_truth, score
+from master.score import Truth, load_truth, score, score_hidden
 
 FINGERS = (0, 1, 2, 3, 4, -1)
 ALL = np.ones(6, dtype=bool)
@@ -130,3 +130,28 @@ def test_rendered_truths_are_read_as_documented(datasets: Path) -> None:
     assert np.isnan(sweep.joints_m).all()
     np.testing.assert_array_equal(np.isfinite(sweep.markers_m).all(axis=(0, 2)), np.arange(6) == 1)
     np.testing.assert_allclose(sweep.markers_m[[0, -1], 1, 2], [1.0, 0.2], atol=1e-9)  # 100 -> 20 cm
+
+
+def test_hidden_fingers_and_steps_at_a_hand_over_are_scored() -> None:
+    visible = np.ones((60, 2, 6))
+    visible[20:40, 0, 1] = 0.4  # the index marker, by one of two cameras less than half
+    found = poses(60, np.zeros((26, 3)), np.zeros((5, 4)), np.zeros((6, 3)))
+    found.position_m[20:40, 6:11, 0] = 3e-3
+    found.position_m[40:, 6:11, 0] = 10e-3
+    found.angles_rad[20:40, 1, 2] = np.radians(8.0)
+    found.valid[30:40, 6:11] = False
+    out = score_hidden(found, truth(60, visible), FINGERS)
+    assert out["joint_mm_hidden"] == pytest.approx(3.0)
+    assert out["pip_deg_hidden"] == pytest.approx(8.0)
+    assert out["hidden_invalid"] == pytest.approx(0.5)
+    assert "hand_over_step_mm" not in out, "no source has changed"
+    found.source[25:, 6:11] = Source.WRIST
+    assert score_hidden(found, truth(60, visible), FINGERS)["hand_over_step_mm"] == pytest.approx(3.0)
+    found.valid[:] = True
+    assert score_hidden(found, truth(60, visible), FINGERS)["hand_over_step_mm"] == pytest.approx(7.0)
+    found.source[25:, 6:11] = Source.SOLVED
+    found.source[55:, 6:11] = Source.WRIST
+    assert score_hidden(found, truth(60, visible), FINGERS)["hand_over_step_mm"] == pytest.approx(7.0)
+    late = truth(60, visible)
+    late.joints_m[40:, 5:10, 0] = 7e-3  # a step that is true
+    assert score_hidden(found, late, FINGERS)["hand_over_step_mm"] == pytest.approx(0.0, abs=1e-9)
