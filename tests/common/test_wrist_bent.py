@@ -205,5 +205,5 @@ def test_a_closed_hand_keeps_lines_and_tips_in_sight_beyond_the_bar_it_holds() -
     held = [t for t in np.arange(0.0, 12.0, 0.2).tolist() if shown.motion.at(t).things[0].held]
     truths = [shown.truth(t) for t in held]
     assert len(truths) > 20
-    assert np.mean([truth.laser_len_vis[2:6] > 0.002 for truth in truths]) > 0.8
-    assert np.mean([truth.tip_visible[1:] for truth in truths]) > 0.8
+    assert np.mean([truth.laser_len_vis[1:6] > 0.002 for truth in truths]) > 0.8
+    assert np.mean([truth.tip_visible for truth in truths]) > 0.5
