@@ -126,7 +126,7 @@ def _judge(
         return judged
     worn = laser_scores(poses, played.worn, epoch_ns, tell)
     images = chain(judged.images, wrist_images(poses, played.worn, epoch_ns, tell))
-    return _Judged(judged.scores | worn, judged.truth, images)
+    return _Judged(judged.scores | worn, judged.truth, images, WristPicture.of(setup))
 
 
 def _of_markers(poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress) -> _Judged:

@@ -15,7 +15,6 @@ from common.hand_model import WRIST, HandModel
 from common.wrist_bend import forearm_palm
 from master.outputs.poses import Poses
 
-_FOREARM_M = 0.16
 _CORNERS = 24
 _ELBOW = np.array(
     [0.0, 0.0, -1.0]
@@ -59,14 +58,14 @@ class DevicePlace:
         out[:, :3, 3] = self.R_rig_forearm @ T_palm_camera[:3, 3] + self.wrist_m
         return out
 
-    def elbow_m(self) -> Float:
-        """Points (T, 3) [m] on the forearm, 16 cm from the wrist."""
-        return self.wrist_m + _FOREARM_M * (self.R_rig_forearm @ _ELBOW)
+    def arm_m(self, length_m: float) -> Float:
+        """Lines (T, 2, 3) [m] from the wrist towards the elbow."""
+        return np.stack([self.wrist_m, self.wrist_m + length_m * (self.R_rig_forearm @ _ELBOW)], axis=1)
 
-    def doubt_m(self) -> Float:
-        """Rings (T, K, 3) [m] about `elbow_m`: where it is at 2 sigma of the bend; NaN where that is not known."""
+    def doubt_m(self, length_m: float) -> Float:
+        """Rings (T, K, 3) [m] about the ends of `arm_m`: where these are at 2 sigma of the bend; NaN: not known."""
         turn = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
         around = np.stack([np.cos(turn), np.sin(turn)], axis=-1)
         bends = self.bend_rad[:, None] + _SIGMAS * self.sigma_rad[:, None] * around
         forearm = self.R_rig_palm[:, None] @ np.swapaxes(forearm_palm(bends), 2, 3)
-        return self.wrist_m[:, None] + _FOREARM_M * (forearm @ _ELBOW)
+        return self.wrist_m[:, None] + length_m * (forearm @ _ELBOW)

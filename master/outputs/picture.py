@@ -25,7 +25,7 @@ from common.messages import Source
 from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
-from master.outputs.picture_panels import INK, PAPER, draw_panels, style, unit
+from master.outputs.picture_panels import INK, PAPER, Colour, draw_panels, style, unit
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
@@ -77,21 +77,21 @@ def draw_summary(
         summary: Key figures by the names of the summary JSON; others are left out.
         truth: Row by row with `poses`; drawn as a ghost, and as error over time.
         row: The pose to show; None: an open hand with as many tracked joints as there are.
-        wrist: The rig's wrist device; None: a marker rig.
+        wrist: The wrist device, alone or beside the rig of markers; None: there is none.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
     """
     figure = Figure(figsize=(WIDTH_PX / _DPI, HEIGHT_PX / _DPI), dpi=_DPI, facecolor=PAPER)
     FigureCanvasAgg(figure)
-    _header(figure, rig, model, summary)
+    _header(figure, rig, wrist, model, summary)
     row = best_row(poses) if row is None else row
     if row is None:
         figure.text(0.3, 0.45, "no valid pose in this run", color=INK, size=20, ha="center")
     else:
         _hand(figure, poses, row, model, truth, wrist)
-        if wrist is None:
-            _rig(figure, poses, row, rig)
+        if wrist is None or wrist.in_rig:
+            _rig(figure, poses, row, rig, wrist)
         else:
             wrist.draw_camera(figure, poses, row, truth)
         draw_panels(figure, poses, row, model, truth)
@@ -110,10 +110,18 @@ def best_row(poses: Poses) -> int | None:
     return int(np.argmax(score))
 
 
-def _header(figure: Figure, rig: RigCalibration, model: HandModel, summary: Mapping[str, float]) -> None:
+def _header(
+    figure: Figure,
+    rig: RigCalibration,
+    wrist: WristPicture | None,
+    model: HandModel,
+    summary: Mapping[str, float],
+) -> None:
     figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
+    worn = [wrist.rig] if wrist is not None and wrist.in_rig else []
+    count = len(rig.cameras) + len(worn)
     cameras, hand = (
-        f"rig {rig.name} · {len(rig.cameras)} camera{'s' if len(rig.cameras) > 1 else ''}",
+        f"rig {' and '.join([rig.name, *worn])} · {count} camera{'s' if count > 1 else ''}",
         f"hand {model.profile.name} ({model.profile.side})",
     )
     what = cameras + (" · " if len(cameras + hand) <= _LINE else "\n") + hand
@@ -134,13 +142,11 @@ def _hand(
     wrist: WristPicture | None,
 ) -> None:
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
-    if wrist is None:
-        view = fit_view(
-            at, axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)
-        )  # thumb to the eye
+    if wrist is None or wrist.in_rig:
+        turned = axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)  # thumb to the eye
     else:
         turned = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
-        view = fit_view(np.concatenate([at, np.zeros((1, 3))]), turned)  # with the camera itself
+    view = fit_view(at if wrist is None else np.concatenate([at, wrist.reach_m(poses, row)]), turned)
     axes = figure.add_axes(_HAND_BOX)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)
@@ -233,7 +239,9 @@ def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, laser: list[
         text.set_color(INK)
 
 
-def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
+def _rig(
+    figure: Figure, poses: Poses, row: int, rig: RigCalibration, wrist: WristPicture | None = None
+) -> None:
     """Small view of the whole rig from the side: cameras, rays to the caps, hand, and the volume it states."""
     axes = figure.add_axes((0.012, 0.02, 0.215, 0.33))
     style(axes, "Rig, seen from the side")
@@ -259,18 +267,20 @@ def _rig(figure: Figure, poses: Poses, row: int, rig: RigCalibration) -> None:
         away = 17.0 * away / max(float(np.linalg.norm(away)), 1e-6)
         axes.annotate(name, (float(centre[0]), float(centre[1])), (float(away[0]), float(away[1])),
                       textcoords="offset points", color=INK, size=10, ha="center", va="center")  # fmt: skip
+    if wrist is not None:
+        _frustum(axes, wrist.pose(poses, row), rotation, unit(SOURCE_RGB[Source.WRIST]))
     axes.invert_yaxis()
     axes.margins(0.2)  # room for the names
 
 
-def _frustum(axes: Axes, pose: Float, rotation: Float) -> None:
+def _frustum(axes: Axes, pose: Float, rotation: Float, colour: Colour = INK) -> None:
     d, w, h = 0.05, 0.03, 0.0225
     corners = np.array([[-w, -h, d], [w, -h, d], [w, h, d], [-w, h, d], [-w, -h, d]])
     image = (corners @ pose[:3, :3].T + pose[:3, 3]) @ rotation.T
     centre = pose[:3, 3] @ rotation.T
-    axes.plot(image[:, 0], image[:, 1], color=INK, lw=1.2)
+    axes.plot(image[:, 0], image[:, 1], color=colour, lw=1.2)
     for corner in image[:4]:
-        axes.plot([centre[0], corner[0]], [centre[1], corner[1]], color=INK, lw=1.2)
+        axes.plot([centre[0], corner[0]], [centre[1], corner[1]], color=colour, lw=1.2)
 
 
 def _source_rgb(code: int) -> Rgb:

@@ -1,4 +1,7 @@
-"""What a wrist device adds to the picture of a run: its laser's fan about the hand, and what its camera sees."""
+"""What a wrist device adds to the picture of a run: its laser's fan about the hand, and what its camera sees.
+
+Beside marker cameras it stands in their rig where palm and bend place it (`device_place`), and the forearm is drawn.
+"""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,11 +13,13 @@ from matplotlib.lines import Line2D
 
 from common.arrays import Float, Image
 from common.camera_model import CameraModel
+from common.geometry import transform
 from common.hand_model import FINGER_JOINTS, FINGERS
-from common.messages import FINGER_COUNT
+from common.messages import FINGER_COUNT, Source
+from master.outputs.device_place import DevicePlace
 from master.outputs.hand_render import View
 from master.outputs.laser_fan import LASER_RGB, fan, fan_rays
-from master.outputs.palette import TRUTH_RGB, series_rgb
+from master.outputs.palette import SOURCE_RGB, TRUTH_RGB, series_rgb
 from master.outputs.picture_panels import PAPER, style, unit
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
@@ -22,6 +27,7 @@ from master.rig import RigSetup
 from master.wrist.setup import WristSetup
 
 _BOX = (0.012, 0.03, 0.225, 0.30)  # left, bottom, width, height of the figure: an image of 4 to 3
+_FOREARM_M = 0.055  # of it
 _BRIGHT = 200.0  # level of the brightest skin as shown: such frames are dark
 
 
@@ -30,12 +36,16 @@ class WristPicture:
     """How to draw one wrist device.
 
     Attributes:
+        rig: Name of its rig.
+        in_rig: Poses are in the frame of a rig of markers, not of its camera.
         setup: Laser plane and palm.
         camera: Its camera.
         rays: (K, 3) directions of the laser's light.
         frame: What the camera saw by laser and LEDs at the row that is shown, (H, W) grey, or None.
     """
 
+    rig: str
+    in_rig: bool
     setup: WristSetup
     camera: CameraModel
     rays: Float
@@ -43,25 +53,56 @@ class WristPicture:
 
     @classmethod
     def of(cls, setup: RigSetup, frame: Image | None = None) -> "WristPicture | None":
-        """Of a wrist rig; None: a marker rig."""
-        if setup.wrist is None:
+        """Of a wrist device, alone or beside marker cameras; None: there is none."""
+        if setup.wrist is None or setup.wrist_rig is None:
             return None
-        camera = setup.models[setup.rig.cameras[0]]
-        return cls(setup.wrist, camera, fan_rays(setup.rig, setup.wrist), frame)
+        rays = fan_rays(setup.wrist_rig, setup.wrist)
+        return cls(setup.wrist_rig.name, setup.has_markers, setup.wrist, setup.wrist.optics, rays, frame)
+
+    def pose(self, poses: Poses, row: int) -> Float:
+        """Pose (4, 4) of its camera in the frame of the poses at that row; NaN: not known."""
+        if not self.in_rig:
+            return np.eye(4)
+        place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
+        return place.cameras(self.setup.T_camera_palm)[0]
+
+    def reach_m(self, poses: Poses, row: int) -> Float:
+        """What of it (N, 3) [m] must be in the picture of the hand at that row: its camera, or the forearm's end."""
+        if not self.in_rig:
+            return np.zeros((1, 3))
+        return DevicePlace.of(poses.rows(row, row + 1), self.setup.model).arm_m(_FOREARM_M)[0]
 
     def draw_laser(self, axes: Axes, view: View, poses: Poses, row: int) -> list[Line2D]:
-        """Fan and points about the hand; return the entries of the legend."""
+        """Fan and points about the hand, and the forearm beside marker cameras; return the entries of the legend."""
+        T = self.pose(poses, row)
         for line in fan(self.setup.laser_m, self.rays):
-            pixels = view.project(line)
+            pixels = view.project(transform(T, line))
             axes.plot(pixels[:, 0], pixels[:, 1], color=unit(LASER_RGB), lw=0.8, alpha=0.4, zorder=4)
-        points = view.project(poses.laser_m[row])
+        points = view.project(transform(T, poses.laser_m[row]))
         for finger in range(FINGER_COUNT):
             colour = unit(series_rgb(finger))
             axes.plot(points[finger, 0], points[finger, 1], "D", mfc=colour, mec=PAPER, ms=9, zorder=8)
+        forearm = [self._draw_forearm(axes, view, poses, row)] if self.in_rig else []
         return [
+            *forearm,
             Line2D([], [], color=unit(LASER_RGB), lw=1.5, label="laser"),
             Line2D([], [], color=unit(series_rgb(0)), marker="D", mec=PAPER, ms=9, ls="", label="laser on a finger"),
         ]  # fmt: skip
+
+    def _draw_forearm(self, axes: Axes, view: View, poses: Poses, row: int) -> Line2D:
+        """From the wrist towards the elbow, and where that end is at 2 sigma; return the entry of the legend."""
+        place = DevicePlace.of(poses.rows(row, row + 1), self.setup.model)
+        colour = unit(SOURCE_RGB[Source.WRIST])
+        arm, ring = view.project(place.arm_m(_FOREARM_M)[0]), view.project(place.doubt_m(_FOREARM_M)[0])
+        axes.plot(arm[:, 0], arm[:, 1], color=colour, lw=3.0, ls=(0, (4, 1.5)), zorder=4)
+        axes.plot(ring[:, 0], ring[:, 1], color=colour, lw=1.0, zorder=4)
+        flexion, deviation = np.degrees(place.bend_rad[0])
+        bend = (
+            f"wrist bent {flexion:+.0f}°, {deviation:+.0f}°"
+            if np.isfinite(flexion)
+            else "bend of the wrist not known"
+        )
+        return Line2D([], [], color=colour, lw=3.0, ls=(0, (4, 1.5)), label=f"forearm, {bend}")
 
     def draw_camera(self, figure: Figure, poses: Poses, row: int, truth: PosesTruth | None) -> None:
         """The camera's view, lower left: its frame, the hand and the laser points as it should see them."""

@@ -33,7 +33,8 @@ from master.outputs.rerun_blueprint import WORLD, camera_path
 from master.outputs.rerun_columns import Columns, seen
 from master.wrist.setup import WristSetup
 
-_FAN_LINE_M, _FOREARM_M = 0.0003, 0.0025
+_FAN_LINE_M, _BONE_M = 0.0003, 0.0025
+_FOREARM_M = 0.16  # of it, as long as a hand
 _BENDS = ("flexion", "deviation")
 _POINT_M = 0.0025
 _UPRIGHT = 0.98  # cosine of 11 degrees off the vertical
@@ -104,9 +105,8 @@ class WristLayer:
                 self._rows.send(path, poses.t_ns[known], columns, None)
         root, t = rr.new_entity_path([WORLD, "hand", poses.hand]), poses.t_ns
         colour = int(pack([SOURCE_RGB[Source.WRIST]])[0])
-        arms = np.stack([place.wrist_m, place.elbow_m()], axis=1)
-        self._rows.lines(f"{root}/forearm", t, arms, colour, _FOREARM_M)
-        self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(), colour, _FAN_LINE_M)
+        self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
+        self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(_FOREARM_M), colour, _FAN_LINE_M)
         for i, name in enumerate(_BENDS):
             self._rows.scalars(f"plots/wrist_bend_deg/{name}", t, np.degrees(place.bend_rad[:, i]))
 
