@@ -1,0 +1,84 @@
+"""Observations made of truth are near it and end where sight does; kept ones are those that were made."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench import fusion_kept
+from bench.fusion_kept import observed
+from bench.fusion_scene import Shown, Sight
+from bench.fusion_shown import shown
+from bench.played import START_NS
+from common.messages import ImuSample, MarkerDetections, WristDetections, encode
+
+SECONDS = 0.5
+
+
+@pytest.fixture(scope="module")
+def made() -> Shown:
+    return shown("both-poses", SECONDS, 3)
+
+
+def test_all_sensors_report_in_order(made: Shown) -> None:
+    stamps = [message.t_ns for message in made.messages]
+    assert stamps == sorted(stamps)
+    count = {
+        kind: sum(isinstance(m, kind) for m in made.messages) for kind in (MarkerDetections, WristDetections)
+    }
+    assert count[MarkerDetections] == 2 * 30
+    assert count[WristDetections] == 15
+    assert sum(isinstance(m, ImuSample) for m in made.messages) >= 60
+
+
+def test_markers_are_reported_near_the_truth_and_only_where_paint_is_in_sight(made: Shown) -> None:
+    both = made.both
+    off: list[float] = []
+    for message in made.messages:
+        if not isinstance(message, MarkerDetections):
+            continue
+        truth = both.scene.truth(
+            1e-9 * (message.t_ns - START_NS) + 0.005
+        )  # its row is exposed a little later
+        uv = both.scene.optics[message.camera].project(truth.markers_m)
+        seen = np.isfinite(message.uv[:, 0])
+        off += np.linalg.norm(message.uv - uv, axis=1)[seen].tolist()
+        k = int(np.argmin(np.abs(made.sight.paint_t_s[message.camera] - 1e-9 * (message.t_ns - START_NS))))
+        assert (made.sight.paint_px2[message.camera][k][seen] > 0.0).all()
+    assert len(off) > 100
+    assert np.median(off) < 5.0  # what is seen of a cap is not its middle
+    assert max(off) < 12.0
+
+
+def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -> None:
+    triples = [message for message in made.messages if isinstance(message, WristDetections)]
+    line = np.array([np.isfinite(message.laser_uv[:, 0]) for message in triples])
+    tip = np.array([np.isfinite(message.tip_uv[:, 0]) for message in triples])
+    assert line.any()
+    assert not (line & (made.sight.line_m < 2e-3)).any()
+    assert not (tip & ~made.sight.tip).any()
+
+
+def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Shown) -> None:
+    calls: list[str] = []
+
+    def once(name: str, seconds: float, seed: int) -> Shown:
+        calls.append(name)
+        return made
+
+    monkeypatch.setitem(fusion_kept._MAKE, "quick", once)
+    for _ in range(2):
+        again = observed("both-poses", SECONDS, 3, "quick", tmp_path)
+        assert [encode(message) for message in again.messages] == [
+            encode(message) for message in made.messages
+        ]
+        _same(again.sight, made.sight)
+    assert calls == ["both-poses"]
+
+
+def _same(a: Sight, b: Sight) -> None:
+    for name in b.paint_t_s:
+        np.testing.assert_array_equal(a.paint_t_s[name], b.paint_t_s[name])
+        np.testing.assert_array_equal(a.paint_px2[name], b.paint_px2[name])
+    for field in ("line_t_s", "line_m", "tip"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))

@@ -1,0 +1,209 @@
+"""What the section fusion counts, on hands worked out by hand: errors, steps, bits, sight, and streams cut off."""
+
+import numpy as np
+import pytest
+
+from bench.fusion_scene import Both, Shown, Sight
+from bench.fusion_score import Figures, Sighted, ratios
+from bench.fusion_solved import Away, Solved
+from bench.played import START_NS
+from common.arrays import Float
+from common.geometry import matrix_to_quaternion
+from common.hand_model import CHAINS, TIPS, WRIST
+from common.messages import HandPose, MarkerDetections, Source, WristDetections
+
+BOTH = Both.of("both-poses", 3)
+HZ = 60.0
+COUNT = 120
+T_S = 2.0 + np.arange(COUNT) / HZ
+INDEX = 1
+
+
+def poses(**changes: Float) -> list[HandPose]:
+    """Poses without error at T_S, tracked to the last joint; but `off_m` (T, 26, 3) is added, and others replaced."""
+    off = changes.get("off_m", np.zeros((COUNT, 26, 3)))
+    tracked = changes.get("tracked", np.ones((COUNT, 26)))
+    valid = changes.get("valid", np.ones((COUNT, 26)))
+    out: list[HandPose] = []
+    for k, t in enumerate(T_S.tolist()):
+        truth = BOTH.scene.truth(t)
+        none = np.full((6, 3), np.nan)
+        out.append(
+            HandPose(
+                hand="anna",
+                t_ns=START_NS + round(t * 1e9),
+                position_m=truth.joints.position_m + off[k],
+                orientation_wxyz=matrix_to_quaternion(truth.joints.rotation),
+                radius_m=BOTH.scene.model.radius_m,
+                valid=valid[k] > 0.0,
+                tracked=tracked[k] * valid[k] > 0.0,
+                cov_m2=np.tile(1e-6 * np.eye(3), (26, 1, 1)),
+                source=np.full(26, Source.SOLVED, np.uint8),
+                angles_rad=truth.angles_rad,
+                markers_m=none,
+                markers_raw_m=none,
+                markers_cov_m2=np.full((6, 3, 3), np.nan),
+                inside_volume=np.ones(26, np.bool_),
+            )
+        )
+    return out
+
+
+def solved(**changes: Float) -> Solved:
+    return Solved.of(BOTH, poses(**changes), BOTH.fused)
+
+
+def shown(paint: float = 100.0, line: float = 0.02) -> Shown:
+    """So much paint of every marker in both cameras, and so much line on every finger, at all times."""
+    times = np.arange(0.0, 6.0, 1.0 / HZ)
+    cameras = BOTH.markers.rig.cameras
+    sight = Sight(
+        dict.fromkeys(cameras, times),
+        {name: np.full((len(times), 6), paint) for name in cameras},
+        times,
+        np.full((len(times), 5), line),
+        np.zeros((len(times), 5), np.bool_),
+    )
+    return Shown(BOTH, 6.0, [], sight)
+
+
+def figures(one: Solved, of: Shown, away: Away | None = None) -> Figures:
+    return Figures.of(one, Sighted.of(of, one, away))
+
+
+def test_a_hand_without_error_has_none_and_every_bit_is_true() -> None:
+    got = figures(solved(), shown())
+    assert got.joint_mm == pytest.approx(0.0, abs=1e-6)
+    assert got.four_deg == pytest.approx(0.0, abs=1e-6)
+    assert got.fingers_mm == pytest.approx(0.0, abs=1e-6)
+    assert (got.valid, got.tracked, got.inside, got.false_tracked) == (1.0, 1.0, 1.0, 0.0)
+    assert got.step_mm == pytest.approx(0.0, abs=1e-6)
+    assert got.hz == pytest.approx(HZ)
+
+
+def test_a_shift_of_the_hand_is_no_error_of_its_fingers_and_one_step() -> None:
+    off = np.zeros((COUNT, 26, 3))
+    off[60:, :, 0] = 0.006
+    got = figures(solved(off_m=off), shown())
+    assert got.joint_mm == pytest.approx(3.0)
+    assert got.fingers_mm == pytest.approx(0.0, abs=1e-6)
+    assert got.step_mm == pytest.approx(6.0)
+    assert got.over_step == pytest.approx(60.0 / (T_S[-1] - T_S[0]))
+    assert got.inside == pytest.approx(0.5)  # 6 mm where 1 mm is claimed
+    assert got.false_tracked == 0.0  # 20 mm are meant
+
+
+def test_a_joint_that_is_not_valid_has_neither_error_nor_step_nor_region() -> None:
+    off, valid = np.zeros((COUNT, 26, 3)), np.ones((COUNT, 26))
+    tip = TIPS[INDEX]
+    off[60:62, tip, 1] = 0.5
+    valid[60:62, tip] = 0.0
+    got = figures(solved(off_m=off, valid=valid), shown())
+    assert got.joint_mm == pytest.approx(0.0, abs=1e-6)
+    assert got.step_mm == pytest.approx(0.0, abs=1e-6)
+    assert got.inside == 1.0
+    assert got.valid == pytest.approx(1.0 - 2.0 / (25 * COUNT))
+
+
+def test_a_tracked_bit_is_false_where_the_joint_is_far_off() -> None:
+    off = np.zeros((COUNT, 26, 3))
+    off[10:22, TIPS[INDEX], 2] = 0.021
+    got = figures(solved(off_m=off), shown())
+    assert got.false_tracked == pytest.approx(12 / COUNT)
+    assert got.off == pytest.approx(12 / (26 * COUNT))
+    assert got.unseen == 0.0
+
+
+@pytest.mark.parametrize(("paint", "line", "false"), [(0.0, 0.02, 1.0), (100.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_a_tracked_bit_is_false_where_nothing_tells_of_the_joint(
+    paint: float, line: float, false: float
+) -> None:
+    got = figures(solved(), shown(paint, line))  # without paint nothing tells where the palm is
+    assert got.false_tracked == false
+    palm_apart = np.ones((COUNT, 26))
+    palm_apart[:, np.setdiff1d(np.arange(26), CHAINS)] = 0.0
+    fingers = figures(solved(tracked=palm_apart), shown(paint, line))
+    assert fingers.unseen == (1.0 if paint == line == 0.0 else 0.0)
+
+
+def test_markers_alone_do_not_see_what_the_wrist_device_sees() -> None:
+    alone = Solved.of(BOTH, poses(), BOTH.markers)
+    assert figures(alone, shown(paint=0.0)).unseen == 1.0
+    assert figures(alone, shown(line=0.0)).unseen == 0.0
+
+
+def test_a_wrist_device_s_hand_is_put_where_it_truly_is() -> None:
+    moved = poses()
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    elsewhere = [_moved(pose, turn, np.array([0.3, -0.1, 0.2])) for pose in moved]
+    alone = Solved.of(BOTH, elsewhere, BOTH.wrist)
+    assert np.nanmax(alone.off_mm) == pytest.approx(0.0, abs=1e-6)
+    strapped = figures(alone, shown(paint=0.0))
+    assert strapped.false_tracked == 0.0  # its palm is where the strap has it
+
+
+def _moved(pose: HandPose, turn: Float, shift: Float) -> HandPose:
+    t = 1e-9 * (pose.t_ns - START_NS)
+    rotation = turn @ BOTH.scene.truth(t).joints.rotation
+    fields = {name: getattr(pose, name) for name in pose.__struct_fields__}
+    fields |= {
+        "position_m": pose.position_m @ turn.T + shift,
+        "orientation_wxyz": matrix_to_quaternion(rotation),
+    }
+    return HandPose(**fields)
+
+
+def test_streams_are_cut_off_in_turn_and_never_both() -> None:
+    away = Away()
+    t = np.arange(0.0, 60.0, 0.01)
+    markers, wrist = away.at(t)
+    assert not (markers & wrist).any()
+    assert markers.mean() == pytest.approx(0.25, abs=0.01)
+    assert wrist.mean() == pytest.approx(0.25, abs=0.01)
+    assert not (markers | wrist)[t < 1.0].any()
+    begins = t[1:][np.diff((markers | wrist).astype(int)) == 1]
+    np.testing.assert_allclose(np.diff(begins), 2.0, atol=0.011)
+
+
+def test_what_is_cut_off_does_not_come() -> None:
+    nothing, five, none = np.full((6, 2), np.nan), np.full((5, 2), np.nan), np.full(5, np.nan)
+    ns = [START_NS + round(t * 1e9) for t in (0.5, 1.5, 2.5, 3.5, 4.5)]
+    six = np.full(6, np.nan)
+    markers = [
+        MarkerDetections("left", 1, k, t, t, nothing, six, six, six, nothing) for k, t in enumerate(ns)
+    ]
+    wrist = [
+        WristDetections("wrist", 1, k, t, t, five, none, none, five, none, none) for k, t in enumerate(ns)
+    ]
+    left = Away().left([*markers, *wrist])
+    assert [one.seq for one in left if isinstance(one, MarkerDetections)] == [0, 2, 3, 4]
+    assert [one.seq for one in left if isinstance(one, WristDetections)] == [0, 1, 2, 4]
+
+
+def test_a_finger_is_in_sight_around_the_frame_that_shows_it() -> None:
+    both = shown(paint=0.0, line=0.0)
+    name = BOTH.markers.rig.cameras[0]
+    both.sight.paint_px2[name][120, INDEX] = 50.0  # at 2 s
+    seen = both.sight.cameras_of(np.array([1.94, 1.97, 2.0, 2.03, 2.06]), 0.04)[:, INDEX]
+    assert seen.tolist() == [0, 1, 1, 1, 0]
+
+
+def test_hand_overs_are_where_sight_changes() -> None:
+    both = shown()
+    for name in BOTH.markers.rig.cameras:
+        both.sight.paint_px2[name][180:, INDEX] = 0.0  # from 3 s on
+    sighted = Sighted.of(both, solved(), None)
+    near = sighted.hand_over[:, INDEX]
+    assert near[np.abs(T_S - 3.04) < 0.45].all()
+    assert not near[np.abs(T_S - 3.04) > 0.55].any()
+    assert not sighted.hand_over[:, 2].any()
+
+
+def test_ratios_compare_what_both_call_valid() -> None:
+    off, more = np.zeros((COUNT, 26, 3)), np.zeros((COUNT, 26, 3))
+    off[..., 0], more[..., 0] = 0.002, 0.004
+    valid = np.ones((COUNT, 26))
+    valid[:, TIPS] = 0.0
+    more[:, TIPS, 0] = 1.0
+    off[:, WRIST, 0] = 0.002
+    assert ratios(solved(off_m=off), solved(off_m=more, valid=valid)).joints == pytest.approx(0.5)
