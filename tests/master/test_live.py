@@ -5,18 +5,20 @@ import socket
 import threading
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from common.clock import SystemClock
 from common.errors import BusError
 from common.keys import new_key
-from common.messages import Command
+from common.messages import Command, HandPose
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
 from master.outputs.files import load_poses
-from master.rig import load_setup
+from master.rig import load_setup, load_setups
 from slave.uplink import Uplink
-from tests.network_helpers import detections, free_udp_port
+from tests.network_helpers import detections, free_udp_port, until
+from tests.wrist_run import exact_triple, wrist_scene
 
 
 def free_tcp_port() -> int:
@@ -65,3 +67,49 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
     assert len(poses) == summary["poses"] > 20
     assert summary["lost"] == 0
     assert lines[0].startswith("listening on 127.0.0.1:")
+
+
+def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, root: Path) -> None:
+    key, clock = bytes.fromhex(new_key()), SystemClock()
+    beacon, bus = free_udp_port(), f"tcp/127.0.0.1:{free_tcp_port()}"
+    settings = LiveSettings(
+        ("127.255.255.255", beacon),
+        ("127.0.0.1", 0),
+        bus,
+        5.0,
+        tmp_path / "poses.npz",
+        tmp_path / "live.json",
+    )
+    setups = load_setups(root / "calib_json", ("desk", "wrist-left"))
+    triple = exact_triple(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
+    stop, lines = threading.Event(), list[str]()
+    master = threading.Thread(target=run_live, args=(setups, key, settings, stop, lines.append))
+    master.start()
+    ends = {name: Uplink(name, key, clock, beacon, "127.0.0.1") for name in ("left", "right", "wrist")}
+    asker = ZenohBus(None, bus)
+    published = asker.subscribe("hand")
+    try:
+        assert all(end.wait_for_start(10.0) for end in ends.values())
+        for seq in range(20):
+            t_ns = clock.now_ns()
+            for name in ("left", "right"):
+                ends[name].send(detections(name, ends[name].session, seq, t_ns))
+            changes = {"session": ends["wrist"].session, "seq": 3 * seq, "t_ns": t_ns, "ready_t_ns": t_ns}
+            ends["wrist"].send(msgspec.structs.replace(triple, **changes))
+            stop.wait(0.01)
+
+        def counted() -> bool:
+            counts = asker.ask(Command("master", "report"), 5.0).counts
+            return counts.get("default-left.poses", 0) == 20 and counts["default-right.poses"] > 10
+
+        assert until(counted)
+        assert until(lambda: "cameras: left, right, wrist" in lines)  # said once a second
+    finally:
+        stop.set()
+        master.join(10.0)
+        poses = [published.get(0.0) for _ in range(64)]
+        for end in (*ends.values(), asker):
+            end.close()
+    assert {pose.hand for pose in poses if isinstance(pose, HandPose)} == {"default-right", "default-left"}
+    assert len(load_poses(tmp_path / "poses-default-left.npz")) == 20
+    assert len(load_poses(tmp_path / "poses.npz")) > 10
