@@ -19,7 +19,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     ("Latency [ms]", "plots/latency_ms", (0.0, 60.0), False),
     (_RATE, "plots/rate_hz", None, False),
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
-    ("Bend of the wrist [deg]", "plots/wrist_bend_deg", None, True),
+    ("Bend of the wrist [deg]", "plots/wrist_bend_deg", (-60.0, 60.0), True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
     ("Joints tracked; markers, or laser points, seen", "plots/seen", (0.0, 30.0), True),

@@ -17,7 +17,7 @@ style.
     world/truth/skeleton, markers        where a truth is known
     plots/...                            latency, rate, jitter, error, PIP angles, bend of the wrist, counts, health
 
-Of several hands the first has these paths; markers, truth and plots of another carry its name behind their group
+Of several hands the first has these paths; markers, laser, truth and plots of another carry its name behind the group
 (`world/markers/HAND/raw`, `plots/pip_deg/HAND/index`).
 """
 
@@ -91,11 +91,11 @@ class RerunScene:
             self._log_lens(name, worn[name])  # beside markers; where it is changes
         self._images = CameraImages(recording, self._models | worn)
         for hand, setup in self._setups.items():
+            group = self._group(hand)
             if setup.wrist is not None and setup.wrist_rig is not None:
                 spread, in_rig = fan_rays(setup.wrist_rig, setup.wrist), setup.has_markers
                 camera = setup.wrist_rig.cameras[0]
-                self._devices[hand] = WristLayer(recording, camera, setup.wrist, spread, in_rig=in_rig)
-            group = self._group(hand)
+                self._devices[hand] = WristLayer(recording, camera, setup.wrist, spread, group, in_rig=in_rig)
             for i, name in enumerate(setup.markers):
                 self._rows.name(f"plots/jitter_mm{group}/{name}", name, series_rgb(i))
             for i, name in enumerate(FINGERS):
@@ -152,6 +152,7 @@ class RerunScene:
             half_sizes=[(high - low) / 2.0],
             colors=[TRUTH_RGB],
             radii=_FRUSTUM_LINE_M,
+            fill_mode="MajorWireframe",
         )
         self._rec.log(f"{WORLD}/volume", box, static=True)
 

@@ -46,7 +46,14 @@ class WristLayer:
     """Logs one wrist device to a recording that belongs to the caller; holds which way the first pose looked."""
 
     def __init__(
-        self, recording: rr.RecordingStream, camera: str, setup: WristSetup, spread: Float, *, in_rig: bool
+        self,
+        recording: rr.RecordingStream,
+        camera: str,
+        setup: WristSetup,
+        spread: Float,
+        group: str = "",
+        *,
+        in_rig: bool,
     ) -> None:
         """Log what never changes.
 
@@ -55,16 +62,18 @@ class WristLayer:
             camera: The device's camera.
             setup: The device.
             spread: Directions (K, 3) of its light, see `fan_rays`.
+            group: What stands behind the paths of laser and plots, see `RerunScene`.
             in_rig: Poses are in the frame of a rig of markers, not of its camera.
         """
         self._rows, self._setup, self._in_rig = Columns(recording), setup, in_rig
+        self._laser, self._group = f"{WORLD}/laser{group}", group
         self._level_world: Float | None = None
         self._camera, self._model = camera, setup.optics
         for i, name in enumerate(_BENDS if in_rig else ()):
-            self._rows.name(f"plots/wrist_bend_deg/{name}", name, series_rgb(i))
+            self._rows.name(f"plots/wrist_bend_deg{group}/{name}", name, series_rgb(i))
         lines = fan(setup.laser_m, spread)
         recording.log(
-            f"{WORLD}/laser/fan",
+            f"{self._laser}/fan",
             rr.LineStrips3D(lines, colors=[(*LASER_RGB, 90)], radii=_FAN_LINE_M),
             static=True,
         )
@@ -81,7 +90,7 @@ class WristLayer:
         else:
             self._log_held(poses)
         colours = np.broadcast_to(pack(_FINGER_RGB), points.shape[:2])
-        self._rows.points(f"{WORLD}/laser/points", t, points, seen(points), colours, _POINT_M)
+        self._rows.points(f"{self._laser}/points", t, points, seen(points), colours, _POINT_M)
         rays, centre = rr.new_entity_path([WORLD, "rays", self._camera]), self._model.centre
         self._rows.rays(f"{rays}/laser", t, centre, points, int(pack([RAY_RGB], alpha=150)[0]))
         tips = np.where(poses.tracked[:, TIPS, None], tips, np.nan)
@@ -89,7 +98,9 @@ class WristLayer:
         self._rows.pixels(
             f"{camera_path(self._camera)}/laser", t, self._model.project(points), colours, _POINT_PX
         )
-        self._rows.scalars("plots/seen/laser_points", t, seen(points).sum(axis=1).astype(np.float64))
+        self._rows.scalars(
+            f"plots/seen{self._group}/laser_points", t, seen(points).sum(axis=1).astype(np.float64)
+        )
 
     def _log_placed(self, poses: Poses, place: DevicePlace, T_rig_camera: Float) -> None:
         """Move the device to where the forearm is, and draw that."""
@@ -98,7 +109,7 @@ class WristLayer:
             xyzw = np.roll(matrix_to_quaternion(T_rig_camera[known, :3, :3]), -1, axis=-1)
             for path in (
                 camera_path(self._camera),
-                f"{WORLD}/laser",
+                self._laser,
                 rr.new_entity_path([WORLD, "rays", self._camera]),
             ):
                 columns = rr.Transform3D.columns(translation=T_rig_camera[known, :3, 3], quaternion=xyzw)
@@ -108,7 +119,9 @@ class WristLayer:
         self._rows.lines(f"{root}/forearm", t, place.arm_m(_FOREARM_M), colour, _BONE_M)
         self._rows.lines(f"{root}/forearm_doubt", t, place.doubt_m(_FOREARM_M), colour, _FAN_LINE_M)
         for i, name in enumerate(_BENDS):
-            self._rows.scalars(f"plots/wrist_bend_deg/{name}", t, np.degrees(place.bend_rad[:, i]))
+            self._rows.scalars(
+                f"plots/wrist_bend_deg{self._group}/{name}", t, np.degrees(place.bend_rad[:, i])
+            )
 
     def _log_held(self, poses: Poses) -> None:
         """Turn the scene: down, y, is down; what the camera looked along at first, z, stays ahead."""
