@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from common.errors import PhalanxError
 from common.frame_recording import Illumination
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
 from master.outputs.files import save_poses
 from master.report import Played, report_scene
-from master.rig import RigSetup
-from master.wrist_report import forearm_tilt, lit_view
+from master.rig import RigSetup, load_setups
+from master.wrist_report import forearm_tilt, laser_scores, lit_view
 from tests.master.test_outputs_rerun import rows_of
 from tests.wrist_run import START_NS, TRIPLE_NS, true_poses, wrist_scene, wrist_setup
 
@@ -104,3 +105,31 @@ def test_what_laser_and_leds_light_is_without_the_room(scene: WristScene) -> Non
     assert ambient[:100].mean() > 5.0  # the room behind the fingers
     assert shown[:100].mean() < 0.5 * ambient[:100].mean()
     assert shown.max() > 100.0
+
+
+def test_a_hand_before_both_kinds_of_rig_is_played_by_one_motion(root: Path) -> None:
+    (both,) = load_setups(root / "calib_json", ("desk", "wrist"))
+    played = Played.of(both, "both-curl@dark", 5)
+    assert played.shown is not None
+    assert played.worn is not None
+    assert played.worn.ambient == "dark"
+    seen, worn = (scene.motion.at(1.3).angles_rad for scene in (played.shown, played.worn))
+    np.testing.assert_array_equal(seen, worn)
+    with pytest.raises(PhalanxError, match="see one hand only in grasp, both-poses"):
+        Played.of(both, "standard", 5)
+    (desk,), (wrist,) = (load_setups(root / "calib_json", (name,)) for name in ("desk", "wrist"))
+    assert Played.of(desk, "grasp", 5).worn is Played.of(wrist, "curl@sun", 5).shown is None
+
+
+def test_laser_points_count_once_for_each_triple(setup: RigSetup, scene: WristScene) -> None:
+    poses = true_poses(setup, [scene.truth(k * TRIPLE_NS * 1e-9 + 1.5) for k in range(6)])
+    twice = replace(poses, laser_m=np.repeat(poses.laser_m[::2], 2, axis=0))
+    told: list[int] = []
+    epoch_ns = START_NS - 1_500_000_000
+    scores = laser_scores(twice, scene, epoch_ns, lambda _what, _done, total: told.append(total))
+    assert set(told) == {3}
+    assert scores["laser_mm"] == pytest.approx(0.0, abs=1e-9)
+    assert (
+        laser_scores(replace(poses, laser_m=np.full_like(poses.laser_m, np.nan)), scene, epoch_ns, print)
+        == {}
+    )
