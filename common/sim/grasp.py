@@ -1,20 +1,20 @@
 """A hand that grasps a bar, lifts it, turns it and puts it back, five times a minute.
 
-From rest the hand comes from below with open fingers until the bar lies before the palm, presses the palm to it and
-closes (`grip`); the palm then hides the finger tips from cameras that see the back of the hand. It lifts the bar,
-turns it briskly in the picture and towards the cameras, lowers it to its old place, opens and goes back. Place, pace,
-turns and postures are drawn from the seed. While the bar is held it follows the palm, and before and after it lies
-still; the hand stands still to the bar whenever its skin touches it.
+From rest the hand comes from below with open fingers until the bar lies before them, and closes (`grip`); palm and
+fingers then hide the finger tips from cameras that see the back of the hand. It lifts the bar, turns it briskly in
+the picture and towards the cameras, lowers it to its old place, opens and goes back. Place, pace, turns and postures
+are drawn from the seed. While the bar is held it follows the palm, and before and after it lies still; the hand stands
+still to the bar whenever its skin touches it.
 
-The wrist is some degrees extended round the bar, as in every power grip, and bends by up to 8 degrees either way
-about that, and by up to 8 degrees to the sides, while the bar is turned; by 4 and 3 degrees at rest.
+The wrist is a little flexed round the bar, and bends by up to 7 degrees either way about that and by up to 8 to the
+sides while the bar is turned; by 3 either way else.
 """
 
 import numpy as np
 
 from common.arrays import Float
 from common.hand_model import HandModel
-from common.sim.grip import SPREAD_DEG, bar_in_palm, closed_round
+from common.sim.grip import MCP_PER_PIP, bar_in_palm, closed_round
 from common.sim.held import Cylinder
 from common.sim.motion import (
     PERIOD_S,
@@ -32,9 +32,9 @@ ROUNDS = 5
 ROUND_S = PERIOD_S / ROUNDS
 BAR_RADIUS_M, BAR_LENGTH_M = 0.012, 0.18
 # Seconds since the beginning of a round, before its pace.
-LEAVE_S, ARRIVE_S, PRESSED_S, CLOSED_S = 0.8, 2.2, 2.7, 3.5
-LIFT_S, LIFTED_S, LOWER_S, LOWERED_S = 3.8, 4.8, 8.5, 9.5
-RELEASE_S, OPEN_S, FREE_S, BACK_S = 9.8, 10.4, 10.8, 11.8
+LEAVE_S, ARRIVE_S, CLOSED_S = 0.8, 2.4, 3.3
+LIFT_S, LIFTED_S, LOWER_S, LOWERED_S = 3.7, 4.8, 8.4, 9.5
+RELEASE_S, OPEN_S, BACK_S = 9.8, 10.5, 11.8
 _STILL_S = 0.5  # in which the hand comes to stand still, and moves again
 _TURN_S, _TURN_FADE_S = 1.7, 0.3
 TURN_DEG = 25.0
@@ -43,10 +43,12 @@ LIFT_M = (0.08, 0.12)
 PLACE_M = np.array([0.025, 0.015, 0.02])  # half of the box of places, rig axes
 UP_M = 0.035  # of the bar above the middle of the view
 COMES_M = np.array([0.015, 0.0, -0.13])  # from there, palm axes
-BEFORE_M = np.array([0.0, 0.022, 0.0])  # how far the palm stays off until it is pressed to the bar
-EXTENDED_DEG = 8.0
-SWAY_DEG, TURNING_DEG = np.array([4.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
-_OPEN = ((30, -8, 0), *((spread, 4, 5) for spread in SPREAD_DEG[1:]))
+LEAN_DEG = np.array(
+    [-26.0, -10.0, 0.0]
+)  # of the whole hand: fingers and thumb a little away from the cameras
+FLEXED_DEG = 3.0
+SWAY_DEG, TURNING_DEG = np.array([3.0, 3.0]), np.array([4.0, 5.0])  # flexion, deviation
+_OPEN = ((30, -8, 0), (3, 4, 5), (0, 4, 5), (-3, 4, 5), (-6, 4, 5))
 
 
 class Grasp:
@@ -79,9 +81,11 @@ class Grasp:
         self._sign = rng.choice((-1.0, 1.0), (ROUNDS, 2))
         self._grip_wobble = np.zeros((5, 4))
         self._grip_wobble[:, 3] = rng.uniform(-0.5, 0.5, 5)
+        self._lean = np.radians(LEAN_DEG) * np.array([1.0, model.side_sign, 1.0])
+        mcp_per_pip = MCP_PER_PIP * (1.0 + rng.normal(0.0, 0.06, 4))
         self._T_palm_object = bar_in_palm(model, radius_m)
-        self._grip = closed_round(model, self._T_palm_object, radius_m, self._grip_wobble)
-        self._T_grip = base_pose(model, self._centre, np.zeros(3), np.zeros(3))
+        self._grip = closed_round(model, self._T_palm_object, radius_m, self._grip_wobble, mcp_per_pip)
+        self._T_grip = base_pose(model, self._centre, np.zeros(3), self._lean)
 
     @property
     def period_s(self) -> float:
@@ -98,23 +102,24 @@ class Grasp:
         """The hand at time `t_s` [s]; before 0 the pose of 0."""
         k, s = self.round_at(t_s)
         wobble, drift, drift_turn = self._drift.at(max(t_s, 0.0) % PERIOD_S)
-        near = _between(s, LEAVE_S, ARRIVE_S, FREE_S, BACK_S)
-        pressed = _between(s, ARRIVE_S - 0.1, PRESSED_S, OPEN_S - 0.1, FREE_S)
-        ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, FREE_S + 0.2, BACK_S)
-        closed = _between(s, PRESSED_S, CLOSED_S, RELEASE_S, OPEN_S)
+        near = _between(s, LEAVE_S, ARRIVE_S, OPEN_S, BACK_S)
+        ready = _between(s, LEAVE_S, ARRIVE_S - 0.5, OPEN_S + 0.3, BACK_S)
+        closed = _between(s, ARRIVE_S, CLOSED_S, RELEASE_S, OPEN_S)
         lifted = _between(s, LIFT_S, LIFTED_S, LOWER_S, LOWERED_S)
         posture = self._rest + ready * (self._open - self._rest) + closed * (self._grip - self._open)
         angles = angles_of(self._model, posture, wobble + closed * (self._grip_wobble - wobble))
-        still = window(s, ARRIVE_S - 0.6, LIFT_S + _STILL_S, _STILL_S)
-        still += window(s, LOWERED_S - 0.6, FREE_S + _STILL_S, _STILL_S)
-        off = (1.0 - near) * self._comes + (1.0 - pressed) * BEFORE_M
-        shift = self._T_grip[:3, :3] @ (off * np.array([self._model.side_sign, 1.0, 1.0]))
+        still = window(s, ARRIVE_S - _STILL_S, LIFT_S + _STILL_S, _STILL_S)
+        still += window(s, LOWERED_S - _STILL_S, OPEN_S + _STILL_S, _STILL_S)
+        side = np.array([self._model.side_sign, 1.0, 1.0])
+        shift = self._T_grip[:3, :3] @ ((1.0 - near) * side * self._comes)
         shift = shift + (1.0 - still) * drift - lifted * np.array([0.0, self._lift_m[k], 0.0])
         turn, swing = self._turning(k, s)
-        pose = base_pose(self._model, self._centre, shift, turn + (1.0 - still) * drift_turn)
+        pose = base_pose(self._model, self._centre, shift, self._lean + turn + (1.0 - still) * drift_turn)
         held = CLOSED_S <= s < RELEASE_S
         bar = (pose if held else self._T_grip) @ self._T_palm_object
-        bend = np.radians(SWAY_DEG * self._sway.at(t_s) + swing - near * np.array([EXTENDED_DEG, 0.0]))
+        bend = np.radians(
+            SWAY_DEG * self._sway.at(max(t_s, 0.0)) + swing + near * np.array([FLEXED_DEG, 0.0])
+        )
         return HandState(pose, angles, bend, (Cylinder(bar, self._radius_m, BAR_LENGTH_M, held),))
 
     def _turning(self, k: int, s: float) -> tuple[Float, Float]:

@@ -3,7 +3,7 @@
 All of them are pure in time, smooth (C2) and closed over their period, and the wrist bends in all of them, since the
 device sits on the forearm (`common.wrist_bend`; limits of the bend as flexion / deviation):
 
-    grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 8 degrees extended, +-8 / +-8 about that
+    grasp         closes round a bar, lifts, turns and puts it back (`grasp`); 3 degrees flexed, +-7 / +-8 about that
     both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
     both-curl     all fingers curl slowly from straight to PIP 105 degrees and back; +-8 / +-5
     both-travel   the hand goes to and fro at a peak of 1 m/s, its fingers slowly moving; +-8 / +-5

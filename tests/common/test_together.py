@@ -27,7 +27,7 @@ CAMERAS = {
 HAND = load(ROOT / "calib_json/hands/default-right.json", HandProfile)
 MODEL = HandModel.of(HAND)
 CENTRE = view_centre(DESK)
-MOST_BEND_DEG = {"grasp": (16.0, 8.0), "both-moves": (25.0, 12.0)}
+MOST_BEND_DEG = {"grasp": (10.0, 8.0), "both-moves": (25.0, 12.0)}
 RATE_HZ = 100
 
 
