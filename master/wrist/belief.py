@@ -96,7 +96,9 @@ class AngleBelief:
         angles = self._model.clamp(self._curve.angles(closing, closed.abduction_rad))
         noise = self._sight.laser_m2(cov_m2, distance_m, closed.length_px, shown)
         noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
-        information = np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self.habits
+        information = (
+            np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self.habits
+        )
         spread = np.full(5, _ANYWHERE_RAD)
         spread[closed.past] = np.maximum(left[closed.past], 0.1) / np.sqrt(12.0)
         information[:, PIP, PIP] += 1.0 / spread**2

@@ -9,34 +9,38 @@ what else is believed of the angles, the least of  (y - f)' R^-1 (y - f) + a' H 
 import numpy as np
 
 from common.arrays import Bool, Float
+from common.hand_limits import FLEXION
 from common.messages import Level
 from master.wrist.belief import FingerAngles
 from master.wrist.finger_poses import SEEN
-from master.wrist.forward import DIP, PIP
+from master.wrist.forward import DIP, PIP, NaturalCurve
 from master.wrist.levels import Sighting
 from master.wrist.ridge import Crossings
 from master.wrist.sight import SightNoise
 
 _ANYWHERE_RAD = np.radians(35.0)  # joints of hands at work, about their mean
+_STIFF_RAD = np.radians(1.0)  # of joints whose angles are told along the natural curve alone
 _COUPLED_RAD = np.radians(5.0)  # of the last joint about its coupling, where a tip was seen
 
 
 class BendSlope:
     """Of one device and hand. What it holds was prepared by the constructor."""
 
-    def __init__(self, noise: SightNoise, habits: Float, dip_per_pip: Float) -> None:
+    def __init__(self, noise: SightNoise, curve: NaturalCurve) -> None:
         """Join the parts.
 
         Args:
             noise: Of what is seen.
-            habits: (5, 4, 4) information [1/rad^2] of fingers whose laser point alone is known.
-            dip_per_pip: (5,) how far the last joint bends with the one before.
+            curve: How joints bend together.
         """
-        self._noise, anywhere = noise, np.eye(4) / _ANYWHERE_RAD**2
-        self._by_habit: Float = habits + anywhere
-        row = np.zeros((5, 4))
-        row[:, PIP], row[:, DIP] = -dip_per_pip, 1.0
-        self._loose: Float = anywhere + row[:, :, None] * row[:, None] / _COUPLED_RAD**2
+        self._noise = noise
+        rows = np.zeros((2, 5, 4))
+        for row, joint in zip(rows, (FLEXION, DIP), strict=True):
+            row[:, joint], row[:, PIP] = 1.0, -curve.slope[:, joint]
+        mcp, dip = rows[..., :, None] * rows[..., None, :]
+        anywhere = np.eye(4) / _ANYWHERE_RAD**2
+        self._by_curve: Float = anywhere + (mcp + dip) / _STIFF_RAD**2
+        self._loose: Float = anywhere + dip / _COUPLED_RAD**2
 
     def __call__(self, at: Crossings, found: FingerAngles, sight: Sighting) -> Float:
         """Derivatives (5, 4, 2) of the angles that were found; `at`: what is seen there. 0: nothing is known."""
@@ -51,5 +55,5 @@ class BendSlope:
         tip = self._noise.tip(sight.tip_sigma_px, sight.distance_m)
         weight[both, 2:, 2:] = np.linalg.inv(tip[both])
         pull = np.swapaxes(at.by_angles, 1, 2) @ weight
-        H = pull @ at.by_angles + np.where(both[:, None, None], self._loose, self._by_habit)
+        H = pull @ at.by_angles + np.where(both[:, None, None], self._loose, self._by_curve)
         return -np.asarray(np.linalg.solve(H, pull @ at.by_bend), np.float64)

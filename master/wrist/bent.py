@@ -25,8 +25,8 @@ from master.wrist.ridge import Crossings, Ridge
 from master.wrist.setup import WristSetup
 
 _RAYS = 24
-_PLAUSIBLE_M = 0.05  # of a laser point, where the tip is where it was seen: noise of both leaves less
-_OFF_RAD = 0.25  # of a tip that no flexion brings to its ray
+_PLAUSIBLE_M = 0.2  # of a laser point, where the tip is where it was seen: noise of both leaves less
+_OFF_RAD = 1.0  # of a tip that no flexion brings to its ray
 _UNKNOWN_M = 1.0  # what a closed form may be wrong by: who wants to be exact asks the cut
 
 

@@ -95,7 +95,7 @@ class WristFingers:
         table = self.inverse.table
         self._believe = AngleBelief(setup, table)
         self._cubic = CubicLaw(setup, table) if setup.cubic else None
-        self._slope = BendSlope(SightNoise(setup), self._believe.habits, poses.dip_per_pip)
+        self._slope = BendSlope(SightNoise(setup), table.curve)
         self._levels = None if setup.level == "fk" else Levels(setup, model or InverseModel(setup))
         self._smooth, self._smooth_tips = (
             _point_filter(setup, self._axes) if continuous else None for _ in range(2)

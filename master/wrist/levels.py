@@ -162,9 +162,10 @@ class Levels:
         return np.logaddexp.reduce(hands[:, None, None] + valley.log), float(np.exp(hands[0]))
 
     def _should_show(self, poses: FingerPoses, natural: FingerAngles, unseen: Bool) -> Bool:
-        """Fingers (5,) whose tip is not seen though habit has it in sight and other fingers show theirs.
+        """Fingers (5,) that are bent otherwise, since their tip is not seen though habit has it in sight.
 
-        They are bent otherwise, or something hides the tip.
+        That is said of one between fingers that show theirs. Where tips of neighbours are missing alike the hand holds
+        something that hides them, and they tell nothing.
         """
         asked = natural.told & unseen
         asked[0] = False  # the tip of a thumb is hardly ever found
@@ -177,7 +178,11 @@ class Levels:
         uv = self._optics.project(tips)
         size = np.array([self._optics.width_px, self._optics.height_px])
         inside = ((uv > _INSIDE_PX) & (uv < size - _INSIDE_PX)).all(axis=-1)
-        return asked & (inside & poses.tips_shown(x)).all(axis=0)
+        missing = asked & (inside & poses.tips_shown(x)).all(axis=0)
+        beside = np.zeros(5, np.bool_)
+        beside[2:] |= missing[1:-1]
+        beside[1:-1] |= missing[2:]
+        return missing & ~beside
 
     def _free(
         self, model: InverseModel, natural: FingerAngles, sight: Sighting, solved: Bool

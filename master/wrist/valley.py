@@ -32,7 +32,7 @@ from master.wrist.pose_table import Forward
 _FINE = 4  # steps of the density from node to node
 _STEPS = 4
 _ROUGH_STEPS, _MENDED_STEPS = 2, 2  # before the laser's cut is asked, and after it
-_HOPELESS = 60.0  # it is not asked of poses whose misfit is worse than the best by so much
+_HOPELESS = 300.0  # it is not asked of poses whose misfit is worse than the best by so much
 _FARTHEST_RAD = np.radians(15.0)  # of one step
 RATIOS = 0.5 * (
     0.84 - 2.0 / 3.0
