@@ -38,10 +38,12 @@ class Played:
     Attributes:
         shown: What cameras of markers saw, or None.
         worn: What a wrist device saw, or None.
+        together: The scene is one for both kinds of rig, whether or not there are both.
     """
 
     shown: Scene | None = None
     worn: WristScene | None = None
+    together: bool = False
 
     @classmethod
     def of(cls, setup: RigSetup, name: str, seed: int) -> "Played":
@@ -51,16 +53,17 @@ class Played:
             PhalanxError: There is no such scene for this kind of rig, or it is not one motion for both kinds.
         """
         moves, hand = name.partition("@")[0], setup.hand.profile
+        together = moves in TOGETHER
         if setup.wrist_rig is None:
-            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed))
+            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed), None, together)
         worn = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
         if not setup.has_markers:
-            return cls(None, worn)
-        if moves not in TOGETHER:
+            return cls(None, worn, together)
+        if not together:
             raise PhalanxError(
                 f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
             )
-        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed), worn)
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed), worn, together)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,7 +124,7 @@ def _judge(
     if played.shown is None:
         assert played.worn is not None, "one of the two there is"
         return _of_wrist(poses, row, setup, played.worn, epoch_ns, tell)
-    judged = _of_markers(poses, setup, played.shown, epoch_ns, tell)
+    judged = _of_markers(poses, setup, played.shown, epoch_ns, tell, hidden=played.together)
     if played.worn is None:
         return judged
     worn = laser_scores(poses, played.worn, epoch_ns, tell)
@@ -129,10 +132,12 @@ def _judge(
     return _Judged(judged.scores | worn, judged.truth, images, WristPicture.of(setup))
 
 
-def _of_markers(poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress) -> _Judged:
+def _of_markers(
+    poses: Poses, setup: RigSetup, scene: Scene, epoch_ns: int, tell: Progress, *, hidden: bool
+) -> _Judged:
     truth, fingers = truth_of(poses, scene, epoch_ns, tell), fingers_of(setup)
     scores = score(poses, truth, fingers)
-    if setup.wrist is not None:
+    if hidden:
         scores |= score_hidden(poses, truth, fingers)
     return _Judged(
         scores,

@@ -152,13 +152,15 @@ def _summarise(
 
 
 def _score_markers(recording: FrameRecording, setup: RigSetup, poses: Poses) -> dict[str, float]:
-    """Of a hand with markers; with a wrist device how good it is where only that sees, too."""
+    """Of a hand with markers; of a recording of both kinds also where cameras lose what a wrist device sees."""
     found = np.isfinite(poses.markers_raw_m).all(axis=2).sum(axis=0)
     truth = load_truth(recording.folder, found == found.max())
     if truth is None:
         return {}
     scores = score(poses, truth, fingers_of(setup))
-    return scores if setup.wrist is None else scores | score_hidden(poses, truth, fingers_of(setup))
+    if recording.manifest.kind == "both":
+        scores |= score_hidden(poses, truth, fingers_of(setup))
+    return scores
 
 
 def _score_worn(
