@@ -42,8 +42,8 @@ _LABELS = {
     "joint_mm": ("joint error, all fingers", "mm"),
     "pip_deg_visible": ("PIP error, visible fingers", "deg"),
     "pip_deg": ("PIP error, all fingers", "deg"),
-    "joint_mm_hidden": ("joint error, fingers no two cameras see", "mm"),
-    "pip_deg_hidden": ("PIP error of those", "deg"),
+    "joint_mm_hidden": ("joint error, hidden fingers", "mm"),
+    "pip_deg_hidden": ("PIP error, hidden fingers", "deg"),
     "hand_over_step_mm": ("step when a sensor takes over", "mm"),
     "forearm_tilt_deg": ("forearm against the vertical, RMS", "deg"),
 }
@@ -99,7 +99,7 @@ def _finish(summary: dict[str, object], file: Path | None) -> None:
     print()
     for key, (label, unit) in _LABELS.items():
         if key in summary:
-            print(f"  {label:41s} {summary[key]:>9} {unit}")
+            print(f"  {label:30s} {summary[key]:>9} {unit}")
 
 
 def _say(line: str) -> None:
