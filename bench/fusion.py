@@ -9,77 +9,35 @@ each compared over what it and the fused hand call valid. What else is meant by 
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal, cast
+from collections.abc import Iterator, Mapping, Sequence
+from typing import cast
 
 import numpy as np
 
-from bench.fusion_kept import Mode, observed
-from bench.fusion_scene import SCENES, Shown
-from bench.fusion_score import Figures, Ratios, Sighted, ratios
-from bench.fusion_solved import Away, Solved, solve
+from bench.fusion_kept import Mode
+from bench.fusion_outcome import KINDS, Outcome, cut_off, solved
+from bench.fusion_scene import SCENES
+from bench.fusion_score import Figures, Ratios
 from bench.row import Row
 from common.hand_model import FINGERS
-from master.rig import RigSetup
 
-Kind = Literal["fused", "markers", "wrist"]
-KINDS: tuple[Kind, ...] = ("fused", "markers", "wrist")
-SECONDS, SEED = 60.0, 41
+SECONDS, CUT_SECONDS, SEED = 24.0, 60.0, 41
 CUT = ("both-travel", "both-poses")
 WORSE, GAIN = 1.05, 0.25  # never worse than the better by more, and in the mean better by at least so much
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """What the pipelines made of one scene.
-
-    Attributes:
-        shown: The scene's messages and truth.
-        solved: Each pipeline's poses beside the truth.
-        figures: How good they are.
-    """
-
-    shown: Shown
-    solved: dict[Kind, Solved]
-    figures: dict[Kind, Figures]
-
-    @classmethod
-    def of(cls, shown: Shown, kinds: Sequence[Kind] = KINDS, away: Away | None = None) -> "Outcome":
-        """Solve and judge the scene with these pipelines, with streams cut off if asked."""
-        both = shown.both
-        setups: dict[Kind, RigSetup] = {"fused": both.fused, "markers": both.markers, "wrist": both.wrist}
-        messages = shown.messages if away is None else away.left(shown.messages)
-        solved: dict[Kind, Solved] = {}
-        figures: dict[Kind, Figures] = {}
-        for kind in kinds:
-            solved[kind] = Solved.of(both, solve(setups[kind], messages), setups[kind])
-            figures[kind] = Figures.of(solved[kind], Sighted.of(shown, solved[kind], away))
-        return cls(shown, solved, figures)
-
-    @property
-    def ratios(self) -> Ratios:
-        """Fused by the better sensor alone."""
-        each = [ratios(self.solved["fused"], self.solved[kind]) for kind in KINDS[1:]]
-        return Ratios(*(float(max(pair)) for pair in zip(*each, strict=True)))
-
-
 def rows() -> Iterator[Row]:
     """All scenes, and two of them with streams cut off."""
-    yield from table(SCENES, CUT, SECONDS, SEED, "rendered")
+    yield from table(solved(SCENES, SECONDS, SEED, "rendered"), cut_off(CUT, CUT_SECONDS, SEED, "rendered"))
 
 
-def table(scenes: Sequence[str], cut: Sequence[str], seconds: float, seed: int, mode: Mode) -> Iterator[Row]:
-    """The rows of these scenes, the comparison of all of them, and of some with streams cut off."""
-    found: list[Outcome] = []
-    for name in scenes:
-        found.append(Outcome.of(observed(name, seconds, seed, mode)))
-        yield from _scene(name, found[-1])
-    yield from _compared(scenes, [one.ratios for one in found])
-    for name in cut:
-        yield from _cut(
-            name, Outcome.of(observed(name, seconds, seed, mode), KINDS[:1], Away()).figures["fused"]
-        )
+def table(found: Mapping[str, Outcome], cut: Mapping[str, Figures]) -> Iterator[Row]:
+    """The rows of scenes, the comparison of all of them, and of some with streams cut off."""
+    for name, one in found.items():
+        yield from _scene(name, one)
+    yield from _compared({name: one.ratios for name, one in found.items()})
+    for name, figures in cut.items():
+        yield from _cut(name, figures)
 
 
 def _scene(name: str, found: Outcome) -> Iterator[Row]:
@@ -129,19 +87,16 @@ def _bits(ours: Figures, note: str) -> Iterator[Row]:
     yield Row("  poses with a false TRACKED bit", 100 * ours.false_tracked, "%", f"{note}; {why}")
 
 
-def _compared(scenes: Sequence[str], each: Sequence[Ratios]) -> Iterator[Row]:
+def _compared(each: Mapping[str, Ratios]) -> Iterator[Row]:
     for what, field in (("joints", "joints"), ("fingers", "fingers"), ("PIP", "pip")):
-        values = np.array([cast(float, getattr(one, field)) for one in each])
-        for name, value in zip(scenes, values.tolist(), strict=True):
-            yield Row(
-                f"{name}: fused / better alone, {what}",
-                value,
-                "x",
-                f"goal {WORSE} or less: {_met(value <= WORSE)}",
-            )
-        gain = 1.0 - float(values.mean())
-        note = f"goal {100 * GAIN:.0f} or more: {_met(gain >= GAIN)}"
-        yield Row(f"fused better than the better alone, {what}, mean", 100 * gain, "%", note)
+        values = {name: cast(float, getattr(one, field)) for name, one in each.items()}
+        for name, value in values.items():
+            note = f"goal {WORSE} or less: {_met(value <= WORSE)}"
+            yield Row(f"{name}: fused / better alone, {what}", value, "x", note)
+        if values:
+            gain = 1.0 - float(np.mean(list(values.values())))
+            note = f"goal {100 * GAIN:.0f} or more: {_met(gain >= GAIN)}"
+            yield Row(f"fused better than the better alone, {what}, mean", 100 * gain, "%", note)
 
 
 def _cut(name: str, ours: Figures) -> Iterator[Row]:
@@ -162,16 +117,22 @@ def _met(there: bool) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the rows of some scenes; return the exit code."""
     parser = argparse.ArgumentParser(prog="python -m bench.fusion", description=__doc__)
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"by default {' '.join(SCENES)}")
     parser.add_argument(
-        "--cut", nargs="*", default=[], metavar="SCENE", help="these with streams cut off as well"
+        "scenes", nargs="*", metavar="SCENE", help=f"by default {' '.join(SCENES)}, and both cuts"
     )
-    parser.add_argument("--seconds", type=float, default=SECONDS)
+    parser.add_argument("--cut", nargs="*", metavar="SCENE", help="these with streams cut off as well")
+    parser.add_argument(
+        "--seconds", type=float, default=SECONDS, help="of the scenes; those cut off last a minute"
+    )
     parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument("--mode", choices=("rendered", "quick"), default="rendered")
     options = parser.parse_args(arguments)
-    made: Iterable[Row] = table(options.scenes, options.cut, options.seconds, options.seed, options.mode)
-    for row in made:
+    scenes = cast(list[str], options.scenes) or list(SCENES)
+    asked = cast(list[str] | None, options.cut)
+    cut = (() if options.scenes else CUT) if asked is None else asked
+    mode = cast(Mode, options.mode)
+    found = solved(scenes, options.seconds, options.seed, mode)
+    for row in table(found, cut_off(cut, CUT_SECONDS, options.seed, mode)):
         print(f"{row.name:58s} {row.value:10.4g} {row.unit:5s} {row.note}", flush=True)
     return 0
 

@@ -1,8 +1,6 @@
-"""`python -m bench.fusion_plot FILE.png`: PIP and joints by scene, fused and alone, and a grasp in time."""
+"""The figure of fusion: errors of PIP and joints by scene, fused and alone, and a grasp in time."""
 
-import argparse
-import sys
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import cast
 
@@ -11,9 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bench.fusion import KINDS, SECONDS, SEED, Kind, Outcome
-from bench.fusion_kept import Mode, observed
-from bench.fusion_scene import SCENES
+from bench.fusion_outcome import KINDS, Kind, Outcome
 from bench.fusion_score import ABOUT_S
 from common.arrays import Float
 
@@ -22,17 +18,8 @@ _NAMES: dict[Kind, str] = {"fused": "fused", "markers": "marker rig alone", "wri
 _GRASP, _ROUND_S = "grasp", 14.0
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Draw; return the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m bench.fusion_plot", description=__doc__)
-    parser.add_argument("file", type=Path, help="PNG to write")
-    parser.add_argument("--seconds", type=float, default=SECONDS)
-    parser.add_argument("--seed", type=int, default=SEED)
-    parser.add_argument("--mode", choices=("rendered", "quick"), default="rendered")
-    options = parser.parse_args(arguments)
-    file: Path = options.file
-    mode = cast(Mode, options.mode)
-    found = {name: Outcome.of(observed(name, options.seconds, options.seed, mode)) for name in SCENES}
+def draw(found: Mapping[str, Outcome], file: Path) -> None:
+    """Draw the outcomes of scenes, `grasp` among them, into a PNG."""
     figure = Figure(figsize=(11.0, 6.4), dpi=110, layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2)
@@ -50,8 +37,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _course(below, found[_GRASP])
     figure.legend(*below.get_legend_handles_labels(), fontsize=8, loc="outside lower center", ncols=4)
     figure.savefig(file)
-    print(file)
-    return 0
 
 
 def _of(found: Outcome, field: str) -> dict[Kind, float]:
@@ -93,7 +78,3 @@ def _course(axes: Axes, found: Outcome) -> None:
     axes.set_xlabel("grasp: reach, close, lift, turn, put back, release [s]", fontsize=9)
     axes.set_ylabel("PIP error, mean of four fingers [°]", fontsize=8)
     axes.grid(alpha=0.25)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
