@@ -264,8 +264,12 @@ class RerunScene:
         name, points = ("markers", truth.markers_m) if truth.laser_m is None else ("laser", truth.laser_m)
         grey = np.full(points.shape[:2], pack([TRUTH_RGB])[0])
         self._rows.points(f"{WORLD}/truth{group}/{name}", t, points, seen(points), grey, 0.002)
-        for name, error in truth.errors_m(poses).items():
-            self._rows.scalars(f"plots/error_mm{group}/{name}", t, mean_known(error) * 1e3)
+        for i, (name, error) in enumerate(truth.errors_m(poses).items()):
+            path = f"plots/error_mm{group}/{name}"
+            if path not in self._styled:
+                self._rows.name(path, name, series_rgb(i))
+                self._styled.add(path)
+            self._rows.scalars(path, t, mean_known(error) * 1e3)
 
     def _rate_hz(self, t_ns: Int) -> Float:
         """Poses per second (T,) over the second that ends at each row; NaN for the very first."""
