@@ -37,7 +37,7 @@ _TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do 
 _FARTHEST_RAD = np.radians(30.0)  # that the other sensors turned it, and it is still but a step
 _WIDE_BEND = np.radians(15.0) ** 2 * np.eye(2)
 _NO_COMMON = np.zeros((3, 2))
-_NO_ANGLES, _NO_COV, _NO_SLOPE = np.full((5, 4), nan), np.tile(np.eye(4), (5, 1, 1)), np.zeros((5, 4, 2))
+_NO_ANGLES, _NO_WORTH = np.full((5, 4), nan), (np.zeros((5, 4, 4)), np.zeros((5, 4, 2)), np.zeros((5, 2, 2)))
 _NONE_TOLD, _NO_LEVEL = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
 
 
@@ -51,7 +51,7 @@ class WristSide:
     def __init__(self, wrist: WristFingers, forearm: Forearm | None, parameters: HandParameters) -> None:
         """Join device and forearm; None: the device has no IMU, or it is not known how that is mounted."""
         self._wrist, self.forearm, self._parameters = wrist, forearm, parameters
-        self._track = FingerTrack(wrist.habits)
+        self._track = FingerTrack()
         self.seen: SeenFingers | None = None
 
     @classmethod
@@ -89,14 +89,15 @@ class WristSide:
         bend, cov = self.bend(t_ns)
         palm, palm_bend = (None, _NO_COMMON) if turned is None else turned
         if fingers is None:
-            return SensedHand(_NO_ANGLES, _NO_COV, _NONE_TOLD, _NO_LEVEL, _NO_SLOPE, cov, palm, palm_bend)
-        slope = fingers.by_bend
+            return SensedHand(_NO_ANGLES, *_NO_WORTH, _NONE_TOLD, _NO_LEVEL, cov, palm, palm_bend)
+        worth = fingers.left()
         return SensedHand(
-            fingers.angles_rad + slope @ (bend - fingers.bend_rad),
-            fingers.own_cov_rad2,
+            fingers.angles_rad + fingers.by_bend @ (bend - fingers.bend_rad),
+            worth.angles,
+            worth.with_bend,
+            worth.bend,
             fingers.told,
             fingers.level,
-            slope,
             cov,
             palm,
             palm_bend,

@@ -2,19 +2,19 @@
 
 A device on the forearm tells how fingers are bent (its camera) and how the palm is turned (its IMU), and both through a
 wrist that bends: if the bend is other than believed, the palm is turned and all fingers seem bent by it. So their
-errors are no five or six of their own. With r the turn from the believed palm (3) and the angles less the believed
-ones (20), S their own covariances, b the bend and J = dr/db,
+errors are no five or six of their own. Information adds up over the turn from the believed palm (3), the angles less
+the believed ones (20) and the bend less the believed one (2):
 
-    cost = r' (S + J cov(b) J')^-1 r / 2
+    fingers: what sights tell of angles and bend       palm: the inverse of its covariance with the bend
 
-which joins the markers and habits in the same normal equations (`master.ik.hand_problem`): no sensor is switched on or
-off, and a bend that all fingers suggest alike is none of theirs.
+and what is left when the bend is integrated out joins markers and habits in the same normal equations
+(`master.ik.hand_problem`): no sensor is switched on or off, and a bend that all fingers suggest is none of theirs.
 
 A sensor that errs once in a while (a false fingertip) must not win by being narrow. A finger whose angles by the fit
-are farther from the believed ones than their covariance allows counts less: its own covariance grows by
-(N + chi square) / (N + 4), the inverse weight of Student's t with N = 4 degrees of freedom (Lange, Little, Taylor 1989,
-"Robust statistical modeling using the t distribution"). What puts a fingertip where its marker, seen by two cameras, is
-not, is not taken at all: it is another thing, such as the edge of what the hand holds.
+are farther from the believed ones than their information allows counts less, by (N + 4) / (N + chi square), the weight
+of Student's t with N = 4 degrees of freedom (Lange, Little, Taylor 1989, "Robust statistical modeling using the t
+distribution"). What puts a fingertip where its marker, seen by two cameras, is not, is not taken at all: it is another
+thing, such as the edge of what the hand holds.
 """
 
 from dataclasses import dataclass, field, replace
@@ -30,7 +30,9 @@ from master.ik.parameters import HandParameters
 _ANGLES, _TURN = 4, 3
 _FREEDOM = 4.0
 _SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is weighed down
+_BEND = 2
 _ALL = _TURN + 5 * _ANGLES
+_PALM_AND_BEND = np.array([0, 1, 2, _ALL, _ALL + 1])
 _ELSEWHERE = 16.3  # chi square of three numbers, 1 in 1000
 _MOST_RAD = np.radians(25.0)  # more doubt of one angle than that moves a tip on no straight line
 _PALM_M = 8e-3  # about so well a palm is known from one moment to the next
@@ -42,42 +44,47 @@ class SensedHand:
 
     Attributes:
         angles_rad: (5, 4); a finger of which nothing is known has NaN.
-        own_cov_rad2: (5, 4, 4) of the fingers, without what the bend does to all of them.
+        weight: (5, 4, 4) [1/rad^2] what sights tell of the angles, the bend given; all three are 0 where nothing is
+            known.
+        with_bend: (5, 4, 2) [1/rad^2] of angles and bend together.
+        of_bend: (5, 2, 2) [1/rad^2] of the bend, the angles given.
         told: (5,) fingers that are seen now, well enough to say how they are bent.
         level: (5,) `Level` codes: what they are told from.
-        by_bend: (5, 4, 2) how the angles change with the bend [rad/rad].
-        bend_cov_rad2: (2, 2).
+        bend_cov_rad2: (2, 2) of the bend before these sights.
         palm: How the palm is turned, its covariance with what the bend is in it; None: not known.
         palm_bend_rad2: (3, 2) covariance of that turn, in rig axes, with the bend.
         information: (23, 23) [1/rad^2] of turn and angles.
     """
 
     angles_rad: Float
-    own_cov_rad2: Float
+    weight: Float
+    with_bend: Float
+    of_bend: Float
     told: Bool
     level: Code
-    by_bend: Float
     bend_cov_rad2: Float
     palm: Orientation | None
     palm_bend_rad2: Float
     information: Float = field(init=False)
 
     def __post_init__(self) -> None:
-        cov = np.zeros((_ALL, _ALL))
+        Q = np.zeros((_ALL + _BEND, _ALL + _BEND))
         for f in range(5):
             own = slice(_TURN + _ANGLES * f, _TURN + _ANGLES * (f + 1))
-            cov[own, own] = self.own_cov_rad2[f]
-        slope = self.by_bend.reshape(-1, 2)
-        cov[_TURN:, _TURN:] += slope @ self.bend_cov_rad2 @ slope.T
-        if self.palm is not None:
-            cov[:_TURN, :_TURN] = self.palm.cov_rad2
-            cov[:_TURN, _TURN:] = self.palm_bend_rad2 @ slope.T
-            cov[_TURN:, :_TURN] = cov[:_TURN, _TURN:].T
-        known = np.concatenate([np.full(_TURN, self.palm is not None), np.repeat(self.known, _ANGLES)])
-        at = np.ix_(known, known)
-        information = np.zeros((_ALL, _ALL))
-        information[at] = np.linalg.inv(cov[at])
-        object.__setattr__(self, "information", information)
+            Q[own, own], Q[own, _ALL:] = self.weight[f], self.with_bend[f]
+            Q[_ALL:, own] = self.with_bend[f].T
+        Q[_ALL:, _ALL:] = self.of_bend.sum(axis=0)
+        if self.palm is None:
+            Q[_ALL:, _ALL:] += np.linalg.inv(self.bend_cov_rad2)
+        else:
+            at = np.ix_(_PALM_AND_BEND, _PALM_AND_BEND)
+            cov = np.block(
+                [[self.palm.cov_rad2, self.palm_bend_rad2], [self.palm_bend_rad2.T, self.bend_cov_rad2]]
+            )
+            Q[at] += np.linalg.inv(cov)
+        crossed = Q[:_ALL, _ALL:]
+        left = Q[:_ALL, :_ALL] - crossed @ np.linalg.solve(Q[_ALL:, _ALL:], crossed.T)
+        object.__setattr__(self, "information", np.asarray(left, np.float64))
 
     @property
     def known(self) -> Bool:
@@ -89,25 +96,36 @@ class SensedHand:
         """Those that are told."""
         return frozenset(np.flatnonzero(self.told).tolist())
 
+    @property
+    def alone(self) -> Float:
+        """(5, 4, 4) [1/rad^2] what is told of each finger's angles, whatever the bend is."""
+        bend = self.of_bend + np.linalg.inv(self.bend_cov_rad2)
+        taken = np.linalg.solve(bend, np.swapaxes(self.with_bend, 1, 2))
+        return np.asarray(self.weight - self.with_bend @ taken, np.float64)
+
     def without(self, fingers: Bool) -> "SensedHand":
         """The same, but nothing of those fingers (5,)."""
+        angles = np.where(fingers[:, None], np.nan, self.angles_rad)
         return replace(
-            self,
-            angles_rad=np.where(fingers[:, None], np.nan, self.angles_rad),
-            told=self.told & ~fingers,
-            by_bend=np.where(fingers[:, None, None], 0.0, self.by_bend),
+            self._shared(np.where(fingers, 0.0, 1.0)), angles_rad=angles, told=self.told & ~fingers
         )
 
     def weighed(self, angles_rad: Float) -> "SensedHand | None":
         """The belief with fingers counting less that a hand of angles (5, 4) contradicts; None: it contradicts none."""
         off = np.where(self.known[:, None], angles_rad - self.angles_rad, 0.0)
-        cov = self.own_cov_rad2 + self.by_bend @ self.bend_cov_rad2 @ np.swapaxes(self.by_bend, 1, 2)
-        cov = np.where(self.known[:, None, None], cov, np.eye(_ANGLES))
-        surprise = np.vecdot(off, np.linalg.solve(cov, off[..., None])[..., 0])
+        surprise = np.vecdot(off, (self.alone @ off[..., None])[..., 0])
         if not (surprise > _SURPRISED).any():
             return None
-        grown = np.where(surprise > _SURPRISED, (_FREEDOM + surprise) / (_FREEDOM + _ANGLES), 1.0)
-        return replace(self, own_cov_rad2=self.own_cov_rad2 * grown[:, None, None])
+        return self._shared(
+            np.where(surprise > _SURPRISED, (_FREEDOM + _ANGLES) / (_FREEDOM + surprise), 1.0)
+        )
+
+    def _shared(self, share: Float) -> "SensedHand":
+        """The same with so much of what each finger tells (5,)."""
+        by = share[:, None, None]
+        return replace(
+            self, weight=by * self.weight, with_bend=by * self.with_bend, of_bend=by * self.of_bend
+        )
 
     def of(self, parameters: HandParameters) -> "SensedFree":
         """The same about a palm and free angles."""
@@ -145,8 +163,8 @@ class MarkerCheck:
         at, tip = self._of_finger, self._model.marker_points(joints, self._markers)
         off = points_m[at] - tip[at]
         arms = tip[at][:, None] - joints.position_m[CHAINS[:, [0, 0, 1, 2]]]
-        cov = sensed.own_cov_rad2 + sensed.by_bend @ sensed.bend_cov_rad2 @ np.swapaxes(sensed.by_bend, 1, 2)
-        variance = np.minimum(np.diagonal(cov, axis1=1, axis2=2), _MOST_RAD**2)
+        cov = np.asarray(np.linalg.inv(sensed.alone + np.eye(_ANGLES) / _MOST_RAD**2), np.float64)
+        variance = np.diagonal(cov, axis1=1, axis2=2)
         spread = (variance * np.vecdot(arms, arms)).sum(axis=1) + _PALM_M**2 + np.trace(cov_m2[at].T) / 3.0
         wrong = np.vecdot(off, off) > _ELSEWHERE * spread  # NaN is not
         return sensed.known & (at >= 0) & wrong

@@ -54,11 +54,7 @@ class FingerAngles:
 
 
 class AngleBelief:
-    """What laser points say of angles, for one device and hand. What it holds was prepared by the constructor.
-
-    Attributes:
-        habits: (5, 4, 4) [1/rad^2] what habit adds to what laser points tell.
-    """
+    """What laser points say of angles, for one device and hand. What it holds was prepared by the constructor."""
 
     def __init__(self, setup: WristSetup, table: ForwardTable, priors: Priors | None = None) -> None:
         priors = priors or Priors()
@@ -66,14 +62,14 @@ class AngleBelief:
         self._sight = SightNoise(setup)
         self._most = np.minimum(table.curve.range_rad[:, 1], setup.model.limits_rad[:, PIP, 1])
         self._aside = table.abduction_rad[:, [0, -1]].T
-        self.habits = np.zeros((5, 4, 4))
+        self._habits = np.zeros((5, 4, 4))
         for f in range(5):
             mcp, dip = (priors.thumb, priors.thumb) if f == 0 else (priors.natural_flexion, priors.free_dip)
             rows = np.zeros((3, 4))
             rows[0, [FLEXION, PIP]] = np.array([1.0, -table.curve.slope[f, FLEXION]]) / mcp
             rows[1, [DIP, PIP]] = np.array([1.0, -table.curve.slope[f, DIP]]) / dip
             rows[2, ABDUCTION] = 1.0 / _ABDUCTION_RAD
-            self.habits[f] = rows.T @ rows
+            self._habits[f] = rows.T @ rows
 
     def __call__(self, closed: Closed, cov_m2: Float, distance_m: Float, laser_px: Float) -> FingerAngles:
         """Angles of fingers.
@@ -97,7 +93,7 @@ class AngleBelief:
         noise = self._sight.laser_m2(cov_m2, distance_m, closed.length_px, shown)
         noise[closed.past, 1, 1] = 1.0  # along, such a point says nothing
         information = (
-            np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self.habits
+            np.swapaxes(closed.by_angles, -1, -2) @ _inverse(noise) @ closed.by_angles + self._habits
         )
         spread = np.full(5, _ANYWHERE_RAD)
         spread[closed.past] = np.maximum(left[closed.past], 0.1) / np.sqrt(12.0)

@@ -1,10 +1,14 @@
-"""How the angles that light tells of fingers change with the bend of the wrist that they are told for.
+"""What sights are worth of angles and bend, and how the angles change with the bend of the wrist they are told for.
 
 What is seen stays, and its model moves: with G how it moves with the angles, B with the bend, R how sure it is and H
 what else is believed of the angles, the least of  (y - f)' R^-1 (y - f) + a' H a  goes by
 
     da / db = -(G' R^-1 G + H)^-1 G' R^-1 B
+
+What the sights tell without habits, of angles and bend together, is  (G B)' R^-1 (G B).
 """
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -21,6 +25,21 @@ from master.wrist.sight import SightNoise
 _ANYWHERE_RAD = np.radians(35.0)  # joints of hands at work, about their mean
 _STIFF_RAD = np.radians(1.0)  # of joints whose angles are told along the natural curve alone
 _COUPLED_RAD = np.radians(5.0)  # of the last joint about its coupling, where a tip was seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SightWorth:
+    """Information [1/rad^2] of what is seen of fingers; zeros: nothing is.
+
+    Attributes:
+        angles: (5, 4, 4) of the angles, their bend given.
+        with_bend: (5, 4, 2) that of angles and bend together.
+        bend: (5, 2, 2) of the bend, the angles given.
+    """
+
+    angles: Float
+    with_bend: Float
+    bend: Float
 
 
 class BendSlope:
@@ -42,8 +61,14 @@ class BendSlope:
         self._by_curve: Float = anywhere + (mcp + dip) / _STIFF_RAD**2
         self._loose: Float = anywhere + dip / _COUPLED_RAD**2
 
-    def __call__(self, at: Crossings, found: FingerAngles, sight: Sighting) -> Float:
-        """Derivatives (5, 4, 2) of the angles that were found; `at`: what is seen there. 0: nothing is known."""
+    def __call__(self, at: Crossings, found: FingerAngles, sight: Sighting) -> tuple[Float, SightWorth]:
+        """Derivatives (5, 4, 2) of the angles that were found, and what the sights are worth.
+
+        Args:
+            at: What is seen at these angles.
+            found: The angles. Where nothing is known the derivatives are 0.
+            sight: What was seen.
+        """
         both: Bool = found.level == Level.IK
         told = np.isfinite(found.angles_rad[:, 0]) & np.isfinite(sight.laser_m[:, 0])
         whole = np.ones(5)
@@ -55,5 +80,7 @@ class BendSlope:
         tip = self._noise.tip(sight.tip_sigma_px, sight.distance_m)
         weight[both, 2:, 2:] = np.linalg.inv(tip[both])
         pull = np.swapaxes(at.by_angles, 1, 2) @ weight
-        H = pull @ at.by_angles + np.where(both[:, None, None], self._loose, self._by_curve)
-        return -np.asarray(np.linalg.solve(H, pull @ at.by_bend), np.float64)
+        turned = np.swapaxes(at.by_bend, 1, 2)
+        worth = SightWorth(pull @ at.by_angles, pull @ at.by_bend, turned @ weight @ at.by_bend)
+        H = worth.angles + np.where(both[:, None, None], self._loose, self._by_curve)
+        return -np.asarray(np.linalg.solve(H, worth.with_bend), np.float64), worth

@@ -24,7 +24,7 @@ from common.wrist_bend import STRAIGHT
 from master.filters import OneEuroParameters, PointFilter
 from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
-from master.wrist.bend_slope import BendSlope
+from master.wrist.bend_slope import BendSlope, SightWorth
 from master.wrist.bent import BentView, BentWrist
 from master.wrist.bent_closing import closings
 from master.wrist.cubic import CubicLaw
@@ -54,12 +54,14 @@ class SeenFingers:
         found: The angles, at the bend that was told.
         laser_m: (5, 3) where the laser meets the fingers [m], camera frame; NaN: not seen.
         by_bend: (5, 4, 2) how the angles would change with the wrist's flexion and deviation [rad/rad].
+        worth: What is seen says of angles and bend by itself, without habits.
     """
 
     t_ns: int
     found: FingerAngles
     laser_m: Float
     by_bend: Float
+    worth: SightWorth
 
 
 class WristFingers:
@@ -104,11 +106,6 @@ class WristFingers:
         self._last_ns = NEVER_NS
         self._angles, self._seen_ns = np.full((5, 4), np.nan), np.full(5, NEVER_NS)
 
-    @property
-    def habits(self) -> Float:
-        """(5, 4, 4) [1/rad^2] what habit adds to what laser points alone tell of the angles."""
-        return self._believe.habits
-
     def push(self, message: WristDetections, bend_rad: Float = STRAIGHT) -> SeenFingers | None:
         """Take what one triple showed.
 
@@ -133,18 +130,18 @@ class WristFingers:
             )
             self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("angles"):
-            found, by_bend = self._angles_of(t_ns, message, points, bend_rad)
+            found, by_bend, worth = self._angles_of(t_ns, message, points, bend_rad)
         seen = np.isfinite(found.angles_rad[:, 0])
         self._angles[seen], self._seen_ns[seen] = found.angles_rad[seen], t_ns
         self._count("past", found.past)
         self._count("off", found.off)
         self._count("ambiguous", found.ambiguous)
-        return SeenFingers(t_ns, found, points.point_m, by_bend)
+        return SeenFingers(t_ns, found, points.point_m, by_bend, worth)
 
     def _angles_of(
         self, t_ns: int, message: WristDetections, points: LaserPoints, bend_rad: Float
-    ) -> tuple[FingerAngles, Float]:
-        """What laser and tips say of the fingers, and how it changes with the bend (5, 4, 2)."""
+    ) -> tuple[FingerAngles, Float, SightWorth]:
+        """What laser and tips say of the fingers, how it changes with the bend (5, 4, 2), and what sights are worth."""
         point = points.point_m
         if self._smooth is not None:
             point = self._smooth.push(t_ns, point, points.cov_m2)
@@ -159,7 +156,7 @@ class WristFingers:
         if self._levels is not None:
             found = self._by_level(self._levels, t_ns, found, sight, view)
         at = (view or self._bent.at(bend_rad)).crossings(np.nan_to_num(found.angles_rad), np.arange(5))
-        return found, self._slope(at, found, sight)
+        return found, *self._slope(at, found, sight)
 
     def _by_level(
         self, levels: Levels, t_ns: int, natural: FingerAngles, sight: Sighting, view: BentView | None
