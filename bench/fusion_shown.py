@@ -64,7 +64,11 @@ def shown(name: str, seconds: float, seed: int, every: int = 1) -> Shown:
     Raises:
         PhalanxError: No such scene.
     """
-    both = Both.of(name, seed)
+    return shown_of(Both.of(name, seed), seconds, every)
+
+
+def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
+    """The same of a scene before other rigs."""
     messages = orientations(both, seconds)
     times, paint = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:

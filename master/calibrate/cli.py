@@ -10,6 +10,7 @@ from master.calibrate.cameras.commands import intrinsics, stereo
 from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
+from master.calibrate.mounting.command import mounting
 from master.calibrate.time.commands import time_command
 from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
@@ -31,6 +32,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "curl": curl,
     "palm": palm,
     "wearer": wearer,
+    "mounting": mounting,
 }
 
 

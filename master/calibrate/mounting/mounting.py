@@ -1,0 +1,331 @@
+"""How a wrist device sits on its forearm, from ten seconds that marker rig and device see together.
+
+What is made of it is in `start`, `fit` and `unknown`; here are what goes in, what comes out, and what is refused.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from dataclasses import replace as replaced
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Bool, Float
+from common.calibration import CameraCalibration, ImuCalibration, RigCalibration
+from common.errors import CalibrationError, FitError
+from common.geometry import cross, matrix_to_quaternion, rotation_vector_to_matrix, transform
+from common.hand_model import CHAINS, FINGERS, HandModel
+from common.messages import HandPose, ImuSample, WristDetections
+from master.calibrate.cameras.lens_files import matrix_of
+from master.calibrate.mounting.fit import fit_mounting
+from master.calibrate.mounting.seen import Fit, Triples
+from master.calibrate.mounting.sights import FINGERS as WORN
+from master.calibrate.mounting.sights import Sights
+from master.calibrate.mounting.start import started
+from master.calibrate.mounting.tracks import GAP_S, HandTrack, ImuTrack
+from master.calibrate.mounting.unknown import (
+    CAMERA_IMU,
+    CAMERA_LATE,
+    FOREARM_IMU,
+    IMU_LATE,
+    SHIFT,
+)
+from master.calibrate.tree_files import provenance
+from master.wrist.laser_plane import in_image, laser_points
+from master.wrist.setup import WristSetup
+
+TOOL = "calibrate mounting"
+MOTION = (
+    "for ten seconds bend fingers one by one and together, bend the wrist as far one way as the other, and turn the"
+    " forearm about all its axes, before the marker cameras"
+)
+_MOST = 200  # triples: more of the same motion add time, not knowledge
+_FEWEST, _LEAST_S = 60, 5.0
+_SIGHTS = 2  # fingers with a laser point or a tip
+_MARKERS = 4
+_TURN_RAD, _SHIFT_M, _CLOCK_S = np.radians(4.0), 4e-3, 8e-3  # standard deviations, at most
+_MISFIT, _STRAYS = 1.8, 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mounting:
+    """A mounting that explains what was seen.
+
+    Attributes:
+        rig: The wrist rig with its new keys: T_camera_palm, imu, stamp_offset_us.
+        report: Lines for a person.
+        fit: What was fitted.
+        triples: To what.
+        sigma: Quantity with its unit -> standard deviation.
+    """
+
+    rig: RigCalibration
+    report: tuple[str, ...]
+    fit: Fit
+    triples: Triples
+    sigma: dict[str, float]
+
+
+def calibrate_mounting(
+    poses: Sequence[HandPose],
+    markers: tuple[str, ...],
+    model: HandModel,
+    triples: Sequence[WristDetections],
+    samples: Sequence[ImuSample],
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    source: str = "a joint motion",
+) -> Mounting:
+    """Fit the mounting of a wrist device to one motion.
+
+    Args:
+        poses: What the line of the marker rig made of it, by markers alone.
+        markers: Their names, in the order of the poses'.
+        model: The hand.
+        triples: What the slave of the device saw, in order.
+        samples: What its IMU measured, in order, with the orientation of its filter.
+        rig: The device: laser plane, a palm pose that is right to a centimetre and ten degrees, an IMU.
+        camera: Its camera.
+        source: Name of the data, for the provenance.
+
+    Raises:
+        FitError: The motion was not done, or not seen, or does not tell the mounting; the text says what to do.
+        CalibrationError: The rig lacks its laser plane, palm pose or IMU.
+    """
+    if rig.imu is None:
+        raise CalibrationError(f"rig {rig.name!r}: imu: missing; nothing else tells how the wrist is bent")
+    if not (poses and triples and samples):
+        missing = "the markers" if not poses else "the wrist camera" if not triples else "the IMU"
+        raise FitError(f"{missing} saw nothing: {MOTION}")
+    setup = WristSetup.of(rig, camera, model)
+    sights, zero_ns = Sights(setup), triples[0].t_ns
+    hand, imu = HandTrack.of(poses, model, zero_ns), ImuTrack(samples, zero_ns)
+    seen = _triples(setup, sights, camera, triples, zero_ns)
+    chosen = _chosen(hand, imu, seen)
+    tips = hand.points_m[:, [_marker_of(model, markers, finger) for finger in FINGERS[WORN]]]
+    start = started(hand, tips, imu, setup.optics, setup.T_camera_palm, seen)
+    if start is None:
+        raise FitError(f"hand and IMU were hardly seen at the same time: {MOTION}")
+    distance = np.linalg.norm(
+        transform(setup.T_camera_palm, model.rest_position_m[CHAINS[1:, 0]].mean(axis=0))
+    )
+    px_per_m = float(setup.optics.matrix[0, 0] / distance)
+    firsts = [replaced(start, camera_late_s=late_s).unknown for late_s in (start.camera_late_s, 0.0)]
+    fit = fit_mounting(sights, model, markers, hand, imu, seen.of(chosen), px_per_m, firsts)
+    sigma = sigmas(fit)
+    _check(fit, sigma)
+    new = _documented(rig, camera, rig.imu, fit, imu, sigma, source)
+    return Mounting(new, report_lines(fit, sigma, len(triples)), fit, seen.of(chosen), sigma)
+
+
+def _marker_of(model: HandModel, markers: tuple[str, ...], finger: str) -> int:
+    """The marker at the tip of a finger.
+
+    Raises:
+        FitError: There is none.
+    """
+    wanted = CHAINS[FINGERS.index(finger), 3]
+    for number, name in enumerate(markers):
+        if model.mount(name).joint == wanted:
+            return number
+    raise FitError(f"no marker sits on the tip of the {finger} finger, which the mounting is found by")
+
+
+def _triples(
+    setup: WristSetup,
+    sights: Sights,
+    camera: CameraCalibration,
+    messages: Sequence[WristDetections],
+    zero_ns: int,
+) -> Triples:
+    """What was seen of index ... little, on the laser plane and in the image."""
+    laser, sigma, tips, tip_sigma = (list[Float]() for _ in range(4))
+    for one in messages:
+        shown = in_image(setup, one.laser_uv, one.laser_sigma_px)
+        found = laser_points(setup, np.where(shown[:, None], one.laser_uv, np.nan), one.laser_sigma_px)
+        laser.append(sights.flat(found.point_m))
+        sigma.append(np.sqrt(np.einsum("fii->fi", sights.flat_cov(found.cov_m2))))
+        shown = in_image(setup, one.tip_uv, one.tip_sigma_px)
+        tips.append(np.where(shown[:, None], one.tip_uv, np.nan))
+        tip_sigma.append(one.tip_sigma_px)
+    return Triples(
+        np.array([1e-9 * (one.t_ns - zero_ns) for one in messages]),
+        np.array(laser)[:, WORN],
+        np.array(sigma)[:, WORN],
+        np.array(tips)[:, WORN],
+        np.array(tip_sigma)[:, WORN],
+        1.0 / camera.frame_rate_hz,  # the frame with the LEDs follows that with the laser
+    )
+
+
+def _chosen(hand: HandTrack, imu: ImuTrack, seen: Triples) -> Bool:
+    """(T,) which triples count: those whose hand both sensors see, at most 200.
+
+    Raises:
+        FitError: There are too few of them, or the IMU was silent.
+    """
+    if len(hand.t_s) < _FEWEST or len(imu) < _FEWEST:
+        raise FitError(
+            f"the markers told {len(hand.t_s)} hands, the IMU {len(imu)} orientations with rates; at least {_FEWEST} of"
+            f" each are needed: {MOTION}"
+        )
+    fingers = (np.isfinite(seen.laser_m[..., 0]) | np.isfinite(seen.tip_uv[..., 0])).sum(axis=1)
+    near = hand.nearest(seen.t_s)
+    marked = np.isfinite(hand.points_m[near, :, 0]).sum(axis=1) >= _MARKERS
+    both = (fingers >= _SIGHTS) & marked & (np.abs(hand.t_s[near] - seen.t_s) < GAP_S)
+    both &= (seen.t_s > imu.t_s[0]) & (seen.t_s < imu.t_s[-1])
+    rows = np.flatnonzero(both)
+    if len(rows) < _FEWEST or np.ptp(seen.t_s[rows]) < _LEAST_S:
+        raise FitError(
+            f"marker cameras and wrist device saw the hand together in {len(rows)} triples, at least {_FEWEST} of"
+            f" {_LEAST_S:.0f} s are needed: {MOTION}"
+        )
+    if imu.gap_s > GAP_S:
+        raise FitError(
+            f"the IMU was silent for {imu.gap_s:.2f} s: its turns cannot be summed up; record again"
+        )
+    out = np.zeros(len(seen.t_s), np.bool_)
+    out[rows[np.unique(np.linspace(0, len(rows) - 1, min(_MOST, len(rows))).astype(np.int64))]] = True
+    return out
+
+
+def sigmas(fit: Fit) -> dict[str, float]:
+    """Standard deviations by quantity with its unit; of vectors that of the worst direction."""
+    unknown, cov = fit.unknown, fit.covariance
+    by = np.zeros((3, len(cov)))  # turn of the straight palm, camera axes
+    by[:, CAMERA_IMU], by[:, FOREARM_IMU] = np.eye(3), -unknown.T_camera_palm[:3, :3]
+
+    def worst(of: Float) -> float:
+        return float(np.sqrt(np.linalg.eigvalsh(of)[-1]))
+
+    return {
+        "turn_sigma_deg": float(np.degrees(worst(by @ cov @ by.T))),
+        "shift_sigma_mm": 1e3 * worst(cov[SHIFT, SHIFT]),
+        "imu_turn_sigma_deg": float(np.degrees(worst(cov[FOREARM_IMU, FOREARM_IMU]))),
+        "camera_imu_sigma_deg": float(np.degrees(worst(cov[CAMERA_IMU, CAMERA_IMU]))),
+        "camera_clock_sigma_ms": 1e3 * float(np.sqrt(cov[CAMERA_LATE, CAMERA_LATE])),
+        "imu_clock_sigma_ms": 1e3 * float(np.sqrt(cov[IMU_LATE, IMU_LATE])),
+    }
+
+
+def _check(fit: Fit, sigma: dict[str, float]) -> None:
+    """Refuse what the motion does not tell, and what no mounting explains.
+
+    Raises:
+        FitError: With what to do.
+    """
+    if fit.rms > _MISFIT or fit.strays > _STRAYS:
+        raise FitError(
+            f"no mounting explains what was seen: it is {fit.rms:.1f} times farther off than noise, and"
+            f" {100 * fit.strays:.0f} % of it strays. Is the hand file that of this hand and side, the laser plane"
+            " measured, the first T_camera_palm right to a centimetre and ten degrees, and are both on one clock?"
+        )
+    turn = max(sigma["turn_sigma_deg"], sigma["imu_turn_sigma_deg"], sigma["camera_imu_sigma_deg"])
+    clock = max(sigma["camera_clock_sigma_ms"], sigma["imu_clock_sigma_ms"])
+    wanting: list[str] = []
+    if np.radians(turn) > _TURN_RAD:
+        wanting.append(
+            f"its turn is known to {turn:.1f} deg only: turn the forearm about another axis as well, and bend the wrist"
+        )
+    if 1e-3 * sigma["shift_sigma_mm"] > _SHIFT_M:
+        wanting.append(
+            f"its place is known to {sigma['shift_sigma_mm']:.1f} mm only: bend every finger before the device, with"
+            " its marker in sight of the cameras"
+        )
+    if 1e-3 * clock > _CLOCK_S:
+        wanting.append(f"its clocks are known to {clock:.1f} ms only: move fingers and forearm faster")
+    if wanting:
+        raise FitError("; ".join(wanting))
+
+
+def _documented(
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    old: ImuCalibration,
+    fit: Fit,
+    imu: ImuTrack,
+    sigma: dict[str, float],
+    source: str,
+) -> RigCalibration:
+    """The rig with what was measured, and where that comes from."""
+    unknown = fit.unknown
+    place = replace(
+        old,
+        q_palm_imu=_quaternion(unknown.R_forearm_imu),
+        q_rig_world=_quaternion(_rig_world(fit, imu)),
+        stamp_offset_us=round(1e6 * unknown.imu_late_s, 1),
+    )
+    residual = {name: round(value, 4) for name, value in (sigma | left_of(fit)).items()}
+    how = provenance(TOOL, (source,), residual, "the wrist is called straight in the middle of its bends")
+    world = provenance(TOOL, (source,), residual, "heading: of this recording only")
+    return replace(
+        rig,
+        T_camera_palm=matrix_of(unknown.T_camera_palm),
+        imu=place,
+        stamp_offset_us=rig.stamp_offset_us | {camera.name: round(1e6 * unknown.camera_late_s, 1)},
+        provenance=rig.provenance | {"T_camera_palm": how, "stamp_offset_us": how, "imu": world},
+    )
+
+
+def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
+    """R_rig_world (3, 3) of the world that the IMU's samples name: the mean of its vertical, the first heading."""
+    unknown, turns = fit.unknown, imu.at(imu.t_s)
+    drift = rotation_vector_to_matrix(-(turns.drift_s @ unknown.zero_rad_s))
+    rig_world = unknown.R_rig_world @ drift @ turns.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
+    known = np.isfinite(rig_world[:, 0, 0])
+    rig_world = rig_world[known]
+    up: Float = rig_world[..., 2].mean(axis=0)
+    first: Float = rig_world[0, :, 0]
+    ahead: Float = first - (first @ up) / (up @ up) * up
+    ahead, up = ahead / np.linalg.norm(ahead), up / np.linalg.norm(up)
+    return np.stack([ahead, cross(up, ahead), up], axis=1)
+
+
+def left_of(fit: Fit) -> dict[str, float]:
+    """What is left of sights, by quantity with its unit."""
+    off = fit.off * fit.sigma
+    laser, tip = (np.sqrt((part**2).sum(axis=-1)) for part in (off[..., :2], off[..., 2:]))
+    return {
+        "laser_mm": 1e3 * float(np.nanmedian(laser)),
+        "tip_px": float(np.nanmedian(tip)),
+        "marker_mm": 1e3 * fit.marker_m,
+        "strays": fit.strays,
+    }
+
+
+def report_lines(fit: Fit, sigma: dict[str, float], count: int) -> tuple[str, ...]:
+    """The result for a person."""
+    unknown, left = fit.unknown, left_of(fit)
+    bend = np.degrees(np.quantile(fit.bend_rad, [0.02, 0.98], axis=0))
+    x, y, z = 1e3 * unknown.shift_m
+    seen = (
+        f"{np.isfinite(fit.off[..., 0]).sum()} laser points, {np.isfinite(fit.off[..., 2]).sum()} fingertips"
+    )
+    what = (
+        f"laser {left['laser_mm']:.2f} mm, tips {left['tip_px']:.1f} px, markers {left['marker_mm']:.2f} mm"
+    )
+    flexed, aside = (f"{low:+.0f} ... {high:+.0f} deg" for low, high in bend.T)
+    lines = [
+        f"mounting from {len(fit.bend_rad)} of {count} triples, {seen}",
+        f"left: {what}; {100 * fit.strays:.0f} % stray",
+        f"wrist bent {flexed}, aside {aside}; its mean is called straight",
+        f"{'':24} {'found':>22} {'standard deviation':>20}",
+    ]
+    for name, value, key in (
+        ("wrist joint, camera", f"{x:.1f} {y:.1f} {z:.1f} mm", "shift_sigma_mm"),
+        ("turn of the palm", "", "turn_sigma_deg"),
+        ("turn of the IMU", "", "imu_turn_sigma_deg"),
+        ("IMU against camera", "", "camera_imu_sigma_deg"),
+        ("camera later by", f"{1e3 * unknown.camera_late_s:+.2f} ms", "camera_clock_sigma_ms"),
+        ("IMU later by", f"{1e3 * unknown.imu_late_s:+.2f} ms", "imu_clock_sigma_ms"),
+    ):
+        lines.append(f"{name:24} {value:>22} {sigma[key]:16.2f} {key.rsplit('_', 1)[1]}")
+    lines.append(
+        "the heading in q_rig_world is of this recording: it begins anywhere when the IMU starts again"
+    )
+    return tuple(lines)
+
+
+def _quaternion(R: Float) -> tuple[float, float, float, float]:
+    w, x, y, z = (round(float(value), 8) for value in matrix_to_quaternion(R))
+    return w, x, y, z

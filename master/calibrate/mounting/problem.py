@@ -1,0 +1,340 @@
+"""The most probable mounting, given what marker rig, wrist camera and IMU saw of one motion: one least-squares problem.
+
+Unknown in each instant is the hand, palm and fingers, as in the line of the markers (`master.ik.hand_problem`, with the
+loosest habits); all instants share the mounting (`unknown.Unknown`). Four kinds of sight pull at them:
+
+- **markers**, where they were at that instant of the rig's clock;
+- **laser points and tips**, of the palm as it lies before the camera. Camera and IMU are one body, so that is
+
+      R_camera_palm = R_camera_imu (R_rig_world R_world_imu)' R_rig_palm
+
+  however the wrist is bent, and its joint stays where it is;
+- **the wrist**, which bends and does not twist:
+  R_forearm_palm = R_forearm_imu (R_rig_world R_world_imu)' R_rig_palm has two angles and no third
+  (`common.wrist_bend`);
+- **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
+
+The hand of each instant is eliminated (Schur's complement), which leaves 25 unknowns. Steps are those of Levenberg and
+Marquardt; sights that stray are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
+all instants of a second together count as a few.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import rotation_vector_to_matrix
+from common.hand_model import HandModel
+from common.wrist_bend import bend_of
+from master.calibrate.mounting.normal import Hands, Normal
+from master.calibrate.mounting.seen import STRAYS, Fit, Triples
+from master.calibrate.mounting.sights import FINGERS, SEEN, Sights
+from master.calibrate.mounting.tracks import HandTrack, ImuTrack, Markers, Turns
+from master.calibrate.mounting.unknown import (
+    CAMERA_IMU,
+    CAMERA_LATE,
+    FOREARM_IMU,
+    IMU_LATE,
+    REACH,
+    RIG_WORLD,
+    SHIFT,
+    THICK,
+    UNKNOWN,
+    ZERO,
+    Unknown,
+    believed,
+)
+from master.ik.attached import Attached
+from master.ik.hand_problem import HandProblem, moved
+from master.ik.parameters import HandParameters
+from master.ik.priors import AnglePrior, Priors
+
+_SKIN_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp
+_CAP_M = 5e-4  # where caps sit, beyond the noise of the cameras
+_HABITS = 1e-2  # of their information: what sensors tell is to count
+_TWIST_RAD = np.radians(1.0)
+_BENT_RAD = np.radians(15.0)
+_PER_S = 4.0  # independent instants
+_FARTHEST = 8.0  # of a finger that the laser should meet and does not
+_TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
+_LITTLE = 1e-5
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What the tracks say while the clocks' errors are near to `about`: markers, turns."""
+
+    about: Unknown
+    markers: Markers
+    turns: Turns
+    tip_px: Float
+
+
+class Problem:
+    """Residuals and steps. Holds what the tracks say about the last guess of the clocks."""
+
+    def __init__(
+        self,
+        sights: Sights,
+        model: HandModel,
+        names: tuple[str, ...],
+        hand: HandTrack,
+        imu: ImuTrack,
+        triples: Triples,
+        px_per_m: float,
+        first: Unknown,
+    ) -> None:
+        self._sights, self._hand, self._imu, self._triples, self._first = sights, hand, imu, triples, first
+        self._model, self._parameters = model, HandParameters.of(model)
+        count = len(triples.t_s)
+        # The last hypothesis is the loosest.
+        free = AnglePrior.of(model, self._parameters, Priors()).of_hypothesis(np.full(count, -1))
+        self._hands = HandProblem(
+            model,
+            self._parameters,
+            Attached.markers(model, self._parameters, names),
+            np.zeros((count, len(names), 3)),
+            np.zeros((count, len(names), 3, 3)),
+            AnglePrior(_HABITS * free.normal, _HABITS * free.pull, _HABITS * free.constant, free.log_density),
+            None,
+            None,
+        )
+        tip_px = np.hypot(np.nan_to_num(triples.tip_sigma_px), _TIP_M * px_per_m)
+        laser_m = np.hypot(np.nan_to_num(triples.laser_sigma_m), _SKIN_M)
+        self.sigma = np.concatenate([laser_m, np.repeat(tip_px[..., None], 2, axis=-1)], axis=-1)
+        last_s, first_s = triples.t_s[-1], triples.t_s[0]
+        self._share = min(_PER_S * (last_s - first_s) / count, 1.0)
+        self._bend_sigma = np.array([_BENT_RAD, _BENT_RAD, _TWIST_RAD])
+        self._believed = believed()
+
+    def followed(self, unknown: Unknown, rounds: Sequence[int]) -> tuple[Unknown, Hands, int]:
+        """From a guess downhill, round by round; and the steps taken."""
+        hands, steps = self.guessed(unknown), 0
+        for most in rounds:
+            self.tell(unknown, hands)
+            unknown, hands, taken = self.solved(unknown, hands, most)
+            steps += taken
+        return unknown, hands, steps
+
+    def guessed(self, unknown: Unknown) -> Hands:
+        """The hands as the markers alone have them."""
+        near = self._hand.nearest(self._triples.t_s + unknown.camera_late_s)
+        x = np.array([self._parameters.of_angles(angles) for angles in self._hand.angles_rad[near]])
+        return Hands(self._hand.T_rig_palm[near], x)
+
+    def tell(self, unknown: Unknown, hands: Hands) -> None:
+        """Ask the tracks where the clocks are believed to be."""
+        at = self._triples.t_s + unknown.camera_late_s
+        markers = self._hand.markers(at)
+        turns = self._imu.at(at - unknown.imu_late_s)
+        self._known = turns.known & (markers.seen.sum(axis=1) > 0)
+        seen = markers.seen & self._known[:, None]
+        cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
+        whiten = np.linalg.inv(np.linalg.cholesky(cov)) * seen[..., None, None]
+        place = self._hands.place(hands.T_rig_palm, hands.x)
+        far = (whiten @ (place - np.nan_to_num(markers.points_m))[..., None])[..., 0]
+        whiten = whiten * ((1.0 + np.vecdot(far, far) / STRAYS**2) ** -0.5)[..., None, None]
+        told = [np.nan_to_num(part) for part in (markers.points_m, markers.speed_m_s, markers.bent_m_s2)]
+        self._told = _Told(
+            unknown,
+            Markers(told[0], told[1], told[2], markers.cov_m2),
+            Turns(
+                np.where(self._known[:, None, None], turns.R_world_imu, _EYE), turns.rate_rad_s, turns.drift_s
+            ),
+            self._tips_with_the_laser(unknown, hands),
+        )
+        self._hands = replace(self._hands, whiten=whiten)
+        data = np.concatenate([self._triples.laser_m, self._told.tip_px], axis=-1)
+        self._data = np.where(self._known[:, None, None], data, np.nan)
+
+    def _tips_with_the_laser(self, unknown: Unknown, hands: Hands) -> Float:
+        """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
+        late_s, t_s = self._triples.tip_late_s, self._triples.t_s
+        at = t_s + unknown.camera_late_s
+        turns = self._imu.at(at - unknown.imu_late_s)
+        R = self._camera_rig(unknown, replace(turns, R_world_imu=np.nan_to_num(turns.R_world_imu)))
+        angles = self._parameters.angles(hands.x)
+        seen = self._sights(
+            R @ hands.T_rig_palm[:, :3, :3], unknown.shift_m, angles, unknown.thick, unknown.reach_m
+        )
+        speed = np.gradient(seen[..., 2:], t_s, axis=0)
+        jump = np.diff(t_s, prepend=t_s[0]) > 0.2
+        speed[jump | np.r_[jump[1:], False] | ~turns.known] = 0.0
+        return self._triples.tip_uv - late_s * np.nan_to_num(speed)
+
+    def solved(self, unknown: Unknown, hands: Hands, rounds: int) -> tuple[Unknown, Hands, int]:
+        """The least cost from a guess, and the steps taken."""
+        damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
+        for _ in range(rounds):
+            normal, gain = self._normal(unknown, hands), 0.0
+            for _ in range(_TRIALS):
+                trial = self._stepped(unknown, hands, *normal.step(damping))
+                trial_cost = self.cost(*trial)
+                if trial_cost < cost:
+                    break
+                damping *= 8.0
+            else:
+                break
+            (unknown, hands), gain, cost, damping = trial, cost - trial_cost, trial_cost, 0.2 * damping
+            taken += 1
+            if gain < _SETTLED:
+                break
+        return unknown, hands, taken
+
+    def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
+        """What is told of the end."""
+        covariance = np.asarray(np.linalg.inv(self._normal(unknown, hands).reduced(0.0)[0]), np.float64)
+        shown, bend = self._shown(unknown, hands)
+        off = (self._data - shown) / self.sigma
+        here = self._here(unknown)
+        far = self._hands.place(hands.T_rig_palm, hands.x) - here.points_m
+        seen = self._hands.whiten[..., 0, 0] > 0.0
+        marker_m = float(np.sqrt((far[seen] ** 2).sum(axis=-1).mean()))
+        return Fit(unknown, covariance, bend[:, :2], bend[:, 2], off, self.sigma, shown, marker_m, steps)
+
+    def _stepped(self, unknown: Unknown, hands: Hands, step: Float, own: Float) -> tuple[Unknown, Hands]:
+        T, x = moved(hands.T_rig_palm, hands.x, own)
+        x = np.minimum(np.maximum(x, self._parameters.low), self._parameters.high)
+        return unknown.moved(step), Hands(T, x)
+
+    def _here(self, unknown: Unknown) -> Markers:
+        """The markers when the frames were taken."""
+        late_s, told = unknown.camera_late_s - self._told.about.camera_late_s, self._told.markers
+        speed = told.speed_m_s + late_s * told.bent_m_s2
+        points = told.points_m + late_s * (told.speed_m_s + 0.5 * late_s * told.bent_m_s2)
+        return Markers(points, speed, told.bent_m_s2, told.cov_m2)
+
+    def _turned(self, unknown: Unknown) -> Turns:
+        """The IMU when the frames were taken."""
+        about, told = self._told.about, self._told.turns
+        late_s = unknown.camera_late_s - unknown.imu_late_s - about.camera_late_s + about.imu_late_s
+        return replace(
+            told, R_world_imu=told.R_world_imu @ rotation_vector_to_matrix(late_s * told.rate_rad_s)
+        )
+
+    @staticmethod
+    def _rig_imu(unknown: Unknown, turns: Turns) -> Float:
+        """(T, 3, 3) IMU axes -> rig axes."""
+        drift = rotation_vector_to_matrix(-(turns.drift_s @ unknown.zero_rad_s))
+        return unknown.R_rig_world @ drift @ turns.R_world_imu
+
+    def _camera_rig(self, unknown: Unknown, turns: Turns) -> Float:
+        """(T, 3, 3) rig axes -> camera axes."""
+        return unknown.R_camera_imu @ np.swapaxes(self._rig_imu(unknown, turns), 1, 2)
+
+    def _wrists(self, unknown: Unknown, hands: Hands, turns: Turns) -> Float:
+        """R_forearm_palm (T, 3, 3)."""
+        palm = np.swapaxes(self._rig_imu(unknown, turns), 1, 2) @ hands.T_rig_palm[:, :3, :3]
+        return unknown.R_forearm_imu @ palm
+
+    def _shown(self, unknown: Unknown, hands: Hands) -> tuple[Float, Float]:
+        """Sights (T, 4, SEEN), and flexion, deviation and twist of the wrist (T, 3) [rad]."""
+        turns = self._turned(unknown)
+        R = self._camera_rig(unknown, turns) @ hands.T_rig_palm[:, :3, :3]
+        angles = self._parameters.angles(hands.x)
+        seen = self._sights(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
+        return seen, _bends(self._wrists(unknown, hands, turns))
+
+    def _off(self, shown: Float) -> Float:
+        """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
+        off = (shown - self._data) / self.sigma
+        missed = np.isnan(shown) & np.isfinite(self._data)
+        return np.where(missed, _FARTHEST, np.nan_to_num(off))
+
+    def cost(self, unknown: Unknown, hands: Hands) -> float:
+        """Sum of squares, strays weighed down."""
+        shown, bend = self._shown(unknown, hands)
+        off = self._off(shown)
+        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
+        data = (STRAYS**2 * np.log1p(pairs / STRAYS**2)).sum()
+        bent = ((bend / self._bend_sigma) ** 2).sum(axis=-1) * self._known
+        wrist = (STRAYS**2 * np.log1p(bent / STRAYS**2)).sum()
+        markers = replace(self._hands, points_m=self._here(unknown).points_m)
+        held = 2.0 * markers.linearise(hands.T_rig_palm, hands.x).cost.sum()
+        believed_off = unknown.off(self._first) / self._believed
+        return float(self._share * (data + wrist + held) + (believed_off**2).sum())
+
+    def _normal(self, unknown: Unknown, hands: Hands) -> "Normal":
+        """Normal equations about a place."""
+        turns, here = self._turned(unknown), self._here(unknown)
+        problem = replace(self._hands, points_m=here.points_m)
+        linear = problem.linearise(hands.T_rig_palm, hands.x)
+        out = Normal.of_markers(problem, linear, hands, here.speed_m_s)
+        rows = self._sight_rows(unknown, hands, turns), self._wrist_rows(unknown, hands, turns)
+        for residual, own, shared in rows:
+            out = out.and_rows(residual, own, shared)
+        out = out.shared_out(self._share, unknown.off(self._first), self._believed)
+        return out.within(hands.x, self._parameters)
+
+    def _sight_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
+        """Residuals (T, 16), and derivatives by own (T, 16, 6 + n) and shared unknowns (T, 16, UNKNOWN)."""
+        camera_rig = self._camera_rig(unknown, turns)
+        R = camera_rig @ hands.T_rig_palm[:, :3, :3]
+        angles = self._parameters.angles(hands.x)
+        shown, by = self._sights.derivatives(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
+        off = self._off(shown)
+        pairs = off[..., 0::2] ** 2 + off[..., 1::2] ** 2
+        root = np.repeat((1.0 + pairs / STRAYS**2) ** -0.5, 2, axis=-1)
+        told = np.isfinite(self._data) & np.isfinite(shown)
+        by = by * (np.where(told, root, 0.0) / self.sigma)[..., None]
+        count, n = len(hands.x), hands.x.shape[1]
+        by_turn = by[..., :3].reshape(count, -1, 3)
+        own = np.zeros((count, 4 * SEEN, 6 + n))
+        own[..., :3] = by_turn @ camera_rig
+        complete = self._parameters.complete.reshape(5, 4, n)[FINGERS]
+        by_x = np.einsum("tfya,fan->tfyn", by[..., 6:10], complete)
+        own[..., 6:] = self._by_parameters(by_x, hands.x).reshape(count, -1, n)
+        shared = np.zeros((count, 4, SEEN, UNKNOWN))
+        for f in range(4):
+            shared[:, f, :, THICK.start + f] = by[:, f, :, 10]
+            shared[:, f, :, REACH.start + f] = by[:, f, :, 11]
+        shared = shared.reshape(count, -1, UNKNOWN)
+        shared[..., CAMERA_IMU] = by_turn
+        shared[..., SHIFT] = by[..., 3:6].reshape(count, -1, 3)
+        self._world_columns(shared, -by_turn @ camera_rig, unknown, turns)
+        return (off * root).reshape(count, -1), own, shared
+
+    def _wrist_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
+        """As `_sight_rows`, of flexion, deviation and twist."""
+        wrist = self._wrists(unknown, hands, turns)
+        bent = _bends(wrist) / self._bend_sigma
+        root = (1.0 + np.vecdot(bent, bent) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
+        weight = (self._known * root)[:, None] / self._bend_sigma
+        by_turn = np.empty((len(wrist), 3, 3))
+        for k in range(3):
+            turned = rotation_vector_to_matrix(_LITTLE * _EYE[k]) @ wrist
+            by_turn[..., k] = (_bends(turned) - _bends(wrist)) / _LITTLE
+        by_turn *= weight[..., None]
+        forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, turns), 1, 2)
+        own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
+        own[..., :3] = by_turn @ forearm_rig
+        shared = np.zeros((len(wrist), 3, UNKNOWN))
+        shared[..., FOREARM_IMU] = by_turn
+        self._world_columns(shared, -by_turn @ forearm_rig, unknown, turns)
+        return _bends(wrist) * weight, own, shared
+
+    def _world_columns(self, shared: Float, by_imu: Float, unknown: Unknown, turns: Turns) -> None:
+        """Fill what turns the IMU in the rig: its world, the zero of its gyroscope, and clocks.
+
+        Args:
+            shared: (T, R, UNKNOWN) which is changed.
+            by_imu: (T, R, 3) derivatives by a turn of the IMU, rig axes.
+            unknown, turns: Where.
+        """
+        shared[..., RIG_WORLD] = by_imu
+        shared[..., ZERO] = -by_imu @ (unknown.R_rig_world @ turns.drift_s)
+        rate = (self._rig_imu(unknown, turns) @ turns.rate_rad_s[..., None])[..., 0]
+        later = (by_imu @ rate[..., None])[..., 0]
+        shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
+
+    def _by_parameters(self, by_free: Float, x: Float) -> Float:
+        """Derivatives (T, 4, R, n) by the free angles as they are -> by the parameters."""
+        return self._parameters.by_parameters(by_free, x)
+
+
+def _bends(R_forearm_palm: Float) -> Float:
+    """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
+    return np.concatenate([bend_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
