@@ -3,6 +3,7 @@
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from math import isnan
 from pathlib import Path
 
 import numpy as np
@@ -106,7 +107,7 @@ def away(cut: Mapping[str, Figures]) -> Iterator[str]:
 
 
 def _three(values: Sequence[float], digits: int = 1) -> str:
-    first, *others = (f"{value:.{digits}f}" for value in values)
+    first, *others = ("–" if isnan(value) else f"{value:.{digits}f}" for value in values)
     return " / ".join([f"**{first}**", *others])
 
 

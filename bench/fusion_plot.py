@@ -55,15 +55,16 @@ def _bars(axes: Axes, scenes: dict[str, dict[Kind, float]], title: str) -> None:
 
 def _course(axes: Axes, found: Outcome) -> None:
     """Mean PIP error of the four fingers through the first round, and when no two cameras see them."""
+    until_s = min(_ROUND_S, found.shown.seconds)
     for kind in reversed(KINDS):
         one = found.solved[kind]
-        early = one.t_s < _ROUND_S
+        early = one.t_s < until_s
         four = one.pip_deg[early, 1:]
         known = np.isfinite(four)
         mean = np.where(known, four, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         mean = np.where(known.any(axis=1), mean, np.nan)
         axes.plot(one.t_s[early], mean, color=_COLOURS[kind], linewidth=1.4, label=_NAMES[kind])
-    t_s: Float = np.arange(0.0, _ROUND_S, 0.02)
+    t_s: Float = np.arange(0.0, until_s, 0.02)
     hidden = (found.shown.sight.cameras_of(t_s, ABOUT_S)[:, 1:5] < 2).mean(axis=1)
     shade = axes.twinx()
     shade.fill_between(t_s, hidden, step="mid", color="#bbbbbb", alpha=0.4, linewidth=0.0)
@@ -73,7 +74,7 @@ def _course(axes: Axes, found: Outcome) -> None:
     axes.fill_between([], [], color="#bbbbbb", alpha=0.4, label="hidden from the cameras")
     axes.set_zorder(shade.get_zorder() + 1)
     axes.patch.set_visible(False)
-    axes.set_xlim(1.0, _ROUND_S)
+    axes.set_xlim(1.0, until_s)
     axes.set_ylim(0.0, None)
     axes.set_xlabel("grasp: reach, close, lift, turn, put back, release [s]", fontsize=9)
     axes.set_ylabel("PIP error, mean of four fingers [°]", fontsize=8)
