@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
@@ -13,13 +13,15 @@ from common.frame_recording import FrameRecording, open_recording
 from common.imu_fusion import OrientationFilter
 from common.imu_recording import IMU, read_imu
 from common.messages import HandPose, ImuSample
-from master.calibrate.mounting.mounting import Mounting, calibrate_mounting, left_of
 from master.calibrate.wrist.device import device_of, say, write_device
 from master.options import CALIB_JSON, Calibration, JsonFile, RecordingRig, ResultTree
 from master.recorded import recorded_detections, recorded_triples
 from master.rig import RigSetup, build_pipeline, load_hand
 from master.stages import StageTimes
 from master.summary import write_summary
+
+if TYPE_CHECKING:
+    from master.calibrate.mounting.mounting import Mounting
 
 Recording = Annotated[
     Path, typer.Argument(help="Folder of a recording of kind `both`: the joint motion.", show_default=False)
@@ -60,6 +62,8 @@ def mounting(
 
       phalanx-master calibrate mounting RECORDING --detections found --out calib_json
     """
+    from master.calibrate.mounting.mounting import calibrate_mounting  # scipy.optimize takes a second to import
+
     device = device_of(recording, rig, calibration, out)
     if device.rig.T_camera_palm is None:
         raise CalibrationError(
@@ -124,8 +128,10 @@ def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequenc
     return [fusion.push(one) for one in samples]
 
 
-def summary(found: Mounting) -> dict[str, object]:
+def summary(found: "Mounting") -> dict[str, object]:
     """What was measured, as numbers."""
+    from master.calibrate.mounting.mounting import left_of
+
     imu = found.rig.imu
     return {
         "T_camera_palm": [list(row) for row in found.rig.T_camera_palm or ()],
