@@ -36,13 +36,14 @@ _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no instant came, the
 _TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do not teach how the palm lies
 _FARTHEST_RAD = np.radians(30.0)  # that the other sensors turned it, and it is still but a step
 _WIDE_BEND = np.radians(15.0) ** 2 * np.eye(2)
+_EXPECTED_NS = 100_000_000  # a hand solved so lately tells where fingers are now
 _NO_COMMON = np.zeros((3, 2))
 _NO_ANGLES, _NO_WORTH = np.full((5, 4), nan), (np.zeros((5, 4, 4)), np.zeros((5, 4, 2)), np.zeros((5, 2, 2)))
 _NONE_TOLD, _NO_LEVEL = np.zeros(5, np.bool_), np.zeros(5, np.uint8)
 
 
 class WristSide:
-    """Push machine. Holds what wrist device and IMU of a hand said last.
+    """Push machine. Holds what wrist device and IMU of a hand said last, and the angles that were solved last.
 
     Attributes:
         seen: The last triple.
@@ -53,6 +54,7 @@ class WristSide:
         self._wrist, self.forearm, self._parameters = wrist, forearm, parameters
         self._track = FingerTrack()
         self.seen: SeenFingers | None = None
+        self._solved: tuple[int, Float] = -(2**62), _NO_ANGLES
 
     @classmethod
     def of(
@@ -70,7 +72,9 @@ class WristSide:
     def push(self, message: WristDetections) -> SeenFingers | None:
         """Take a triple; None: it is late."""
         bend, _cov = self.bend(message.t_ns)
-        seen = self._wrist.push(message, bend)
+        last_ns, expected = self._solved
+        fresh = abs(message.t_ns - last_ns) <= _EXPECTED_NS
+        seen = self._wrist.push(message, bend, expected if fresh else None)
         if seen is not None:
             self._track.push(seen, bend)
             self.seen = seen
@@ -105,6 +109,8 @@ class WristSide:
 
     def solved(self, t_ns: int, hand: TrackedHand, told: SensedHand | None) -> None:
         """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from it."""
+        if hand.solution is not None:
+            self._solved = t_ns, hand.solution.angles_rad
         if self.forearm is None or hand.solution is None:
             return
         palm = palm_alone(

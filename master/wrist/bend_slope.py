@@ -6,9 +6,14 @@ what else is believed of the angles, the least of  (y - f)' R^-1 (y - f) + a' H 
     da / db = -(G' R^-1 G + H)^-1 G' R^-1 B
 
 What the sights tell without habits, of angles and bend together, is  (G B)' R^-1 (G B).
+
+**Near what is expected.** A laser point alone leaves a curve of poses, and habit picks one of them. Who knows better
+wants G at the pose of that curve that is nearest to what he expects: a few steps of Gauss and Newton from there to
+where the light falls as it did (`near`).
 """
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,6 +29,7 @@ from master.wrist.sight import SightNoise
 
 _ANYWHERE_RAD = np.radians(35.0)  # joints of hands at work, about their mean
 _STIFF_RAD = np.radians(1.0)  # of joints whose angles are told along the natural curve alone
+_STEPS, _LEAST_M, _ARRIVED_M = 3, 2e-3, 1e-3
 _COUPLED_RAD = np.radians(5.0)  # of the last joint about its coupling, where a tip was seen
 
 
@@ -40,6 +46,37 @@ class SightWorth:
     angles: Float
     with_bend: Float
     bend: Float
+
+
+def near(
+    crossings: Callable[[Float], Crossings],
+    found: FingerAngles,
+    expected_rad: Float,
+    low_high: tuple[Float, Float],
+) -> FingerAngles:
+    """The angles with those that laser points alone tell moved along to where they are expected.
+
+    Args:
+        crossings: What is seen of angles (5, 4).
+        found: The angles by habit.
+        expected_rad: (5, 4); NaN: nothing is expected.
+        low_high: Limits (5, 4) of the angles.
+    """
+    moving = found.told & (found.level == Level.FK) & np.isfinite(expected_rad[:, 0])
+    if not moving.any():
+        return found
+    a = np.where(moving[:, None], expected_rad, np.nan_to_num(found.angles_rad))
+    seen = crossings(np.nan_to_num(found.angles_rad)).seen[:, :2]
+    for _ in range(_STEPS):
+        at = crossings(a)
+        G = at.by_angles[:, :2]
+        step = np.swapaxes(G, 1, 2) @ np.linalg.solve(
+            G @ np.swapaxes(G, 1, 2) + _LEAST_M**2 * np.eye(2), (seen - at.seen[:, :2])[..., None]
+        )
+        a = np.where(moving[:, None], np.clip(a + step[..., 0], *low_high), a)
+    at = crossings(a)
+    arrived = moving & at.met & (np.abs(at.seen[:, :2] - seen).max(axis=1) < _ARRIVED_M)
+    return replace(found, angles_rad=np.where(arrived[:, None], a, found.angles_rad))
 
 
 class BendSlope:

@@ -24,7 +24,7 @@ from common.wrist_bend import STRAIGHT
 from master.filters import OneEuroParameters, PointFilter
 from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
-from master.wrist.bend_slope import BendSlope, SightWorth
+from master.wrist.bend_slope import BendSlope, SightWorth, near
 from master.wrist.bent import BentView, BentWrist
 from master.wrist.bent_closing import closings
 from master.wrist.cubic import CubicLaw
@@ -39,6 +39,7 @@ from master.wrist.setup import WristSetup
 from master.wrist.sight import SightNoise
 
 FORGET_S = 0.5
+_FINGERS = np.arange(5)
 _LINGERS_S = 0.5  # a hand at work has another pose after that: sooner, poses tell the same of the light
 NEVER_NS = -(2**62)
 _NO_TIPS = np.full((5, 2), np.nan), np.full(5, np.nan)
@@ -106,12 +107,16 @@ class WristFingers:
         self._last_ns = NEVER_NS
         self._angles, self._seen_ns = np.full((5, 4), np.nan), np.full(5, NEVER_NS)
 
-    def push(self, message: WristDetections, bend_rad: Float = STRAIGHT) -> SeenFingers | None:
+    def push(
+        self, message: WristDetections, bend_rad: Float = STRAIGHT, expected_rad: Float | None = None
+    ) -> SeenFingers | None:
         """Take what one triple showed.
 
         Args:
             message: A triple.
             bend_rad: (2,) flexion and deviation of the wrist at its instant (`common.wrist_bend`).
+            expected_rad: (5, 4) angles, where they are expected; NaN or None: habit tells. What a laser point alone
+                leaves open of a finger follows them.
 
         Returns:
             What it says, or None: it is not later than the last, and was counted and dropped.
@@ -130,7 +135,7 @@ class WristFingers:
             )
             self._count("no_plane", shown & np.isnan(points.point_m[:, 0]))
         with self._stage("angles"):
-            found, by_bend, worth = self._angles_of(t_ns, message, points, bend_rad)
+            found, by_bend, worth = self._angles_of(t_ns, message, points, bend_rad, expected_rad)
         seen = np.isfinite(found.angles_rad[:, 0])
         self._angles[seen], self._seen_ns[seen] = found.angles_rad[seen], t_ns
         self._count("past", found.past)
@@ -139,7 +144,12 @@ class WristFingers:
         return SeenFingers(t_ns, found, points.point_m, by_bend, worth)
 
     def _angles_of(
-        self, t_ns: int, message: WristDetections, points: LaserPoints, bend_rad: Float
+        self,
+        t_ns: int,
+        message: WristDetections,
+        points: LaserPoints,
+        bend_rad: Float,
+        expected_rad: Float | None,
     ) -> tuple[FingerAngles, Float, SightWorth]:
         """What laser and tips say of the fingers, how it changes with the bend (5, 4, 2), and what sights are worth."""
         point = points.point_m
@@ -155,7 +165,11 @@ class WristFingers:
         sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px, message.tip_depth)
         if self._levels is not None:
             found = self._by_level(self._levels, t_ns, found, sight, view)
-        at = (view or self._bent.at(bend_rad)).crossings(np.nan_to_num(found.angles_rad), np.arange(5))
+        seen = view or self._bent.at(bend_rad)
+        if expected_rad is not None:
+            limits = np.moveaxis(self._setup.model.limits_rad, -1, 0)
+            found = near(lambda a: seen.crossings(a, _FINGERS), found, expected_rad, (limits[0], limits[1]))
+        at = seen.crossings(np.nan_to_num(found.angles_rad), _FINGERS)
         return found, *self._slope(at, found, sight)
 
     def _by_level(
