@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as dataclass_replace
 from pathlib import Path
 from time import perf_counter
 from typing import TypeVar
@@ -27,6 +28,7 @@ from common.errors import FitError
 from common.frame_recording import open_recording
 from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
 from common.messages import HandPose, ImuSample, MarkerDetections, WristDetections
+from common.sim.motion import HandMotion, HandState
 from common.sim.record_both import record_both
 from common.sim.scenes import scene_by_name
 from common.sim.wrist.scene import WristScene
@@ -74,11 +76,29 @@ class Seen:
         )
 
 
-def both_of(rig: str, seed: int, scene: str = SCENE) -> Both:
+@dataclass(frozen=True, slots=True, eq=False)
+class Paced:
+    """A motion, so many times as fast."""
+
+    motion: HandMotion
+    pace: float
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which it repeats."""
+        return self.motion.period_s / self.pace
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]."""
+        return self.motion.at(self.pace * t_s)
+
+
+def both_of(rig: str, seed: int, pace: float = 1.0, scene: str = SCENE) -> Both:
     """A scene before a marker rig and the wrist device, whose hand is that of the marker rig."""
     markers, wrist = load_setup(CALIBRATION, rig), load_setup(CALIBRATION, WRIST_RIG)
     worn_rig = msgspec.structs.replace(wrist.rig, hand=markers.rig.hand)
     seen = scene_by_name(scene, markers.rig, markers.cameras, markers.hand.profile, seed)
+    seen = dataclass_replace(seen, motion=Paced(seen.motion, pace))
     wrist = RigSetup.of(worn_rig, wrist.cameras, markers.hand)
     worn = WristScene(worn_rig, wrist.cameras, markers.hand, seen.motion, seed=seed)
     return Both(scene, seed, seen, worn, markers, wrist)
@@ -93,10 +113,10 @@ def guessed(rig: RigCalibration, seed: int) -> RigCalibration:
     return msgspec.structs.replace(rig, T_camera_palm=matrix_of(palm), imu=imu)
 
 
-def seen_noisy(rig: str, seed: int, seconds: float = SECONDS, every: int = 1) -> Seen:
+def seen_noisy(rig: str, seed: int, pace: float = 1.0, seconds: float = SECONDS) -> Seen:
     """Truth with errors as measured."""
-    both = both_of(rig, seed)
-    messages = shown_of(both, seconds, every).messages
+    both = both_of(rig, seed, pace)
+    messages = shown_of(both, seconds).messages
     pipeline = build_pipeline(both.markers, StageTimes())
     solved = [one for m in messages if isinstance(m, MarkerDetections) for one in pipeline.push(m)]
     poses = [one.pose for one in [*solved, *pipeline.flush()]]
@@ -128,9 +148,9 @@ def errors(found: Mounting, both: Both) -> Float:
     )
 
 
-def seen_rendered(rig: str, seed: int, folder: Path, seconds: float = SECONDS) -> Seen:
+def seen_rendered(rig: str, seed: int, folder: Path, pace: float = 1.0, seconds: float = SECONDS) -> Seen:
     """The same of rendered frames, detected by the slave's own command lines' functions."""
-    both = both_of(rig, seed)
+    both = both_of(rig, seed, pace)
     wrong = guessed(both.wrist.rig, seed)
     late_ns = -round(1e9 * CAMERA_LATE_S)
     record_both(folder, both.scene, both.worn, seconds, wrist_late_ns=late_ns, step=3, wrist_rig=wrong)

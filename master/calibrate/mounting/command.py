@@ -62,7 +62,9 @@ def mounting(
 
       phalanx-master calibrate mounting RECORDING --detections found --out calib_json
     """
-    from master.calibrate.mounting.mounting import calibrate_mounting  # scipy.optimize takes a second to import
+    from master.calibrate.mounting.mounting import (
+        calibrate_mounting,
+    )  # scipy.optimize takes a second to import
 
     device = device_of(recording, rig, calibration, out)
     if device.rig.T_camera_palm is None:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from common.arrays import Bool, Float
 from common.calibration import CameraCalibration, ImuCalibration, RigCalibration
 from common.errors import CalibrationError, FitError
-from common.geometry import cross, matrix_to_quaternion, rotation_vector_to_matrix, transform
+from common.geometry import cross, matrix_to_quaternion, transform
 from common.hand_model import CHAINS, FINGERS, HandModel
 from common.messages import HandPose, ImuSample, WristDetections
 from master.calibrate.cameras.lens_files import matrix_of
@@ -269,9 +269,8 @@ def _documented(
 
 def _rig_world(fit: Fit, imu: ImuTrack) -> Float:
     """R_rig_world (3, 3) of the world that the IMU's samples name: the mean of its vertical, the first heading."""
-    unknown, turns = fit.unknown, imu.at(imu.t_s)
-    drift = rotation_vector_to_matrix(-(turns.drift_s @ unknown.zero_rad_s))
-    rig_world = unknown.R_rig_world @ drift @ turns.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
+    turns = imu.mended(fit.unknown.gyro).at(imu.t_s)
+    rig_world = fit.unknown.R_rig_world @ turns.R_world_imu @ np.swapaxes(imu.held_at(imu.t_s), 1, 2)
     known = np.isfinite(rig_world[:, 0, 0])
     rig_world = rig_world[known]
     up: Float = rig_world[..., 2].mean(axis=0)

@@ -14,7 +14,7 @@ loosest habits); all instants share the mounting (`unknown.Unknown`). Four kinds
   (`common.wrist_bend`);
 - **its zero**, which no sensor knows: a wrist that bends as far one way as the other is straight in the mean.
 
-The hand of each instant is eliminated (Schur's complement), which leaves 25 unknowns. Steps are those of Levenberg and
+The hand of each instant is eliminated (Schur's complement), which leaves 34 unknowns. Steps are those of Levenberg and
 Marquardt; sights that stray are weighed down (Cauchy). What skin and tips are off by lasts as long as a bend does, so
 all instants of a second together count as a few.
 """
@@ -36,6 +36,7 @@ from master.calibrate.mounting.unknown import (
     CAMERA_IMU,
     CAMERA_LATE,
     FOREARM_IMU,
+    GAIN,
     IMU_LATE,
     REACH,
     RIG_WORLD,
@@ -126,10 +127,11 @@ class Problem:
         return Hands(self._hand.T_rig_palm[near], x)
 
     def tell(self, unknown: Unknown, hands: Hands) -> None:
-        """Ask the tracks where the clocks are believed to be."""
+        """Ask the tracks where the clocks and the errors of the gyroscope are believed to be."""
+        self._mended, self._mended_of = self._imu.mended(unknown.gyro), unknown.gyro
         at = self._triples.t_s + unknown.camera_late_s
         markers = self._hand.markers(at)
-        turns = self._imu.at(at - unknown.imu_late_s)
+        turns = self._mended.at(at - unknown.imu_late_s)
         self._known = turns.known & (markers.seen.sum(axis=1) > 0)
         seen = markers.seen & self._known[:, None]
         cov = np.where(seen[..., None, None], markers.cov_m2, 0.0) + _CAP_M**2 * _EYE
@@ -142,7 +144,7 @@ class Problem:
             unknown,
             Markers(told[0], told[1], told[2], markers.cov_m2),
             Turns(
-                np.where(self._known[:, None, None], turns.R_world_imu, _EYE), turns.rate_rad_s, turns.drift_s
+                np.where(self._known[:, None, None], turns.R_world_imu, _EYE), turns.rate_rad_s, turns.drift
             ),
             self._tips_with_the_laser(unknown, hands),
         )
@@ -154,7 +156,7 @@ class Problem:
         """Tips (T, 4, 2) [px] as they were when the laser shone: moved back by how the hand moved meanwhile."""
         late_s, t_s = self._triples.tip_late_s, self._triples.t_s
         at = t_s + unknown.camera_late_s
-        turns = self._imu.at(at - unknown.imu_late_s)
+        turns = self._mended.at(at - unknown.imu_late_s)
         R = self._camera_rig(unknown, replace(turns, R_world_imu=np.nan_to_num(turns.R_world_imu)))
         angles = self._parameters.angles(hands.x)
         seen = self._sights(
@@ -215,10 +217,9 @@ class Problem:
             told, R_world_imu=told.R_world_imu @ rotation_vector_to_matrix(late_s * told.rate_rad_s)
         )
 
-    @staticmethod
-    def _rig_imu(unknown: Unknown, turns: Turns) -> Float:
+    def _rig_imu(self, unknown: Unknown, turns: Turns) -> Float:
         """(T, 3, 3) IMU axes -> rig axes."""
-        drift = rotation_vector_to_matrix(-(turns.drift_s @ unknown.zero_rad_s))
+        drift = rotation_vector_to_matrix(-(turns.drift @ (unknown.gyro - self._mended_of)))
         return unknown.R_rig_world @ drift @ turns.R_world_imu
 
     def _camera_rig(self, unknown: Unknown, turns: Turns) -> Float:
@@ -317,7 +318,7 @@ class Problem:
         return _bends(wrist) * weight, own, shared
 
     def _world_columns(self, shared: Float, by_imu: Float, unknown: Unknown, turns: Turns) -> None:
-        """Fill what turns the IMU in the rig: its world, the zero of its gyroscope, and clocks.
+        """Fill what turns the IMU in the rig: its world, the errors of its gyroscope, and clocks.
 
         Args:
             shared: (T, R, UNKNOWN) which is changed.
@@ -325,7 +326,8 @@ class Problem:
             unknown, turns: Where.
         """
         shared[..., RIG_WORLD] = by_imu
-        shared[..., ZERO] = -by_imu @ (unknown.R_rig_world @ turns.drift_s)
+        by_gyro = -by_imu @ (unknown.R_rig_world @ turns.drift)
+        shared[..., ZERO], shared[..., GAIN] = by_gyro[..., :3], by_gyro[..., 3:]
         rate = (self._rig_imu(unknown, turns) @ turns.rate_rad_s[..., None])[..., 0]
         later = (by_imu @ rate[..., None])[..., 0]
         shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later

@@ -52,7 +52,7 @@ class Start:
             self.T_camera_palm[:3, 3],
             self.R_palm_imu,
             self.R_rig_world,
-            np.zeros(3),
+            np.zeros(12),
             self.camera_late_s,
             self.imu_late_s,
             np.zeros(4),

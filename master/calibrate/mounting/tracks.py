@@ -5,6 +5,7 @@ and orientations are asked for at instants that shift while the fit goes on: eac
 """
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -119,12 +120,12 @@ class Turns:
     Attributes:
         R_world_imu: (T, 3, 3); NaN: no sample nearby.
         rate_rad_s: (T, 3) IMU axes.
-        drift_s: (T, 3, 3) by how much it has turned since the middle, world axes, for each rad/s of the gyroscope.
+        drift: (T, 3, 12) by how much too far it has turned since the middle, world axes, by errors of the gyroscope.
     """
 
     R_world_imu: Float
     rate_rad_s: Float
-    drift_s: Float
+    drift: Float
 
     @property
     def known(self) -> Bool:
@@ -136,7 +137,9 @@ class ImuTrack:
     """How one IMU turned (S samples): its rates summed up. Fixed by the constructor.
 
     The orientation that comes with the samples leans by some degrees whenever the arm is accelerated, since gravity
-    holds it; for ten seconds rates alone are better, once their zero is known. The two worlds agree in the middle.
+    holds it; for ten seconds rates alone are better, once their errors are known. The two worlds agree in the middle.
+    Errors (12,) of a gyroscope are its zero (3) [rad/s] and its gain (3, 3), by row: what it says is too much by
+    zero + gain @ what it says.
 
     Attributes:
         t_s: (S,) [s], by its stamps.
@@ -154,20 +157,31 @@ class ImuTrack:
         self._held = quaternion_to_matrix(held)
         step = np.diff(self.t_s)[:, None]
         self.gap_s = float(step.max(initial=0.0))
-        self._turned = np.empty_like(self._held)
+        self._turned, self._drift = np.empty_like(self._held), np.zeros((len(self.t_s), 3, 12))
         if len(told):
-            self._sum_up(step)
+            self._sum_up()
 
-    def _sum_up(self, step_s: Float) -> None:
-        """Orientations by rates alone, and what an error of the rates makes of them."""
+    def mended(self, errors: Float) -> "ImuTrack":
+        """The same without errors (12,) of its gyroscope."""
+        out = copy(self)
+        out._rate = self._rate - errors[:3] - self._rate @ errors[3:].reshape(3, 3).T
+        out._turned = np.empty_like(self._turned)
+        out._sum_up()
+        return out
+
+    def _sum_up(self) -> None:
+        """Orientations by rates alone, and what errors of the rates make of them."""
+        step_s = np.diff(self.t_s)[:, None]
         arcs = rotation_vector_to_matrix(0.5 * step_s * (self._rate[1:] + self._rate[:-1]))
         now = np.eye(3)
         for k, arc in enumerate([np.eye(3), *arcs]):
             self._turned[k] = now = now @ arc
         middle = len(self.t_s) // 2
         self._turned = self._held[middle] @ self._turned[middle].T @ self._turned
-        mean = 0.5 * step_s[..., None] * (self._turned[1:] + self._turned[:-1])
-        drift = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(mean, axis=0)])
+        by_gain = self._turned[..., None] * self._rate[:, None, None]  # axis, row and column of the gain
+        each = np.concatenate([self._turned, by_gain.reshape(-1, 3, 9)], axis=-1)
+        mean = 0.5 * step_s[..., None] * (each[1:] + each[:-1])
+        drift = np.concatenate([np.zeros((1, 3, 12)), np.cumsum(mean, axis=0)])
         self._drift = drift - drift[middle]
 
     def __len__(self) -> int:
