@@ -8,6 +8,10 @@ found as ever, and the better their colours fit the references together, the mor
 The lights tried lie on the line of black bodies. In the logarithms of red/green and blue/green it is straight: by
 Wien's law a channel at wavelength l gains -c2/l (1/T' - 1/T) (Finlayson and Hordley 2001, J. Opt. Soc. Am. A 18, 253).
 The fit to the blobs then leaves the line as far as they ask for it.
+
+Where little but skin is seen, a light far warmer than any lamp explains it best: skin is the paint of a thumb there,
+its shadow that of a finger. So a light beyond what is followed proves nothing, and one that nobody expects needs
+more markers than the one that is expected.
 """
 
 from dataclasses import dataclass, replace
@@ -30,11 +34,13 @@ LARGEST = 0.1  # of the image; a larger blob is no marker
 FITS = 3.0  # standard deviations (of a triple, whose mean is 1.6) at which a blob proves nothing any more
 TINT = 0.25  # log gain of red against green by which lamps of rooms may lie off the line of black bodies
 PROOF = 2  # markers that must fit: one colour fits some light always
+PROOF_ELSEWHERE = 3  # of a light that is clearly not the expected one: two colours fit some other light often
 AHEAD = 0.7  # markers by which the best light must lead every light that is clearly another
 OTHER = 0.2  # log gains of red or blue against green by which two lights are clearly different
 EXPECTED = 0.3  # markers that the expected light is worth by itself
 LINEAR = to_linear(np.arange(256) / 255.0).astype(np.float32)
 BLOBS_EACH = 3  # of each colour, the largest
+ROUNDED = 1e-9  # log gains
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +52,10 @@ class Evidence:
         score: Markers that fit, each 0..1.
         matched: How many of them.
         misfit: (M,) of each marker in standard deviations; NaN: none found.
-        proven: At least `PROOF` markers fit, and no clearly different light comes near.
+        proven: At least `PROOF` markers fit, `PROOF_ELSEWHERE` where it is clearly not the expected light, and no
+            clearly different light comes near.
         excluded: `PROOF` markers fit a light that leaves the expected one far behind.
+        beyond: The fit would leave the bounds of red or blue against green.
     """
 
     log_gains: Float
@@ -56,6 +64,7 @@ class Evidence:
     misfit: Float
     proven: bool = False
     excluded: bool = False
+    beyond: bool = False
 
 
 def first_light(image: Image, table: ColourTable, reference: Float, expected: Float) -> Evidence:
@@ -69,6 +78,8 @@ def first_light(image: Image, table: ColourTable, reference: Float, expected: Fl
     """
 
     def worth(item: Evidence) -> float:
+        if item.beyond:
+            return 0.0
         return item.score + (0.0 if different(item.log_gains, expected) else EXPECTED)
 
     half = np.ascontiguousarray(image[::STRIDE, ::STRIDE])
@@ -83,7 +94,9 @@ def first_light(image: Image, table: ColourTable, reference: Float, expected: Fl
         return best
     other = max((worth(e) for e in tried if different(e.log_gains, best.log_gains)), default=0.0)
     usual = max((worth(e) for e in tried if not different(e.log_gains, expected)), default=0.0)
-    return replace(best, proven=worth(best) - other >= AHEAD, excluded=worth(best) - usual >= AHEAD)
+    least = min(PROOF_ELSEWHERE, len(reference)) if different(best.log_gains, expected) else PROOF
+    proven = best.matched >= least and worth(best) - other >= AHEAD
+    return replace(best, proven=proven, excluded=worth(best) - usual >= AHEAD)
 
 
 def lights() -> Float:
@@ -120,13 +133,20 @@ def evidence(half: Image, table: ColourTable, reference: Float, log_gains: Float
     fit = fit_gains(colour, reference, weight, log_gains)
     close = np.nan_to_num(1.0 - (fit.misfit / FITS) ** 2, nan=0.0)
     score = float(np.maximum(close, 0.0).sum())
-    return Evidence(bounded(fit.log_gains), score, int((close > 0.0).sum()), fit.misfit)
+    light = bounded(fit.log_gains)
+    beyond = _hues_apart(light, fit.log_gains) > ROUNDED
+    return Evidence(light, score, int((close > 0.0).sum()), fit.misfit, beyond=beyond)
 
 
 def different(a: Float, b: Float) -> bool:
     """Whether two lights, log gains (3,), are clearly different in hue."""
-    d = a - b
-    return bool(max(abs(d[0] - d[1]), abs(d[2] - d[1])) > OTHER)
+    return _hues_apart(a, b) > OTHER
+
+
+def _hues_apart(a: Float, b: Float) -> float:
+    """Log gain of red or blue against green, whichever differs more."""
+    blue, green, red = (a - b).tolist()
+    return max(abs(blue - green), abs(red - green))
 
 
 def _colours(half: Image, mask: Image) -> list[Float]:

@@ -7,8 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from bench.light import standard_scene
 from common.arrays import Float, Image
+from common.sim.grasp import Grasp
 from common.sim.illuminant import Light
+from common.sim.render import Renderer
+from common.sim.scene import Scene, view_centre
 from common.srgb import relit_bytes
 from slave.markers.classify import ColourTable
 from slave.markers.first_light import OTHER, first_light, lights
@@ -24,6 +28,13 @@ def under(image: Image, gains: Float, seed: int = 0) -> Image:
     lit = np.asarray(cv2.LUT(image, relit_bytes(gains).T[None]), dtype=np.int16)
     noise = np.random.default_rng(seed).normal(0.0, 2.0, lit.shape).round()
     return np.clip(lit + noise, 0, 255).astype(np.uint8)
+
+
+def grasping(seed: int) -> Scene:
+    usual = standard_scene(seed)
+    return Scene.of_motion(
+        usual.rig, usual.cameras, usual.model.profile, Grasp(usual.model, view_centre(usual.rig), seed), seed
+    )
 
 
 def hues_apart(a: Float, b: Float) -> float:
@@ -52,6 +63,19 @@ def test_a_few_markers_prove_the_right_light_or_none(shown: tuple[int, ...], kel
     found = first_light(under(painted.render(discs), gains), TABLE, REFERENCE, np.zeros(3))
     if found.proven:
         assert hues_apart(found.log_gains, np.log(gains)) < OTHER
+
+
+@pytest.mark.parametrize(("seed", "t_s"), [(3, 2.7), (7, 5.0)])
+def test_skin_of_a_closed_hand_is_no_paint_under_a_light_that_no_lamp_gives(seed: int, t_s: float) -> None:
+    # A hand round a bar shows one marker, skin and shadows; these are two or three paints under light that is warmer
+    # than any that is followed.
+    shown = grasping(seed)
+    ranges = shown.cameras["left"].markers or {}
+    colours = [ranges[name] for name in shown.rig.markers]
+    reference = np.array([colour.reference_bgr_linear for colour in colours])
+    found = first_light(Renderer(shown, "left").render(t_s), ColourTable(colours), reference, np.zeros(3))
+    assert not found.excluded
+    assert hues_apart(found.log_gains, np.zeros(3)) < OTHER
 
 
 def test_clutter_in_a_marker_colour_does_not_bend_the_light() -> None:
