@@ -179,8 +179,11 @@ def _source(
         scene = scene_of(options.calibration, rig, options.scene, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
+        waits = isinstance(true_clock, FrameClock)
         sleep = true_clock.sleep if isinstance(true_clock, FrameClock) else time.sleep
-        return SyntheticCamera(scene, camera.name, epoch_ns, clock, late_ns, true_clock, sleep, lights)
+        return SyntheticCamera(
+            scene, camera.name, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
+        )
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 

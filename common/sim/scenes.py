@@ -16,7 +16,7 @@ from common.sim.render import Renderer
 from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
 from common.sim.together import TOGETHER, together_motion
-from common.sim.wrist.render import WristRenderer
+from common.sim.wrist.render import LIVE_STEP, SKIN_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = f"standard | lights | poses | hand-routine | leap:FILE.npz | {' | '.join(TOGETHER)}"
@@ -74,17 +74,24 @@ def view_by_name(
 
 
 @overload
-def renderer_of(scene: WristScene, camera: str) -> WristRenderer: ...
+def renderer_of(scene: WristScene, camera: str, *, live: bool = False) -> WristRenderer: ...
 @overload
-def renderer_of(scene: Scene | BoardScene, camera: str) -> Renderer | BoardRenderer: ...
 def renderer_of(
-    scene: Scene | BoardScene | WristScene, camera: str
+    scene: Scene | BoardScene, camera: str, *, live: bool = False
+) -> Renderer | BoardRenderer: ...
+def renderer_of(
+    scene: Scene | BoardScene | WristScene, camera: str, *, live: bool = False
 ) -> Renderer | BoardRenderer | WristRenderer:
     """What draws the scene as one camera sees it; that of a wrist scene is told what lights each frame.
+
+    Args:
+        scene: What the camera looks at.
+        camera: Its name.
+        live: What is not drawn in time is lost: skin before a wrist device is shaded more coarsely.
 
     Raises:
         CalibrationError: The scene has no such camera, or a marker without paint.
     """
     if isinstance(scene, WristScene):
-        return WristRenderer(scene, camera)
+        return WristRenderer(scene, camera, LIVE_STEP if live else SKIN_STEP)
     return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

@@ -69,6 +69,8 @@ class SyntheticCamera:
         true_clock: Clock,
         sleep: Callable[[float], None] = time.sleep,
         lights: LitBy | None = None,
+        *,
+        live: bool = False,
     ) -> None:
         """Prepare the renderer. The camera may join at any time: `seq` counts from the epoch.
 
@@ -81,11 +83,12 @@ class SyntheticCamera:
             true_clock: The clock of the scene.
             sleep: Waits so many seconds.
             lights: What lights a wrist device, on `clock`; None: this camera switches its lights itself.
+            live: The scene does not wait for who draws it, so that is done as fast as looks right.
 
         Raises:
             CalibrationError: The scene has no such camera, or a marker without paint.
         """
-        self._renderer = renderer_of(scene, camera_name)
+        self._renderer = renderer_of(scene, camera_name, live=live)
         camera = scene.cameras[camera_name]
         self._lit_for, self._camera = camera, camera
         self._clock, self._true, self._sleep = clock, true_clock, sleep

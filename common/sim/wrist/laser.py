@@ -108,18 +108,18 @@ class LaserSheet:
         flesh, first = self.flesh, self.flesh.still
         rays = _fan(self.forward, self.across, self.angle_rad)
         if flesh.same_palm(bodies, self.still):
-            near, body = _nearest(distances(bodies.of(slice(first, None)), self.origin, rays))
-            body = np.where(near < self.still_m, body + first, self.still_body)
+            near, body = self._meet(bodies, rays, first)
+            body = np.where(near < self.still_m, body, self.still_body)
             near = np.minimum(near, self.still_m)
         else:
-            near, body = _nearest(distances(bodies, self.origin, rays))
+            near, body = self._meet(bodies, rays)
         met = np.where(np.isfinite(near), flesh.group_of(body), -1)
         with np.errstate(invalid="ignore"):
             ends = np.flatnonzero((met[1:] != met[:-1]) | (np.abs(np.diff(near)) > JOINED_M))
         part = np.arange(1, FINER) / FINER * (self.angle_rad[1] - self.angle_rad[0])
         between = (self.angle_rad[ends][:, None] + part).ravel()
         more = _fan(self.forward, self.across, between)
-        more_near, more_body = _nearest(distances(bodies, self.origin, more))
+        more_near, more_body = self._meet(bodies, more)
         order = np.argsort(np.concatenate([self.angle_rad, between]))
         near, body = np.concatenate([near, more_near])[order], np.concatenate([body, more_body])[order]
         lit = np.flatnonzero(np.isfinite(near))
@@ -130,6 +130,26 @@ class LaserSheet:
         chord = np.linalg.norm(np.diff(points, axis=0), axis=1)
         joined[:-1] = (np.diff(lit) == 1) & (group[1:] == group[:-1]) & (chord < JOINED_M)
         return LaserCurve(rays, points, body, group, segment, self.seen(bodies, points), joined)
+
+    def _meet(self, bodies: Cones, rays: Float, first: int = 0) -> tuple[Float, Int]:
+        """How far along rays (N, 3) of the sheet the nearest of the bodies from `first` on begins (N,) [m], and which
+        that is (N,); only those that the sheet passes through are asked."""
+        middle = 0.5 * (bodies.start_m + bodies.stop_m)
+        reach = 0.5 * np.linalg.norm(bodies.stop_m - bodies.start_m, axis=1)
+        reach += np.maximum(bodies.start_radius_m, bodies.stop_radius_m)
+        cut = np.abs(middle @ self.normal - self.offset_m) < reach + SEEN_WITHIN_M
+        cut[:first] = False
+        which = np.flatnonzero(cut)
+        if not which.size:
+            return np.full(len(rays), np.inf), np.full(len(rays), first)
+        some = Cones(
+            bodies.start_m[which],
+            bodies.stop_m[which],
+            bodies.start_radius_m[which],
+            bodies.stop_radius_m[which],
+        )
+        near, body = _nearest(distances(some, self.origin, rays))
+        return near, which[body]
 
     def seen(self, bodies: Cones, points: Float, within_m: float = SEEN_WITHIN_M) -> Bool:
         """Which of points (K, 3) [m] nothing hides from the camera that is more than `within_m` before them (K,)."""

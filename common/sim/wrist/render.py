@@ -18,7 +18,10 @@ from common.sim.wrist.scene import WristScene
 from common.sim.wrist.skin import Skin, SkinView
 from common.sim.wrist.stripe import draw_stripe
 
-REAL_TIME_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
+SKIN_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and four times slower
+# For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
+# the laser line is drawn to parts of a pixel of the picture whatever the step is.
+LIVE_STEP = 4
 _KINDS = tuple(Illumination)  # frames of one instant differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
@@ -27,7 +30,7 @@ class WristRenderer:
     """Images of one scene. It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure
     function of t."""
 
-    def __init__(self, scene: WristScene, camera: str, step: int = REAL_TIME_STEP) -> None:
+    def __init__(self, scene: WristScene, camera: str, step: int = SKIN_STEP) -> None:
         """Prepare all that stands still (some tenths of a second).
 
         Args:

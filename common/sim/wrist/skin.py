@@ -109,6 +109,8 @@ class Skin:
         near, rays = depth.reshape(shape), self._rays.reshape(3, *shape)
         for b in which:
             (x0, y0), (x1, y1) = low[b], high[b]
+            if x0 >= x1 or y0 >= y1:  # outside the picture
+                continue
             box = slice(y0, y1), slice(x0, x1)
             found = first_hits(known[:, b], rays[:, *box])
             nearer = found < near[box]
