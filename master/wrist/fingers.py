@@ -33,7 +33,7 @@ from master.wrist.forward import ForwardTable
 from master.wrist.inverse import InverseModel
 from master.wrist.invert import Inverse
 from master.wrist.laser_plane import LaserPoints, PlaneAxes, in_image, laser_points
-from master.wrist.levels import Levels, Sighting
+from master.wrist.levels import NOTHING, Levels, Sighting
 from master.wrist.light_unit import LightUnit
 from master.wrist.setup import WristSetup
 from master.wrist.sight import SightNoise
@@ -164,7 +164,8 @@ class WristFingers:
         tip, sigma_px = _NO_TIPS if self._levels is None else self._tips(t_ns, message)
         sight = Sighting(flat, cov, point[:, 2], message.laser_px, tip, sigma_px, message.tip_depth)
         if self._levels is not None:
-            found = self._by_level(self._levels, t_ns, found, sight, view)
+            expected = NOTHING if expected_rad is None else np.isfinite(expected_rad[:, 0])
+            found = self._by_level(self._levels, t_ns, found, sight, view, expected)
         seen = view or self._bent.at(bend_rad)
         if expected_rad is not None:
             limits = np.moveaxis(self._setup.model.limits_rad, -1, 0)
@@ -173,7 +174,13 @@ class WristFingers:
         return found, *self._slope(at, found, sight)
 
     def _by_level(
-        self, levels: Levels, t_ns: int, natural: FingerAngles, sight: Sighting, view: BentView | None
+        self,
+        levels: Levels,
+        t_ns: int,
+        natural: FingerAngles,
+        sight: Sighting,
+        view: BentView | None,
+        expected: Bool,
     ) -> FingerAngles:
         """What laser and tips say together."""
         fresh = self._continuous & (1e-9 * (t_ns - self._seen_ns) <= FORGET_S)
@@ -181,7 +188,7 @@ class WristFingers:
         gone_s = 1e-9 * (t_ns - self._told_ns)
         news = -np.expm1(-gone_s / _LINGERS_S) if self._continuous else 1.0
         self._told_ns = t_ns
-        found, refused = levels(natural, sight, last, self._light, float(news), view)
+        found, refused = levels(natural, sight, last, self._light, float(news), view, expected)
         self._count("tip_refused", refused)
         self._count("ik", found.level == Level.IK)
         return found

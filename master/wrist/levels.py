@@ -49,6 +49,8 @@ _CONTRADICTED = 0.01  # less probable than this, a natural hand is none
 _FLESH_RAD = np.radians(2.5)  # 2 mm of a tip that is not quite where the hand file has it, over two bones
 _CLEARLY_RAD, _INSIDE_PX = np.radians(10.0), 20.0  # by which a tip is in sight that is hardly ever missed
 _SHOWN = np.log(10.0)  # of ten tips that the model says are seen nine are found
+NOTHING = np.zeros(5, np.bool_)
+NOTHING.flags.writeable = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +94,7 @@ class Levels:
         unit: LightUnit,
         news: float = 1.0,
         view: BentView | None = None,
+        expected: Bool = NOTHING,
     ) -> tuple[FingerAngles, Bool]:
         """Angles of fingers, and whose tip was refused (5,).
 
@@ -102,6 +105,7 @@ class Levels:
             unit: What is known of the unit of `sight.tip_depth`; it is told more.
             news: How far this pose is from the last one: 1 where they are unrelated.
             view: What is seen at the bend of the wrist; None: it is straight.
+            expected: (5,) fingers of which somebody else says how they are bent.
         """
         model = self._model if view is None else self._model.bent(view.poses, view)
         seen = np.concatenate([sight.laser_m, sight.tip], axis=1)
@@ -127,7 +131,7 @@ class Levels:
         solved = believed & (shown >= HARDLY)
         kept = natural if habit > _CONTRADICTED else self._free(model, natural, sight, solved)
         if not self._alone:
-            hidden = self._should_show(model.poses, kept, np.isnan(sight.tip[:, 0]))
+            hidden = self._should_show(model.poses, kept, np.isnan(sight.tip[:, 0]), expected)
             kept = replace(kept, told=kept.told & ~hidden, off=kept.off | hidden)
         kept = replace(kept, angles_rad=kept.angles_rad.copy(), cov_rad2=kept.cov_rad2.copy())
         kept.angles_rad[solved], kept.cov_rad2[solved] = found.angles_rad[solved], found.cov_rad2[solved]
@@ -161,11 +165,12 @@ class Levels:
         hands = of_all - np.logaddexp.reduce(of_all)
         return np.logaddexp.reduce(hands[:, None, None] + valley.log), float(np.exp(hands[0]))
 
-    def _should_show(self, poses: FingerPoses, natural: FingerAngles, unseen: Bool) -> Bool:
-        """Fingers (5,) that are bent otherwise, since their tip is not seen though habit has it in sight.
+    def _should_show(self, poses: FingerPoses, natural: FingerAngles, unseen: Bool, expected: Bool) -> Bool:
+        """Fingers (5,) of which habit is not believed: it has their tip in sight, and that is not seen.
 
-        That is said of one between fingers that show theirs. Where tips of neighbours are missing alike the hand holds
-        something that hides them, and they tell nothing.
+        They are bent otherwise. Where tips of neighbours are missing alike the hand may as well hold something that
+        hides them. From a triple alone nobody can tell; where fingers are expected somewhere it is this that their
+        laser point follows, not habit, and it counts.
         """
         asked = natural.told & unseen
         asked[0] = False  # the tip of a thumb is hardly ever found
@@ -182,7 +187,7 @@ class Levels:
         beside = np.zeros(5, np.bool_)
         beside[2:] |= missing[1:-1]
         beside[1:-1] |= missing[2:]
-        return missing & ~beside
+        return missing & ~(beside & expected)
 
     def _free(
         self, model: InverseModel, natural: FingerAngles, sight: Sighting, solved: Bool

@@ -166,15 +166,22 @@ def test_fingers_that_are_not_seen_do_not_change(device: Device) -> None:
     np.testing.assert_array_equal(seen.by_bend, 0.0)
 
 
-def test_tips_that_something_hides_alike_leave_habit_its_word(device: Device) -> None:
-    """A hand that holds a thing: neighbours show no tips. One alone without its tip is bent otherwise."""
+def test_of_neighbours_without_their_tips_the_laser_counts_where_fingers_are_expected(device: Device) -> None:
+    """A hand that holds a thing, or one that pinches? One triple cannot tell. One finger alone is bent otherwise."""
     slope, base = device.poses.habit
     x = bent(0.0, 40.0)
     x[:, 1] = base + slope * x[:, 2]
     whole = shown(device, x, STRAIGHT)
-    for hidden, told in (([2], False), ([2, 3], True)):
+    expected = device.poses.angles(x)
+    expected[4] = np.nan
+    for hidden, told in (([2], []), ([2, 3], [2, 3]), ([2, 3, 4], [2, 3])):
         tip, sigma = whole.tip_uv.copy(), whole.tip_sigma_px.copy()
         tip[hidden], sigma[hidden] = np.nan, np.nan
-        found = pushed(device, msgspec.structs.replace(whole, tip_uv=tip, tip_sigma_px=sigma), STRAIGHT).found
-        assert (found.told[hidden] == told).all()
-        assert (found.level[hidden] == Level.FK).all()
+        message = msgspec.structs.replace(whole, tip_uv=tip, tip_sigma_px=sigma)
+        for known, still in ((None, []), (expected, told)):
+            seen = fingers(device).push(message, STRAIGHT, known)
+            assert seen is not None
+            found = seen.found
+            assert [f for f in hidden if found.told[f]] == still
+            assert [f for f in hidden if found.off[f]] == [f for f in hidden if f not in still]
+            assert (found.level[hidden] == Level.FK).all()
