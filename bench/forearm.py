@@ -25,6 +25,7 @@ from common.sim.imu import SimulatedImu
 from common.sim.motion import HandState, smooth_step
 from common.wrist_bend import STRAIGHT, forearm_palm
 from master.fusion.forearm import Forearm
+from master.fusion.told_forearm import ToldForearm
 
 # Cameras that look down on a desk: the vertical is 30 degrees off the rig's -y.
 _WORLD = (float(np.cos(np.radians(60.0))), float(np.sin(np.radians(60.0))), 0.0, 0.0)
@@ -162,7 +163,7 @@ def moments(arm: Arm, kind: Kind) -> Iterator[Moment]:
             yield _moment(arm, forearm, sample, looked[0], last)
         if since_s <= _TOLD_S:
             seen, cov = told.of(arm.palm(t_s))
-            forearm.saw(sample.t_ns, seen, cov)
+            forearm.saw(sample.t_ns, ToldForearm.of_palm(seen, cov))
             last, _ = forearm.bend_at(sample.t_ns)
 
 
@@ -211,7 +212,7 @@ def _cost(arm: Arm) -> Row:
         forearm.push(sample.t_ns, sample.orientation_wxyz, sample.heading_sigma_rad)
         seen, cov = told.of(arm.palm(sample.seq / IMU.rate_hz))
         start = perf_counter_ns()
-        forearm.saw(sample.t_ns, seen, cov)
+        forearm.saw(sample.t_ns, ToldForearm.of_palm(seen, cov))
         spent.append((perf_counter_ns() - start) * 1e-3)
     return Row(
         "cost of a palm",

@@ -21,7 +21,15 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix
 from common.wrist_bend import forearm_palm
-from master.fusion.forearm_state import ANYWHERE_RAD, HEADING, ForearmState, SeenPalm, bend_axes
+from master.fusion.forearm_state import (
+    ANYWHERE_RAD,
+    HEADING,
+    TELLS_RAD,
+    ForearmState,
+    SeenForearm,
+    bend_axes,
+)
+from master.fusion.told_forearm import ToldForearm
 from master.ik.orientation import TURN_RAD_S, turn_of
 from master.ik.orientation_samples import Between
 from master.ik.palm import Orientation
@@ -40,9 +48,9 @@ class Forearm:
     """Push machine. Holds the samples of an IMU, tilt, heading and bend as of the last palm, and what contradicts them.
 
     Attributes:
-        counts: `forearm.seen`, palms that were taken; left out: `forearm.missing` (no rotation, or no covariance),
-            `forearm.alone` (no sample near), `forearm.late`, `forearm.outlier`; `forearm.begun`, how often the heading
-            was learnt from nothing; and those of `PalmWorld`.
+        counts: `forearm.seen`, instants that were taken; left out: `forearm.missing` (numbers), `forearm.alone` (no
+            sample near), `forearm.late`, `forearm.vague` (tells next to nothing), `forearm.outlier`; `forearm.begun`,
+            how often the heading was learnt from nothing; and those of `PalmWorld`.
     """
 
     def __init__(self, imu: ImuCalibration, counts: Counter[str] | None = None) -> None:
@@ -123,36 +131,40 @@ class Forearm:
         palm = matrix_to_quaternion(forearm @ forearm_palm(bend))
         return palm, np.array([tilt, min(heading, ANYWHERE_RAD)])
 
-    def saw(self, t_ns: int, R_rig_palm: Float, cov_rad2: Float) -> None:
-        """Take how the palm lies in the rig by markers alone.
+    def saw(self, t_ns: int, told: ToldForearm) -> None:
+        """Take what markers, and fingers before the device, tell of palm and bend.
 
         Args:
-            t_ns: When; one that is older than the last, by less than a second, is late and left out.
-            R_rig_palm: (3, 3) palm axes -> rig frame.
-            cov_rad2: (3, 3) [rad^2] of the rotation vector, rig axes, that turns it to the true one.
+            t_ns: When; what is older than the last, by less than a second, is late and left out.
+            told: That, in the rig.
         """
         found = self._world.samples.between(t_ns)
-        if not (np.isfinite(R_rig_palm).all() and np.isfinite(cov_rad2).all()):
+        if not told.known:
             self.counts["forearm.missing"] += 1
         elif self._t_ns is not None and _CLOCK_NS < t_ns - self._t_ns < 0:
             self.counts["forearm.late"] += 1
         elif found is None:
             self.counts["forearm.alone"] += 1
         else:
-            self._take(t_ns, found, SeenPalm.of(R_rig_palm, cov_rad2, self._forearm(found)))
+            self._take(t_ns, found, SeenForearm.of(told, self._forearm(found)))
 
-    def _take(self, t_ns: int, found: Between, seen: SeenPalm) -> None:
-        """Learn from a palm, or leave it out."""
+    def _take(self, t_ns: int, found: Between, seen: SeenForearm) -> None:
+        """Learn from an instant, or leave it out."""
         since_s = self._since_s(t_ns)
         walked_rad2 = self._walked_rad2(t_ns, found)
         state = self._state.after(since_s, walked_rad2)
+        palm, cov = seen.told.palm(state.bend_rad, state.bend_cov)
+        turned = bool(np.linalg.eigvalsh(cov)[-1] < TELLS_RAD**2)
         contrary = self._contrary_ns
-        anew = len(contrary) >= _CONTRARY and abs(t_ns - contrary[0]) > _CONTRARY_NS
+        anew = turned and len(contrary) >= _CONTRARY and abs(t_ns - contrary[0]) > _CONTRARY_NS
         if anew:
             state = state.anew()
+        if len(seen.pull) == 0 or (state.heading_sigma_rad > _LOST_RAD and not turned):
+            self.counts["forearm.vague"] += 1
+            return
         if state.heading_sigma_rad > _LOST_RAD:
             self.counts["forearm.begun"] += 1
-            state, self._rival = state.lost().towards(seen), None
+            state, self._rival = state.lost().towards(palm, seen.world_forearm), None
         misfit = seen.against(state)
         likely, density = seen.likely(state, misfit)
         if not (likely or anew):
@@ -166,16 +178,19 @@ class Forearm:
         contrary.clear()
         rival = None if self._rival is None else self._rival.after(since_s, walked_rad2)
         self._state, self._t_ns, self._drift_rad = state.told(seen, misfit), t_ns, found.drift_rad
-        self._challenge(t_ns, rival, seen, density)
+        if rival is not None or turned:
+            self._challenge(t_ns, rival, palm, seen, density)
 
-    def _challenge(self, t_ns: int, rival: ForearmState | None, seen: SeenPalm, density: float) -> None:
+    def _challenge(
+        self, t_ns: int, rival: ForearmState | None, palm: Float, seen: SeenForearm, density: float
+    ) -> None:
         """Let a rival that began lately, with any heading, take over where it foretells the palms far better.
 
         What a small jump of the heading does looks like a bend at first (generalised likelihood ratio: Willsky, Jones
         1976). While there is none a rival leads by e^n no more often than once in e^n (Ville's inequality).
         """
         if rival is None or self._lead < _BEHIND or abs(t_ns - self._rival_ns) > _RIVAL_NS:
-            rival = self._state.anew().towards(seen)
+            rival = self._state.anew().towards(palm, seen.world_forearm)
             self._rival, self._rival_ns, self._lead = rival.told(seen, seen.against(rival)), t_ns, 0.0
             return
         misfit = seen.against(rival)

@@ -16,9 +16,9 @@ the covariance keeps what one has to do with the other. By itself
   posture of -30...3 deg (43 types of work; Hansson et al. 2009, Int. J. Ind. Ergonomics 39, 221; ours: 20 deg/s); most
   of what hands do daily takes 5 deg of flexion, 30 of extension, 10 and 15 of deviation (Palmer et al. 1985, J. Hand
   Surg. 10A, 39);
-- error of the markers (3), in units of the covariance that they come with. On rendered hands it hardly changes from
-  frame to frame, but within a second or two, as shape and hidden fingers do. More than that is taken as new in each
-  frame, so that plain noise does not surprise either.
+- error of what is told of turn and bend (5), in units of the covariance that this comes with, palm axes. On rendered
+  hands it hardly changes from frame to frame, but within a second or two, as shape and hidden fingers do. More than
+  that is taken as new in each frame, so that plain noise does not surprise either.
 """
 
 from dataclasses import dataclass
@@ -30,21 +30,20 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import axis_rotation, matrix_to_rotation_vector, rotation_vector_to_matrix
 from common.wrist_bend import forearm_palm
+from master.fusion.told_forearm import ToldForearm
 
 ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 HEADING = 2
-_SIZE = 12
-_TILT, _HABIT, _MOTION, _RATE, _ERROR = slice(2), slice(3, 5), slice(5, 7), slice(7, 9), slice(9, 12)
+_SIZE = 14
+_TILT, _HABIT, _MOTION, _RATE, _ERROR = slice(2), slice(3, 5), slice(5, 7), slice(7, 9), slice(9, 14)
 _ANGLES = slice(7)
 _TILT_S = 5.0
 _HABIT_RAD, _HABIT_S = np.radians([10.0, 7.0]), 20.0  # flexion, deviation
 _MOTION_RAD, _PACE_1_S = np.radians([10.0, 9.0]), 3.0
-_FRESH, _STAYING, _STAYS_S = (
-    0.4,
-    0.8,
-    1.5,
-)  # shares of the markers' covariance: new in each frame, and staying
-_BEYOND = 16.27  # chi square, three degrees, 99.9 %
+FRESH, STAYING = 0.4, np.array([0.8, 0.8, 0.8, 2.5, 2.5])  # of what is told: new in each frame, and staying
+_STAYS_S = 1.5
+_BEYOND = (0.0, 10.83, 13.82, 16.27, 18.47, 20.52)  # chi square of so many degrees, 99.9 %
+TELLS_RAD = radians(15.0)  # what is less sure does not teach
 _FLICK_RAD_S, _FLICK_RAD = 5.0, radians(20.0)  # faster than usual, but wrists can; and how far that may go
 _STEPS, _NEAR_RAD = 4, 0.02
 _EYE, _UP = np.eye(3), np.array([0.0, 0.0, 1.0])
@@ -54,13 +53,13 @@ _BEND[:, _HABIT] = _BEND[:, _MOTION] = np.eye(2)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForearmState:
-    """A Gaussian over tilt, heading, habit, motion, its rate and the markers' error.
+    """A Gaussian over tilt, heading, habit, motion, its rate and the error of what is told.
 
     Attributes:
         rig_world: (3, 3) the IMU's world -> rig frame, right up to heading and tilt.
-        usual: (12,) variances that doubt grows to; that of the heading, 0, is not one of them.
-        mean: (12,) [rad], [rad/s], [1].
-        cov: (12, 12).
+        usual: (14,) variances that doubt grows to; that of the heading, 0, is not one of them.
+        mean: (14,) [rad], [rad/s], [1].
+        cov: (14, 14).
     """
 
     rig_world: Float
@@ -91,7 +90,7 @@ class ForearmState:
 
     @property
     def with_bend(self) -> Float:
-        """Covariance (12, 2) of the state with flexion and deviation."""
+        """Covariance (14, 2) of the state with flexion and deviation."""
         return self.cov @ _BEND.T
 
     @property
@@ -100,7 +99,7 @@ class ForearmState:
         return sqrt(self.cov[HEADING, HEADING])
 
     def palm(self, world_forearm: Float) -> tuple[Float, Float]:
-        """The palm (3, 3) in the rig, and the derivative (3, 12) of a small turn of it, in rig axes, by the state."""
+        """The palm (3, 3) in the rig, and the derivative (3, 14) of a small turn of it, in rig axes, by the state."""
         bend = self.bend_rad
         rig_tilted = self.rig_world @ rotation_vector_to_matrix(np.array([*self.mean[_TILT], 0.0]))
         rig_forearm = rig_tilted @ axis_rotation(2, self.mean[HEADING]) @ world_forearm
@@ -126,16 +125,16 @@ class ForearmState:
         """As before anything was seen, with a heading that may be anywhere."""
         return ForearmState(self.rig_world, self.usual, np.zeros(_SIZE), np.diag(self.usual)).lost()
 
-    def towards(self, seen: "SeenPalm") -> "ForearmState":
+    def towards(self, R_rig_palm: Float, world_forearm: Float) -> "ForearmState":
         """The same with the heading that comes nearest to a palm, as little as that may say."""
         tilted = self.rig_world @ rotation_vector_to_matrix(np.array([*self.mean[_TILT], 0.0]))
-        turn = tilted.T @ seen.rotation @ (seen.world_forearm @ forearm_palm(self.bend_rad)).T
+        turn = tilted.T @ R_rig_palm @ (world_forearm @ forearm_palm(self.bend_rad)).T
         mean = self.mean.copy()
         mean[HEADING] = atan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1])
         return ForearmState(self.rig_world, self.usual, mean, self.cov)
 
-    def told(self, seen: "SeenPalm", misfit: "Misfit") -> "ForearmState":
-        """What a palm, and its misfit to this state, leave of it: an iterated Kalman update (Bell, Cathey 1993)."""
+    def told(self, seen: "SeenForearm", misfit: "Misfit") -> "ForearmState":
+        """What an instant, and its misfit to this state, leave of it: an iterated Kalman update (Bell, Cathey 1993)."""
         before = np.zeros(_SIZE)
         off, gain = self._corrected(seen, misfit, before)
         for _ in range(_STEPS):
@@ -145,18 +144,18 @@ class ForearmState:
             misfit = seen.against(ForearmState(self.rig_world, self.usual, self.mean + off, self.cov))
             off, gain = self._corrected(seen, misfit, before)
         left = np.eye(_SIZE) - gain @ misfit.slope
-        cov = left @ self.cov @ left.T + gain @ seen.fresh @ gain.T
+        cov = left @ self.cov @ left.T + FRESH * (gain @ gain.T)
         mean = self.mean + off
         mean[HEADING] = remainder(mean[HEADING], 2.0 * pi)
         return ForearmState(self.rig_world, self.usual, mean, 0.5 * (cov + cov.T))
 
-    def _corrected(self, seen: "SeenPalm", misfit: "Misfit", off: Float) -> tuple[Float, Float]:
-        """The correction (12,) of the mean and Kalman's gain (12, 3), by a misfit that is linear about mean + `off`."""
+    def _corrected(self, seen: "SeenForearm", misfit: "Misfit", off: Float) -> tuple[Float, Float]:
+        """The correction (14,) of the mean and Kalman's gain (14, K), by a misfit that is linear about mean + `off`."""
         crossed = misfit.slope @ self.cov
-        gain = np.linalg.solve(crossed @ misfit.slope.T + seen.fresh, crossed).T.astype(
+        gain = np.linalg.solve(crossed @ misfit.slope.T + FRESH * np.eye(len(crossed)), crossed).T.astype(
             np.float64, copy=False
         )
-        return gain @ (misfit.off_rad + misfit.slope @ off), gain
+        return gain @ (misfit.off + misfit.slope @ off), gain
 
     def flicked(self, step_s: float) -> "ForearmState":
         """The same after a motion of the wrist that is quicker than usual."""
@@ -167,47 +166,57 @@ class ForearmState:
 
 
 class Misfit(NamedTuple):
-    """The turn (3,) [rad], rig axes, from a state's palm to one that is seen; its derivative (3, 12) by the state."""
+    """What is told less what a state has, in K directions (K,), each in its sigma; its derivative (K, 14)."""
 
-    off_rad: Float
+    off: Float
     slope: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SeenPalm:
-    """How the palm lies by markers alone, and the forearm by the IMU at the same instant.
+class SeenForearm:
+    """What an instant tells of palm and bend, and the forearm by the IMU then.
 
     Attributes:
-        rotation: (3, 3) palm axes -> rig frame.
+        told: That.
         world_forearm: (3, 3) forearm axes -> the IMU's world.
-        root: (3, 3) [rad] turns the state's error of the markers into rig axes.
-        fresh: (3, 3) [rad^2] covariance of what is new in each frame.
+        directions: (K, 5) those of turn, palm axes, and bend that it tells; orthonormal.
+        per_sigma: (K, 5) the same for a turn in rig axes, by their standard deviations [1/rad].
+        pull: (K,) how far it tells them to be from where `told` counts, by their standard deviations.
     """
 
-    rotation: Float
+    told: ToldForearm
     world_forearm: Float
-    root: Float
-    fresh: Float
+    directions: Float
+    per_sigma: Float
+    pull: Float
 
     @classmethod
-    def of(cls, rotation: Float, cov_rad2: Float, world_forearm: Float) -> "SeenPalm":
-        """From the covariance (3, 3) [rad^2] of the rotation vector, rig axes, that turns it to the true one."""
-        values, axes = np.linalg.eigh(_STAYING * cov_rad2)
-        root = axes * np.sqrt(np.maximum(values, 0.0)) @ axes.T
-        return cls(rotation, world_forearm, root, _FRESH * cov_rad2)
+    def of(cls, told: ToldForearm, world_forearm: Float) -> "SeenForearm":
+        """Find the directions in which something is told: none may be."""
+        to_rig = np.eye(5)
+        to_rig[:3, :3] = told.R_rig_palm
+        values, axes = np.linalg.eigh(to_rig.T @ told.information @ to_rig)
+        told_well = values > TELLS_RAD**-2.0
+        directions, sigma = axes.T[told_well], 1.0 / np.sqrt(values[told_well])
+        in_rig = directions @ to_rig.T
+        return cls(told, world_forearm, directions, in_rig / sigma[:, None], sigma * (in_rig @ told.pull))
 
     def against(self, state: ForearmState) -> Misfit:
         """What it lacks to be as a state has it."""
-        palm, slope = state.palm(self.world_forearm)
-        slope[:, _ERROR] = self.root
-        off = matrix_to_rotation_vector(self.rotation @ palm.T) - self.root @ state.mean[_ERROR]
-        return Misfit(off, slope)
+        palm, turn = state.palm(self.world_forearm)
+        off = np.concatenate(
+            [matrix_to_rotation_vector(self.told.R_rig_palm @ palm.T), self.told.bend_rad - state.bend_rad]
+        )
+        slope = self.per_sigma @ np.concatenate([turn, _BEND])
+        slope[:, _ERROR] = self.directions * np.sqrt(STAYING)
+        return Misfit(self.pull + self.per_sigma @ off - slope[:, _ERROR] @ state.mean[_ERROR], slope)
 
     def likely(self, state: ForearmState, misfit: Misfit) -> tuple[bool, float]:
-        """Whether a state makes this palm no outlier, and the logarithm of its density, less a constant."""
-        cov = misfit.slope @ state.cov @ misfit.slope.T + self.fresh
-        square = float(misfit.off_rad @ np.linalg.solve(cov, misfit.off_rad))
-        return square < _BEYOND, -0.5 * (square + float(np.linalg.slogdet(cov)[1]))
+        """Whether a state makes this no outlier, and the logarithm of its density, less a constant."""
+        count = len(misfit.off)
+        cov = misfit.slope @ state.cov @ misfit.slope.T + FRESH * np.eye(count)
+        square = float(misfit.off @ np.linalg.solve(cov, misfit.off))
+        return square < _BEYOND[count], -0.5 * (square + float(np.linalg.slogdet(cov)[1]))
 
 
 def bend_axes(bend_rad: Float) -> Float:
@@ -217,7 +226,7 @@ def bend_axes(bend_rad: Float) -> Float:
 
 
 def _moves(step_s: float) -> Float:
-    """How the mean (12,) goes on in a step (12, 12); a step back is one of the same process, which has no direction."""
+    """How the mean (14,) goes on in a step (14, 14); a step back is one of the same process, which has no direction."""
     away = abs(step_s)
     moves = np.eye(_SIZE)
     for part, lasts_s in ((_TILT, _TILT_S), (_HABIT, _HABIT_S), (_ERROR, _STAYS_S)):

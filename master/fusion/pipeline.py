@@ -19,22 +19,19 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float
-from common.geometry import rotation_vector_to_matrix
 from common.messages import Detections, HandPose, WristDetections
 from common.wrist_bend import STRAIGHT
 from master.fusion.finger_track import REACH_NS, FingerTrack
 from master.fusion.forearm import Forearm
-from master.ik.hand import HandSolution
+from master.fusion.told_forearm import told_forearm
 from master.ik.parameters import HandParameters
-from master.ik.sensed_hand import SensedFree, SensedHand
-from master.ik.tracker import TrackedHand
+from master.ik.sensed_hand import SensedHand
+from master.ik.tracker import ON_MARKERS, TrackedHand
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.wrist.fingers import SeenFingers, WristFingers
 from master.wrist.setup import WristSetup
 
 _SILENT_FRAMES = 2.2  # of the slowest camera: when so long no instant came, the device's triples lead
-_TELLS_RAD = np.radians(15.0)  # markers that leave more doubt about an axis do not teach how the palm lies
-_FARTHEST_RAD = np.radians(30.0)  # that the other sensors turned it, and it is still but a step
 _WIDE_BEND = np.radians(15.0) ** 2 * np.eye(2)
 _EXPECTED_NS = 100_000_000  # a hand solved so lately tells where fingers are now
 _NO_COMMON = np.zeros((3, 2))
@@ -108,44 +105,13 @@ class WristSide:
         )
 
     def solved(self, t_ns: int, hand: TrackedHand, told: SensedHand | None) -> None:
-        """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from it."""
-        if hand.solution is not None:
-            self._solved = t_ns, hand.solution.angles_rad
-        if self.forearm is None or hand.solution is None:
+        """As `OtherSensors.solved`: where markers tell how the palm lies, the forearm learns from the instant."""
+        if hand.solution is None:
             return
-        palm = palm_alone(
-            hand.solution, None if told is None else told.of(self._parameters), self._parameters
-        )
-        if palm is not None:
-            self.forearm.saw(t_ns, *palm)
-
-
-def palm_alone(
-    hand: HandSolution, told: SensedFree | None, parameters: HandParameters
-) -> tuple[Float, Float] | None:
-    """The palm's rotation (3, 3) and covariance (3, 3) [rad^2] as markers alone tell them; None: they hardly do.
-
-    In a least-squares fit information adds up, and at its solution the pulls of all that is known cancel: what other
-    sensors `told` is taken out of both again.
-    """
-    rotation = hand.T_rig_palm[:3, :3]
-    if told is None:
-        cov = hand.alone[:3, :3]
-    else:
-        size = len(hand.alone)
-        pull, added = np.zeros(size), np.zeros((size, size))
-        told.add_to(rotation, parameters.of_angles(hand.angles_rad), pull, added)
-        information = np.asarray(np.linalg.inv(hand.alone), np.float64) - added
-        if np.linalg.eigvalsh(information)[0] <= 0.0:
-            return None
-        cov = np.linalg.inv(information)
-        step = (cov @ pull)[:3]
-        if float(step @ step) > _FARTHEST_RAD**2:
-            return None
-        rotation, cov = rotation_vector_to_matrix(step) @ rotation, cov[:3, :3]
-    if np.linalg.eigvalsh(cov)[-1] > _TELLS_RAD**2:
-        return None
-    return rotation, np.asarray(cov, np.float64)
+        self._solved = t_ns, hand.solution.angles_rad
+        if self.forearm is not None and hand.rests[5] & ON_MARKERS:
+            bend, _cov = self.forearm.bend_at(t_ns)
+            self.forearm.saw(t_ns, told_forearm(hand.solution, bend, self._parameters))
 
 
 class FusedPipeline:

@@ -32,8 +32,10 @@ _PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is
 _NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
 
-def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> Float:
+def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> tuple[Float, float]:
     """Covariance (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and of the free angles [rad], of one instant.
+
+    And by how much the misfit has scaled it.
 
     Args:
         problem: The fit, which may believe in the last pose as well.
@@ -46,7 +48,7 @@ def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -
     told = 0 if problem.others is None else len(problem.others.belief.fingers)
     free = max(3 * (len(problem.points_m) + told) - 6 + (0 if problem.facing is None else 2), 0)
     scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), 1.0)
-    return np.asarray(scale * np.linalg.inv(normal), np.float64)
+    return np.asarray(scale * np.linalg.inv(normal), np.float64), scale
 
 
 def chi_square_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> float:

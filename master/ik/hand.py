@@ -8,7 +8,7 @@ It is solved twice side by side, for a natural hand and for one that is free of 
 counts by its evidence (`master.ik.mixture`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -52,6 +52,9 @@ class HandSolution:
         alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
             instant alone.
         moved: (26, 3, 6 + n) derivatives of the joint positions by these.
+        x: (n,) free angles that the fit ended with, before a finger is brought onto its cap.
+        scale: By how much the misfit of the instant has scaled `alone`.
+        others: What other sensors said, as the fit took it; None: nothing.
     """
 
     T_rig_palm: Float
@@ -66,6 +69,9 @@ class HandSolution:
     natural: float
     alone: Float
     moved: Float
+    x: Float = field(default_factory=lambda: np.zeros(0))
+    scale: float = 1.0
+    others: SensedHand | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -314,6 +320,9 @@ class HandSolver:
             natural=found.natural,
             alone=found.alone,
             moved=J,
+            x=found.x,
+            scale=found.scale,
+            others=None if problem.others is None else problem.others.belief,
         )
 
 

@@ -33,6 +33,7 @@ class Mixture:
         T_rig_palm, x: Mean pose (4, 4) and angles (n,), inside the bounds.
         alone: Covariance (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and the angles [rad], by this instant
             alone (`master.ik.certainty`).
+        scale: By how much the misfit of the instant has scaled it.
         cost: Of the likeliest.
         natural: Probability of the first hypothesis.
     """
@@ -40,6 +41,7 @@ class Mixture:
     T_rig_palm: Float
     x: Float
     alone: Float
+    scale: float
     cost: float
     natural: float
 
@@ -63,10 +65,11 @@ class Mixture:
         share = np.ones(1) if sure else weight
         off = np.array([_between(minima[h], top) for h in kept])
         steps = np.zeros_like(off)
-        alone = np.zeros((off.shape[1], off.shape[1]))
+        alone, scale = np.zeros((off.shape[1], off.shape[1])), 0.0
         for k, h in enumerate(kept.tolist()):
             found, one = minima[h], problem.of_hypothesis(h)
-            alone += share[k] * covariance_alone(one, habits.of_hypothesis(h), found)
+            cov, scaled = covariance_alone(one, habits.of_hypothesis(h), found)
+            alone, scale = alone + share[k] * cov, scale + share[k] * scaled
             if h > 0 and share[k] > _NOTICED:
                 steps[k] = one.mean_step(found)
         off += steps
@@ -79,7 +82,7 @@ class Mixture:
             )
             between = problem.of_points(np.einsum("h,hmi->mi", share, ends))
             T, x = _onto(between, *moved(T, x, mean), top.linear.normal)
-        return cls(T, x, alone, float(top.linear.cost), natural)
+        return cls(T, x, alone, float(scale), float(top.linear.cost), natural)
 
 
 def _weights(problem: HandProblem, minima: list[Minimum], natural: float, counts: float) -> Float:

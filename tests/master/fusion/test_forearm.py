@@ -21,7 +21,8 @@ from common.geometry import (
 )
 from common.wrist_bend import forearm_palm
 from master.fusion.forearm import Forearm
-from master.fusion.forearm_state import ForearmState, SeenPalm
+from master.fusion.forearm_state import FRESH, STAYING, ForearmState, SeenForearm
+from master.fusion.told_forearm import ToldForearm
 from master.ik.palm import Orientation
 from tests.hand_helpers import any_rotation
 
@@ -70,7 +71,7 @@ def played(
     for t_ms in times_ms[:: 1 if times_ms.step > 1 else 8]:
         forearm.push((t_ms + shift_ms) * MS, arm.said(t_ms), drift)
         if seen and t_ms % FRAME_MS == 0 and t_ms - 16 >= times_ms.start:
-            forearm.saw((t_ms - 16 + shift_ms) * MS, arm.palm(t_ms - 16), COV)
+            forearm.saw((t_ms - 16 + shift_ms) * MS, ToldForearm.of_palm(arm.palm(t_ms - 16), COV))
 
 
 def degrees(a: Float, b: Float) -> float:
@@ -110,8 +111,8 @@ def test_two_steps_are_one_and_doubt_ends_at_what_is_usual(
 ) -> None:
     rng = np.random.default_rng(seed)
     state = ForearmState.of(np.eye(3), 0.02, 0.3)
-    state.mean[:] = rng.normal(size=12)
-    state.cov[:] = (root := 0.1 * rng.normal(size=(12, 12))) @ root.T
+    state.mean[:] = rng.normal(size=14)
+    state.cov[:] = (root := 0.1 * rng.normal(size=(14, 14))) @ root.T
     twice, once = state.after(first_s, 0.01).after(second_s, 0.02), state.after(first_s + second_s, 0.03)
     np.testing.assert_allclose(twice.mean, once.mean, atol=1e-9)
     np.testing.assert_allclose(twice.cov, once.cov, atol=1e-9)
@@ -139,7 +140,7 @@ def test_one_palm_tells_the_sum_of_heading_and_a_bend_whose_axis_is_upright_and_
     forearm = Forearm(IMU)
     lies = RIG_WORLD @ axis_rotation(0, radians(90.0))  # deviation, about the palm's y, is upright
     forearm.push(0, matrix_to_quaternion(RIG_WORLD.T @ lies @ PALM_IMU))
-    forearm.saw(0, lies, radians(1.0) ** 2 * np.eye(3))
+    forearm.saw(0, ToldForearm.of_palm(lies, radians(1.0) ** 2 * np.eye(3)))
     bend, cov = forearm.bend_at(0)
     assert np.degrees(np.abs(bend)).max() < 0.1
     assert sigmas_deg(cov)[1] == pytest.approx(11.4, abs=0.2)  # as before
@@ -155,7 +156,7 @@ def test_nothing_is_said_of_the_palm_before_a_heading_is_known() -> None:
     bend, cov = forearm.bend_at(50 * MS)
     np.testing.assert_array_equal(bend, 0.0)
     assert 10.0 < sigmas_deg(cov).min() < sigmas_deg(cov).max() < 15.0
-    forearm.saw(48 * MS, arm.palm(48), COV)
+    forearm.saw(48 * MS, ToldForearm.of_palm(arm.palm(48), COV))
     assert degrees(at(forearm, 48).rotation, arm.palm(48)) < 2.5
 
 
@@ -190,11 +191,11 @@ def test_what_is_no_palm_is_left_out_and_counted() -> None:
     arm, forearm = Arm(), Forearm(IMU)
     played(forearm, arm, range(0, 4_000))
     before, seen = at(forearm, 3_984).rotation, forearm.counts["forearm.seen"]
-    forearm.saw(3_992 * MS, np.full((3, 3), np.nan), COV)
-    forearm.saw(3_992 * MS, arm.palm(3_992), np.full((3, 3), np.nan))
-    forearm.saw(3_900 * MS, arm.palm(3_900), COV)
-    forearm.saw(4_900 * MS, arm.palm(4_900), COV)
-    forearm.saw(3_992 * MS, arm.palm(3_992) @ axis_rotation(2, 2.5), COV)
+    forearm.saw(3_992 * MS, ToldForearm.of_palm(np.full((3, 3), np.nan), COV))
+    forearm.saw(3_992 * MS, ToldForearm.of_palm(arm.palm(3_992), np.full((3, 3), np.nan)))
+    forearm.saw(3_900 * MS, ToldForearm.of_palm(arm.palm(3_900), COV))
+    forearm.saw(4_900 * MS, ToldForearm.of_palm(arm.palm(4_900), COV))
+    forearm.saw(3_992 * MS, ToldForearm.of_palm(arm.palm(3_992) @ axis_rotation(2, 2.5), COV))
     expected = {"missing": 2, "late": 1, "alone": 1, "outlier": 1}
     assert {name: forearm.counts[f"forearm.{name}"] for name in expected} == expected
     assert forearm.counts["forearm.seen"] == seen
@@ -276,16 +277,16 @@ def held(rng: np.random.Generator) -> Iterator[bool]:
     truth = ForearmState(RIG_WORLD, believed.usual, drawn(rng, believed.cov), believed.cov)
     world_forearm, palm = any_rotation(rng), np.eye(3)
     for step_s in (0.017,) * 20 + (0.5,):
-        moved, certain = truth.after(step_s, 1e-6), np.zeros((12, 12))
+        moved, certain = truth.after(step_s, 1e-6), np.zeros((14, 14))
         noise = ForearmState(RIG_WORLD, truth.usual, truth.mean, certain).after(step_s, 1e-6).cov
         truth = ForearmState(RIG_WORLD, truth.usual, moved.mean + drawn(rng, noise), truth.cov)
         believed = believed.after(step_s, 1e-6)
         palm, _ = truth.palm(world_forearm)
         if step_s == 0.5:
             break
-        exact = SeenPalm.of(palm, COV, world_forearm)
-        error = rotation_vector_to_matrix(exact.root @ truth.mean[9:] + drawn(rng, exact.fresh))
-        seen = SeenPalm.of(error @ palm, COV, world_forearm)
+        off = np.sqrt(STAYING[:3]) * truth.mean[9:12] + np.sqrt(FRESH) * rng.normal(size=3)
+        error = rotation_vector_to_matrix(palm @ off * np.sqrt(COV[0, 0]))
+        seen = SeenForearm.of(ToldForearm.of_palm(error @ palm, COV), world_forearm)
         believed = believed.told(seen, seen.against(believed))
     expected, slope = believed.palm(world_forearm)
     off = matrix_to_rotation_vector(palm @ expected.T)
