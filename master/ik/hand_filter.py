@@ -14,15 +14,17 @@ limits; what has to be cut is an abduction that the filtered flexion does not al
 **Leaps.** A finger that is seen again, or the palm, is elsewhere than it was held; and where another sensor takes over
 from markers, or these from it, it is elsewhere by their errors. The difference between what was shown last and what is
 solved now is added to the solution and fades within a tenth of a second, as networked games lead a player over to where
-the server says it is: the motion goes on, the error goes. A hand that other sensors kept in sight meanwhile is led no
-faster than a given speed. While it fades, the covariance of a joint contains the square of how far it is shown from
-where it is solved to be, and such a joint is not called tracked while it is shown more than 5 mm from there.
+the server says it is: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
+of how far it is shown from where it is solved to be.
+
+A hand that several kinds of sensors watch leaps more often, and is led in as `master.ik.lead` has it. A joint of it is
+not called tracked while it is shown more than 5 mm from where it is solved to be.
 
 Beside that the covariance is the solution's. Filtering takes noise away and adds lag; neither is in it.
 """
 
 from dataclasses import dataclass, replace
-from math import atan2, exp
+from math import atan2
 
 import numpy as np
 
@@ -30,16 +32,13 @@ from common.arrays import Bool, Float, Int
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, unskew
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
 from master.ik.hand import HandSolution
+from master.ik.lead import ANGLES, PARTS, PLACE, TURN, Lead
 from master.ik.part_filter import PartFilter
 from master.ik.tracker import TrackedHand
 
 LEAD_OVER_S = 0.1
-_EASE_S = 0.04  # in which the last of what is led at a given speed fades
-_NOTHING_M = 1e-5
 _ELSEWHERE_M = 5e-3
 _FORGET_S = 0.5  # after this long without a hand the next one begins anew
-_PLACE, _TURN, _ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
-_PARTS = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
 
 
 @dataclass(slots=True, eq=False)
@@ -67,8 +66,8 @@ class _Shown:
     until_ns: int
 
     def leap(self, t_ns: int, parts: Bool, solved: Float) -> None:
-        """Parts (6,) are seen again, or by another sensor, at signals (26,)."""
-        self.offset = np.where(parts[_PARTS], self.values - solved, self.offset)
+        """Parts (6,) are seen again, at signals (26,)."""
+        self.offset = np.where(parts[PARTS], self.values - solved, self.offset)
         self.since_ns = np.where(parts, t_ns, self.since_ns)
         self.until_ns = t_ns + round(LEAD_OVER_S * 1e9)
 
@@ -77,16 +76,7 @@ class _Shown:
         if t_ns >= self.until_ns:
             return None
         x = np.minimum((t_ns - self.since_ns) * (1e-9 / LEAD_OVER_S), 1.0)
-        return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[_PARTS]  # smooth at both ends
-
-    def led(self, dt_s: float, lead_m_s: float) -> Float | None:
-        """The same where parts are led no faster than a speed [m/s]: a leap upon a leap goes on from what is left."""
-        size_m = np.bincount(_PARTS, np.abs(self.offset))
-        if size_m.max() < _NOTHING_M:
-            return None
-        slow = 1.0 - lead_m_s * dt_s / np.maximum(size_m, _NOTHING_M)
-        self.offset = self.offset * np.maximum(slow, exp(-dt_s / _EASE_S))[_PARTS]
-        return self.offset
+        return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[PARTS]  # smooth at both ends
 
 
 class HandFilter:
@@ -106,7 +96,7 @@ class HandFilter:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._jitter_m, self._lead_m_s = model, jitter_m, lead_m_s
+        self._model, self._jitter_m = model, jitter_m
         rest = model.rest_position_m
         self._knuckle = rest[MIDDLE_PROXIMAL]
         fingers = [model.mount(name).finger for name in markers]
@@ -115,9 +105,12 @@ class HandFilter:
         # The DIP bends with the PIP, so it counts as far.
         self._reach_m = np.linalg.norm(rest[TIPS][:, None] - rest[CHAINS[:, [0, 0, 1, 1]]], axis=2)
         self._across_m = float(np.linalg.norm(rest[TIPS[1:]] - self._knuckle, axis=1).mean())
+        self._on_palm = np.array([model.mount(name).joint is None for name in markers], np.bool_)
+        self._lead_m_s = lead_m_s
+        self._lead: Lead | None = None
         self._shown: _Shown | None = None
 
-    def push(self, t_ns: int, hand: TrackedHand, cov_m2: Float) -> TrackedHand:
+    def push(self, t_ns: int, hand: TrackedHand, cov_m2: Float, points_m: Float | None = None) -> TrackedHand:
         """The hand as it is to be shown: palm, angles, joints and their covariance; the rest of it stays.
 
         Args:
@@ -125,6 +118,7 @@ class HandFilter:
             hand: As solved. One that is not valid is passed on, and what follows begins anew.
             cov_m2: (M, 3, 3) [m^2] noise of the markers; NaN: not measured. What rests on none is filtered by
                 the noise it shows.
+            points_m: (M, 3) [m] the markers, of a hand that other sensors watch, too; NaN: not seen.
         """
         solution, shown = hand.solution, self._shown
         if solution is None or not hand.valid.any():
@@ -134,30 +128,29 @@ class HandFilter:
         seen: Bool = rests > 0
         gap_s = 0.0 if shown is None else (t_ns - shown.t_ns) * 1e-9
         if shown is None or gap_s > _FORGET_S:
-            shown = self._shown = self._begin(t_ns, solution, rests)
+            shown, gap_s = self._begin(t_ns, solution, rests), 0.0
+            self._shown = shown
         elif gap_s <= 0.0:
             return hand
-        else:
-            again = (
-                seen if gap_s > LEAD_OVER_S else seen & (rests != shown.rests)
-            )  # without frames, nothing was seen
-            if again.any():
-                shown.leap(t_ns, again, self._signals(solution, shown))
-        left = shown.left(t_ns) if self._lead_m_s is None else shown.led(gap_s, self._lead_m_s)
         signals = self._signals(solution, shown)
+        if self._lead is not None and points_m is not None:
+            left: Float | None = self._lead.push(gap_s, rests, shown.values, signals, points_m)
+        else:
+            self._leap(t_ns, gap_s, shown, rests, signals)
+            left = shown.left(t_ns)
         if left is not None:
-            signals += left
+            signals = signals + left
         signals = shown.smooth.push(gap_s, signals, self._noise(cov_m2, seen))
-        rotation = (
-            rotation_vector_to_matrix((signals - shown.values)[_TURN] / self._across_m) @ shown.rotation
-        )
+        rotation = rotation_vector_to_matrix((signals - shown.values)[TURN] / self._across_m) @ shown.rotation
         joints, angles = self._posed(signals, rotation)
         cov, tracked = solution.cov_m2, hand.tracked
         if left is not None:
             off = joints.position_m - solution.joints.position_m
             cov = cov + off[:, :, None] * off[:, None, :]
-            if self._lead_m_s is not None:
+            if self._lead is not None:
                 tracked = tracked & (np.vecdot(off, off) < _ELSEWHERE_M**2)
+        if self._lead is not None:
+            self._lead.moved(gap_s, signals - shown.values)
         shown.t_ns, shown.rests, shown.values, shown.rotation = t_ns, rests, signals, rotation
         T = joints.T_rig_palm
         return replace(
@@ -166,8 +159,18 @@ class HandFilter:
             tracked=tracked,
         )
 
+    def _leap(self, t_ns: int, gap_s: float, shown: _Shown, rests: Int, solved: Float) -> None:
+        """Keep what is seen again from leaping to where it is solved to be (26,) [m]."""
+        if gap_s <= 0.0:
+            return
+        seen: Bool = rests > 0
+        again = seen if gap_s > LEAD_OVER_S else seen & (shown.rests == 0)  # without frames, nothing was seen
+        if again.any():
+            shown.leap(t_ns, again, solved)
+
     def _begin(self, t_ns: int, solution: HandSolution, rests: Int) -> _Shown:
         smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m)
+        self._lead = None if self._lead_m_s is None else Lead(self._lead_m_s, self._on_palm)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
         return _Shown(smooth, t_ns, rests, np.zeros(26), rotation, np.zeros(26), never, t_ns)
 
@@ -176,17 +179,17 @@ class HandFilter:
         rotation, angles = solution.T_rig_palm[:3, :3], solution.angles_rad.copy()
         angles[1:, 3] -= self._dip_per_pip * angles[1:, 2]
         signals = np.empty(26)
-        signals[_PLACE] = rotation @ self._knuckle + solution.T_rig_palm[:3, 3]
-        signals[_TURN] = shown.values[_TURN] + self._across_m * _turn(rotation @ shown.rotation.T)
-        signals[_ANGLES] = (angles * self._reach_m).ravel()
+        signals[PLACE] = rotation @ self._knuckle + solution.T_rig_palm[:3, 3]
+        signals[TURN] = shown.values[TURN] + self._across_m * _turn(rotation @ shown.rotation.T)
+        signals[ANGLES] = (angles * self._reach_m).ravel()
         return signals
 
     def _posed(self, signals: Float, rotation: Float) -> tuple[HandJoints, Float]:
         """Joints and angles (5, 4) [rad] of filtered signals (26,) [m]."""
-        angles = signals[_ANGLES].reshape(5, 4) / self._reach_m
+        angles = signals[ANGLES].reshape(5, 4) / self._reach_m
         angles[1:, 3] += self._dip_per_pip * angles[1:, 2]
         angles = self._model.clamp(angles)
-        wrist = signals[_PLACE] - rotation @ self._knuckle
+        wrist = signals[PLACE] - rotation @ self._knuckle
         return self._model.joints(rigid(rotation, wrist), self._model.chains(angles)), angles
 
     def _noise(self, cov_m2: Float, seen: Bool) -> Float:
@@ -199,10 +202,10 @@ class HandFilter:
         place = measured.sum(axis=0) / len(measured)
         turn = place.sum() / 3.0
         if seen[5]:
-            noise[_PLACE], noise[_TURN] = place, turn
+            noise[PLACE], noise[TURN] = place, turn
         finger = axes[self._marker_of].sum(axis=1) / 3.0 + turn
         finger[~seen[:5] | (self._marker_of < 0)] = np.nan
-        noise[_ANGLES] = finger.repeat(4)
+        noise[ANGLES] = finger.repeat(4)
         return noise
 
 

@@ -32,7 +32,8 @@ from master.volume import inside
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
-ON_MARKERS, ON_OTHERS = 1, 2
+ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
+_FIRST_MARKER = 8  # bit
 _PALM_BY_MARKERS = 3
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
 _GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
@@ -45,8 +46,9 @@ class TrackedHand:
     Attributes:
         solution: The hand; None: nothing was solved yet.
         valid, tracked, source: (26,) as of `HandPose`.
-        rests: (6,) what thumb ... little and the palm rest on now: `ON_MARKERS` plus `ON_OTHERS` by the level of the
-            finger, or one of the two for the palm.
+        rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
+            a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
+            the palm one of the former and which markers are seen.
     """
 
     solution: HandSolution | None
@@ -310,7 +312,9 @@ class HandTracker:
             tracked[palm] = True
             source[palm] = Source.SOLVED
         on_finger = self._finger >= 0
-        rests[5] = palm_rests
+        if tells_palm:
+            rests[5] = palm_rests | (BY_MARKERS if palm_rests == ON_MARKERS else 0)
+            rests[5] += int((seen << np.arange(_FIRST_MARKER, _FIRST_MARKER + len(seen))).sum())
         if others is not None:
             # Where a finger is rests on where the palm is; how it is bent does not.
             rests[:5] += ON_OTHERS * np.where(others.told, others.level, 0)
@@ -322,6 +326,7 @@ class HandTracker:
             tracked[told] = True
             source[told] = Source.SOLVED
         rests[self._finger[seen & on_finger]] += ON_MARKERS
+        rests[self._finger[placed & on_finger]] += BY_MARKERS
         source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
         return TrackedHand(solution, valid, tracked & valid, source, rests)
 

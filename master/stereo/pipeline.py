@@ -193,7 +193,7 @@ class MarkerPipeline:
             if self._others is not None:
                 self._others.solved(instant.t_ns, hand, told)
             if self._steady is not None:
-                hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand])
+                hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand], raw[self._on_hand])
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
