@@ -23,7 +23,11 @@ from typing import cast
 from deploy.process import Process
 
 _READY_S = 30.0
-_LEAD_NS = 4_000_000_000  # processes need about two seconds to be ready; the scene begins then
+# Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
+# one in which IMU, heading and light become known while the hand still rests. Poses before that are not judged.
+_READY_CORE_S, _KNOWN_S, _LEAST_S, _MOST_S = 2.0, 1.0, 4.0, 20.0
+# What draws pictures gives way to what is measured: a real camera costs no processor its time.
+_GIVES_WAY = 4
 _LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
 TOGETHER = (
     "grasp",
@@ -87,13 +91,19 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
     """
-    epoch_ns = time.monotonic_ns() + _LEAD_NS
+    epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(_sensors(settings)) + 1, os.getloadavg()[0]))
     restarts = play(settings, epoch_ns, stop, say)
     summary = _report(settings, epoch_ns, say)
     if restarts:
         summary["restarts"] = restarts
         (settings.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     return summary
+
+
+def lead_s(processes: int, load: float) -> float:
+    """How long after their start [s] the scene of so many processes begins, while `load` others want to run."""
+    ready = _READY_CORE_S * (processes + load) / (os.cpu_count() or 1)
+    return min(max(ready + _KNOWN_S, _LEAST_S), _MOST_S)
 
 
 def play(
@@ -120,8 +130,10 @@ def play(
     state = _State()
     processes: list[Process] = []
     try:
+        drawn = {sensor.name for sensor in _sensors(settings) if not sensor.imu}
         for name, command, environment in _table(settings, epoch_ns):
-            processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state)))
+            nice = _GIVES_WAY if name in drawn else 0
+            processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state), nice))
         say(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
         _wait_until_tracking(state, processes, stop, say)
         _until_end(settings, state, processes, epoch_ns, stop, say)

@@ -12,6 +12,7 @@ from typing import IO
 
 _TAIL = 12
 _STOP_S = 5.0
+_SESSION_TRIES, _SESSION_AGAIN_S = 3, 0.11  # who is not root may change one session in a tenth of a second
 
 
 class Process:
@@ -28,6 +29,7 @@ class Process:
         environment: Mapping[str, str],
         log: Path,
         on_line: Callable[[str, str], None],
+        nice: int = 0,
     ) -> None:
         """Start the command.
 
@@ -37,6 +39,7 @@ class Process:
             environment: Added to this process's own.
             log: File that its output goes to, begun anew; a restarted child goes on in it.
             on_line: Called with name and line.
+            nice: By how many steps of the scheduler's it gives way to others, 0..19.
 
         Raises:
             OSError: The program or the log file cannot be opened.
@@ -45,7 +48,7 @@ class Process:
         self.restarts = 0
         self.tail: deque[str] = deque(maxlen=_TAIL)
         self._command, self._environment = list(command), {**os.environ, **environment}
-        self._on_line = on_line
+        self._on_line, self._nice = on_line, nice
         self._log: IO[str] = log.open("w", buffering=1)
         self._stopping = False
         self._child = self._start()
@@ -99,6 +102,8 @@ class Process:
             errors="replace",
             start_new_session=True,
         )
+        if self._nice:
+            _give_way(child.pid, self._nice)
         assert child.stdout is not None
         self._reader = threading.Thread(target=self._read, args=(child.stdout,), daemon=True)
         self._reader.start()
@@ -111,3 +116,19 @@ class Process:
             if not self._log.closed:
                 self._log.write(f"{time.monotonic():.3f} {text}\n")
             self._on_line(self.name, text)
+
+
+def _give_way(pid: int, nice: int) -> None:
+    """Let a process that was just started, and all that it starts, run after others that want to."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, pid, min(os.getpriority(os.PRIO_PROCESS, 0) + nice, 19))
+        # Linux may share its time among sessions first, and each child has one of its own (sched(7), autogroup).
+        session = Path(f"/proc/{pid}/autogroup")
+        for _ in range(_SESSION_TRIES if session.exists() else 0):
+            try:
+                session.write_text(str(nice))
+                return
+            except BlockingIOError:
+                time.sleep(_SESSION_AGAIN_S)
+    except OSError:
+        return  # it has ended, or nobody may say so here: it runs as the others do

@@ -1,5 +1,6 @@
 """Watched children: their lines are heard, a crash is followed by a new start, a stop is clean."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -81,4 +82,21 @@ def test_the_last_lines_are_kept_for_an_error_message(tmp_path: Path) -> None:
     assert until(lambda: process.ended() is not None and len(lines) == 30)
     assert list(process.tail)[-2:] == ["28", "29"]
     assert len(process.tail) == 12
+    process.stop()
+
+
+def test_a_child_gives_way_also_after_a_new_start(tmp_path: Path) -> None:
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    process = Process(
+        "child",
+        [sys.executable, "-c", "import time; time.sleep(60)"],
+        {},
+        tmp_path / "log",
+        lambda _name, _line: None,
+        nice=4,
+    )
+    for _ in range(2):
+        assert os.getpriority(os.PRIO_PROCESS, process.pid) == min(own + 4, 19)
+        process._child.kill()
+        assert until(lambda: process.check() is not None)
     process.stop()
