@@ -16,7 +16,7 @@ from common.sim.render import Renderer
 from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
 from common.sim.together import TOGETHER, together_motion
-from common.sim.wrist.render import LIVE_STEP, SKIN_STEP, WristRenderer
+from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = f"standard | lights | poses | hand-routine | leap:FILE.npz | {' | '.join(TOGETHER)}"
@@ -87,11 +87,14 @@ def renderer_of(
     Args:
         scene: What the camera looks at.
         camera: Its name.
-        live: What is not drawn in time is lost: skin before a wrist device is shaded more coarsely.
+        live: What is not drawn in time is lost: skin before a wrist device is shaded more coarsely, the
+            palm of a bent wrist by steps of its bend.
 
     Raises:
         CalibrationError: The scene has no such camera, or a marker without paint.
     """
     if isinstance(scene, WristScene):
-        return WristRenderer(scene, camera, LIVE_STEP if live else SKIN_STEP)
+        return (
+            WristRenderer(scene, camera, LIVE_STEP, LIVE_BEND_RAD) if live else WristRenderer(scene, camera)
+        )
     return BoardRenderer(scene, camera) if isinstance(scene, BoardScene) else Renderer(scene, camera)

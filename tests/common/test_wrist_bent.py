@@ -85,16 +85,16 @@ def test_the_forearm_stays_before_its_camera_when_the_wrist_bends() -> None:
 
 def test_a_palm_that_never_bends_is_prepared_once_and_one_that_hardly_bends_looks_alike() -> None:
     skin = Skin(SCENE, COARSE)
-    assert skin.palm(SCENE.bodies_at(7.0)) is skin.straight
+    assert skin.palm(SCENE.bodies_at(7.0), np.zeros(2)) is skin.straight
     hardly = doing(np.array([1e-9, 0.0]))
-    assert skin.palm(hardly.bodies_at(7.0)) is not skin.straight
+    assert skin.palm(hardly.bodies_at(7.0), hardly.motion.at(7.0).bend_rad) is not skin.straight
     one, other = (WristRenderer(s, "wrist", COARSE).render(7.0, LED).astype(int) for s in (SCENE, hardly))
     assert (one != other).mean() < 1e-3
 
 
 def test_a_palm_bent_out_of_the_picture_leaves_it_empty() -> None:
     away = doing(np.array([-1.6, 0.0]))
-    assert not len(Skin(away, COARSE).palm(away.bodies_at(7.0)).seen.pixel)
+    assert not len(Skin(away, COARSE).palm(away.bodies_at(7.0), away.motion.at(7.0).bend_rad).seen.pixel)
     assert WristRenderer(away, "wrist", COARSE).render(7.0, LED).max() < 12
     assert np.isnan(away.truth(7.0).laser_uv).all()
 

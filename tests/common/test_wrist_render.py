@@ -11,6 +11,7 @@ from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.errors import CalibrationError
 from common.frame_recording import Illumination
+from common.sim.scenes import renderer_of
 from common.sim.wrist.light import SKIN_AT_M, Leds, Sensor
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
@@ -143,6 +144,16 @@ def test_the_coarse_grid_of_real_time_shows_what_the_fine_one_shows() -> None:
     apart = np.abs(fine - coarse)
     assert np.median(apart[fine > 20]) < 4.0
     assert (apart > 40).mean() < 0.01  # edges
+
+
+def test_live_pictures_show_what_exact_ones_show() -> None:
+    shown = WristScene.by_name("grasp@dark", RIG, CAMERAS, HAND, 7)
+    live, exact = renderer_of(shown, "wrist", live=True), renderer_of(shown, "wrist")
+    for t_s in (6.0, 6.01):  # a bent wrist and a bar; the palm of the second is that of the first
+        for lit in (LED, LASER):
+            one, other = (renderer.render(t_s, lit).astype(float) for renderer in (live, exact))
+            assert np.median(np.abs(one - other)[other > 20]) < 5.0
+            assert (np.abs(one - other) > 40).mean() < 0.015  # edges
 
 
 def test_another_camera_is_refused() -> None:

@@ -22,6 +22,9 @@ SKIN_STEP = 2  # px between the rays that shade skin; 1 is twice as sharp and fo
 # For a camera that loses what it has no time to draw. Half the time; fingertips are found as often and as well, and
 # the laser line is drawn to parts of a pixel of the picture whatever the step is.
 LIVE_STEP = 4
+LIVE_BEND_RAD = np.radians(
+    0.25
+)  # the palm of a bent wrist is drawn anew by such steps: a tenth of a millimetre, twice
 _KINDS = tuple(Illumination)  # frames of one instant differ in their noise, too
 SATURATED = np.float32(300.0)  # levels: more cannot be seen, but would widen edges
 
@@ -30,13 +33,16 @@ class WristRenderer:
     """Images of one scene. It holds prepared rays, the palm of a straight wrist, the room and noise; a frame is a pure
     function of t."""
 
-    def __init__(self, scene: WristScene, camera: str, step: int = SKIN_STEP) -> None:
+    def __init__(
+        self, scene: WristScene, camera: str, step: int = SKIN_STEP, bend_step_rad: float = 0.0
+    ) -> None:
         """Prepare all that stands still (some tenths of a second).
 
         Args:
             scene: What it looks at.
             camera: The one camera of its rig.
             step: Pixels between the rays that shade skin.
+            bend_step_rad: To multiples of this the bend is rounded at which the palm is drawn; 0: not at all.
 
         Raises:
             CalibrationError: No such camera.
@@ -44,7 +50,7 @@ class WristRenderer:
         if camera not in scene.rig.cameras:
             raise CalibrationError(f"rig {scene.rig.name!r}: cameras: no camera {camera!r}")
         self._scene = scene
-        self._skin = Skin(scene, step)
+        self._skin = Skin(scene, step, bend_step_rad)
         self._room = light.Room.of(scene.ambient, scene.seed)
         self._leds = light.Leds(np.array(scene.rig.led, dtype=np.float64))
         optics = scene.optics
@@ -69,8 +75,9 @@ class WristRenderer:
 
     def render(self, t_s: float, lit: Illumination) -> Image:
         """Image (H, W), grey, of the frame at mid-exposure at scene time `t_s` [s], lit by the room and by `lit`."""
-        bodies = self._scene.bodies_at(t_s)
-        palm = self._skin.palm(bodies)
+        state = self._scene.motion.at(t_s)
+        bodies = self._scene.bodies_of(state)
+        palm = self._skin.palm(bodies, state.bend_rad)
         fingers = self._skin.look(bodies, palm)
         leds = lit is Illumination.LED
         count = len(self._scene.flesh.group)

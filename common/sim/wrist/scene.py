@@ -154,12 +154,19 @@ class WristScene:
 
     def bodies_at(self, t_s: float) -> Cones:
         """All that camera and laser meet at scene time `t_s` [s], camera frame: the flesh, after it the things."""
-        state = self.motion.at(t_s)
+        return self.bodies_of(self.motion.at(t_s))
+
+    def bodies_of(self, state: HandState) -> Cones:
+        """The same of a hand in that state."""
         return self._bodies(state, self._joints(state))
 
     def straight_bodies(self) -> Cones:
         """The flesh while wrist and fingers are straight, camera frame."""
         return self.flesh.bodies(self._straight)
+
+    def bent_bodies(self, bend_rad: Float) -> Cones:
+        """The flesh of straight fingers while the wrist is bent by that (2,), camera frame."""
+        return self.bodies_of(HandState(np.eye(4), np.zeros((5, 4)), bend_rad))
 
     def truth(self, t_s: float) -> WristTruth:
         """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""

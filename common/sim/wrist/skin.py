@@ -52,7 +52,7 @@ class Palm:
 
 
 class Skin:
-    """The grid and the palm of one scene. What it holds was prepared by the constructor.
+    """The grid and the palm of one scene. Holds what was prepared by the constructor, and the last palm by its bend.
 
     Attributes:
         size: Of the grid, (W, H).
@@ -60,9 +60,10 @@ class Skin:
         straight: The palm of a straight wrist.
     """
 
-    def __init__(self, scene: WristScene, step: int) -> None:
+    def __init__(self, scene: WristScene, step: int, bend_step_rad: float = 0.0) -> None:
         optics = scene.optics
-        self._scene, self._step = scene, step
+        self._scene, self._step, self._bend_step_rad = scene, step, bend_step_rad
+        self._bent: tuple[tuple[int, ...], Palm] | None = None
         self.size = (-(-optics.width_px // step), -(-optics.height_px // step))
         columns, lines = (np.arange(n, dtype=np.float64) * step + 0.5 * (step - 1) for n in self.size)
         rays = optics.ray(np.stack(np.meshgrid(columns, lines), axis=-1)).reshape(-1, 3)
@@ -77,11 +78,18 @@ class Skin:
         outside = set(forearm) - set(np.unique(met).tolist())
         self._turning = [body for body in range(scene.flesh.still) if body not in outside]
 
-    def palm(self, bodies: Cones) -> Palm:
-        """The palm of a hand whose flesh is at `bodies`; `straight` itself while the wrist is straight."""
+    def palm(self, bodies: Cones, bend_rad: Float) -> Palm:
+        """The palm of a hand whose flesh is at `bodies`, of a wrist bent by that (2,); `straight` itself while it is
+        straight."""
         if self._scene.flesh.same_palm(bodies, self._straight_bodies):
             return self.straight
-        return self._palm(bodies, self._turning)
+        if self._bend_step_rad <= 0.0:
+            return self._palm(bodies, self._turning)
+        steps = tuple(np.rint(bend_rad / self._bend_step_rad).astype(int).tolist())
+        if self._bent is None or self._bent[0] != steps:
+            rounded = self._scene.bent_bodies(self._bend_step_rad * np.array(steps))
+            self._bent = steps, self._palm(rounded, self._turning)
+        return self._bent[1]
 
     def look(self, bodies: Cones, palm: Palm) -> SkinView:
         """What is seen of fingers, thumb and things, of a hand whose flesh is at `bodies`, before its palm."""
