@@ -18,15 +18,18 @@ from common.arrays import Bool, Float, Int
 from common.hand_limits import ABDUCTION, FLEXION
 from common.hand_model import CHAINS
 from master.wrist.finger_poses import SEEN, UNKNOWNS, FingerPoses
-from master.wrist.forward import PIP
+from master.wrist.finger_shape import Shape, ShapedFingers
+from master.wrist.forward import PIP, NaturalCurve
 from master.wrist.laser_cut import LaserCut
 from master.wrist.pose_table import SHAPE
 from master.wrist.ridge import Crossings, Ridge
 from master.wrist.setup import WristSetup
 
 _RAYS = 24
+_CLOSINGS = 25
 _PLAUSIBLE_M = 0.2  # of a laser point, where the tip is where it was seen: noise of both leaves less
 _OFF_RAD = 1.0  # of a tip that no flexion brings to its ray
+_THE_SAME_RAD = 1e-9  # as a node: rounding
 _UNKNOWN_M = 1.0  # what a closed form may be wrong by: who wants to be exact asks the cut
 
 
@@ -44,13 +47,34 @@ class BentWrist:
             model.rest_position_m[CHAINS[:, 0]],
             model.rest_rotation[CHAINS[:, 0]],
         )
-        tips = poses.tips_in_palm(poses.angles(x))
+        angles = poses.angles(x)
+        tips = poses.tips_in_palm(angles)
         self.reach = np.einsum("fij,pfi->pfj", self.root, tips - self.knuckle_m)
+        self.path_rad, self.path = self._path(poses.curve)
+        self._nodes = self.ridge.shapes(angles.reshape(-1, 4), np.tile(np.arange(5), SHAPE[PIP]))
 
     def at(self, bend_rad: Float) -> "BentView":
         """What is seen at a bend (2,) [rad]."""
         setup = self._setup.bent(bend_rad)
-        return BentView(self, setup, self._poses.bent(setup), self._cut.bent(setup), bend_rad)
+        ridge = self.ridge.bent(setup, bend_rad)
+        return BentView(self, setup, self._poses.bent(setup), self._cut.bent(setup), ridge)
+
+    def _path(self, curve: NaturalCurve) -> tuple[Float, ShapedFingers]:
+        """Even steps of closing (5, C) [rad] from straight to closed, and fingers (5 C) that close so, not aside."""
+        closing = curve.range_rad[:, :1] + np.linspace(0.0, 1.0, _CLOSINGS) * np.diff(curve.range_rad)
+        finger = np.repeat(np.arange(5), _CLOSINGS)
+        angles = curve.base_rad[finger] + closing.reshape(-1, 1) * curve.slope[finger]
+        angles[:, ABDUCTION] = 0.0
+        return closing, self.ridge.shapes.fingers(angles, finger)
+
+    def shape(self, angles_rad: Float, finger: Int) -> Shape:
+        """The fingers (N,) of angles (N, 4) whose DIP follows the PIP; of PIPs that are nodes from a table."""
+        pip, low, high = angles_rad[:, PIP], self._pip[0, finger], self._pip[-1, finger]
+        share = np.nan_to_num((pip - low) / (high - low)).clip(0.0, 1.0)
+        node = np.rint((SHAPE[PIP] - 1.0) * share).astype(np.int64)
+        if (np.abs(self._pip[node, finger] - pip) < _THE_SAME_RAD).all():
+            return self._nodes.of(5 * node + finger)
+        return self.ridge.shapes(angles_rad, finger)
 
     @property
     def pip(self) -> Float:
@@ -67,10 +91,10 @@ class BentView:
     """
 
     def __init__(
-        self, wrist: BentWrist, setup: WristSetup, poses: FingerPoses, cut: LaserCut, bend_rad: Float
+        self, wrist: BentWrist, setup: WristSetup, poses: FingerPoses, cut: LaserCut, ridge: Ridge
     ) -> None:
-        self.poses, self.bend_rad = poses, bend_rad
-        self._wrist, self._setup, self._cut = wrist, setup, cut
+        self.poses = poses
+        self._wrist, self._setup, self._cut, self._ridge = wrist, setup, cut, ridge
         self.first = poses.low
         self.step = (poses.high - poses.low) / (np.array(SHAPE) - 1.0)
         self.met: Bool = np.ones(5, np.bool_)
@@ -79,12 +103,16 @@ class BentView:
 
     def crossings(self, angles_rad: Float, finger: Int) -> Crossings:
         """What is seen of angles (N, 4) of fingers (N,) in closed form."""
-        return self._wrist.ridge(self.poses.chains(angles_rad, finger), finger, self.bend_rad)
+        return self._ridge(self._ridge.shapes.fingers(angles_rad, finger))
+
+    def path(self) -> tuple[Float, Crossings]:
+        """Closings (5, C) [rad] of fingers that close naturally, and what is seen of them (5 C)."""
+        return self._wrist.path_rad, self._ridge(self._wrist.path)
 
     def views(self, x: Float, finger: Int) -> tuple[Float, Float, Float]:
         """As `PoseTable.views`: (N, 4) seen, (N, 4, 3) its derivatives [1/rad], (N,) length of the line [px]."""
         angles, follows = self.poses.angles_of(x, finger)
-        found = self.crossings(angles, finger)
+        found = self._ridge(self._fingers(angles, finger))
         J = found.by_angles[..., :UNKNOWNS].copy()
         J[..., PIP] += follows[:, None] * found.by_angles[..., -1]
         length = found.length_px if self._length_px is None else self._length_px
@@ -94,23 +122,34 @@ class BentView:
         """Laser points (N, 2) [m] alone."""
         return self._points(x, finger)[0] + self._lacks[:, :2]
 
-    def mended(self, x: Float, finger: Int) -> "BentView":
+    def mended(self, x: Float, finger: Int, y: Float) -> tuple["BentView", Float]:
         """The same, exact at poses (N, 3) of fingers (N,): to be asked for these, or what they become, alone.
 
-        NaN where the laser misses the finger.
+        Of these y (N, 4) is seen in closed form. Second: what is seen exactly; NaN where the laser misses the finger.
         """
         other = copy(self)
         other.exact, other._lacks = True, np.zeros((len(x), SEEN))
-        other._lacks[:, :2], other._length_px = self.lacking(x, finger)
-        return other
+        angles, _ = self.poses.angles_of(x, finger)
+        point, other._length_px = self.cut(self._fingers(angles, finger))
+        other._lacks[:, :2] = point - y[:, :2]
+        return other, y + other._lacks
 
-    def lacking(self, x: Float, finger: Int) -> tuple[Float, Float]:
-        """What laser points in closed form lack at poses (N, 3) of fingers (N,): (N, 2) [m], and lines (N,) [px].
+    def cut(self, fingers: ShapedFingers) -> tuple[Float, Float]:
+        """Laser points of fingers (N) by the cut itself: (N, 2) [m], and lines (N,) [px].
 
         NaN where the laser misses the finger.
         """
-        exact, length = self.poses.of_fingers(x, finger, self._cut)
-        return exact[:, :2] - self._points(x, finger)[0], length
+        line = self._cut.line(*self._ridge.spheres(fingers), fingers.finger == 0)
+        return line.point_m, line.length_px
+
+    def lacking(self, angles_rad: Float, finger: Int) -> tuple[Crossings, Float, Float]:
+        """What is seen of angles (N, 4) of fingers (N,) in closed form, and what its laser points lack (N, 2) [m].
+
+        Third: lines (N,) [px]. NaN where the laser misses the finger.
+        """
+        fingers = self._ridge.shapes.fingers(angles_rad, finger)
+        found, (point, length) = self._ridge(fingers), self.cut(fingers)
+        return found, point - found.seen[:, :2], length
 
     def candidates(self, seen: Float) -> tuple[Float, Float]:
         """As `PoseTable.candidates`: places (5, P, 3) [rad], and how badly their laser points fit (5, P); inf: not."""
@@ -137,7 +176,12 @@ class BentView:
 
     def _points(self, x: Float, finger: Int) -> tuple[Float, Bool]:
         angles, _ = self.poses.angles_of(x, finger)
-        return self._wrist.ridge.points(self.poses.chains(angles, finger), finger, self.bend_rad)
+        return self._ridge.points(self._fingers(angles, finger))
+
+    def _fingers(self, angles_rad: Float, finger: Int) -> ShapedFingers:
+        """Fingers (N) of angles (N, 4) whose DIP follows the PIP."""
+        shape = self._wrist.shape(angles_rad, finger)
+        return self._ridge.shapes.fingers(angles_rad, finger, shape)
 
     def _by_tip(self, tip: Float) -> tuple[Float, Float]:
         """Poses (2, P, 5, 3) that show tips (5, 2), the far and the near one, and how far beside (2, P, 5) [rad]."""

@@ -11,11 +11,10 @@ import numpy as np
 from common.arrays import Float, Int
 from common.hand_limits import ABDUCTION
 from master.wrist.bent import BentView
-from master.wrist.forward import DIP, ForwardTable, NaturalCurve
+from master.wrist.forward import ForwardTable, NaturalCurve
 from master.wrist.invert import PAST_M, Closed
 from master.wrist.ridge import Crossings
 
-_CLOSINGS = 25
 _STEPS = 3
 _FARTHEST_RAD = np.radians(10.0)  # of one step
 _BACK_M = 1e-3  # a point that goes away from the device by more ends the branch
@@ -28,30 +27,28 @@ def closings(view: BentView, table: ForwardTable, point_m: Float) -> Closed:
     """Closing and abduction of fingers whose points on the plane are (5, 2) [m]; NaN: not seen."""
     curve, fingers = table.curve, np.arange(5)
     most = table.abduction_rad[:, -1] + _OUTSIDE_RAD
-    grid = curve.range_rad[:, :1] + np.linspace(0.0, 1.0, _CLOSINGS) * np.diff(curve.range_rad)  # (5, C)
-    path = _found(view, curve, grid.ravel(), np.zeros(grid.size), np.repeat(fingers, _CLOSINGS))
-    first, last = _branch(path)
+    grid, path = view.path()  # (5, C)
+    count: int = grid.shape[1]
+    first, last = _branch(path, count)
     y, by = path.seen[:, :2].reshape(5, -1, 2), path.by_angles[:, :2, ABDUCTION].reshape(5, -1, 2)
     steep = np.where(np.abs(by[..., 0]) > _LEAST_M, by[..., 0], np.inf)
     aside = np.clip((point_m[:, None, 0] - y[..., 0]) / steep, -most[:, None], most[:, None])
     short = y[..., 1] + aside * by[..., 1] - point_m[:, None, 1]  # falls while the finger closes
-    row = np.arange(_CLOSINGS)
+    row: Int = np.arange(count)
     reached = (row >= first[:, None]) & (row <= last[:, None]) & (short <= 0.0)
     at = np.where(reached.any(axis=1), reached.argmax(axis=1), last)
-    before = np.minimum(np.maximum(at - 1, first), _CLOSINGS - 1)
+    before = np.minimum(np.maximum(at - 1, first), count - 1)
     near, far = short[fingers, before], short[fingers, at]
     share = np.clip(near / np.where(near > far, near - far, 1.0), 0.0, 1.0)
     seen = np.isfinite(point_m[:, 0]) & (last >= first)
-    past = seen & (last < _CLOSINGS - 1) & ~reached.any(axis=1) & (short[fingers, last] > PAST_M)
+    past = seen & (last < count - 1) & ~reached.any(axis=1) & (short[fingers, last] > PAST_M)
     ends = grid[fingers, np.minimum(first, last)], grid[fingers, last]
     closing, abduction = (
         (1.0 - share) * of[fingers, before] + share * of[fingers, at] for of in (grid, aside)
     )
     abduction = np.where(seen, abduction, 0.0)
-    x = _angles(curve, closing, abduction, fingers)[:, :DIP]
-    lacks, length = view.lacking(x, fingers)
+    found, lacks, length = view.lacking(_angles(curve, closing, abduction, fingers), fingers)
     aim = np.where(seen[:, None], point_m, 0.0) - np.nan_to_num(lacks)
-    found = _found(view, curve, closing, abduction, fingers)
     for _ in range(_STEPS):
         by_closing = (found.by_angles[:, :2] * curve.slope[:, None]).sum(axis=-1)
         to = _solved(by_closing, found.by_angles[:, :2, ABDUCTION], aim - found.seen[:, :2])
@@ -74,21 +71,21 @@ def _angles(curve: NaturalCurve, closing: Float, abduction: Float, finger: Int) 
     return angles
 
 
-def _branch(path: Crossings) -> tuple[Int, Int]:
-    """First and last rows (5,) of branches along closings (5 C); the first behind the last: there is none.
+def _branch(path: Crossings, count: int) -> tuple[Int, Int]:
+    """First and last rows (5,) of branches along so many closings of each finger; there is none: the first is behind.
 
     A thumb's has no end: it never reaches its own tip.
     """
     along, met = path.seen[:, 1].reshape(5, -1), path.met.reshape(5, -1)
     stretch = path.stretch.reshape(5, -1)
-    rows = np.arange(_CLOSINGS)
-    first = np.where(met.any(axis=1), met.argmax(axis=1), _CLOSINGS)
+    rows = np.arange(count)
+    first = np.where(met.any(axis=1), met.argmax(axis=1), count)
     ends = ~met
     back = (np.diff(along, axis=1) > _BACK_M) | (np.diff(stretch, axis=1) > _JUMPS)
     back[0] = False
     ends[:, 1:] |= back & met[:, :-1]
     ends &= rows > first[:, None]
-    return first, np.where(ends.any(axis=1), ends.argmax(axis=1) - 1, _CLOSINGS - 1)
+    return first, np.where(ends.any(axis=1), ends.argmax(axis=1) - 1, count - 1)
 
 
 def _solved(a: Float, b: Float, off: Float) -> Float:

@@ -8,6 +8,8 @@ plane: that is what the sensing calls the laser point. Other fingers, which may 
 at the two tangents of the finger and its rays are densest there (Chebyshev's nodes): a grazing ray moves along the
 skin with the root of its angle. Where the line goes out of the camera's sight, the chord between the last ray that is
 seen and the first that is not counts by share: as far as the edge of the phalanx that hides the rest, or of its own.
+
+Arrays within have the N fingers last: what is done is done to all of them.
 """
 
 from copy import copy
@@ -73,50 +75,53 @@ class LaserCut:
 
     def line(self, spheres: Float, radius: Float, thumb: Bool | np.bool_) -> Line:
         """The line on fingers with spheres (..., K, 3) [m], camera frame, of radii (..., K), thumbs or not (...)."""
-        laser, radius = self._setup.laser_m, np.broadcast_to(radius, spheres.shape[:-1])
-        chain = Cones(spheres[..., :-1, :], spheres[..., 1:, :], radius[..., :-1], radius[..., 1:])
-        known = terms(chain, laser, np.float64)
-        rays, broad = self._fan(spheres, radius, known), 2.0 * radius.max(axis=-1)
+        lead, spheres = spheres.shape[:-2], spheres.reshape(-1, *spheres.shape[-2:])
+        radius = np.broadcast_to(radius, (*lead, spheres.shape[1])).reshape(-1, spheres.shape[1])
+        thumb = np.broadcast_to(thumb, lead).ravel()
+        laser = self._setup.laser_m[:, None, None]
+        chain = Cones(spheres[:, :-1], spheres[:, 1:], radius[:, :-1], radius[:, 1:])
+        known = _known(chain, self._setup.laser_m)
+        rays, broad = self._fan(spheres, radius, known), 2.0 * radius.max(axis=1)
         hits = _hits(known, rays)
-        body = hits.argmin(axis=-1)
-        far = np.take_along_axis(hits, body[..., None], axis=-1)[..., 0]
+        body, far = hits.argmin(axis=0), hits.min(axis=0)
         # What the metacarpal of the thumb carries is its ball, and no finger.
-        lit = np.isfinite(far) & ((body >= ROOT - 1) | ~np.asarray(thumb)[..., None])
-        points = laser + np.where(lit, far, 1.0)[..., None] * rays
-        distance = np.sqrt(np.vecdot(points, points))
-        sights, from_camera = points / distance[..., None], terms(chain, np.zeros(3), np.float64)
+        lit = np.isfinite(far) & ((body >= ROOT - 1) | ~thumb)
+        points = laser + np.where(lit, far, 1.0) * rays
+        distance = np.sqrt((points * points).sum(axis=0))
+        sights, from_camera = points / distance, _known(chain, np.zeros(3))
         before = _hits(from_camera, sights)
-        seen_at = before.min(axis=-1)
+        seen_at = before.min(axis=0)
         # How clearly it is seen [m]: at most _SEEN_M, and not at all below 0.
         clear = np.where(lit, np.minimum(seen_at - distance, 0.0) + _SEEN_M, -np.inf)
-        step = np.diff(points, axis=-2)
-        whole = lit[..., 1:] & lit[..., :-1]
-        whole &= np.vecdot(step, step) < (_STRETCH * broad[..., None]) ** 2
-        first, last = _seen_part(clear[..., :-1], clear[..., 1:])
-        cut = np.nonzero(whole & ((clear[..., 1:] > 0.0) != (clear[..., :-1] > 0.0)))
+        step = points[:, 1:] - points[:, :-1]
+        whole = lit[1:] & lit[:-1]
+        whole &= (step * step).sum(axis=0) < (_STRETCH * broad) ** 2
+        first, last = _seen_part(clear[:-1], clear[1:])
+        cut = np.nonzero(whole & ((clear[1:] > 0.0) != (clear[:-1] > 0.0)))
         _at_edge(first, last, cut, clear, sights, before, from_camera)
-        image = points[..., :2] / points[..., 2:]
-        step = np.diff(image, axis=-2)
-        weight = np.where(whole, np.sqrt(np.vecdot(step, step)) * (last - first), 0.0)
-        total = weight.sum(axis=-1)
+        image = points[:2] / points[2]
+        step = image[:, 1:] - image[:, :-1]
+        weight = np.where(whole, np.sqrt((step * step).sum(axis=0)) * (last - first), 0.0)
+        total = weight.sum(axis=0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            share = weight / total[..., None]
-        middle = image[..., :-1, :] + (0.5 * (first + last))[..., None] * step
-        ray = np.ones((*total.shape, 3))
-        ray[..., :2] = (share[..., None, :] @ middle)[..., 0, :]
-        point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[..., None]
-        place = (share * body[..., 1:]).sum(axis=-1)
-        return Line(self._axes.flat(point), total * self._setup.optics.matrix[0, 0], place)
+            share = weight / total
+        middle = image[:, :-1] + 0.5 * (first + last) * step
+        ray = np.ones((len(total), 3))
+        ray[:, :2] = (share * middle).sum(axis=1).T
+        point = ray * (self._setup.offset_m / (ray @ self._setup.normal))[:, None]
+        place = (share * body[1:]).sum(axis=0).reshape(lead)
+        length = (total * self._setup.optics.matrix[0, 0]).reshape(lead)
+        return Line(self._axes.flat(point).reshape(*lead, 2), length, place)
 
     def _fan(self, spheres: Float, radius: Float, known: Float) -> Float:
-        """Rays (..., R, 3) in the laser plane from one tangent of each finger to the other."""
+        """Rays (3, R, N) in the laser plane from one tangent of each finger to the other."""
         low, high = self._tangents(spheres, radius, known)
-        turn = 0.5 * (low + high)[..., None] + 0.5 * (high - low)[..., None] * self._nodes
-        across, along = self._axes.axes
-        return np.sin(turn)[..., None] * across + np.cos(turn)[..., None] * along
+        turn = 0.5 * (low + high) + 0.5 * (high - low) * self._nodes[:, None]
+        across, along = self._axes.axes[..., None, None]
+        return np.sin(turn) * across + np.cos(turn) * along
 
     def _tangents(self, spheres: Float, radius: Float, known: Float) -> tuple[Float, Float]:
-        """Turns (...) [rad] of the first and the last ray of the plane that touches a finger; 0 where none does.
+        """Turns (N,) [rad] of the first and the last ray of the plane that touches a finger; 0 where none does.
 
         The plane cuts a sphere in a circle. It touches the side of a cone where the discriminant of its quadric
         (`common.round_cones`), for directions (s, c) the form A s^2 + 2 B s c + C c^2, is nought.
@@ -127,14 +132,14 @@ class LaserCut:
             turn = np.arctan2(flat[..., 0], flat[..., 1])
             room = np.arcsin(np.sqrt((radius**2 - height**2) / np.vecdot(flat, flat)))
             sides = self._sides(known)
-            low = np.fmin.reduce(np.concatenate([turn - room, *sides], axis=-1), axis=-1)
-            high = np.fmax.reduce(np.concatenate([turn + room, *sides], axis=-1), axis=-1)
+            low = np.fmin.reduce(np.concatenate([(turn - room).T, *sides]), axis=0)
+            high = np.fmax.reduce(np.concatenate([(turn + room).T, *sides]), axis=0)
         return np.nan_to_num(low), np.nan_to_num(high)
 
     def _sides(self, known: Float) -> tuple[Float, Float]:
-        """Turns (..., K - 1) of both rays that touch the side of each cone; NaN where none does."""
+        """Turns (K - 1, N) of both rays that touch the side of each cone; NaN where none does."""
         d2, k0, lean, shift = known[6:10]
-        axis = np.tensordot(self._axes.axes, known[:3], 1)  # (2, ..., K - 1): across, along
+        axis = np.tensordot(self._axes.axes, known[:3], 1)  # (2, K - 1, N): across, along
         slope = d2 * np.tensordot(self._axes.axes, known[3:6], 1) + lean * axis
         a, c = slope * slope - k0 * (d2 - axis * axis)
         b = slope[0] * slope[1] + k0 * axis[0] * axis[1]
@@ -150,9 +155,14 @@ class LaserCut:
         return out[0], out[1]
 
 
+def _known(chain: Cones, origin: Float) -> Float:
+    """The terms (12, K - 1, N) of chains of cones (N, K - 1), seen from a point."""
+    return np.ascontiguousarray(np.swapaxes(terms(chain, origin, np.float64), 1, 2))
+
+
 def _hits(known: Float, rays: Float) -> Float:
-    """How far along rays (..., R, 3) cones of these terms (12, ..., K - 1) begin (..., R, K - 1); inf: missed."""
-    hits: Float = first_hits(known[..., None, :], np.moveaxis(rays, -1, 0)[..., None])
+    """How far along rays (3, R, N) cones of these terms (12, K - 1, N) begin (K - 1, R, N); inf: missed."""
+    hits: Float = first_hits(known[:, :, None], rays[:, None])
     return hits
 
 
@@ -177,30 +187,30 @@ def _at_edge(
     """Let chords that another part of the finger cuts off end at the edge of that part.
 
     Args:
-        first, last: (..., R - 1) seen part of each chord, which is changed.
+        first, last: (R - 1, N) seen part of each chord, which is changed.
         cut: Indices of the chords of which one end is seen.
-        clear: (..., R) how clearly rays are seen.
-        sights: (..., R, 3) unit rays of the camera.
-        before: (..., R, K - 1) where the cones begin on them.
-        from_camera: (12, ..., K - 1) terms of the cones.
+        clear: (R, N) how clearly rays are seen.
+        sights: (3, R, N) unit rays of the camera.
+        before: (K - 1, R, N) where the cones begin on them.
+        from_camera: (12, K - 1, N) terms of the cones.
     """
-    if not len(cut[0]):
+    chord, pose = cut
+    if not len(chord):
         return
-    lead, chord = cut[:-1], cut[-1]
-    rises = clear[*lead, chord + 1] > 0.0
+    rises = clear[chord + 1, pose] > 0.0
     hidden, seen = np.where(rises, chord, chord + 1), np.where(rises, chord + 1, chord)
-    body = before[*lead, hidden].argmin(axis=-1)
-    known = from_camera[:, *lead, body]
-    inside, foot = _depths(known, sights[*lead, hidden].T)
-    outside, _ = _depths(known, sights[*lead, seen].T)
+    body = before[:, hidden, pose].argmin(axis=0)
+    known = from_camera[:, body, pose]
+    inside, foot = _depths(known, sights[:, hidden, pose])
+    outside, _ = _depths(known, sights[:, seen, pose])
     crossed = (inside > 0.0) & (outside < 0.0)
     crossed[2] &= (foot > 0.0) & (foot < known[6])
     share = np.where(crossed, outside / np.where(crossed, outside - inside, 1.0), np.inf).min(axis=0)
     # Where the part's own surface turns away from the camera no ray passes it by, and clearness says how far.
     edge = np.isfinite(share)
     up, down = edge & rises, edge & ~rises
-    first[tuple(i[up] for i in cut)] = 1.0 - share[up]
-    last[tuple(i[down] for i in cut)] = share[down]
+    first[chord[up], pose[up]] = 1.0 - share[up]
+    last[chord[down], pose[down]] = share[down]
 
 
 def _depths(known: Float, rays: Float) -> tuple[Float, Float]:

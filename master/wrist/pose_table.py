@@ -52,8 +52,8 @@ class Forward(Protocol):
         """Laser points alone."""
         ...
 
-    def mended(self, x: Float, finger: Int) -> "Forward":
-        """The same, as exact as a valley asks for at these poses."""
+    def mended(self, x: Float, finger: Int, y: Float) -> tuple["Forward", Float]:
+        """The same, as exact as a valley asks for at these poses, and what is seen of them then."""
         ...
 
     def doubt(self, x: Float, finger: Int) -> Float:
@@ -159,9 +159,9 @@ class PoseTable:
         """Laser points (N, 2) [m] alone."""
         return self.views(x, finger)[0][:, :2]
 
-    def mended(self, x: Float, finger: Int) -> "PoseTable":
-        """Itself: for what is read along a valley a table is exact enough."""
-        return self
+    def mended(self, x: Float, finger: Int, y: Float) -> tuple["PoseTable", Float]:
+        """Itself, and y: for what is read along a valley a table is exact enough."""
+        return self, y
 
     def doubt(self, x: Float, finger: Int) -> Float:
         """How far the corners of a cell differ in what they say of the laser point (N, 2) [m] of poses (N, 3).

@@ -11,18 +11,17 @@ light, and within millimetres where the next one begins to hide it.
 plane then meets the chain s (its direction) at  q + v - s (n . v) / (n . s),  n: normal of the plane.
 """
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import transform
-from common.hand_model import CHAINS, Chains
-from common.wrist_bend import forearm_palm
-from master.wrist.fingertip import Fingertips
+from master.wrist.finger_shape import FingerShapes, Shape, ShapedFingers
 from master.wrist.laser_plane import PlaneAxes
 from master.wrist.setup import WristSetup
-from master.wrist.skin import PLACES, ROOT, Skin
+from master.wrist.skin import PLACES, ROOT
 
 _PULLED_IN = 0.77
 _CAP = np.array(
@@ -57,117 +56,136 @@ class Crossings:
 
 
 class Ridge:
-    """The crossings of one hand before one device. What it holds was prepared by the constructor."""
+    """The crossings of one hand before one device. What it holds was prepared by the constructor.
+
+    Attributes:
+        shapes: Of the fingers beyond their knuckles.
+    """
 
     def __init__(self, setup: WristSetup) -> None:
-        model = setup.model
-        self._setup, self._axes = setup, PlaneAxes.of(setup)
-        self._skin, self._beyond_m = Skin.of(model), Fingertips.of(model).beyond_m
-        self._abduction = model.side_sign * model.rest_rotation[CHAINS[:, 0], :, 1]
+        axes = PlaneAxes.of(setup)
+        self.shapes = FingerShapes(setup.model)
+        self._laser_m, self._offset_m = setup.laser_m[:, None], setup.offset_m
+        self._plane = np.concatenate([axes.axes, setup.normal[None]])  # across, along, its normal
+        self._origin = axes.axes @ axes.origin_m
         self._focal_px = setup.optics.matrix[0, 0]
         self._before = np.sign(
             setup.normal @ setup.T_camera_palm[:3, 3] - setup.offset_m
         )  # side of the wrist
+        self._forearm = setup.T_camera_palm[:3, :3]
+        self._T = setup.T_camera_palm
+        self._knuckle, self._abduction, self._wrist = self._placed(np.zeros(2))
 
-    def __call__(self, chains: Chains, finger: Int, bend_rad: Float) -> Crossings:
-        """What is seen of fingers (N,), each with its own chain (N, 4, ...) in the palm frame, at a bend (2,)."""
-        palm = self._palm(bend_rad)
-        q, way, stretch, met, length = self._met(chains, finger, palm)
-        tip = transform(palm, Fingertips(self._beyond_m[finger]).points(chains))
-        turn, at = self._hinges(chains, finger, palm, bend_rad)
-        moves, bone = np.ones((len(finger), 6, 1)), _BONE[stretch]
-        moves[:, 2, 0], moves[:, 3, 0] = bone >= 1, bone >= 2
-        v = moves * _cross(turn, q[:, None] - at)
-        slide = (v @ self._setup.normal) / (way @ self._setup.normal)[:, None]
-        on_plane = (v - slide[..., None] * way[:, None]) @ self._axes.axes.T
-        of_tip = _cross(turn, tip[:, None] - at)
-        image = tip[:, :2] / tip[:, 2:]
-        in_image = (of_tip[..., :2] - image[:, None] * of_tip[..., 2:]) / tip[:, None, 2:]
-        J = np.swapaxes(np.concatenate([on_plane, in_image], axis=-1), 1, 2)
-        seen = np.concatenate([self._axes.flat(q), image], axis=1)
-        return Crossings(seen, J[..., :4], J[..., 4:], length, stretch, met)
+    def bent(self, setup: WristSetup, bend_rad: Float) -> "Ridge":
+        """The same hand before the palm of a wrist that is bent by (2,) [rad]."""
+        other = copy(self)
+        other._T = setup.T_camera_palm
+        other._knuckle, other._abduction, other._wrist = other._placed(bend_rad)
+        return other
 
-    def points(self, chains: Chains, finger: Int, bend_rad: Float) -> tuple[Float, Bool]:
-        """Laser points (N, 2) [m] alone, and whether the fingers cross the plane (N,)."""
-        q, _, _, met, _ = self._met(chains, finger, self._palm(bend_rad))
-        return self._axes.flat(q), met
-
-    def _palm(self, bend_rad: Float) -> Float:
-        """Palm -> camera (4, 4) at a bend."""
-        palm = self._setup.T_camera_palm.copy()
-        palm[:3, :3] = palm[:3, :3] @ forearm_palm(bend_rad)
-        return palm
-
-    def _hinges(self, chains: Chains, finger: Int, palm: Float, bend_rad: Float) -> tuple[Float, Float]:
-        """Axes of the four angles and the two of the bend (N, 6, 3), and a point on each (N, 6, 3), camera frame."""
-        T, R = self._setup.T_camera_palm, palm[:3, :3]
+    def _placed(self, bend_rad: Float) -> tuple[Float, Float, Float]:
+        """Knuckles (3, 5) [m], axes of their abduction (3, 5) and of the wrist's bend (3, 2), camera frame."""
         flexion = np.array([np.cos(bend_rad[1]), 0.0, -np.sin(bend_rad[1])])
-        wrist = np.stack([flexion, np.array([0.0, 1.0, 0.0])]) @ T[:3, :3].T
-        turn, at = np.empty((2, len(finger), 6, 3))
-        turn[:, 0] = self._abduction[finger] @ R.T
-        turn[:, 1:4] = -chains.rotation[:, :3, :, 0] @ R.T
-        turn[:, 4:] = wrist
-        at[:, 1:4] = transform(palm, chains.position_m[:, :3])
-        at[:, 0], at[:, 4:] = at[:, 1], T[:3, 3]
-        return turn, at
+        wrist = self._forearm @ np.stack([flexion, np.array([0.0, 1.0, 0.0])], axis=1)
+        knuckle = transform(self._T, self.shapes.knuckle_m).T
+        return knuckle, self._T[:3, :3] @ self.shapes.abduction.T, wrist
 
-    def _met(self, chains: Chains, finger: Int, palm: Float) -> tuple[Float, Float, Int, Bool, Float]:
-        """Points (N, 3) [m], way of the chain there (N, 3), its stretch (N,), whether it is met (N,), lengths (N,)."""
-        spheres = transform(palm, self._spheres(chains, finger))
-        points, radius = self._points(spheres, finger)
-        q, stretch, way, met = self._nearest(points, finger)
-        broad = radius[np.arange(len(finger)), np.minimum(stretch, radius.shape[1] - 1)]
-        length = _LENGTH * broad * self._focal_px / np.maximum(q[:, 2], _NEAREST_M)
-        return q, way, stretch, met, length
+    def __call__(self, fingers: ShapedFingers) -> Crossings:
+        """What is seen of fingers (N)."""
+        finger, shape = fingers.finger, fingers.shape
+        R, knuckle = self._turned(fingers), self._knuckle[:, finger]
+        q, way, stretch, met = self._met(R, knuckle, finger, shape)
+        local = np.concatenate([q[:, None], shape.fixed, way[:, None]], axis=1)  # (3, 8, N)
+        seen = (R[:, :, None] * local).sum(axis=1)
+        seen[:, :4] += knuckle[:, None]
+        q, hinge, tip, turn, way = seen[:, 0], seen[:, 1:3], seen[:, 3], seen[:, 4:7], seen[:, 7]
+        v, of_tip = self._moved(finger, knuckle, q, hinge, tip, turn)
+        bone = _BONE[stretch]
+        v[:, 2] *= bone >= 1
+        v[:, 3] *= bone >= 2
+        way = self._plane @ way
+        v = (self._plane @ v.reshape(3, -1)).reshape(v.shape)
+        image = tip[:2] / tip[2]
+        J = np.empty((4, *v.shape[1:]))
+        J[:2] = v[:2] - v[2] / way[2] * way[:2, None]
+        J[2:] = (of_tip[:2] - image[:, None] * of_tip[2]) / tip[2]
+        J = np.ascontiguousarray(np.moveaxis(J, -1, 0))
+        broad = shape.radius[np.minimum(stretch, len(shape.radius) - 1), np.arange(len(finger))]
+        length = _LENGTH * broad * self._focal_px / np.maximum(q[2], _NEAREST_M)
+        flat = self._plane[:2] @ q - self._origin[:, None]
+        return Crossings(np.concatenate([flat, image]).T, J[..., :4], J[..., 4:], length, stretch, met)
 
-    def _spheres(self, chains: Chains, finger: Int) -> Float:
-        skin = Skin(self._skin.palmar_m[finger], self._skin.radius_m[finger])
-        return skin.spheres(chains)
+    def points(self, fingers: ShapedFingers) -> tuple[Float, Bool]:
+        """Laser points (N, 2) [m] alone, and whether the fingers cross the plane (N,)."""
+        R, knuckle = self._turned(fingers), self._knuckle[:, fingers.finger]
+        q, _, _, met = self._met(R, knuckle, fingers.finger, fingers.shape)
+        q = (R * q).sum(axis=1) + knuckle
+        return (self._plane[:2] @ q - self._origin[:, None]).T, met
 
-    def _points(self, spheres: Float, finger: Int) -> tuple[Float, Float]:
-        """The chain (N, 9, 3) [m] through the ridge of spheres (N, 8, 3), camera frame, and their radii (N, 8) [m]."""
-        radius = self._skin.radius_m[finger]
-        bone = np.diff(spheres, axis=1)
-        bone /= np.sqrt(np.vecdot(bone, bone))[..., None]
-        along = np.concatenate([bone[:, :1], bone[:, 1:] + bone[:, :-1], bone[:, -1:]], axis=1)
-        along /= np.sqrt(np.vecdot(along, along))[..., None]
-        light = self._setup.laser_m - spheres
-        light -= np.vecdot(light, along)[..., None] * along
-        light /= np.sqrt(np.vecdot(light, light))[..., None]
-        cap = spheres[:, -1] + radius[:, -1:] * (_CAP[0] * along[:, -1] + _CAP[1] * light[:, -1])
-        return np.concatenate(
-            [spheres + (_PULLED_IN * radius)[..., None] * light, cap[:, None]], axis=1
-        ), radius
+    def spheres(self, fingers: ShapedFingers) -> tuple[Float, Float]:
+        """Centres (N, 8, 3) and radii (N, 8) of the skin's spheres [m], camera frame."""
+        R, shape = self._T[:3, :3] @ fingers.rotation, fingers.shape
+        knuckle = self._knuckle[:, None, fingers.finger].T
+        return shape.spheres.T @ np.swapaxes(R, 1, 2) + knuckle, shape.radius.T
 
-    def _nearest(self, points: Float, finger: Int) -> tuple[Float, Int, Float, Bool]:
-        """Where chains (N, 9, 3) cross the plane nearest to the laser (N, 3), on which stretch and its way (N, 3).
+    def _turned(self, fingers: ShapedFingers) -> Float:
+        """Rotations (3, 3, N), first bone -> camera."""
+        return np.ascontiguousarray(np.moveaxis(self._T[:3, :3] @ fingers.rotation, 0, -1))
 
-        Last (N,): whether they cross it.
+    def _moved(
+        self, finger: Int, knuckle: Float, q: Float, hinge: Float, tip: Float, turn: Float
+    ) -> tuple[Float, Float]:
+        """How laser points and tips (3, 6, N) would move with each angle and bend, were they on the last bone [m/rad].
+
+        All in the camera frame: knuckles, points and tips (3, N), joints of PIP and DIP (3, 2, N), axes of the flexions
+        (3, 3, N).
         """
-        normal, rows = self._setup.normal, np.arange(len(points))
-        height = points @ normal - self._setup.offset_m
-        near, far = height[:, :-1], height[:, 1:]
+        w, at = np.empty((2, 3, 6, len(finger)))
+        w[:, 0], w[:, 1:4], w[:, 4:] = self._abduction[:, finger], turn, self._wrist[..., None]
+        at[:, 0], at[:, 1], at[:, 2:4], at[:, 4:] = knuckle, knuckle, hinge, self._T[:3, 3, None, None]
+        moved = _cross(w[:, None], np.stack([q, tip], axis=1)[:, :, None] - at[:, None])
+        return moved[:, 0], moved[:, 1]
+
+    def _met(self, R: Float, knuckle: Float, finger: Int, shape: Shape) -> tuple[Float, Float, Int, Bool]:
+        """Where the chains cross the plane nearest to the laser (3, N), their way there (3, N), in the bones' frames.
+
+        Then on which stretch (N,), and whether they cross it (N,).
+        """
+        laser = (R * (self._laser_m - knuckle)[:, None]).sum(axis=0)
+        normal = (self._plane[2] @ R.reshape(3, -1)).reshape(3, -1)
+        points = _points(shape, laser)
+        height = (normal[:, None] * points).sum(axis=0) - (self._offset_m - self._plane[2] @ knuckle)
+        near, far = height[:-1], height[1:]
         crossed = (near > 0.0) != (far > 0.0)
-        crossed[finger == 0, : ROOT - 1] = False  # what the metacarpal of the thumb carries is its ball
+        crossed[: ROOT - 1, finger == 0] = False  # what the metacarpal of the thumb carries is its ball
         share = near / np.where(crossed, near - far, 1.0)
-        q = points[:, :-1] + share[..., None] * np.diff(points, axis=1)
-        off = q - self._setup.laser_m
-        away = np.where(crossed, np.vecdot(off, off), np.inf)
-        stretch = away.argmin(axis=1)
-        met = crossed.any(axis=1)
+        off = points[:, :-1] + share * (points[:, 1:] - points[:, :-1]) - laser[:, None]
+        away = np.where(crossed, (off * off).sum(axis=0), np.inf)
+        stretch, met, rows = away.argmin(axis=0), crossed.any(axis=0), np.arange(len(finger))
         # One that ends before the plane is prolonged at its end, one that begins behind it at its beginning.
-        stretch = np.where(met, stretch, np.where(self._before * height[:, -1] > 0.0, points.shape[1] - 2, 0))
-        start, way = points[rows, stretch], points[rows, stretch + 1] - points[rows, stretch]
-        rise = way @ normal
-        size = np.sqrt(np.vecdot(way, way))
-        rise = np.where(np.abs(rise) < _LEVEL * size, np.copysign(_LEVEL * size, rise), rise)
-        share = np.clip(-height[rows, stretch] / rise, -_FARTHEST, _FARTHEST)
-        q = start + share[:, None] * way
-        way = way + (rise - way @ normal)[:, None] * normal
-        return q, stretch, way, met
+        stretch = np.where(met, stretch, np.where(self._before * height[-1] > 0.0, len(height) - 2, 0))
+        start = points[:, stretch, rows]
+        way = points[:, stretch + 1, rows] - start
+        rises: Float = (normal * way).sum(axis=0)
+        least: Float = _LEVEL * np.sqrt((way * way).sum(axis=0))
+        rise: Float = np.where(np.abs(rises) < least, np.copysign(least, rises), rises)
+        share: Float = np.clip(-near[stretch, rows] / rise, -_FARTHEST, _FARTHEST)
+        return start + share * way, way + (rise - rises) * normal, stretch, met
+
+
+def _points(shape: Shape, laser: Float) -> Float:
+    """The chain (3, 9, N) [m] through the ridge of spheres that faces the laser (3, N), in their frame."""
+    light = laser[:, None] - shape.spheres
+    light -= (light * shape.along).sum(axis=0) * shape.along
+    light /= np.sqrt((light * light).sum(axis=0))
+    points = np.empty((3, len(shape.radius) + 1, laser.shape[1]))
+    points[:, :-1] = shape.spheres + _PULLED_IN * shape.radius * light
+    cap = _CAP[0] * shape.along[:, -1] + _CAP[1] * light[:, -1]
+    points[:, -1] = shape.spheres[:, -1] + shape.radius[-1] * cap
+    return points
 
 
 def _cross(a: Float, b: Float) -> Float:
-    """Cross products (..., 3)."""
-    (ax, ay, az), (bx, by, bz) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
+    """Cross products (3, ...)."""
+    (ax, ay, az), (bx, by, bz) = a, b
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -104,25 +104,26 @@ class Valleys:
         low, high = self._low[finger][:, side], self._high[finger][:, side]
         white = np.asarray(np.linalg.inv(np.linalg.cholesky(R)), np.float64)[finger]
 
-        def stepped(x: Float, by: Forward) -> Float:
-            y, J, _ = by.views(x, finger)
+        def stepped(x: Float, y: Float, J: Float) -> Float:
             to, _ = self._to(white, np.nan_to_num(seen[finger] - y[:, :numbers]), J[:, :numbers, :2], finger)
             out = x.copy()
             out[:, side] = np.clip(x[:, side] + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high)
             return out
 
+        y, J, length_px = table.views(x, finger)
         for _ in range(_STEPS if table.exact else _ROUGH_STEPS):
-            x = stepped(x, table)
+            x = stepped(x, y, J)
+            y, J, length_px = table.views(x, finger)
         if not table.exact:
-            y, _, _ = table.views(x, finger)
             off = (white @ np.nan_to_num(seen[finger] - y[:, :numbers])[..., None])[..., 0]
             near = _near(np.vecdot(off, off), finger)
             finger, node = finger[near], node[near]
-            x, white, low, high = x[near], white[near], low[near], high[near]
-            table = table.mended(x, finger)
+            x, y, J = x[near], y[near], J[near]
+            white, low, high = white[near], low[near], high[near]
+            table, y = table.mended(x, finger, y)
             for _ in range(_MENDED_STEPS):
-                x = stepped(x, table)
-        y, J, length_px = table.views(x, finger)
+                x = stepped(x, y, J)
+                y, J, length_px = table.views(x, finger)
         # What a DIP that is not where the coupling has it does to the laser point.
         wide = R[finger].copy()
         moved = np.zeros((len(x), numbers))
