@@ -103,7 +103,7 @@ class Corridors:
         return self.root + np.stack([along * x - across * y, along * y + across * x], axis=-1)
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=128)  # one for each way the palm may lie
 def corridors_of(view: WristView) -> Corridors:
     """The corridors of one wrist rig and hand.
 

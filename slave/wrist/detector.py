@@ -12,10 +12,13 @@ from common.arrays import Float
 from common.messages import WristDetections
 from slave.cameras.source import Frame
 from slave.wrist.background import lit
+from slave.wrist.corridors import corridors_of
 from slave.wrist.engine import NUMPY, Engine
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.laser import LaserLines, laser_lines
+from slave.wrist.palm_turn import prepare
+from slave.wrist.reach import reach_of
 from slave.wrist.registration import shifted
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
@@ -99,6 +102,9 @@ def prepared(view: WristView, engine: Engine = NUMPY) -> WristView:
 
     A triple in which all is dark goes through the whole line, so that the first real one takes no longer than others.
     """
+    for turned in prepare(view):
+        corridors_of(turned)
+        reach_of(turned)
     dark = Frame(0, 0, 0, np.zeros((view.optics.height_px, view.optics.width_px), np.uint8))
     find(Triple(dark, dark, dark), view, engine=engine)
     return view

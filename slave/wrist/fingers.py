@@ -1,12 +1,13 @@
 """Which finger a pixel of the LED image belongs to: seams between neighbouring fingers, which never cross (D4).
 
-The palm stands still in the image (`slave.wrist.view`), so what the fingers of this hand can do says in which corridor
-each of the four seams runs (`slave.wrist.corridors`). Along the stations of a corridor a seam is the path of least
-energy, found by dynamic programming: first the three among index ... little, side by side, then the thumb's, which
-lies over them where they meet. A pixel costs little where it is a valley, dark between brighter neighbours: a crease
-between touching fingers as well as the open gap between spread ones, near the LEDs and far from them. The skin of a
-finger costs so much that no seam crosses one. Of paths alike the one nearer to the middle of its corridor is taken: in
-an image that shows nothing the seams are those of the hand's geometry alone.
+How the palm lies in the image is calibrated, and seen where the wrist is bent (`slave.wrist.palm_turn`), so what the
+fingers of this hand can do says in which corridor each of the four seams runs (`slave.wrist.corridors`). Along the
+stations of a corridor a seam is the path of least energy, found by dynamic programming: first the three among index
+... little, side by side, then the thumb's, which lies over them where they meet. A pixel costs little where it is a
+valley, dark between brighter neighbours: a crease between touching fingers as well as the open gap between spread
+ones, near the LEDs and far from them. The skin of a finger costs so much that no seam crosses one. Of paths alike the
+one nearer to the middle of its corridor is taken: in an image that shows nothing the seams are those of the hand's
+geometry alone.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ import numpy as np
 from common.arrays import Float, Image, Int
 from slave.wrist.corridors import STATION_PX, Corridors, Float32, corridors_of
 from slave.wrist.engine import NUMPY, Engine
+from slave.wrist.palm_turn import PalmTurn, palm_turn
 from slave.wrist.pieces import NONE
 from slave.wrist.valleys import DARK, STARTS, WIDTHS
 from slave.wrist.view import WristView
@@ -38,11 +40,13 @@ class Fingers:
         seams: (4, S) index|middle, middle|ring, ring|little [px, along the row of each station], and the thumb's
             [rad, along the circle of each station].
         shown: Whether the LED image showed a hand; else the seams are those of geometry alone.
+        turn: How the palm lies.
     """
 
     corridors: Corridors
     seams: Float
     shown: bool
+    turn: PalmTurn
 
     def finger_of(self, uv: Float) -> Int:
         """Finger (N,), 0 thumb ... 4 little, of pixels (N, 2); -1 where the pixel is NaN."""
@@ -64,7 +68,8 @@ class Fingers:
 
 def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
     """Find the seams in the difference of LED and ambient frame."""
-    corridors = corridors_of(view)
+    turn = palm_turn(led, view)
+    corridors = corridors_of(turn.view)
     dark = cv2.erode(led, _CREASE)
     palm = dark[corridors.palm[:, 1], corridors.palm[:, 0]] if len(corridors.palm) else dark
     shown = bool(2 * np.count_nonzero(palm > _SHOWN) > palm.size)
@@ -86,7 +91,7 @@ def separate(led: Image, view: WristView, engine: Engine = NUMPY) -> Fingers:
         thumb = energy[:, STARTS[3] :]
         thumb += _TAKEN * (np.abs(np.arange(WIDTHS[3]) - taken[..., None]) < _VALLEY).any(axis=0)
         seams[3:] = corridors.across(slice(3, 4), engine.least_paths(thumb, WIDTHS[3:]))
-    return Fingers(corridors, seams, shown)
+    return Fingers(corridors, seams, shown, turn)
 
 
 def _part(paths: Int, strips: Image, energy: Float32, corridors: Corridors, engine: Engine) -> None:

@@ -3,7 +3,8 @@
 The profile of nearness along each finger (`spines`) is compared with those of all its bends (`tip_bends`). From that
 comes where the end of the finger lies between the edges that are seen, the contour above and the step below, whose
 places are then measured at full resolution (`tip_ends`); and how likely that end is seen at all. A finger that points
-away ends behind its own horizon, one that is folded shows its back: no tip is reported.
+away ends behind its own horizon, one that is folded shows its back: no tip is reported. Nor is one of a bent wrist,
+which turns fingers before the camera in ways that no template has.
 
 The thumb is one more finger, read along its own way (`strips`). It shows its end where it is raised off the palm. Where
 a seam runs over skin and not through a crease, it cuts a finger, mostly the thumb before others: what lies beside it
@@ -55,9 +56,11 @@ class Fingertips:
 
 def fingertips(led: Image, fingers: Fingers, view: WristView) -> Fingertips:
     """Find them in the difference of LED and ambient frame (H, W)."""
+    uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
+    if not fingers.turn.straight:
+        return Fingertips(uv, sigma, depth)
     optics, bank, strips = led_optics(view), templates_of(view), strips_of(view)
     near = nearness(shrink(led), optics)
-    uv, sigma, depth = np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan)
     gain = palm_gain(near, bank)
     if gain is None:
         return Fingertips(uv, sigma, depth)

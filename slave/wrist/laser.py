@@ -16,7 +16,7 @@ from slave.wrist.owners import owners
 from slave.wrist.pieces import NONE, Pieces
 from slave.wrist.reach import reach_of
 from slave.wrist.runs import FLOOR
-from slave.wrist.thumb_line import beyond_ball
+from slave.wrist.thumb_line import beyond_ball, on_ball
 from slave.wrist.view import WristView
 
 _LEAST_M = 2e-3  # of line that must be seen
@@ -44,7 +44,7 @@ class LaserLines:
 
 def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine = NUMPY) -> LaserLines:
     """Find the segments in the difference of laser and ambient frame."""
-    reach = reach_of(view)
+    reach = reach_of(fingers.turn.view).turned(fingers.turn)
     runs, on_line = engine.lines(laser, reach.first_row)
     if not len(runs.row):
         return LaserLines(np.full((5, 2), np.nan), np.full(5, np.nan), np.full(5, np.nan))
@@ -53,13 +53,16 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
     finger[~on_line] = NONE
     finger = owners(finger, runs, points, reach)
     finger[~reach.holds(finger, points)] = NONE
+    finger[reach.on_palm(points)] = NONE
     pieces = engine.measure(runs, finger, view.optics.width_px)
     uv, length = pieces.uv, pieces.line
     seen = length * reach.metres_per_px(uv) >= _LEAST_M
     sigma = _sigma_px(pieces, shown=fingers.shown)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
-        off, doubt = beyond_ball(runs, thumb, reach.on_plane(points[thumb])[0])
+        beyond = reach.on_plane(points[thumb])[0]
+        off, doubt = beyond_ball(runs, thumb, beyond)
+        seen[0] = not (reach.bent and on_ball(beyond))
         uv[0] += off
         sigma[0] = np.hypot(sigma[0], doubt)
     uv[~seen], sigma[~seen], length[~seen] = np.nan, np.nan, np.nan

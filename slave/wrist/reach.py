@@ -1,6 +1,9 @@
-"""Where in the image the laser can meet each finger: a known set, since the laser's plane and the palm stand still."""
+"""Where in the image the laser can meet each finger, and where what it meets there is beside the palm.
 
-from dataclasses import dataclass
+A known set, since the laser's plane stands still, and the palm lies as calibrated or as it was seen (`palm_turn`).
+"""
+
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import cast
 
@@ -9,19 +12,25 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Bool, Float, Image, Int
+from common.camera_model import CameraModel
+from common.geometry import intersect_plane
 from common.hand_model import CHAINS
+from slave.wrist.palm_turn import PalmTurn
 from slave.wrist.sweep import NEAREST_M, PER_BONE, along_bones, finger_postures, radius_along, thumb_postures
 from slave.wrist.view import WristView
 
 Float32 = npt.NDArray[np.float32]
 
 _CELL_PX = 8
+_THUMB = 0
 # Beyond the skin over the thumb's MCP, from its root. A thumb that is bent before the palm meets the plane at its MCP,
 # half a centimetre either way as device and bones are known; a finger folded to the palm does so a centimetre beyond.
 _THUMBS_M, _NO_THUMBS_M = 4e-3, 10e-3
 _BALL_M = -3e-3  # nearer there is no finger
 _LEAST_SPACING_M = 5e-3  # of axes, which fan out from the knuckles and meet behind the wrist
 _BESIDE_PALM = 0.5  # place: beyond the outside of the index
+_FOLDED_RADII = 2.0  # of the knuckle, above the palm's bones: what a finger folded to the palm is beyond
+_ORIGIN = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,28 +38,48 @@ class Reach:
     """Which pixels can show the laser on a finger.
 
     Attributes:
-        pixels: (5, H, W), thumb ... little.
-        beyond_m: (H, W) how far the plane there is beyond the skin of the thumb's MCP, from the thumb's root [m].
-        place: (H, W) beside whose axis the plane is: 1 index ... 4 little, and between and beyond them.
-        depth_per_focal_m: (H, W) how much of the plane one pixel shows there [m]; 0: none.
+        cells: (5, H / 8, W / 8), thumb ... little, where it can be.
+        plane_m: (H, W, 3) what each pixel shows of the laser's plane, camera frame [m]; 0: nothing.
+        focal_px: Of the camera.
+        T_camera_palm: (4, 4) how the palm lies [m].
+        bent: Whether the wrist is.
+        palm: What is known of the palm.
         first_row: Above it the laser meets no finger.
     """
 
-    pixels: Bool
-    beyond_m: Float32
-    place: Float32
-    depth_per_focal_m: Float32
+    cells: Bool
+    plane_m: Float32
+    focal_px: float
+    T_camera_palm: Float
+    bent: bool
+    palm: "Palm"
     first_row: int
+
+    def turned(self, turn: PalmTurn) -> "Reach":
+        """The same where the palm lies just so."""
+        return replace(self, T_camera_palm=turn.T_camera_palm, bent=not turn.straight)
 
     def holds(self, finger: Int, uv: Float) -> Bool:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
-        return self.pixels[finger, row, column]
+        return self.cells[finger, row // _CELL_PX, column // _CELL_PX] & (
+            (finger == _THUMB) | (self.on_plane(uv)[0] > _BALL_M)
+        )
 
     def on_plane(self, uv: Float) -> tuple[Float, Float]:
-        """`beyond_m` and `place` (N,) at pixels (N, 2) of the image."""
-        column, row = self._cell(uv)
-        return self.beyond_m[row, column].astype(np.float64), self.place[row, column].astype(np.float64)
+        """How far (N,) the plane at pixels (N, 2) is beyond the skin of the thumb's MCP, from the thumb's root [m].
+
+        And its place (N,): beside whose axis, 1 index ... 4 little, and between and beyond them.
+        """
+        points = self._before_palm(uv)
+        return self.palm.beyond_m(points), self.palm.place(points)
+
+    def on_palm(self, uv: Float) -> Bool:
+        """Whether at pixels (N, 2) a bent wrist has brought the palm itself into the plane."""
+        if not self.bent:
+            return np.zeros(len(uv), np.bool_)
+        points = self._before_palm(uv)
+        return self.palm.skin(points, self.palm.place(points))
 
     def only_thumb(self, beyond_m: Float, place: Float) -> Bool:
         """Whether there (N,) the laser meets the thumb or nothing."""
@@ -61,19 +90,71 @@ class Reach:
         return (beyond_m > _NO_THUMBS_M) & (place > _BESIDE_PALM)
 
     def metres_per_px(self, uv: Float) -> Float:
-        """`depth_per_focal_m` (N,) at pixels (N, 2) of the image; 0 where they are NaN."""
+        """How much of the plane one pixel shows [m] at pixels (N, 2); 0 where they are NaN, or show none of it."""
         column, row = self._cell(np.nan_to_num(uv))
-        return np.where(np.isnan(uv[:, 0]), 0.0, self.depth_per_focal_m[row, column])
+        return np.where(np.isnan(uv[:, 0]), 0.0, self.plane_m[row, column, 2] / self.focal_px)
+
+    def _before_palm(self, uv: Float) -> Float:
+        """What pixels (N, 2) show of the plane, palm frame (N, 3) [m]."""
+        column, row = self._cell(uv)
+        T = self.T_camera_palm
+        return (self.plane_m[row, column] - T[:3, 3]) @ T[:3, :3]
 
     def _cell(self, uv: Float) -> tuple[Int, Int]:
         column, row = (uv + 0.5).astype(np.int64).T
-        return column, np.minimum(row, self.pixels.shape[1] - 1)
+        return column, np.minimum(row, self.plane_m.shape[0] - 1)
 
 
-@lru_cache(maxsize=8)
+@dataclass(frozen=True, slots=True, eq=False)
+class Palm:
+    """The palm's bones and the thumb's root, in the palm frame.
+
+    Attributes:
+        root_m: (3,) the thumb's.
+        border_m: How far from it the skin over the thumb's MCP is [m].
+        knuckles_m: (4, 3).
+        aside: (4, 2) way x, z across the axis of each finger, towards the little one's side.
+        radius_m: (4,) of the knuckles.
+    """
+
+    root_m: Float
+    border_m: float
+    knuckles_m: Float
+    aside: Float
+    radius_m: Float
+
+    def beyond_m(self, points: Float) -> Float:
+        """How far points (N, 3) are (N,) beyond the skin over the thumb's MCP, from the thumb's root [m].
+
+        However the thumb is turned, that skin lies about as far from its root (CMC); so it is a sphere about the root,
+        and for one way the palm lies a fixed line in the image.
+        """
+        return np.linalg.norm(points - self.root_m, axis=1) - self.border_m
+
+    def place(self, points: Float) -> Float:
+        """Beside whose axis, from index 1 to little 4, points (N, 3) are (N,), seen from before the palm.
+
+        Between two axes, and beyond the outer ones, by their distances.
+        """
+        flat = self.knuckles_m[:, ::2]
+        off = points[:, ::2] @ self.aside.T - (flat * self.aside).sum(axis=1)  # falls finger by finger
+        left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
+        here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
+        return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
+
+    def skin(self, points: Float, place: Float) -> Bool:
+        """Whether points (N, 3) of these places (N,) are on the palm's skin: before the knuckles, near their bones.
+
+        A finger that is folded to it lies on it, and is thicker than that.
+        """
+        at = np.arange(1.0, 5.0)
+        y, z, thick = (np.interp(place, at, of) for of in (*self.knuckles_m.T[1:], self.radius_m))
+        return (points[:, 2] < z) & (y - points[:, 1] < _FOLDED_RADII * thick)
+
+
+@lru_cache(maxsize=128)  # one for each way the palm may lie
 def reach_of(view: WristView) -> Reach:
     """The reach of one wrist rig and hand."""
-    size = (view.optics.width_px, view.optics.height_px)
     thumb, fingers = (
         along_bones(view, thumb_postures(view, 7, 7, 5, 5)),
         along_bones(view, finger_postures(view, 5, 10, 10)),
@@ -82,13 +163,11 @@ def reach_of(view: WristView) -> Reach:
     beyond = slice(PER_BONE, None)  # the metacarpal of the thumb is the palm's
     cells = [_cells(view, thumb[:, 0, beyond], radius[0, beyond])]
     cells += [_cells(view, fingers[:, finger], radius[finger]) for finger in range(1, 5)]
-    pixels = np.stack([cv2.resize(part, size, interpolation=cv2.INTER_NEAREST) for part in cells]).astype(
-        np.bool_
-    )
-    beyond, place, metres = _on_plane(view)
-    pixels[1:] &= beyond > _BALL_M
-    rows = np.flatnonzero(pixels.any(axis=(0, 2)))
-    return Reach(pixels, beyond, place, metres, int(rows[0]) if len(rows) else size[1] - 1)
+    held = np.stack(cells).astype(np.bool_)
+    rows = np.flatnonzero(held.any(axis=(0, 2)))
+    plane = _plane(view.optics, *view.normal.tolist(), view.offset_m)
+    first = _CELL_PX * int(rows[0]) if len(rows) else view.optics.height_px - 1
+    return Reach(held, plane, float(view.optics.matrix[0, 0]), view.T_camera_palm, False, _palm(view), first)
 
 
 def _cells(view: WristView, bones: Float, radius: Float) -> Image:
@@ -119,37 +198,23 @@ def _cells(view: WristView, bones: Float, radius: Float) -> Image:
     return out
 
 
-def _on_plane(view: WristView) -> tuple[Float32, Float32, Float32]:
-    """`beyond_m`, `place` and `depth_per_focal_m` of every pixel, each (H, W).
+@lru_cache(maxsize=8)
+def _plane(optics: CameraModel, x: float, y: float, z: float, offset_m: float) -> Float32:
+    """What every pixel (H, W, 3) shows of the plane of normal (x, y, z), camera frame [m]; 0: nothing."""
+    u, v = np.meshgrid(np.arange(optics.width_px), np.arange(optics.height_px))
+    rays = optics.ray(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64))
+    points = intersect_plane(_ORIGIN, rays, np.array([x, y, z]), offset_m)
+    return np.nan_to_num(points).reshape(*u.shape, 3).astype(np.float32)
 
-    However the thumb is turned, the skin over its MCP lies about as far from its root (CMC); so it is a sphere about
-    the root, and a fixed line in the image.
-    """
-    model, T = view.model, view.T_camera_palm
+
+def _palm(view: WristView) -> Palm:
+    model = view.model
     root, knuckle = model.rest_position_m[CHAINS[0, :2]]
-    border = np.hypot(np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]])
-    u, v = np.meshgrid(np.arange(view.optics.width_px), np.arange(view.optics.height_px))
-    points = np.nan_to_num(view.on_plane(np.stack([u, v], axis=-1).reshape(-1, 2).astype(np.float64)))
-    palm = (points - T[:3, 3]) @ T[:3, :3]
-    beyond = np.linalg.norm(palm - root, axis=1) - border
-    metres = points[:, 2] / view.optics.matrix[0, 0]
-    shown = [values.reshape(u.shape).astype(np.float32) for values in (beyond, _place(view, palm), metres)]
-    return shown[0], shown[1], shown[2]
-
-
-def _place(view: WristView, palm: Float) -> Float:
-    """Beside whose axis, from index 1 to little 4, points (N, 3) of the palm frame are (N,), seen from before the palm.
-
-    Between two axes, and beyond the outer ones, by their distances.
-    """
-    knuckles, ends = (view.model.rest_position_m[CHAINS[1:, k]][:, ::2] for k in (0, 1))
-    along = (ends - knuckles) / np.linalg.norm(ends - knuckles, axis=1, keepdims=True)
+    knuckles, ends = (model.rest_position_m[CHAINS[1:, k]] for k in (0, 1))
+    along = (ends - knuckles)[:, ::2]
+    along = along / np.linalg.norm(along, axis=1, keepdims=True)
     aside = np.stack([along[:, 1], -along[:, 0]], axis=-1)
-    if aside[0] @ (knuckles[3] - knuckles[0]) < 0.0:
+    if aside[0] @ (knuckles[3] - knuckles[0])[::2] < 0.0:
         aside = -aside
-    off = np.stack(
-        [(palm[:, ::2] - knuckles[k]) @ aside[k] for k in range(4)], axis=-1
-    )  # falls finger by finger
-    left = np.clip((off > 0.0).sum(axis=1) - 1, 0, 2)[:, None]
-    here, there = np.take_along_axis(off, left, 1)[:, 0], np.take_along_axis(off, left + 1, 1)[:, 0]
-    return 1.0 + left[:, 0] + here / np.maximum(here - there, _LEAST_SPACING_M)
+    border = float(np.hypot(np.linalg.norm(knuckle - root), model.radius_m[CHAINS[0, 1]]))
+    return Palm(root, border, knuckles, aside, model.radius_m[CHAINS[1:, 0]])

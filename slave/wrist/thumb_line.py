@@ -21,6 +21,14 @@ _TAILS = 1.5  # centroids lump at the whole line and at its end: 1.96 deviations
 _LEAST_PX = 4.0  # of line, for a centroid
 
 
+def on_ball(beyond_m: Float) -> bool:
+    """Whether a line (N,) so far beyond the MCP's skin [m] is rather on the ball than on the thumb.
+
+    Where the wrist is straight the thumb stands across the plane; a bent one can bring the ball there alone.
+    """
+    return float(np.median(beyond_m)) < _BORDER_M
+
+
 def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, float]:
     """How much the thumb's part of a line has its centroid beside that of the whole (2,), and its deviation [px].
 

@@ -117,7 +117,7 @@ def test_what_no_finger_can_reach_is_not_a_finger() -> None:
 
 def test_less_than_two_millimetres_of_line_is_not_reported() -> None:
     reach = reach_of(VIEW)
-    row, column = np.argwhere(reach.pixels[2])[reach.pixels[2].sum() // 2].tolist()
+    row, column = (8 * np.argwhere(reach.cells[2])[reach.cells[2].sum() // 2]).tolist()
     image = drawn(lambda u: np.full_like(u, float(row)), (column, column + 2), 220.0)
     assert np.isnan(laser_lines(image, separate(BLACK, VIEW), VIEW).uv).all()
 
