@@ -33,7 +33,7 @@ _SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is wei
 _BEND = 2
 _ALL = _TURN + 5 * _ANGLES
 _PALM_AND_BEND = np.array([0, 1, 2, _ALL, _ALL + 1])
-_ELSEWHERE = 16.3  # chi square of three numbers, 1 in 1000
+_ELSEWHERE = 9.0  # three standard deviations, of all axes together
 _MOST_RAD = np.radians(25.0)  # more doubt of one angle than that moves a tip on no straight line
 _PALM_M = 8e-3  # about so well a palm is known from one moment to the next
 
