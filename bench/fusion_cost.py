@@ -1,0 +1,63 @@
+"""What the fused line costs a small PC, message by message, beside each sensor alone in the same process.
+
+Times are of the processor, on one thread: what else the machine does is not in them, though a shared core is slower.
+A device alone knows nothing of its wrist's bend and takes it for straight; that is the baseline of a triple.
+"""
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from time import process_time
+
+from bench.fusion_scene import Observed
+from bench.fusion_shown import shown
+from bench.row import Row
+from common.messages import ImuSample, WristDetections
+from master.rig import RigSetup, pipeline_of
+from master.stages import StageTimes
+
+SCENE, SECONDS, SEED = "grasp", 6.0, 7
+
+
+def rows() -> Iterator[Row]:
+    """A hand that grasps, solved by markers, by the wrist device, and by both."""
+    told = shown(SCENE, SECONDS, SEED)
+    markers, wrist, fused = (
+        costs(setup, told.messages) for setup in (told.both.markers, told.both.wrist, told.both.fused)
+    )
+    yield Row("an instant of two cameras, markers alone", 1e3 * markers["instant"], "ms", "")
+    yield _row("  fused with the wrist device", fused["instant"], markers["instant"], "markers alone")
+    yield Row("a triple, straight wrist", 1e3 * wrist["triple"], "ms", "")
+    yield _row("  at the bend that the fused hand tells", fused["triple"], wrist["triple"], "straight")
+    yield Row("a sample of the IMU, fused", 1e3 * fused["sample"], "ms", "")
+    note = f"markers alone {100 * markers['second']:.0f}, wrist device alone {100 * wrist['second']:.0f}"
+    yield Row("one core, fused hand", 100 * fused["second"], "%", note)
+
+
+def costs(setup: RigSetup, messages: Iterable[Observed]) -> dict[str, float]:
+    """Processor time [s] of an instant, a triple and an IMU sample, mean, and of a second of all.
+
+    The message that completes an instant pays for it; the others of its cameras count to it, too.
+    """
+    pipeline = pipeline_of(setup, StageTimes())
+    spent, count = defaultdict[str, float](float), defaultdict[str, int](int)
+    for message in messages:
+        start_s = process_time()
+        if isinstance(message, ImuSample):
+            if message.source not in setup.imus:
+                continue
+            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
+            kind, news = "sample", 1
+        elif message.camera in setup.cameras:
+            poses = pipeline.push(message)
+            kind = "triple" if isinstance(message, WristDetections) else "instant"
+            news = 1 if kind == "triple" else len(poses)
+        else:
+            continue
+        spent[kind] += process_time() - start_s
+        count[kind] += news
+    each = {kind: total / count[kind] for kind, total in spent.items()}
+    return {**each, "second": sum(spent.values()) / SECONDS}
+
+
+def _row(name: str, cost_s: float, baseline_s: float, what: str) -> Row:
+    return Row(name, 1e3 * cost_s, "ms", f"{cost_s / baseline_s:.2f} x {what}, goal 2")
