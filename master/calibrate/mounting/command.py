@@ -132,7 +132,7 @@ def imu_samples(recording: FrameRecording, name: str, rate_hz: float) -> Sequenc
 
 def summary(found: "Mounting") -> dict[str, object]:
     """What was measured, as numbers."""
-    from master.calibrate.mounting.mounting import left_of
+    from master.calibrate.mounting.report import left_of
 
     imu = found.rig.imu
     return {

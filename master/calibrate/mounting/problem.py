@@ -27,7 +27,6 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
 from common.hand_model import HandModel
-from common.wrist_bend import bend_of
 from master.calibrate.mounting.normal import Hands, Normal
 from master.calibrate.mounting.seen import STRAYS, Fit, Triples
 from master.calibrate.mounting.sights import FINGERS, SEEN, Sights
@@ -47,6 +46,7 @@ from master.calibrate.mounting.unknown import (
     Unknown,
     believed,
 )
+from master.calibrate.mounting.wrists import bends, bends_by_turn
 from master.ik.attached import Attached
 from master.ik.hand_problem import HandProblem, moved
 from master.ik.parameters import HandParameters
@@ -60,7 +60,6 @@ _BENT_RAD = np.radians(15.0)
 _PER_S = 4.0  # independent instants
 _FARTHEST = 8.0  # of a finger that the laser should meet and does not
 _TRIALS, _SETTLED = 6, 0.03  # of a step; the gain that is none
-_LITTLE = 1e-5
 _EYE = np.eye(3)
 
 
@@ -171,7 +170,7 @@ class Problem:
         """The least cost from a guess, and the steps taken."""
         damping, cost, taken = 1e-3, self.cost(unknown, hands), 0
         for _ in range(rounds):
-            normal, gain = self._normal(unknown, hands), 0.0
+            normal, gain = self.normal(unknown, hands), 0.0
             for _ in range(_TRIALS):
                 trial = self._stepped(unknown, hands, *normal.step(damping))
                 trial_cost = self.cost(*trial)
@@ -188,7 +187,7 @@ class Problem:
 
     def result(self, unknown: Unknown, hands: Hands, steps: int) -> Fit:
         """What is told of the end."""
-        covariance = np.asarray(np.linalg.inv(self._normal(unknown, hands).reduced(0.0)[0]), np.float64)
+        covariance = np.asarray(np.linalg.inv(self.normal(unknown, hands).reduced(0.0)[0]), np.float64)
         shown, bend = self._shown(unknown, hands)
         off = (self._data - shown) / self.sigma
         here = self._here(unknown)
@@ -237,7 +236,7 @@ class Problem:
         R = self._camera_rig(unknown, turns) @ hands.T_rig_palm[:, :3, :3]
         angles = self._parameters.angles(hands.x)
         seen = self._sights(R, unknown.shift_m, angles, unknown.thick, unknown.reach_m)
-        return seen, _bends(self._wrists(unknown, hands, turns))
+        return seen, bends(self._wrists(unknown, hands, turns))
 
     def _off(self, shown: Float) -> Float:
         """Fitted minus seen (T, 4, SEEN) in standard deviations, 0 where not seen; what the laser misses is far."""
@@ -258,7 +257,7 @@ class Problem:
         believed_off = unknown.off(self._first) / self._believed
         return float(self._share * (data + wrist + held) + (believed_off**2).sum())
 
-    def _normal(self, unknown: Unknown, hands: Hands) -> "Normal":
+    def normal(self, unknown: Unknown, hands: Hands) -> Normal:
         """Normal equations about a place."""
         turns, here = self._turned(unknown), self._here(unknown)
         problem = replace(self._hands, points_m=here.points_m)
@@ -287,7 +286,7 @@ class Problem:
         own[..., :3] = by_turn @ camera_rig
         complete = self._parameters.complete.reshape(5, 4, n)[FINGERS]
         by_x = np.einsum("tfya,fan->tfyn", by[..., 6:10], complete)
-        own[..., 6:] = self._by_parameters(by_x, hands.x).reshape(count, -1, n)
+        own[..., 6:] = self._parameters.by_parameters(by_x, hands.x).reshape(count, -1, n)
         shared = np.zeros((count, 4, SEEN, UNKNOWN))
         for f in range(4):
             shared[:, f, :, THICK.start + f] = by[:, f, :, 10]
@@ -301,21 +300,17 @@ class Problem:
     def _wrist_rows(self, unknown: Unknown, hands: Hands, turns: Turns) -> tuple[Float, Float, Float]:
         """As `_sight_rows`, of flexion, deviation and twist."""
         wrist = self._wrists(unknown, hands, turns)
-        bent = _bends(wrist) / self._bend_sigma
+        bent = bends(wrist) / self._bend_sigma
         root = (1.0 + np.vecdot(bent, bent) / STRAYS**2) ** -0.5  # where the hand itself was mistaken
         weight = (self._known * root)[:, None] / self._bend_sigma
-        by_turn = np.empty((len(wrist), 3, 3))
-        for k in range(3):
-            turned = rotation_vector_to_matrix(_LITTLE * _EYE[k]) @ wrist
-            by_turn[..., k] = (_bends(turned) - _bends(wrist)) / _LITTLE
-        by_turn *= weight[..., None]
+        by_turn = weight[..., None] * bends_by_turn(wrist)
         forearm_rig = unknown.R_forearm_imu @ np.swapaxes(self._rig_imu(unknown, turns), 1, 2)
         own = np.zeros((len(wrist), 3, 6 + hands.x.shape[1]))
         own[..., :3] = by_turn @ forearm_rig
         shared = np.zeros((len(wrist), 3, UNKNOWN))
         shared[..., FOREARM_IMU] = by_turn
         self._world_columns(shared, -by_turn @ forearm_rig, unknown, turns)
-        return _bends(wrist) * weight, own, shared
+        return bends(wrist) * weight, own, shared
 
     def _world_columns(self, shared: Float, by_imu: Float, unknown: Unknown, turns: Turns) -> None:
         """Fill what turns the IMU in the rig: its world, the errors of its gyroscope, and clocks.
@@ -331,12 +326,3 @@ class Problem:
         rate = (self._rig_imu(unknown, turns) @ turns.rate_rad_s[..., None])[..., 0]
         later = (by_imu @ rate[..., None])[..., 0]
         shared[..., CAMERA_LATE], shared[..., IMU_LATE] = later, -later
-
-    def _by_parameters(self, by_free: Float, x: Float) -> Float:
-        """Derivatives (T, 4, R, n) by the free angles as they are -> by the parameters."""
-        return self._parameters.by_parameters(by_free, x)
-
-
-def _bends(R_forearm_palm: Float) -> Float:
-    """Flexion, deviation and twist (..., 3) [rad] of rotations (..., 3, 3)."""
-    return np.concatenate([bend_of(R_forearm_palm), R_forearm_palm[..., 1, :1]], axis=-1)
