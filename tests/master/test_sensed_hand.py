@@ -107,6 +107,7 @@ def test_hidden_fingers_are_bent_as_the_device_has_them_and_say_so() -> None:
 
 def test_a_finger_that_is_elsewhere_than_its_marker_is_not_taken() -> None:
     truth = natural_angles(np.random.default_rng(4))
+    truth[2, 1:] = np.radians([10.0, 18.0, 12.0])
     false = truth.copy()
     false[2, 1:3] += np.radians([10.0, 70.0])
     check, points = MarkerCheck(RIGHT, MARKERS), markers(truth)
