@@ -24,7 +24,8 @@ from deploy.process import Process
 
 _READY_S = 30.0
 # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
-# one in which IMU, heading and light become known while the hand still rests. Poses before that are not judged.
+# one in which cameras already look at the hand, which does not move yet, so that the light is known and a hand found.
+# Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
 _READY_CORE_S, _KNOWN_S, _LEAST_S, _MOST_S = 2.0, 1.0, 4.0, 20.0
 # What draws pictures gives way to what is measured: a real camera costs no processor its time.
 _GIVES_WAY = 4
@@ -166,7 +167,7 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     played = ["--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
     for index, sensor in enumerate(_sensors(settings)):
         clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
-        start = ["--start-offset-ms", str(_LATE_MS * index)]
+        start = ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
         driver = ["imu", "--imu", "synthetic"] if sensor.imu else ["run", "--camera", "synthetic", *start]
         who = ["--name", sensor.name, "--rig", sensor.rig, *tree, "--scene", sensor.scene]
         command = [*driver, *who, *played, *clock, *link]
