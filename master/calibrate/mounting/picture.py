@@ -16,15 +16,16 @@ def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
         RecordingError: The file cannot be written.
     """
     fit, triples = found.fit, found.triples
+    seen = fit.shown + fit.off * fit.sigma  # tips as they were when the laser shone
     figure = figure_of((17.0, 5.4))
     figure.suptitle(found.report[0] + "; " + found.report[1])
     above, image, wrist = figure.subplots(1, 3)
     framed(image, optics, "fingertips (dots), as fitted (rings)")
     for f, colour in enumerate(FINGER_COLOURS[1:]):
         lit, tipped = (np.isfinite(fit.off[:, f, k]) for k in (0, 2))
-        above.plot(*(1e3 * triples.laser_m[lit, f]).T, ".", color=colour, markersize=4)
+        above.plot(*(1e3 * seen[lit, f, :2]).T, ".", color=colour, markersize=4)
         above.plot(*(1e3 * fit.shown[lit, f, :2]).T, "o", color=colour, markerfacecolor="none", markersize=7)
-        image.plot(*triples.tip_uv[tipped, f].T, ".", color=colour, markersize=5)
+        image.plot(*seen[tipped, f, 2:].T, ".", color=colour, markersize=5)
         image.plot(*fit.shown[tipped, f, 2:].T, "o", color=colour, markerfacecolor="none", markersize=8)
     above.set(title="laser points from above [mm]: dots seen, rings fitted", xlabel="across", ylabel="along")
     above.set_aspect("equal")
@@ -33,7 +34,7 @@ def draw_mounting(path: Path, found: Mounting, optics: CameraModel) -> None:
         (fit.bend_rad[:, 1], ORANGE, "deviation"),
         (fit.twist_rad, GREY, "twist, which no wrist has"),
     ):
-        wrist.plot(triples.t_s, np.degrees(values), color=colour, label=name)
+        wrist.plot(triples.t_s, np.degrees(values), ".", color=colour, label=name)
     wrist.set(title="the wrist [deg]", xlabel="time [s]")
     wrist.legend(fontsize=8)
     saved(figure, path)
