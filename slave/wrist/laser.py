@@ -60,7 +60,7 @@ def laser_lines(laser: Image, fingers: Fingers, view: WristView, engine: Engine 
     sigma = _sigma_px(pieces, shown=fingers.shown)
     if seen[0]:
         thumb = np.flatnonzero(finger == 0)
-        beyond = reach.on_plane(points[thumb])[0]
+        beyond = reach.beyond_m(points[thumb])
         off, doubt = beyond_ball(runs, thumb, beyond)
         seen[0] = not (reach.bent and on_ball(beyond))
         uv[0] += off

@@ -63,13 +63,17 @@ class Reach:
         """Whether the laser can be on these fingers (N,) at pixels (N, 2) of the image."""
         column, row = self._cell(uv)
         return self.cells[finger, row // _CELL_PX, column // _CELL_PX] & (
-            (finger == _THUMB) | (self.on_plane(uv)[0] > _BALL_M)
+            (finger == _THUMB) | (self.beyond_m(uv) > _BALL_M)
         )
 
-    def on_plane(self, uv: Float) -> tuple[Float, Float]:
-        """How far (N,) the plane at pixels (N, 2) is beyond the skin of the thumb's MCP, from the thumb's root [m].
+    def beyond_m(self, uv: Float) -> Float:
+        """How far (N,) the plane at pixels (N, 2) is beyond the skin of the thumb's MCP, from the thumb's root [m]."""
+        return self.palm.beyond_m(self._before_palm(uv))
 
-        And its place (N,): beside whose axis, 1 index ... 4 little, and between and beyond them.
+    def on_plane(self, uv: Float) -> tuple[Float, Float]:
+        """`beyond_m` (N,) of pixels (N, 2), and beside whose axis the plane is there (N,): 1 index ... 4 little.
+
+        Between and beyond them by their distances.
         """
         points = self._before_palm(uv)
         return self.palm.beyond_m(points), self.palm.place(points)
