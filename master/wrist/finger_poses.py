@@ -109,6 +109,11 @@ class FingerPoses:
         """Tips (..., 5, 3) [m], palm frame, of angles (..., 5, 4)."""
         return self._tips.points(self._setup.model.chains(angles_rad))
 
+    def tips_of(self, angles_rad: Float, finger: Int) -> Float:
+        """Tips (N, 3) [m], camera frame, of angles (N, 4) of fingers (N,), each its own."""
+        chains = self.chains(angles_rad, finger)
+        return transform(self._setup.T_camera_palm, Fingertips(self._tips.beyond_m[finger]).points(chains))
+
     def views(self, x: Float, wanted: Bool, cut: LaserCut | None = None) -> Views:
         """What is seen of some of the fingers with unknowns (N, 5, 3): the `wanted` (N, 5); NaN of the others."""
         cut = cut or self._cut

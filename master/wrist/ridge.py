@@ -109,7 +109,7 @@ class Ridge:
         J = np.empty((4, *v.shape[1:]))
         J[:2] = v[:2] - v[2] / way[2] * way[:2, None]
         J[2:] = (of_tip[:2] - image[:, None] * of_tip[2]) / tip[2]
-        J = np.ascontiguousarray(np.moveaxis(J, -1, 0))
+        J = np.ascontiguousarray(J.transpose(2, 0, 1))
         broad = shape.radius[np.minimum(stretch, len(shape.radius) - 1), np.arange(len(finger))]
         length = _LENGTH * broad * self._focal_px / np.maximum(q[2], _NEAREST_M)
         flat = self._plane[:2] @ q - self._origin[:, None]
@@ -130,7 +130,7 @@ class Ridge:
 
     def _turned(self, fingers: ShapedFingers) -> Float:
         """Rotations (3, 3, N), first bone -> camera."""
-        return np.ascontiguousarray(np.moveaxis(self._T[:3, :3] @ fingers.rotation, 0, -1))
+        return np.ascontiguousarray((self._T[:3, :3] @ fingers.rotation).transpose(1, 2, 0))
 
     def _moved(
         self, finger: Int, knuckle: Float, q: Float, hinge: Float, tip: Float, turn: Float
@@ -188,4 +188,4 @@ def _points(shape: Shape, laser: Float) -> Float:
 def _cross(a: Float, b: Float) -> Float:
     """Cross products (3, ...)."""
     (ax, ay, az), (bx, by, bz) = a, b
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

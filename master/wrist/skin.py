@@ -81,15 +81,15 @@ class Skin:
 
     def spheres(self, chains: Chains) -> Float:
         """Centres (..., 5, 8, 3) [m] of the spheres, in the frame of the chains."""
-        bone = np.diff(chains.position_m, axis=-2)
-        along = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+        bone = chains.position_m[..., 1:, :] - chains.position_m[..., :-1, :]
+        along = bone / np.sqrt(np.vecdot(bone, bone))[..., None]
         dorsal = chains.rotation[..., :3, :, 1]
         dorsal = dorsal - np.vecdot(dorsal, along)[..., None] * along
-        dorsal = dorsal / np.linalg.norm(dorsal, axis=-1, keepdims=True)
+        dorsal = dorsal / np.sqrt(np.vecdot(dorsal, dorsal))[..., None]
         back = dorsal[..., _BONE, :]
         for sphere in _JOINTS:
             between = dorsal[..., _BONE[sphere] - 1, :] + dorsal[..., _BONE[sphere], :]
-            back[..., sphere, :] = between / np.linalg.norm(between, axis=-1, keepdims=True)
+            back[..., sphere, :] = between / np.sqrt(np.vecdot(between, between))[..., None]
         on_bone = chains.position_m[..., _BONE, :] + _SHARE[:, None] * bone[..., _BONE, :]
         return on_bone + (self.radius_m - self.palmar_m)[..., None] * back
 

@@ -209,11 +209,7 @@ def _near(misfit: Float, finger: Int) -> Int:
 
 def _by_dip(poses: FingerPoses, x: Float, finger: Int) -> Float:
     """How tips move with the DIP alone (N, 2) [1/rad]."""
-    order = np.arange(len(x))
-    many = np.zeros((len(x), 5, UNKNOWNS))
-    many[order, finger] = x
-    angles = poses.angles(many)
-    before = poses.tips(angles)[order, finger]
-    angles[..., DIP] += _NUDGE_RAD
-    after = poses.tips(angles)[order, finger]
+    angles, _ = poses.angles_of(np.concatenate([x, x]), np.concatenate([finger, finger]))
+    angles[len(x) :, DIP] += _NUDGE_RAD
+    before, after = poses.tips_of(angles, np.concatenate([finger, finger])).reshape(2, -1, 3)
     return (after[:, :2] / after[:, 2:] - before[:, :2] / before[:, 2:]) / _NUDGE_RAD
