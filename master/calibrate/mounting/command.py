@@ -51,10 +51,11 @@ def mounting(
 ) -> None:
     """Measure how the wrist device sits on the forearm, how its IMU lies, and how late both clocks are.
 
-    With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers one by one and together, bend the wrist
-    as far one way as the other, and turn the forearm about all its axes. It needs the laser plane, a pose of the palm
-    that is right to a centimetre and ten degrees (the drawing of the device), and the hand file of that hand. Three
-    markers on the back of the hand (rig desk-back3) tell it best. Nothing is written without --out.
+    With the device on, before the marker cameras, for ten seconds, each to and fro about once a second: bend fingers
+    one by one and together, bend the wrist as far one way as the other, and turn the forearm about all its axes. It
+    needs the laser plane, a pose of the palm that is right to a centimetre and ten degrees (the drawing of the
+    device), and the hand file of that hand. Three markers on the back of the hand (rig desk-back3) tell it best.
+    Nothing is written without --out.
 
     Examples:
 
