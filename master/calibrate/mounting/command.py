@@ -63,9 +63,8 @@ def mounting(
 
       phalanx-master calibrate mounting RECORDING --detections found --out calib_json
     """
-    from master.calibrate.mounting.mounting import (
-        calibrate_mounting,
-    )  # scipy.optimize takes a second to import
+    # Imported here: scipy.optimize takes a second.
+    from master.calibrate.mounting.mounting import calibrate_mounting
 
     device = device_of(recording, rig, calibration, out)
     if device.rig.T_camera_palm is None:
