@@ -115,7 +115,7 @@ class WristSide:
 
 
 class FusedPipeline:
-    """Push machine. Holds the marker line, the wrist side, and when the last pose was."""
+    """Push machine. Holds the marker line, the wrist side, and when the cameras last made a pose."""
 
     def __init__(self, markers: MarkerPipeline, side: WristSide, slowest_hz: float) -> None:
         """Join the parts.
@@ -132,7 +132,10 @@ class FusedPipeline:
     def push(self, message: Detections) -> list[SolvedPose]:
         """Take what one camera saw; return the poses it completes, oldest first."""
         if not isinstance(message, WristDetections):
-            return self._told(self._markers.push(message))
+            poses = self._markers.push(message)
+            if poses:
+                self._last_ns = poses[-1].pose.t_ns
+            return self._told(poses)
         seen = self._side.push(message)
         if seen is None or (self._last_ns is not None and seen.t_ns - self._last_ns <= self._silent_ns):
             return []
@@ -153,8 +156,6 @@ class FusedPipeline:
 
     def _told(self, poses: list[SolvedPose]) -> list[SolvedPose]:
         """Poses with what else is known of the hand."""
-        if poses:
-            self._last_ns = poses[-1].pose.t_ns
         return [SolvedPose(self._with_wrist(solved.pose), solved.ready_t_ns) for solved in poses]
 
     def _with_wrist(self, pose: HandPose) -> HandPose:

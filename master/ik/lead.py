@@ -4,8 +4,8 @@ Such a hand is solved elsewhere from one instant to the next whenever another ma
 sensor tells a finger, and when what is told without markers is suddenly else. What is shown goes on as the hand moves,
 and all that leads elsewhere is led in, no faster than a given speed.
 
-How the hand moves meanwhile is told without solving it: the palm goes as those markers go that are seen in both
-instants, that on its back before all others, and everything else at the speed at which it was shown.
+How the hand moves meanwhile is told without solving it: the palm goes as the markers on its back go that are seen in
+both instants, and everything else at half the speed at which it was shown.
 """
 
 from math import exp
@@ -19,9 +19,10 @@ PLACE, TURN, ANGLES = slice(0, 3), slice(3, 6), slice(6, 26)
 PARTS: Int = np.repeat([5, 0, 1, 2, 3, 4], [6, 4, 4, 4, 4, 4])  # signal -> finger, or 5: the palm
 _SUDDEN_M = 3e-3  # from one instant to the next, beside motion
 _SPEED_S = 0.03  # of the shown hand, which is smooth
+_GOES_ON = 0.5  # of it: a motion that is not seen any more rather ends than goes on
 _STALE_S = 0.1  # after such a gap nothing of a speed is left
 _EASE_S = 0.04  # in which the last of what is led fades
-_NOTHING_M = 1e-5
+_LITTLE_M, _NOTHING_M = 1e-3, 1e-5  # a part that is led by more is not yet where its markers are
 
 
 class Lead:
@@ -44,16 +45,15 @@ class Lead:
             points_m: (M, 3) the markers; NaN: not seen.
         """
         if gap_s > 0.0:
-            goes_on = shown + min(gap_s, _STALE_S) * self._speed
-            went = points_m - self._points_m
-            both = np.isfinite(went[:, 0])
-            if both.any() and gap_s <= _STALE_S:
-                goes_on[PLACE] = shown[PLACE] + went[
-                    both & self._on_palm if (both & self._on_palm).any() else both
-                ].mean(axis=0)
+            goes_on = shown + _GOES_ON * min(gap_s, _STALE_S) * self._speed
+            went = (points_m - self._points_m)[self._on_palm]
+            went = went[np.isfinite(went[:, 0])]
+            if len(went) and gap_s <= _STALE_S:
+                goes_on[PLACE] = shown[PLACE] + went.mean(axis=0)
             off = np.sqrt(np.bincount(PARTS, np.square(goes_on - solved - self._offset)))
             placed = (rests & self._rests & BY_MARKERS) > 0
-            leaps = ((rests != self._rests) | ~placed) & (off > _SUDDEN_M)
+            led = np.bincount(PARTS, np.abs(self._offset)) > _LITTLE_M
+            leaps = ((rests != self._rests) | ~placed | led) & (off > _SUDDEN_M)
             self._offset = np.where(leaps[PARTS], goes_on - solved, self._offset)
             size_m = np.maximum(np.bincount(PARTS, np.abs(self._offset)), _NOTHING_M)
             self._offset = (

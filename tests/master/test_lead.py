@@ -20,7 +20,7 @@ class Shown:
     def push(self, place: float, rests: int, marker: float = np.nan) -> float:
         """What is shown of a place that was solved, by a marker on the back that is seen there."""
         solved, points = np.zeros(26), np.full((2, 3), np.nan)
-        solved[0], points[1] = place, marker
+        solved[0], points[1] = place, (marker, 0.0, 0.0)
         before = self.values[0]
         self.values = solved + self.lead.push(self.gap_s, np.full(6, rests), self.values, solved, points)
         self.lead.moved(self.gap_s, np.append(self.values[0] - before, np.zeros(25)))
