@@ -12,9 +12,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandJoints, HandModel
+from common.messages import Level
 from master.ik.attached import Attached
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
@@ -29,6 +30,7 @@ _ACROSS = 0.9  # cosine to the sight, at most
 EXPLAINED = 16.3  # chi square of three numbers, 1 in 1000
 _BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins: open to closed
 _SHOWS_RAD = np.radians(45.0)  # a finger bent by less in all its joints shows its end from behind
+_PIP = 2  # of a finger's four angles
 _MIND_S = 0.3  # how fast a hand may change from habits to none
 
 
@@ -189,6 +191,13 @@ class HandSolver:
         habits = self._habits(told, like)
         # Where a hidden finger was held is a memory, not what this instant tells.
         alone = habits if told.hidden is None else self._priors[frozenset()]
+        if told.others is not None and self.model.mcp_per_pip is not None:
+            lit = self._by_laser(told.others, told.seen)
+            if len(lit):
+                habits, alone = (
+                    prior.without_single(lit, self.priors.pip_mean, self.priors.pip)
+                    for prior in (habits, alone)
+                )
         problem = self._problem(told, habits)
         last, near, points = told.last, told.near, told.points_m
         if last is not None:
@@ -202,6 +211,13 @@ class HandSolver:
                 return found
         best = problem.minimise(*self._seeds(points, told), told.enough)
         return self._solution(problem, alone, best, points)
+
+    def _by_laser(self, others: SensedHand, seen: Bool) -> Int:
+        """Columns of PIPs of fingers that a laser point alone tells: they bend as their knuckles do, not as hands do."""
+        lit = others.told & (others.level == Level.FK)
+        lit[self._attached.finger[seen & self._attached.on_finger[:, 0]]] = False
+        lit[0] = False  # a thumb has other habits
+        return np.flatnonzero(lit[self.parameters.free // 4] & (self.parameters.free % 4 == _PIP))
 
     def _problem(self, told: _Told, habits: AnglePrior) -> HandProblem:
         last, seen = told.last, told.seen

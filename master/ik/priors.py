@@ -136,6 +136,14 @@ class AnglePrior:
         constant = self.constant + 0.5 * float(pull @ mean)
         return AnglePrior(normal, self.pull + pull, constant, self.log_density)
 
+    def without_single(self, columns: Int, mean: float, sigma: float) -> "AnglePrior":
+        """The same, but the first hypothesis without the belief about each of these angles by itself that it holds."""
+        normal, pull, constant = self.normal.copy(), self.pull.copy(), self.constant.copy()
+        normal[0, columns, columns] -= 1.0 / sigma**2
+        pull[0, columns] -= mean / sigma**2
+        constant[0] -= 0.5 * len(columns) * (mean / sigma) ** 2
+        return AnglePrior(normal, pull, constant, self.log_density)
+
     def of_hypothesis(self, which: Int | int) -> "AnglePrior":
         """That of one hypothesis, or of several (S,), one for each search."""
         return AnglePrior(self.normal[which], self.pull[which], self.constant[which], self.log_density[which])
