@@ -213,7 +213,7 @@ class HandSolver:
         return self._solution(problem, alone, best, points)
 
     def _by_laser(self, others: SensedHand, seen: Bool) -> Int:
-        """Columns of PIPs of fingers that a laser point alone tells: they bend as their knuckles do, not as hands do."""
+        """Columns of the PIPs of fingers that a laser point alone tells: they bend as their knuckles do."""
         lit = others.told & (others.level == Level.FK)
         lit[self._attached.finger[seen & self._attached.on_finger[:, 0]]] = False
         lit[0] = False  # a thumb has other habits
