@@ -35,6 +35,7 @@ _BAD_FIT_M = 8e-3
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _PALM_BY_MARKERS = 3
+_OBSERVED_M = 0.010  # standard deviation, all axes together
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
 _GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
 
@@ -328,6 +329,9 @@ class HandTracker:
         rests[self._finger[seen & on_finger]] += ON_MARKERS
         rests[self._finger[placed & on_finger]] += BY_MARKERS
         source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
+        if others is not None:
+            # Sights through a wrist that bends may leave a joint anywhere: that is not to observe it.
+            tracked &= np.trace(solution.cov_m2, axis1=1, axis2=2) < _OBSERVED_M**2
         return TrackedHand(solution, valid, tracked & valid, source, rests)
 
 
