@@ -15,7 +15,7 @@ _EXAMPLES = {
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
   phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
   phalanx demo --scene grasp                    both at once, while a hand closes round a bar: cameras lose its fingers
-  phalanx demo --scene grasp --rig desk         the same without the wrist device, to compare
+  phalanx demo --scene grasp --rig desk-back3   the same without the wrist device, to compare
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _demo(options: argparse.Namespace) -> int:
     together = options.scene.partition("@")[0] in TOGETHER
-    rigs = options.rigs or (("desk", "wrist") if together else ("desk",))
+    rigs = options.rigs or (("desk-back3", "wrist-back3") if together else ("desk",))
     settings = DemoSettings(
         options.seconds,
         options.headless,
@@ -147,7 +147,8 @@ def _parser() -> argparse.ArgumentParser:
         dest="rigs",
         action="append",
         metavar="NAME",
-        help="once for each that runs; default: desk, for scenes of both kinds desk and wrist",
+        help="once for each that runs; default: desk, for scenes of both kinds desk-back3 (three markers on the back "
+        "tell how the palm lies) and wrist-back3 of the same hand; --rig desk --rig wrist has one",
     )
     rig.add_argument(
         "--wrist", dest="rigs", action="store_const", const=["wrist"], help="the wrist device: --rig wrist"

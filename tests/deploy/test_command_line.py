@@ -258,7 +258,7 @@ def test_two_hands_are_played_each_by_its_own_scene(tmp_path: Path) -> None:
     ("words", "rigs"),
     [
         ([], ("desk",)),
-        (["--scene", "grasp@dark"], ("desk", "wrist")),
+        (["--scene", "grasp@dark"], ("desk-back3", "wrist-back3")),
         (["--scene", "grasp", "--rig", "desk"], ("desk",)),
         (["--wrist", "--scene", "grasp"], ("wrist",)),
     ],

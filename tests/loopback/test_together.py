@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "deploy", "demo", "--scene", "grasp", "--headless", "--seconds", "5"]
+    command = [sys.executable, "-m", "deploy", "demo", "--scene", "grasp", "--headless", "--seconds", "8"]
     demo = subprocess.Popen(
         [*command, "--out", str(tmp_path)],
         cwd=ROOT,
@@ -33,7 +33,7 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     for line in demo.stdout:
         heard.append(line)
         pids = pids or {name: int(pid) for name, pid in re.findall(r"(\w+) \(pid (\d+)\)", line)}
-        if re.search(r"[234] of 5 s", line) and not killed_ns:
+        if re.search(r"[567] of 8 s", line) and not killed_ns:
             killed_ns = time.monotonic_ns()
             os.kill(pids["wrist"], signal.SIGKILL)
     said = "".join(heard)
@@ -57,6 +57,6 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     for name in ("hand.png", "run.rrd", "poses.npz", *(f"{name}.log" for name in pids)):
         assert (tmp_path / name).stat().st_size > 0, name
     poses = load_poses(tmp_path / "poses.npz")
-    assert poses.marker_count == 6
+    assert poses.marker_count == 8
     assert (np.diff(poses.t_ns) > 0).all()
     assert (poses.t_ns > killed_ns).sum() > 5, "the hand is tracked by what is left"

@@ -90,6 +90,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
     published = asker.subscribe("hand")
     try:
         assert all(end.wait_for_start(10.0) for end in ends.values())
+        asker.ask(Command("master", "report"), 5.0)  # who is answered is subscribed
         for seq in range(20):
             t_ns = clock.now_ns()
             for name in ("left", "right"):
