@@ -41,6 +41,7 @@ _WRIST_YAW, _WRIST_PITCH = np.deg2rad(30.0), np.deg2rad(58.0)
 _RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
 _STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
 _LINE = 52  # letters of what was tracked that fit in one line beside the figures
+_HALF_LINE = 36  # and beside nine of them
 # Key figures of the summary, in the order of importance: key, what it says, format.
 _FIGURES = (
     ("poses_per_s", "poses / s", "{:.1f}"),
@@ -120,12 +121,13 @@ def _header(
     figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
     worn = [wrist.rig] if wrist is not None and wrist.in_rig else []
     count = len(rig.cameras) + len(worn)
-    cameras, hand = (
-        f"rig {' and '.join([rig.name, *worn])} · {count} camera{'s' if count > 1 else ''}",
-        f"hand {model.profile.name} ({model.profile.side})",
-    )
-    what = cameras + (" · " if len(cameras + hand) <= _LINE else "\n") + hand
-    figure.text(0.019, 0.897, what, color=INK, alpha=0.75, size=12, va="center")
+    rigs, cameras = f"rig {' and '.join([rig.name, *worn])}", f"{count} camera{'s' if count > 1 else ''}"
+    hand = f"hand {model.profile.name} ({model.profile.side})"
+    watched = f"{rigs} · {cameras}"
+    if len(watched) > _HALF_LINE:
+        watched = f"{rigs}\n{cameras}"
+    what = watched + (" · " if len(watched + hand) <= _LINE else "\n") + hand
+    figure.text(0.019, 0.925, what, color=INK, alpha=0.75, size=12, va="top")
     shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary]
     for i, (label, value) in enumerate(reversed(shown)):
         x = 0.945 - i * 0.0845
