@@ -22,6 +22,7 @@ from master.wrist.bend_slope import SightWorth
 from master.wrist.fingers import SeenFingers
 
 REACH_NS = 70_000_000  # two triples at 30 Hz: a finger that was told longer ago is not seen now
+_OWN_NS = 17_000_000  # half of the time from triple to triple
 _WALK_RAD_S, _SHARE = 0.7, 0.5
 _FASTEST_RAD_S = 10.0
 _FLESH_RAD = np.radians(2.5)
@@ -63,8 +64,9 @@ class TrackedFingers:
 class FingerTrack:
     """Push machine. Holds what the last few triples said."""
 
-    def __init__(self) -> None:
-        """Begin without any."""
+    def __init__(self, *, continuous: bool = True) -> None:
+        """Begin without any; where instants are unrelated poses a finger is as the one triple says that is its own."""
+        self._continuous = continuous
         self._said: deque[TrackedFingers] = deque(maxlen=4)
 
     def push(self, seen: SeenFingers, bend_rad: Float) -> None:
@@ -96,6 +98,9 @@ class FingerTrack:
 
     def at(self, t_ns: int) -> TrackedFingers | None:
         """The fingers at an instant; None: no triple is near enough."""
+        if not self._continuous:
+            own = min(self._said, key=lambda said: abs(said.t_ns - t_ns), default=None)
+            return None if own is None or abs(own.t_ns - t_ns) > _OWN_NS else replace(own, t_ns=t_ns)
         near = [said for said in self._said if abs(said.t_ns - t_ns) <= REACH_NS]
         before = [said for said in near if said.t_ns <= t_ns]
         after = [said for said in near if said.t_ns > t_ns]

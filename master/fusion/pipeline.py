@@ -46,10 +46,12 @@ class WristSide:
         seen: The last triple.
     """
 
-    def __init__(self, wrist: WristFingers, forearm: Forearm | None, parameters: HandParameters) -> None:
+    def __init__(
+        self, wrist: WristFingers, forearm: Forearm | None, parameters: HandParameters, *, continuous: bool
+    ) -> None:
         """Join device and forearm; None: the device has no IMU, or it is not known how that is mounted."""
         self._wrist, self.forearm, self._parameters = wrist, forearm, parameters
-        self._track = FingerTrack()
+        self._track, self._continuous = FingerTrack(continuous=continuous), continuous
         self.seen: SeenFingers | None = None
         self._solved: tuple[int, Float] = -(2**62), _NO_ANGLES
 
@@ -64,13 +66,13 @@ class WristSide:
         """
         wrist = WristFingers(setup, counts, continuous=continuous, stage=stage)
         forearm = None if setup.imu is None or not setup.imu.placed else Forearm(setup.imu, counts)
-        return cls(wrist, forearm, HandParameters.of(setup.model))
+        return cls(wrist, forearm, HandParameters.of(setup.model), continuous=continuous)
 
     def push(self, message: WristDetections) -> SeenFingers | None:
         """Take a triple; None: it is late."""
         bend, _cov = self.bend(message.t_ns)
         last_ns, expected = self._solved
-        fresh = abs(message.t_ns - last_ns) <= _EXPECTED_NS
+        fresh = self._continuous and abs(message.t_ns - last_ns) <= _EXPECTED_NS
         seen = self._wrist.push(message, bend, expected if fresh else None)
         if seen is not None:
             self._track.push(seen, bend)

@@ -93,3 +93,12 @@ def test_what_fits_no_finger_says_nothing_and_of_two_poses_the_whole_doubt_count
     left = found.left().angles
     assert not left[1].any()
     assert left[2, 2, 2] == pytest.approx(1.0 / (0.04 + 1.0 / 400.0))
+
+
+def test_of_unrelated_poses_each_has_its_own_triple() -> None:
+    track = FingerTrack(continuous=False)
+    for k in range(3):
+        track.push(triple(k, 0.4 * k), STRAIGHT)
+    np.testing.assert_allclose(pip(track, round(1.4 * TRIPLE_NS)), 0.4)
+    np.testing.assert_allclose(pip(track, round(2.4 * TRIPLE_NS)), 0.8)
+    assert track.at(3 * TRIPLE_NS) is None
