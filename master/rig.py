@@ -332,7 +332,7 @@ def build_pipeline(
     others: OtherSensors | None = None,
     counts: Counter[str] | None = None,
 ) -> MarkerPipeline:
-    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used.
+    """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `others`.
 
     Args:
         setup: The rig.
@@ -372,10 +372,10 @@ def build_pipeline(
 def pipeline_of(
     setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
 ) -> Pipeline:
-    """The pipeline of a rig of either kind; arguments and errors as of `build_pipeline`, a wrist device has no tracker.
+    """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
-    It takes what the cameras of its own kind of rig send, and nothing else is ever pushed: the link refuses a camera
-    that sends what those of the other kind do.
+    A wrist device alone has no tracker. What is pushed is of cameras of these rigs: the link refuses one that sends what
+    those of the other kind do.
     """
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))

@@ -50,17 +50,11 @@ class Minima:
 
     Attributes:
         x_rad: (5, K, 3) abduction, flexion, PIP.
-        cov_rad2: (5, K, 3, 3).
         misfit: (5, K) the energy, a chi-square of SEEN - UNKNOWNS degrees of freedom where nothing is at its limit.
-        length_px: (5, K) of the laser line there.
-        midway: (5, K) misfit half way from the best to each: little more than of these, and there is one wide valley.
     """
 
     x_rad: Float
-    cov_rad2: Float
     misfit: Float
-    length_px: Float
-    midway: Float
 
 
 class InverseModel:
@@ -101,7 +95,7 @@ class InverseModel:
         found = self._refined(x[keep], finger[keep], seen, white, np.fmax(0.5 * coarse, _ARRIVED_RAD), exact)
         if exact.any():
             found = self._search(found, exact, seen, white)
-        return self._minima(found, seen, white)
+        return _minima(found)
 
     def _dips(self, seen: Float, told: Bool, white: Float) -> tuple[Float, Int]:
         """Where the least energy for each PIP has its minima over the PIP: poses (N, 3) and their fingers (N,)."""
@@ -154,24 +148,6 @@ class InverseModel:
             moving &= ~short & (best < least[finger] + _BEATEN)
         return Found(best_x, finger, best, length, best_J)
 
-    def _minima(self, found: Found, seen: Float, white: Float) -> Minima:
-        """Those of each finger in their order, with what is told of them."""
-        found = found.of(np.lexsort((found.misfit, found.finger)))
-        finger = found.finger
-        slot = np.arange(len(finger)) - np.searchsorted(finger, finger)
-        middle = 0.5 * (found.x_rad + found.x_rad[np.searchsorted(finger, finger)])
-        y, J, _ = self.table.views(middle, finger)
-        midway, _ = self._step(middle, finger, white[finger], seen[finger] - y, J)
-        return _table_of(
-            finger,
-            slot,
-            x_rad=found.x_rad,
-            cov_rad2=self._cov(found.J, white[finger], finger),
-            misfit=found.misfit,
-            length_px=found.length_px,
-            midway=midway,
-        )
-
     def _step(
         self, x: Float, finger: Int, white: Float, off: Float, J: Float, bend: bool = True
     ) -> tuple[Float, Float]:
@@ -192,22 +168,15 @@ class InverseModel:
         to = np.linalg.solve(H, np.where(stuck, 0.0, down)[..., None])[..., 0]
         return energy, np.clip(x + np.clip(to, -_FARTHEST_RAD, _FARTHEST_RAD), low, high) - x
 
-    def _cov(self, J: Float, white: Float, finger: Int) -> Float:
-        """Covariances (N, 3, 3) of unknowns at derivatives (N, 4, 3)."""
-        slope = white @ J
-        information = np.swapaxes(slope, 1, 2) @ slope
-        np.einsum("nii->ni", information)[...] += self._loose[finger]
-        return np.asarray(np.linalg.inv(information), np.float64)
 
-
-def _table_of(finger: Int, slot: Int, **values: Float) -> Minima:
-    """Values (N, ...) of minima in their places, as many of each finger."""
-    empty = {"misfit": np.inf, "midway": np.inf}
-    table: dict[str, Float] = {}
-    for name, value in values.items():
-        table[name] = np.full((5, MINIMA, *value.shape[1:]), empty.get(name, np.nan))
-        table[name][finger, slot] = value
-    return Minima(**table)
+def _minima(found: Found) -> Minima:
+    """Those of each finger in their order, as many of each."""
+    found = found.of(np.lexsort((found.misfit, found.finger)))
+    finger = found.finger
+    slot = np.arange(len(finger)) - np.searchsorted(finger, finger)
+    x, misfit = np.full((5, MINIMA, found.x_rad.shape[1]), np.nan), np.full((5, MINIMA), np.inf)
+    x[finger, slot], misfit[finger, slot] = found.x_rad, found.misfit
+    return Minima(x, misfit)
 
 
 def _mended(J: Float, by: Float, did: Float) -> Float:
