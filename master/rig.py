@@ -374,8 +374,8 @@ def pipeline_of(
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
-    A wrist device alone has no tracker. What is pushed is of cameras of these rigs: the link refuses one that sends what
-    those of the other kind do.
+    A wrist device alone has no tracker. What is pushed is of cameras of these rigs: the link refuses one that sends
+    what those of the other kind do.
     """
     if setup.wrist is None:
         return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
