@@ -21,11 +21,13 @@ from common.calibration_parts import (
     Number,
     Part,
     Positive,
+    Provenance,
     Quaternion,
     Vector3,
 )
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, Name
+from common.object_profile import ObjectProfile, check_object, check_pose
 from common.replacing import replacing
 from common.strobe_calibration import StrobeCalibration, check_strobe
 from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, check_flat_field, check_wrist
@@ -60,19 +62,6 @@ class HsvRange(Part, frozen=True):
     hsv_low: Hsv
     hsv_high: Hsv
     reference_bgr_linear: tuple[LinearLight, LinearLight, LinearLight] | None = None
-
-
-class Provenance(Part, frozen=True):
-    """Where a measured part of a file comes from: when, by what, from which data, and how well the fit agrees.
-
-    `residual`: quantity with its unit -> value, such as rms_px.
-    """
-
-    date: Annotated[str, Meta(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ(?!\n)$")]
-    tool: str
-    data: tuple[str, ...]
-    residual: dict[str, Number]
-    note: str = ""
 
 
 class CameraCalibration(Part, frozen=True):
@@ -154,6 +143,9 @@ class RigCalibration(Part, frozen=True):
     """rigs/<name>.json: which cameras, where, which markers, which depth model, whose hand.
 
     `free_markers` are those of `markers` that sit on no hand: they are placed and filtered, no hand is fitted to them.
+    `objects`: files of the objects that are tracked; their markers are free ones. `T_rig_tracking`: where the frame of
+    a system whose devices track themselves (Lighthouse) lies in the rig. `gestures`: file of what counts as a gesture;
+    null: as calib_json/gestures/default.json has it.
     `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
     `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
@@ -171,9 +163,12 @@ class RigCalibration(Part, frozen=True):
     hand: Name
     markers: Markers = ("thumb", "index", "middle", "ring", "little", "back")
     free_markers: tuple[Name, ...] = ()
+    objects: tuple[Name, ...] = ()
     other_hands: tuple[Name, ...] = ()
     T_rig_camera: dict[Name, Matrix4] = {}
     T_world_rig: Matrix4 | None = None
+    T_rig_tracking: Matrix4 | None = None
+    gestures: Name | None = None
     depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
     power_law: PowerLawCalibration | None = None
     affine_disparity: AffineDisparityCalibration | None = None
@@ -326,6 +321,8 @@ def check(value: Struct, where: str) -> None:
     """
     if isinstance(value, RigCalibration):
         _check_rig(value, where)
+    elif isinstance(value, ObjectProfile):
+        check_object(value, where)
     elif isinstance(value, CameraCalibration):
         for name, colour in (value.markers or {}).items():
             for i, letter in ((1, "S"), (2, "V")):
@@ -358,32 +355,26 @@ def _check_rig(rig: RigCalibration, where: str) -> None:
     if rig.kind == "wrist":
         if len(rig.cameras) != 1:
             raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")
-        for key in ("other_hands", "T_world_rig"):
+        for key in ("other_hands", "T_world_rig", "objects", "T_rig_tracking"):
             if getattr(rig, key):
                 raise CalibrationError(f"{where}: {key}: of marker rigs; a wrist device is worn by one hand")
         return
     if len({rig.hand, *rig.other_hands}) != 1 + len(rig.other_hands):
         raise CalibrationError(f"{where}: other_hands: a hand stands twice")
-    if rig.T_world_rig is not None:
-        _check_pose(np.array(rig.T_world_rig), f"{where}: T_world_rig")
+    if len(set(rig.objects)) != len(rig.objects):
+        raise CalibrationError(f"{where}: objects: a name stands twice")
+    for key, pose in (("T_world_rig", rig.T_world_rig), ("T_rig_tracking", rig.T_rig_tracking)):
+        if pose is not None:
+            check_pose(np.array(pose), f"{where}: {key}")
     # None at all: a rig that is still to be measured.
     for camera in rig.cameras if rig.T_rig_camera else ():
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
-        _check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
+        check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
         )
-
-
-def _check_pose(pose: Float, where: str) -> None:
-    """Refuse a matrix (4, 4) that is no rotation and shift."""
-    turned = pose[:3, :3]
-    if not np.allclose(turned @ turned.T, np.eye(3), atol=1e-4) or np.linalg.det(turned) < 0:
-        raise CalibrationError(f"{where}: upper left 3x3 is not a rotation")
-    if not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
-        raise CalibrationError(f"{where}: last row must be 0 0 0 1")
 
 
 def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> None:

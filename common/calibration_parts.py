@@ -15,3 +15,16 @@ Matrix4 = tuple[Row4, Row4, Row4, Row4]
 
 class Part(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=False):
     """Base of every calibration type."""
+
+
+class Provenance(Part, frozen=True):
+    """Where a measured part of a file comes from: when, by what, from which data, and how well the fit agrees.
+
+    `residual`: quantity with its unit -> value, such as rms_px.
+    """
+
+    date: Annotated[str, Meta(pattern=r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ(?!\n)$")]
+    tool: str
+    data: tuple[str, ...]
+    residual: dict[str, Number]
+    note: str = ""

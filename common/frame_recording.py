@@ -20,6 +20,7 @@ from msgspec import Struct
 from common.calibration import CameraCalibration, RigCalibration, check, load
 from common.errors import CalibrationError, RecordingError
 from common.messages import TimeNs
+from common.object_profile import ObjectProfile
 
 MANIFEST = "recording.json"
 FRAMES = "frames.csv"
@@ -58,6 +59,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
         clicks: Camera -> marker -> (u, v) [px] of a pixel on that marker in the first frame.
         continuous: False: frames are unrelated poses, each solved afresh.
         clock: The clock of all `t_ns`; None: not known.
+        objects: Object name -> the object file's content, of the objects that the rigs name.
     """
 
     version: Literal[1]
@@ -69,6 +71,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     continuous: bool = True
     note: str = ""
     clock: RecordedClock | None = None
+    objects: dict[str, ObjectProfile] = {}
 
     @property
     def all_rigs(self) -> tuple[RigCalibration, ...]:

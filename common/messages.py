@@ -11,17 +11,18 @@ from copy import copy
 from enum import IntEnum
 from functools import cache
 from math import isinf, nan
-from typing import Annotated, TypeAlias, cast
+from typing import Annotated, Literal, TypeAlias, cast
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct, field
 
-from common.arrays import Bool, Code, Float
+from common.arrays import Bool, Code, Float, Ids
 from common.errors import MessageError
 
-WIRE_VERSION = 7
+WIRE_VERSION = 8
 MAX_MARKERS = 48
+MAX_TAGS = 16  # in one frame: their corners fit one Ethernet packet
 JOINT_COUNT = 26
 FINGER_COUNT = 5
 MAX_PREVIEW_BYTES = 256 * 1024
@@ -51,6 +52,20 @@ class Level(IntEnum):
     NONE = 0
     FK = 1
     IK = 2
+
+
+class ObjectSource(IntEnum):
+    """What the pose of an object comes from."""
+
+    NONE = 0
+    MARKERS = 1
+    TAGS = 2
+    TRACKER = 3
+    HELD = 4
+
+
+GestureKind = Literal["pose", "pinch", "dial", "tap", "point"]
+Phase = Literal["begin", "update", "end"]
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
@@ -159,6 +174,69 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
                 raise ValueError(
                     f"{what}_sigma_px: must be positive where {what}_uv is seen and NaN elsewhere"
                 )
+
+
+class TagDetections(Message, frozen=True, eq=False, tag=True):
+    """The fiducial tags (AprilTag, ArUco) that one camera found in one frame. Not every frame needs to be searched.
+
+    Attributes:
+        camera: Camera name, a member of the rig's `cameras`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of this camera; it may rise by more than one.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the frame was handed to the slave [ns], same clock as `t_ns`.
+        ids: (N,) their numbers in the family, rising.
+        uv: (N, 4, 2) corners [px], distorted image, (0, 0) = centre of the top-left pixel; of the tag as printed top
+            left, top right, bottom right, bottom left.
+        sigma_px: (N,) standard deviation per axis of the corners.
+        t_sigma_ns: Standard deviation of `t_ns` [ns], as in `MarkerDetections`.
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    ids: Ids
+    uv: Float
+    sigma_px: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if n > MAX_TAGS:
+            raise ValueError(f"{n} tags, at most {MAX_TAGS}")
+        _freeze(self, "ids", np.uint16, (n,))
+        _freeze(self, "uv", np.float64, (n, 4, 2))
+        _freeze(self, "sigma_px", np.float64, (n,))
+        if (self.ids[1:] <= self.ids[:-1]).any():
+            raise ValueError("ids: must rise, each once")
+        if np.isnan(self.uv).any() or not (self.sigma_px > 0.0).all():
+            raise ValueError("uv, sigma_px: a tag that was found has corners and a positive sigma")
+
+
+class TrackerPose(Message, frozen=True, eq=False, tag=True):
+    """Where a device that tracks itself (a Vive tracker under Lighthouse) says it is, in its system's own frame.
+
+    Attributes:
+        source: Name of the device, the `tracker` of an object file.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Pose counter of this device; a gap is a dropped pose.
+        t_ns: When the pose holds [ns], sender's clock until `ingest`, then the master's.
+        position_m: (3,) of the device [m], frame of its system. NaN: it has lost itself.
+        orientation_wxyz: (4,) quaternion, device axes -> its system's. NaN: it has lost itself.
+    """
+
+    source: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+
+    def __post_init__(self) -> None:
+        _freeze(self, "position_m", np.float64, (3,))
+        _freeze(self, "orientation_wxyz", np.float64, (4,))
 
 
 class ImuSample(Message, frozen=True, eq=False, tag=True):
@@ -285,6 +363,122 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
         _freeze(self, "wrist_bend_sigma_rad", np.float64, (2,))
 
 
+class ObjectPose(Message, frozen=True, eq=False, tag=True):
+    """One rigid object at one instant.
+
+    Attributes:
+        object: Name of the object file.
+        t_ns: The instant at which the pose holds [ns], master's clock.
+        position_m: (3,) of the object's own frame [m], rig frame. NaN: never seen yet, or not for long.
+        orientation_wxyz: (4,) unit quaternion, object axes -> rig frame. NaN with the position.
+        cov: (6, 6) of position [m] and of a small turn about the rig's axes [rad]. NaN: unknown.
+        residual_m: Root mean square by which what was measured misses the object in this pose [m]. NaN: not measured.
+        source: `ObjectSource` code.
+        tracked: The pose is measured now, not held.
+        seen: How many of its features (markers, tags) the pose rests on.
+        expected: How many would be seen by some camera, as it is turned, with nothing before it.
+        occluded: Something hides a part of it: fewer are seen than expected.
+        latency_ns: From the hand-over of the last contributing frame to its slave, to the publication of this pose
+            [ns]; 0 in an offline run.
+    """
+
+    object: Name
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+    cov: Float
+    residual_m: float
+    source: Annotated[int, Meta(ge=0, le=int(max(ObjectSource)))]
+    tracked: bool
+    seen: Annotated[int, Meta(ge=0, le=MAX_MARKERS)]
+    expected: Annotated[int, Meta(ge=0, le=MAX_MARKERS)]
+    occluded: bool
+    latency_ns: TimeNs = 0
+
+    def __post_init__(self) -> None:
+        _freeze(self, "position_m", np.float64, (3,))
+        _freeze(self, "orientation_wxyz", np.float64, (4,))
+        _freeze(self, "cov", np.float64, (6, 6))
+        if self.residual_m < 0.0 or isinf(self.residual_m):
+            raise ValueError(f"residual_m: {self.residual_m}: must be 0 or more, or NaN")
+
+
+class Contact(Message, frozen=True, eq=False, tag=True):
+    """How near a hand is to an object, and where it touches it.
+
+    Attributes:
+        hand: Name of the hand profile.
+        object: Name of the object file.
+        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        distance_m: (5,) from the skin of the last segment of thumb ... little to the surface of the object [m],
+            negative inside. NaN: finger or object is not known.
+        sigma_m: (5,) standard deviations of these.
+        point_m: (5, 3) the point of the object's surface that is nearest to each [m], rig frame.
+        touching: (5,) the finger touches: with hysteresis, so that it does not flicker.
+        palm_distance_m: From the palm's skin to the surface [m].
+        held: The hand has a grip of it: the thumb or the palm, and a finger against them.
+    """
+
+    hand: Name
+    object: Name
+    t_ns: TimeNs
+    distance_m: Float
+    sigma_m: Float
+    point_m: Float
+    touching: Bool
+    palm_distance_m: float
+    held: bool
+
+    def __post_init__(self) -> None:
+        _freeze(self, "distance_m", np.float64, (FINGER_COUNT,))
+        _freeze(self, "sigma_m", np.float64, (FINGER_COUNT,))
+        _freeze(self, "point_m", np.float64, (FINGER_COUNT, 3))
+        _freeze(self, "touching", np.bool_, (FINGER_COUNT,))
+        if isinf(self.palm_distance_m):
+            raise ValueError("palm_distance_m: infinite value")
+
+
+class Gesture(Message, frozen=True, eq=False, tag=True):
+    """What a hand says. One that lasts begins, is repeated with every pose of the hand, and ends.
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        kind: `pose` (the hand is held in a shape), `pinch` (thumb and a finger), `dial` (a grip that turns), `tap`
+            (the thumb on a part of a finger; begins and ends in one message of phase `end`), `point` (a ray).
+        name: Which one: the pose (open_palm, counting_two, pointing, small_grasp, large_grasp, pinch, or one that was
+            taught); of a pinch the finger; of a tap the key (0 ... 9, star, hash); else the kind again.
+        phase: begin, update, end.
+        began_t_ns: When it began [ns], same clock as `t_ns`.
+        confidence: 0..1.
+        distance_m: Of a pinch: between the skin of thumb and finger [m].
+        strength: Of a pinch: 0 (open) .. 1 (closed).
+        angle_rad: Of a dial: by how much it was turned since it began, clockwise as the user sees the back of the hand.
+        origin_m: (3,) of a pointing ray [m], rig frame; of a pinch the middle between the two; of a dial its centre.
+        direction: (3,) unit vector of a pointing ray, rig frame; of a dial its axis.
+    """
+
+    hand: Name
+    t_ns: TimeNs
+    kind: GestureKind
+    name: Name
+    phase: Phase
+    began_t_ns: TimeNs
+    confidence: Annotated[float, Meta(ge=0.0, le=1.0)]
+    distance_m: float = nan
+    strength: float = nan
+    angle_rad: float = nan
+    origin_m: Float = field(default_factory=lambda: _NO_POINT)
+    direction: Float = field(default_factory=lambda: _NO_POINT)
+
+    def __post_init__(self) -> None:
+        _freeze(self, "origin_m", np.float64, (3,))
+        _freeze(self, "direction", np.float64, (3,))
+        for name in ("distance_m", "strength", "angle_rad"):
+            if isinf(getattr(self, name)):
+                raise ValueError(f"{name}: infinite value")
+
+
 class Health(Message, frozen=True, eq=False, tag=True):
     """What a process counted since it started.
 
@@ -356,8 +550,21 @@ class Still(Message, frozen=True, eq=False, tag=True):
 
 
 Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera sends, of either kind
+Told: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it
 AnyMessage: TypeAlias = (
-    MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still
+    MarkerDetections
+    | WristDetections
+    | TagDetections
+    | TrackerPose
+    | ImuSample
+    | HandPose
+    | ObjectPose
+    | Contact
+    | Gesture
+    | Health
+    | Command
+    | Preview
+    | Still
 )
 
 _JPEG_START = b"\xff\xd8\xff"
@@ -365,12 +572,24 @@ _NONE = np.empty((0, 2))
 _NO_LASER = np.full((FINGER_COUNT, 3), np.nan)
 _NO_LEVEL = np.zeros(FINGER_COUNT, dtype=np.uint8)
 _NOT_AMBIGUOUS = np.zeros(FINGER_COUNT, dtype=np.bool_)
-_NO_ROTATION, _NO_SIGMA = np.full(4, np.nan), np.full(2, np.nan)
-for _nothing in (_NO_LASER, _NO_LEVEL, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA):
+_NO_ROTATION, _NO_SIGMA, _NO_POINT = np.full(4, np.nan), np.full(2, np.nan), np.full(3, np.nan)
+for _nothing in (_NO_LASER, _NO_LEVEL, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA, _NO_POINT):
     _nothing.flags.writeable = False
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(
-    MarkerDetections | WristDetections | ImuSample | HandPose | Health | Command | Preview | Still,
+    MarkerDetections
+    | WristDetections
+    | TagDetections
+    | TrackerPose
+    | ImuSample
+    | HandPose
+    | ObjectPose
+    | Contact
+    | Gesture
+    | Health
+    | Command
+    | Preview
+    | Still,
     dec_hook=lambda kind, raw: _from_bytes(kind, raw),
 )
 
@@ -399,10 +618,10 @@ def decode(data: bytes | memoryview) -> AnyMessage:
 def _to_bytes(array: object) -> bytes:
     if not isinstance(array, np.ndarray):
         raise NotImplementedError(f"cannot encode {type(array)}")
-    return np.ascontiguousarray(cast(Float | Bool | Code, array)).tobytes()
+    return np.ascontiguousarray(cast(Float | Bool | Code | Ids, array)).tobytes()
 
 
-_WIRE_DTYPE = {Float: np.dtype("<f8"), Bool: np.dtype("?"), Code: np.dtype("u1")}
+_WIRE_DTYPE = {Float: np.dtype("<f8"), Bool: np.dtype("?"), Code: np.dtype("u1"), Ids: np.dtype("<u2")}
 
 
 def _from_bytes(kind: type, raw: object) -> object:

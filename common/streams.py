@@ -5,13 +5,18 @@ from enum import StrEnum
 
 from common.messages import (
     Command,
+    Contact,
+    Gesture,
     HandPose,
     Health,
     ImuSample,
     MarkerDetections,
     Message,
+    ObjectPose,
     Preview,
     Still,
+    TagDetections,
+    TrackerPose,
     WristDetections,
 )
 
@@ -43,8 +48,13 @@ class Stream:
 STREAMS = {
     "markers": Stream(MarkerDetections, Path.DATAGRAM, None, True),
     "wrist": Stream(WristDetections, Path.DATAGRAM, None, True),
+    "tags": Stream(TagDetections, Path.DATAGRAM, None, True),
+    "tracker": Stream(TrackerPose, Path.DATAGRAM, None, True),
     "imu": Stream(ImuSample, Path.DATAGRAM, None, True),
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
+    "object": Stream(ObjectPose, Path.ZENOH, "phalanx/object/{name}", True),
+    "contact": Stream(Contact, Path.ZENOH, "phalanx/contact/{name}", True),
+    "gesture": Stream(Gesture, Path.ZENOH, "phalanx/gesture/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
     "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
     "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False),
