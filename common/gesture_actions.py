@@ -1,0 +1,117 @@
+"""What counts as a pinch, a turned dial, a tap of the thumb and a pointing finger: the parts of a gestures file.
+
+All distances are between skins, of round cones about the bones as the hand's profile has them: 0 is touch, and what is
+beyond it presses. Every threshold comes in a pair, one to begin and one to end, so that nothing flickers between.
+"""
+
+import math
+from typing import Annotated
+
+from msgspec import Meta
+
+from common.calibration_parts import NonNegative, Part, Positive
+from common.errors import CalibrationError
+
+
+class PinchSettings(Part, frozen=True):
+    """Thumb and one finger, pad to pad.
+
+    `begin_gap_m`, `end_gap_m`: skin to skin at which it begins and ends. `closed_gap_m`, `open_gap_m`: where the
+    strength is 1 and 0. `clear_m`: how much nearer than the finger next to it the finger is to the thumb; less is a
+    fist or a bunch. `apart_rad`: how far the pads may be turned from facing each other. `fist_curl`: of 0..1, the
+    other fingers together are curled less. `sigma_most_m`: of a tip, above which a finger is not known; `lost_s`: how
+    long a pinch of such a finger lasts.
+    """
+
+    begin_gap_m: Positive = 0.009
+    end_gap_m: Positive = 0.015
+    closed_gap_m: NonNegative = 0.001
+    open_gap_m: Positive = 0.040
+    clear_m: NonNegative = 0.006
+    apart_rad: Positive = math.radians(80.0)
+    fist_curl: Positive = 0.72
+    sigma_most_m: Positive = 0.012
+    lost_s: NonNegative = 0.35
+
+
+class DialSettings(Part, frozen=True):
+    """A grip about something round, thumb against fingers, that turns.
+
+    `hold_s`: how long the grip is held until it begins, its tips moving less than `still_m_s` against each other.
+    `radius_low_m`, `radius_high_m`: of the circle on which the tips lie. `fingers_least`: how many of the four lie on
+    it. `round_m`: how far from it they may be; `opposed_rad`: at least so far round it is the thumb from each of them.
+    `slack`: by how much all these are wider for a grip that has begun. `regrip_s`: how long an open hand may take to
+    grip again; the angle goes on where it was. `lost_s`: how long tips may be unknown. `sigma_most_m`: of a tip, above
+    which it is.
+    """
+
+    hold_s: NonNegative = 0.25
+    still_m_s: Positive = 0.06
+    radius_low_m: Positive = 0.014
+    radius_high_m: Positive = 0.050
+    fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
+    round_m: Positive = 0.012
+    opposed_rad: Positive = math.radians(75.0)
+    slack: Positive = 1.35
+    regrip_s: NonNegative = 0.8
+    lost_s: NonNegative = 0.5
+    sigma_most_m: Positive = 0.015
+
+
+class TapSettings(Part, frozen=True):
+    """The thumb's tip on a segment of a finger: twelve keys, while the fingers lie side by side as a pad.
+
+    Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
+    `touch_gap_m`, `leave_gap_m`: between the skins of thumb and segment at which it touches and leaves.
+    `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between two taps. `level_rad`: how differently the
+    fingers of a pad are bent at most; `curl_most`: of 0..1, how far at most. `nearer_m`: how much nearer the thumb must
+    be to this key than to another. `sigma_most_m`: of thumb and finger, above which nothing is told.
+    """
+
+    touch_gap_m: Positive = 0.005
+    leave_gap_m: Positive = 0.011
+    shortest_s: NonNegative = 0.03
+    longest_s: Positive = 0.6
+    apart_s: NonNegative = 0.08
+    level_rad: Positive = math.radians(40.0)
+    curl_most: Positive = 0.6
+    nearer_m: NonNegative = 0.001
+    sigma_most_m: Positive = 0.012
+
+
+class PointSettings(Part, frozen=True):
+    """The index finger stretched, the three after it bent.
+
+    `stretched_rad`, `bent_rad`: sums of the flexions of PIP and DIP, of the index at most and of each of the others at
+    least. `slack_rad`: by how much both are wider for one that has begun. `hold_s`: how long until it begins, and how
+    long the shape may be lost. `sigma_most_m`: of a finger's tip, above which it is not known.
+    """
+
+    stretched_rad: Positive = math.radians(45.0)
+    bent_rad: Positive = math.radians(85.0)
+    slack_rad: NonNegative = math.radians(20.0)
+    hold_s: NonNegative = 0.12
+    sigma_most_m: Positive = 0.015
+
+
+def check_actions(
+    pinch: PinchSettings, dial: DialSettings, tap: TapSettings, point: PointSettings, where: str
+) -> None:
+    """Refuse thresholds that contradict each other.
+
+    Raises:
+        CalibrationError: With `where` and the key.
+    """
+    rising = (
+        ("pinch.end_gap_m", pinch.begin_gap_m, pinch.end_gap_m, "begin_gap_m"),
+        ("pinch.open_gap_m", pinch.closed_gap_m, pinch.open_gap_m, "closed_gap_m"),
+        ("dial.radius_high_m", dial.radius_low_m, dial.radius_high_m, "radius_low_m"),
+        ("tap.leave_gap_m", tap.touch_gap_m, tap.leave_gap_m, "touch_gap_m"),
+        ("tap.longest_s", tap.shortest_s, tap.longest_s, "shortest_s"),
+        ("point.bent_rad", point.stretched_rad, point.bent_rad, "stretched_rad"),
+    )
+    for key, low, high, other in rising:
+        if not high > low:
+            raise CalibrationError(f"{where}: {key}: {high:g} must be more than {other}, {low:g}")
+    if dial.slack < 1.0:
+        raise CalibrationError(f"{where}: dial.slack: {dial.slack:g} must be 1 or more")
