@@ -26,6 +26,7 @@ from common.calibration_parts import (
     Vector3,
 )
 from common.errors import CalibrationError
+from common.gesture_settings import GestureSettings, check_gestures
 from common.messages import MAX_MARKERS, Name
 from common.object_profile import ObjectProfile, check_object, check_pose
 from common.replacing import replacing
@@ -323,6 +324,8 @@ def check(value: Struct, where: str) -> None:
         _check_rig(value, where)
     elif isinstance(value, ObjectProfile):
         check_object(value, where)
+    elif isinstance(value, GestureSettings):
+        check_gestures(value, where)
     elif isinstance(value, CameraCalibration):
         for name, colour in (value.markers or {}).items():
             for i, letter in ((1, "S"), (2, "V")):

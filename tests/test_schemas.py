@@ -7,11 +7,13 @@ import pytest
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, schema
 from common.frame_recording import Manifest
+from common.gesture_settings import GestureSettings
 from common.object_profile import ObjectProfile
 
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "schema"
 KINDS: dict[str, type[msgspec.Struct]] = {
     "camera.json": CameraCalibration,
+    "gestures.json": GestureSettings,
     "hand.json": HandProfile,
     "object.json": ObjectProfile,
     "recording.json": Manifest,

@@ -1,0 +1,124 @@
+"""What gestures are read from: how far each finger is bent, where its tip and pad are, and how sure that is.
+
+All of it is geometry of the solved joints, not of the profile's angles: those are zero in the rest pose of a profile,
+and rest poses differ from hand to hand. A bend is the signed angle between two bones about the hinge between them,
+that of the MCP between the palm's plane and the first bone; positive is towards the palm, for both hands alike.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.geometry import quaternion_to_matrix, rigid
+from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, WRIST, HandModel
+from common.messages import HandPose
+
+KNOWN_SIGMA_M = 0.015  # a tip that may be farther off is anywhere between straight and half bent
+# Sum of a finger's bends [rad], MCP, PIP and DIP, where it is as curled as it goes; of the thumb MCP and IP.
+_CURLED_RAD = np.radians([90.0, 230.0, 230.0, 230.0, 230.0])
+_PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad is thickest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandFeatures:
+    """One hand at one instant; fingers thumb ... little.
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: The instant [ns], that of the pose.
+        known: (5,) the finger's tip is known to `KNOWN_SIGMA_M` or better.
+        sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
+        angles_rad: (5, 4) of the pose, zero in the profile's rest pose.
+        bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line; of the
+            thumb the first is how far its metacarpal stands out of the palm's plane, then MCP and IP.
+        curl: (5,) 0 straight ... 1 curled.
+        tips_m: (5, 3) middle of the tip's round end [m], rig frame.
+        pads_m: (5, 3) middle of the pad's skin [m], rig frame.
+        radius_m: (5,) of the round end [m].
+        joints_m: (26, 3) [m], rig frame.
+        T_rig_palm: (4, 4) palm -> rig frame.
+        dorsal, palmar, forward: (3,) unit vectors, rig frame: out of the back of the hand, out of the palm, along the
+            palm to the fingers.
+        size_m: From the wrist to the middle knuckle [m].
+        side_sign: +1 right, -1 left.
+        palm_world_wxyz: (4,) as in the pose.
+    """
+
+    hand: str
+    t_ns: int
+    known: Bool
+    sigma_m: Float
+    angles_rad: Float
+    bend_rad: Float
+    curl: Float
+    tips_m: Float
+    pads_m: Float
+    radius_m: Float
+    joints_m: Float
+    T_rig_palm: Float
+    dorsal: Float
+    palmar: Float
+    forward: Float
+    size_m: float
+    side_sign: float
+    palm_world_wxyz: Float
+
+
+def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
+    """The features of a pose of `model`'s hand; None where the pose has no hand."""
+    joints = pose.position_m
+    if not (pose.valid[WRIST] and np.isfinite(joints).all() and np.isfinite(pose.orientation_wxyz).all()):
+        return None
+    rotation = quaternion_to_matrix(pose.orientation_wxyz)
+    palm = rotation[WRIST] @ model.rest_rotation[WRIST].T
+    place = joints[WRIST] - palm @ model.rest_position_m[WRIST]
+    bend = _bends(joints[CHAINS], rotation[CHAINS], palm)
+    total = bend.sum(axis=1)
+    total[0] -= bend[0, 0]
+    sigma = _sigma_m(pose)
+    known = pose.valid[TIPS] & (sigma <= KNOWN_SIGMA_M)
+    last = CHAINS[:, 2]
+    along = joints[last] + _PAD_SHARE * (joints[TIPS] - joints[last])
+    radius = pose.radius_m[last] + _PAD_SHARE * (pose.radius_m[TIPS] - pose.radius_m[last])
+    return HandFeatures(
+        hand=pose.hand,
+        t_ns=pose.t_ns,
+        known=known,
+        sigma_m=sigma,
+        angles_rad=pose.angles_rad,
+        bend_rad=bend,
+        curl=np.clip(total / _CURLED_RAD, 0.0, 1.0),
+        tips_m=joints[TIPS],
+        pads_m=along - radius[:, None] * rotation[TIPS][..., 1],
+        radius_m=pose.radius_m[TIPS],
+        joints_m=joints,
+        T_rig_palm=rigid(palm, place),
+        dorsal=palm[:, 1],
+        palmar=-palm[:, 1],
+        forward=palm[:, 2],
+        size_m=float(np.linalg.norm(joints[MIDDLE_PROXIMAL] - joints[WRIST])),
+        side_sign=model.side_sign,
+        palm_world_wxyz=pose.palm_world_wxyz,
+    )
+
+
+def _sigma_m(pose: HandPose) -> Float:
+    """Standard deviations (5,) [m] of the tips along their worst axis; inf where they are not known."""
+    cov = pose.cov_m2[TIPS]
+    told = np.isfinite(cov).all(axis=(1, 2)) & pose.valid[TIPS]
+    worst = np.linalg.eigvalsh(np.where(told[:, None, None], cov, 0.0))[:, 2]
+    return np.where(told, np.sqrt(np.maximum(worst, 0.0)), np.inf)
+
+
+def _bends(chain: Float, rotation: Float, palm: Float) -> Float:
+    """`HandFeatures.bend_rad` of joints (5, 4, 3), their frames (5, 4, 3, 3) and the palm's (3, 3)."""
+    bone = np.diff(chain, axis=1)
+    out = np.empty((5, 3))
+    first = bone[:, 0] @ palm
+    out[1:, 0] = np.arctan2(-first[1:, 1], first[1:, 2])
+    out[0, 0] = np.arctan2(-first[0, 1], np.hypot(first[0, 0], first[0, 2]))
+    before, after, hinge = bone[:, :-1], bone[:, 1:], rotation[:, 1:3, :, 0]
+    # A flexion by a turns by -a about the joint's +x.
+    out[:, 1:] = np.arctan2(-np.vecdot(np.cross(before, after), hinge), np.vecdot(before, after))
+    return out
