@@ -14,8 +14,8 @@ from common.errors import CalibrationError
 from common.gesture_actions import DialSettings, PinchSettings, PointSettings, TapSettings, check_actions
 from common.messages import Name
 
-# Bends are of the bones, 0 where they lie in the palm's plane in one line; `bend` is MCP and PIP together, of the thumb
-# MCP and IP. `thumb_across`, `thumb_below`, `thumb_ahead`: where the thumb's tip is from the wrist: to the thumb's side,
+# Bends are of the bones, 0 where they lie in the palm's plane in one line; `bend` is MCP and PIP together, of the
+# thumb MCP and IP. `thumb_across`, `thumb_below`, `thumb_ahead`: where its tip is from the wrist: to the thumb's side,
 # out of the palm, to the fingers, as share of the palm's length. Gaps are between the skins of two tips.
 # `index_ahead`: how much more than the mean of the other three the index is bent. Spreads are between neighbours.
 Quantity = Literal[
