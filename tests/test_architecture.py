@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("common", "slave", "master", "deploy")
 OURS = frozenset(PACKAGES)
-DRIVERS = frozenset({"serial", "smbus2", "picamera2", "libcamera", "gpiod"})
+DRIVERS = frozenset({"serial", "smbus2", "picamera2", "libcamera", "gpiod", "openvr"})
 
 # Who may not import whom. `rerun` in master and the drivers in slave have files of their own, see ONLY_IN.
 FORBIDDEN: dict[str, frozenset[str]] = {
@@ -36,6 +36,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),
     "numba": ("slave/markers/fast*.py",),
+    "openvr": ("slave/objects/openvr*.py",),
 }
 NEVER = frozenset({"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"})
 # Import name -> name in pyproject.toml, where they differ. picamera2 and libcamera come with the Pi's system.
@@ -122,6 +123,8 @@ def undeclared(path: str, text: str) -> set[str]:
         promised += project["optional-dependencies"]["wrist"]
     if fnmatch(path, "slave/markers/fast*.py"):
         promised += project["optional-dependencies"]["fast"]
+    if fnmatch(path, "slave/objects/openvr*.py"):
+        promised += project["optional-dependencies"]["vive"]
     have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())
     names = set(imported(text)) - OURS - sys.stdlib_module_names
     return {name for name in names if DISTRIBUTION.get(name, name) not in have}
