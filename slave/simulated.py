@@ -10,6 +10,7 @@ from common.clock import SkewedClock
 from common.errors import CameraError
 from common.frame_recording import open_recording
 from common.imu_recording import write_imu
+from common.object_profile import ObjectProfile
 from common.sim.board import BoardScene
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
@@ -41,7 +42,8 @@ def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Sc
     """
     hand = load(calibration / "hands" / f"{rig.hand}.json", HandProfile)
     cameras = {n: load(calibration / "cameras" / f"{n}.json", CameraCalibration) for n in rig.cameras}
-    return view_by_name(name, rig, cameras, hand, seed)
+    objects = {n: load(calibration / "objects" / f"{n}.json", ObjectProfile) for n in rig.objects}
+    return view_by_name(name, rig, cameras, hand, seed, objects)
 
 
 def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed: int) -> SimulatedImu:

@@ -27,6 +27,10 @@ PAINT_LINEAR_RGB = {
 MORE_PAINT_LINEAR_RGB = {
     "back2": (0.30, 0.03, 0.31),
     "back3": (0.075, 0.42, 0.04),
+    # A tracked object has those of the second and third marker of the back, and the only hue that is left: yellow.
+    "wand1": (0.55, 0.47, 0.02),
+    "wand2": (0.075, 0.42, 0.04),
+    "wand3": (0.30, 0.03, 0.31),
 }
 SKIN_LINEAR_RGB = (0.700, 0.410, 0.255)
 SLEEVE_LINEAR_RGB = (0.235, 0.195, 0.165)

@@ -48,12 +48,14 @@ class HandState:
         angles_rad: (5, 4) [rad].
         bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
         things: What stands about, or is held.
+        objects: Poses (4, 4) [m], rig frame, of the tracked objects that move by themselves, in the rig's order.
     """
 
     T_rig_palm: Float
     angles_rad: Float
     bend_rad: Float = field(default_factory=lambda: STRAIGHT)
     things: tuple[Cylinder, ...] = ()
+    objects: tuple[Float, ...] = ()
 
 
 class HandMotion(Protocol):

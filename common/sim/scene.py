@@ -12,10 +12,13 @@ from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
+from common.geometry import transform
 from common.hand_model import HandJoints, HandModel
+from common.object_profile import ObjectProfile
 from common.sim.held import Cylinder
 from common.sim.illuminant import LightCourse
 from common.sim.motion import HandMotion, HandState, ScriptedMotion
+from common.sim.tracked import TrackedObjects
 
 STANDARD_SEED = 7
 HAND_DEPTH_M = 0.47
@@ -33,9 +36,10 @@ class SceneTruth:
         T_rig_palm: (4, 4) palm frame -> rig frame [m].
         angles_rad: (5, 4).
         joints: Positions (26, 3) [m] and rotations of all joints, rig frame.
-        markers_m: (M, 3) centroids of the painted surfaces [m], rig frame.
+        markers_m: (M, 3) centroids of the painted surfaces [m], rig frame; middles of the beads of objects.
         bend_rad: (2,) how the wrist is bent between forearm and palm (`common.wrist_bend`).
-        things: What stands about, or is held.
+        things: What stands about, or is held, and is not tracked.
+        objects: Tracked object -> `T_rig_object` (4, 4) [m].
     """
 
     t_s: float
@@ -45,6 +49,7 @@ class SceneTruth:
     markers_m: Float
     bend_rad: Float
     things: tuple[Cylinder, ...]
+    objects: Mapping[str, Float] = field(default_factory=dict[str, Float])
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,6 +116,8 @@ class Scene:
         seed: Of textures and noise.
         centre_m: Middle of the volume (3,), rig frame [m].
         light: How the light changes; None: as it was when the colours were calibrated.
+        objects: Files of the objects that the rig names.
+        optics: The cameras; tracked: the objects.
     """
 
     rig: RigCalibration
@@ -121,7 +128,9 @@ class Scene:
     cards: tuple[Card, ...] = ()
     seed: int = STANDARD_SEED
     light: LightCourse | None = None
+    objects: Mapping[str, ObjectProfile] = field(default_factory=dict[str, ObjectProfile])
     optics: Mapping[str, CameraModel] = field(default_factory=dict[str, CameraModel])
+    tracked: TrackedObjects = field(init=False)
 
     def __post_init__(self) -> None:
         for name in self.rig.cameras:
@@ -131,6 +140,7 @@ class Scene:
             name: CameraModel.of(self.cameras[name], self.rig.camera_pose(name)) for name in self.rig.cameras
         }
         object.__setattr__(self, "optics", optics)
+        object.__setattr__(self, "tracked", TrackedObjects.of(self.rig, self.objects))
 
     @classmethod
     def standard(
@@ -139,15 +149,18 @@ class Scene:
         cameras: Mapping[str, CameraCalibration],
         hand: HandProfile,
         seed: int = STANDARD_SEED,
+        objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
         """The standard scene of demo and benchmarks: every motion in each half of 60 s, two occlusion gaps.
 
         Raises:
-            CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger.
+            CalibrationError: A camera of the rig is missing or has no intrinsics; a marker is on no finger; an object
+                of the rig has no file.
         """
         model = HandModel.of(hand)
         centre = view_centre(rig)
-        return cls(rig, cameras, model, ScriptedMotion(model, centre, seed), centre, STANDARD_CARDS, seed)
+        motion = ScriptedMotion(model, centre, seed)
+        return cls(rig, cameras, model, motion, centre, STANDARD_CARDS, seed, objects=objects or {})
 
     @classmethod
     def of_motion(
@@ -157,9 +170,11 @@ class Scene:
         hand: HandProfile,
         motion: HandMotion,
         seed: int = STANDARD_SEED,
+        objects: Mapping[str, ObjectProfile] | None = None,
     ) -> "Scene":
         """A scene without occluders around any motion, such as one that follows a recording."""
-        return cls(rig, cameras, HandModel.of(hand), motion, view_centre(rig), (), seed)
+        model, centre = HandModel.of(hand), view_centre(rig)
+        return cls(rig, cameras, model, motion, centre, (), seed, objects=objects or {})
 
     @property
     def period_s(self) -> float:
@@ -170,10 +185,36 @@ class Scene:
         """Exact state at scene time `t_s` [s]; before 0 the pose of 0."""
         state = self.motion.at(t_s)
         joints = self.model.forward(state.T_rig_palm, state.angles_rad)
-        markers = self.model.marker_points(joints, self.rig.markers)
+        poses = self.object_poses(state)
         return SceneTruth(
-            t_s, state.T_rig_palm, state.angles_rad, joints, markers, state.bend_rad, state.things
+            t_s,
+            state.T_rig_palm,
+            state.angles_rad,
+            joints,
+            self._marker_points(joints, poses),
+            state.bend_rad,
+            self.untracked(state),
+            dict(zip(self.rig.objects, poses, strict=True)),
         )
+
+    def object_poses(self, state: HandState) -> tuple[Float, ...]:
+        """`T_rig_object` (4, 4) [m] of every tracked object, in the order of the rig."""
+        return self.tracked.poses(state, self.centre_m)
+
+    def untracked(self, state: HandState) -> tuple[Cylinder, ...]:
+        """Things that are not tracked: a tracked object is in the place of the thing that the hand takes."""
+        return state.things[len(self.rig.objects) :]
+
+    def _marker_points(self, joints: HandJoints, poses: tuple[Float, ...]) -> Float:
+        """Centroids (M, 3) [m] of all markers of the rig; NaN for a free one that is on no object."""
+        if not self.rig.free_markers:
+            return self.model.marker_points(joints, self.rig.markers)
+        points = np.full((len(self.rig.markers), 3), np.nan)
+        own = [m for m, name in enumerate(self.rig.markers) if name not in self.rig.free_markers]
+        points[own] = self.model.marker_points(joints, tuple(self.rig.markers[m] for m in own))
+        for marker, (which, at) in self.tracked.beads.items():
+            points[marker] = transform(poses[which], at)
+        return points
 
     def joints(self, times_s: tuple[float, ...]) -> HandJoints:
         """Joints at several instants at once, stacked along the first axis."""

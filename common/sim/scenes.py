@@ -8,6 +8,7 @@ from typing import overload
 from common.calibration import CameraCalibration, HandProfile, RigCalibration
 from common.errors import PhalanxError
 from common.hand_model import HandModel
+from common.object_profile import ObjectProfile
 from common.sim.board import BoardRenderer, BoardScene
 from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
@@ -16,49 +17,64 @@ from common.sim.render import Renderer
 from common.sim.routine import HandRoutine
 from common.sim.scene import Scene, view_centre
 from common.sim.together import TOGETHER, together_motion
+from common.sim.travel import CARDS, ObjectTravel
 from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
-NAMES = f"standard | lights | poses | hand-routine | leap:FILE.npz | {' | '.join(TOGETHER)}"
+NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
 VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
 
 
 def scene_by_name(
-    name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
+    name: str,
+    rig: RigCalibration,
+    cameras: Mapping[str, CameraCalibration],
+    hand: HandProfile,
+    seed: int,
+    objects: Mapping[str, ObjectProfile] | None = None,
 ) -> Scene:
     """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
-    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), one that moves as before a
-    wrist device at the same time (`TOGETHER`), or one that follows a recorded motion.
+    (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
+    that travels (`object`), one that moves as before a wrist device at the same time (`TOGETHER`), or one that follows
+    a recorded motion. `objects` are the files of the objects that the rig names (`common.sim.tracked`).
 
     Raises:
-        PhalanxError: No such scene; a rig, camera or hand that does not fit; a recording that cannot be read.
+        PhalanxError: No such scene; a rig, camera, hand or object that does not fit; a recording that cannot be read.
     """
     if rig.kind != "markers":
         raise PhalanxError(
             f"scene {name!r}: shows markers, and rig {rig.name!r} is of kind {rig.kind!r}; that has {WRIST_NAMES}"
         )
     if name == "standard":
-        return Scene.standard(rig, cameras, hand, seed)
+        return Scene.standard(rig, cameras, hand, seed, objects)
     if name == "lights":
-        return replace(Scene.standard(rig, cameras, hand, seed), light=ROOM)
+        return replace(Scene.standard(rig, cameras, hand, seed, objects), light=ROOM)
     if name == "poses":
         motion = StudyPoses(HandModel.of(hand), view_centre(rig), seed)
-        return Scene.of_motion(rig, cameras, hand, motion, seed)
+        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
     if name == "hand-routine":
         motion = HandRoutine(HandModel.of(hand), view_centre(rig), seed)
-        return Scene.of_motion(rig, cameras, hand, motion, seed)
+        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
+    if name == "object":
+        motion = ObjectTravel(HandModel.of(hand), view_centre(rig), seed)
+        return replace(Scene.of_motion(rig, cameras, hand, motion, seed, objects), cards=CARDS)
     if name.startswith(_LEAP):
         motion = load_leap(Path(name.removeprefix(_LEAP)), HandModel.of(hand), view_centre(rig))
-        return Scene.of_motion(rig, cameras, hand, motion, seed)
+        return Scene.of_motion(rig, cameras, hand, motion, seed, objects)
     together = together_motion(name, HandModel.of(hand), view_centre(rig), seed)
     if together is not None:
-        return Scene.of_motion(rig, cameras, hand, together, seed)
+        return Scene.of_motion(rig, cameras, hand, together, seed, objects)
     raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board for cameras only)")
 
 
 def view_by_name(
-    name: str, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandProfile, seed: int
+    name: str,
+    rig: RigCalibration,
+    cameras: Mapping[str, CameraCalibration],
+    hand: HandProfile,
+    seed: int,
+    objects: Mapping[str, ObjectProfile] | None = None,
 ) -> Scene | BoardScene | WristScene:
     """What a simulated camera may look at: a scene with a hand, that of a wrist rig where the rig is one, or `board`,
     a checkerboard to calibrate cameras with.
@@ -70,7 +86,7 @@ def view_by_name(
         return BoardScene(rig, cameras, seed)
     if rig.kind == "wrist":
         return WristScene.by_name(name, rig, cameras, hand, seed)
-    return scene_by_name(name, rig, cameras, hand, seed)
+    return scene_by_name(name, rig, cameras, hand, seed, objects)
 
 
 @overload

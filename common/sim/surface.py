@@ -61,6 +61,7 @@ class HandSurface:
 
     Attributes:
         model: The hand.
+        markers: Of the rig; free: those of them that sit on no hand.
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
         count: Number of key points.
@@ -68,14 +69,15 @@ class HandSurface:
 
     model: HandModel
     markers: tuple[str, ...]
+    free: tuple[str, ...]
     radius_m: Float
     caps: tuple[Cap, ...]
     boxes: tuple[Box, ...]
     count: int
 
     @classmethod
-    def of(cls, model: HandModel, markers: tuple[str, ...]) -> "HandSurface":
-        """Lay out the key points.
+    def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
+        """Lay out the key points of a hand with these markers, without those of them that sit on no hand.
 
         Raises:
             CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
@@ -92,6 +94,8 @@ class HandSurface:
         caps: list[Cap] = []
         boxes: list[Box] = []
         for m, name in enumerate(markers):
+            if name in free:
+                continue
             mount = model.mount(name)
             finger = mount.finger
             if mount.joint is None:
@@ -105,7 +109,7 @@ class HandSurface:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
                 )
-        return cls(model, markers, radius, tuple(caps), tuple(boxes), count)
+        return cls(model, markers, free, radius, tuple(caps), tuple(boxes), count)
 
     def key_points(self, joints: HandJoints) -> Float:
         """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
@@ -124,7 +128,7 @@ class HandSurface:
         arm = -0.55 * z + 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
         points[..., SLEEVE_SPHERES[0], :] = cuff
         points[..., SLEEVE_SPHERES[1], :] = cuff + 0.45 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
-        centroid = self.model.marker_points(joints, self.markers)
+        centroid = self._centroids(joints)
         for cap in self.caps:
             ahead = -joints.rotation[..., CHAINS[cap.finger, 3], :, 2]
             points[..., cap.centre, :] = (
@@ -137,6 +141,15 @@ class HandSurface:
             corners = box_corners()
             turned = np.einsum("...ij,kj->...ki", T[..., :3, :3], corners)
             points[..., box.corners, :] = centroid[..., box.marker, None, :] + turned
+        return points
+
+    def _centroids(self, joints: HandJoints) -> Float:
+        """Centroids (..., M, 3) [m] of the painted surfaces; NaN for those on no hand."""
+        if not self.free:
+            return self.model.marker_points(joints, self.markers)
+        own = [m for m, name in enumerate(self.markers) if name not in self.free]
+        points = np.full((*joints.position_m.shape[:-2], len(self.markers), 3), np.nan)
+        points[..., own, :] = self.model.marker_points(joints, tuple(self.markers[m] for m in own))
         return points
 
 

@@ -87,7 +87,7 @@ class View:
             raise CalibrationError(f"camera {camera!r}: the scene has only {', '.join(scene.optics)}")
         self.scene = scene
         self.optics: CameraModel = scene.optics[camera]
-        self.surface = HandSurface.of(scene.model, scene.rig.markers)
+        self.surface = HandSurface.of(scene.model, scene.rig.markers, scene.rig.free_markers)
         self.row_s = self.optics.row_time_ns * 1e-9
         self.exposure_s = scene.cameras[camera].exposure_us * 1e-6
         self.T_camera_rig = invert(self.optics.T_rig_camera)
@@ -238,7 +238,7 @@ class View:
         speed = slope + (when - t_middle)[:, None] * bend
         z = np.maximum(points[:, 2:], NEAREST_M)
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
-        return points, self.project(points), speed_uv, when, states[1].things
+        return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])
 
     def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
         """Each thing at the moment of the row of its middle; `things` is where they are halfway through the frame."""
@@ -246,7 +246,7 @@ class View:
         for k, thing in enumerate(things):
             middle = transform(self.T_camera_rig, thing.T_rig_object[:3, 3])
             when = t_s + float(self.project(middle)[1]) * self.row_s
-            now, later = (self.scene.motion.at(t).things[k] for t in (when, when + 1e-3))
+            now, later = (self.scene.untracked(self.scene.motion.at(t))[k] for t in (when, when + 1e-3))
             views.append(seen(now, later, 1e-3, self.T_camera_rig, self.to_light, self.circle, self.project))
         return tuple(views)
 

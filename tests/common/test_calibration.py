@@ -28,6 +28,7 @@ from common.calibration import (
     save,
 )
 from common.errors import CalibrationError
+from common.object_profile import ObjectProfile
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -347,7 +348,12 @@ def test_no_input_at_all_takes_down_the_parser() -> None:
     assert 1000 < refused < 3000
 
 
-FOLDERS = {"cameras": CameraCalibration, "rigs": RigCalibration, "hands": HandProfile}
+FOLDERS = {
+    "cameras": CameraCalibration,
+    "rigs": RigCalibration,
+    "hands": HandProfile,
+    "objects": ObjectProfile,
+}
 
 
 @pytest.mark.parametrize("folder", FOLDERS)
@@ -364,6 +370,9 @@ def test_the_rigs_of_the_project_name_cameras_and_hands_that_exist() -> None:
         for camera in rig.cameras:
             assert (ROOT / "calib_json" / "cameras" / f"{camera}.json").is_file()
         assert (ROOT / "calib_json" / "hands" / f"{rig.hand}.json").is_file()
+        for name in rig.objects:
+            profile = load(ROOT / "calib_json" / "objects" / f"{name}.json", ObjectProfile)
+            assert set(profile.markers) <= set(rig.free_markers)
 
 
 def test_hands_of_the_data_sets_load(datasets: Path) -> None:

@@ -200,10 +200,13 @@ def test_colours_of_the_camera_files_find_their_marker_and_nothing_else() -> Non
                 assert not (found & ~near).any(), (name, t, m)
 
 
-def test_hsv_ranges_of_two_markers_never_meet() -> None:
+@pytest.mark.parametrize("rig", ["desk", "desk-back3", "desk-wand"])
+def test_hsv_ranges_of_two_markers_of_one_rig_never_meet(rig: str) -> None:
+    shown = load(ROOT / f"calib_json/rigs/{rig}.json", RigCalibration)
     for camera in CAMERAS.values():
         assert camera.markers is not None
-        spans = sorted((c.hsv_low[0], c.hsv_high[0]) for c in camera.markers.values())
+        spans = sorted((camera.markers[m].hsv_low[0], camera.markers[m].hsv_high[0]) for m in shown.markers)
+        assert len(spans) == len(shown.markers)
         assert all(a[1] < b[0] for a, b in itertools.pairwise(spans))
         skin = cv2.cvtColor(
             np.array([[light.shades(light.SKIN_LINEAR_RGB)[3]]], np.uint8), cv2.COLOR_BGR2HSV
