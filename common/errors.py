@@ -5,6 +5,8 @@
     ├── RecordingError     a recording folder cannot be read or written
     ├── CameraError        a camera is gone, or refused a setting
     ├── ImuError           an IMU is gone, or nothing here can read it
+    ├── TrackerError       a device that tracks itself is gone, or nothing here can read it
+    │   └── TrackerChoiceError  several are there, and nobody said which
     ├── LightsError        laser or LEDs cannot be switched, or would be on for longer than is safe
     ├── MessageError       bytes that are not a message of ours
     ├── BusError           the bus cannot be opened, or nobody answers
@@ -33,6 +35,14 @@ class CameraError(PhalanxError):
 
 class ImuError(PhalanxError):
     """An IMU is gone, or there is no driver for it. Never answered with a fake IMU."""
+
+
+class TrackerError(PhalanxError):
+    """A device that tracks itself is gone, or its system is not installed. Never answered with a fake one."""
+
+
+class TrackerChoiceError(TrackerError):
+    """Several devices are there, and nobody said which one is meant. Waiting mends nothing."""
 
 
 class LightsError(PhalanxError):

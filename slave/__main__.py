@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
     from slave.imu.recording import ImuRecorder
     from slave.imu.source import ImuSource
+    from slave.objects.source import TrackerSource
 
 PROGRESS_EVERY = 500  # frames
 
@@ -105,6 +106,40 @@ def _imu(options: argparse.Namespace) -> int:
             source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop)
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         run_live(options.name, source, orientation, uplink, clock, stop, say)
+    return 0
+
+
+def _tracker(options: argparse.Namespace) -> int:
+    from common.keys import rig_key
+    from slave.objects.live import run_live
+    from slave.objects.opening import object_with, open_real
+    from slave.uplink import Uplink
+
+    rig = load(options.calibration / "rigs" / f"{options.rig}.json", RigCalibration)
+    profile = object_with(options.calibration, rig, options.name)
+    true_clock = SystemClock()
+    clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
+    key = rig_key(os.environ, options.key_file)
+
+    def say(line: str) -> None:
+        print(f"{options.name}: {line}", flush=True)
+
+    with _stop_by_signal() as stop:
+        if options.device == "synthetic":
+            from slave.objects.synthetic import SyntheticTracker
+            from slave.simulated import tracker_of
+
+            epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
+            tracker = tracker_of(options.calibration, rig, options.scene, options.seed, profile)
+            source: TrackerSource = SyntheticTracker(options.name, tracker, epoch_ns, clock, stop)
+        else:
+            source = open_real(options.name, options.device, options.serial, options.program, clock, stop)
+        try:
+            uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+        except PhalanxError:
+            source.close()
+            raise
+        run_live(options.name, source, uplink, clock, stop, say)
     return 0
 
 
@@ -380,6 +415,7 @@ def _colours(options: argparse.Namespace) -> int:
 COMMANDS = {
     "run": _run,
     "imu": _imu,
+    "tracker": _tracker,
     "lights": _lights,
     "record": _record,
     "join": _join,

@@ -8,6 +8,7 @@ from pathlib import Path
 from slave.cameras import real
 from slave.imu import opening
 from slave.lights.opening import CHOICES, SWITCHED
+from slave.objects import opening as trackers
 
 ABOUT = (
     "The slave stands beside a camera: it finds the painted markers, or the fingers before a wrist device, and sends\n"
@@ -45,6 +46,19 @@ HELP = {
         an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
   phalanx-slave imu --name imu --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
         an LSM6DSOX on I2C bus 1 of a Pi
+""",
+    ),
+    "tracker": (
+        "send where a Vive tracker is",
+        """\
+  phalanx-slave tracker tracker --rig desk-tracker --device openvr --key-file rig.key
+        by SteamVR on this PC: needs the extra `vive` and SteamVR running; docs/tracker.md
+  phalanx-slave tracker tracker --rig desk-tracker --device survive --serial LHR-1A2B3C4D --key-file rig.key
+        by libsurvive: starts survive-cli and reads its lines
+  phalanx-slave tracker tracker --rig desk-tracker --device survive:walk.rec.gz --key-file rig.key
+        what survive-cli --record wrote, at its pace
+  phalanx-slave tracker tracker --rig desk-tracker --device synthetic --scene object --bind 127.0.0.1 --key-file rig.key
+        a tracker on the object of the simulated scene
 """,
     ),
     "lights": (
@@ -113,6 +127,7 @@ def parser() -> argparse.ArgumentParser:
     fill = {
         "run": _run,
         "imu": _imu,
+        "tracker": _tracker,
         "lights": _lights,
         "record": _record,
         "join": _join,
@@ -155,6 +170,15 @@ def _imu(imu: argparse.ArgumentParser) -> None:
     opening.add_options(imu)
     _link(imu)
     _simulated(imu.add_argument_group("synthetic IMU").add_argument)
+
+
+def _tracker(tracker: argparse.ArgumentParser) -> None:
+    tracker.add_argument("name", metavar="NAME", help="the `tracker` of an object of the rig")
+    tracker.add_argument("--rig", default="desk", help="rig, a file in DIR/rigs (default: %(default)s)")
+    tracker.add_argument("--calibration", type=Path, default=Path("calib_json"), metavar="DIR")
+    trackers.add_options(tracker)
+    _link(tracker)
+    _simulated(tracker.add_argument_group("synthetic tracker").add_argument)
 
 
 def _lights(lights: argparse.ArgumentParser) -> None:

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import SkewedClock
-from common.errors import CameraError
+from common.errors import CameraError, TrackerError
 from common.frame_recording import open_recording
 from common.imu_recording import write_imu
 from common.object_profile import ObjectProfile
@@ -15,6 +15,7 @@ from common.sim.board import BoardScene
 from common.sim.imu import SimulatedImu
 from common.sim.scene import Scene
 from common.sim.scenes import view_by_name
+from common.sim.tracker import SimulatedTracker
 from common.sim.wrist.scene import WristScene
 
 
@@ -59,6 +60,21 @@ def imu_of(camera: str, calibration: Path, rig: RigCalibration, name: str, seed:
             f"--imu: only a hand before a synthetic camera has one, not {camera} with scene {name}"
         )
     return SimulatedImu.of(scene)
+
+
+def tracker_of(
+    calibration: Path, rig: RigCalibration, name: str, seed: int, profile: ObjectProfile
+) -> SimulatedTracker:
+    """The tracker on an object that synthetic cameras see in the scene `name`.
+
+    Raises:
+        TrackerError: There is no object in that scene.
+        PhalanxError: As `scene_of`, and `SimulatedTracker.of`.
+    """
+    scene = scene_of(calibration, rig, name, seed)
+    if not isinstance(scene, Scene):
+        raise TrackerError(f"--scene {name}: there is no object in it that a tracker could sit on")
+    return SimulatedTracker.of(scene, profile, seed)
 
 
 def add_imu(folder: Path, imu: SimulatedImu, epoch_ns: int, clock: SkewedClock) -> None:

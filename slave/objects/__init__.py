@@ -1,0 +1,1 @@
+"""Devices that track themselves, such as a Vive tracker: one seam, one file per driver."""

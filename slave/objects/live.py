@@ -1,0 +1,81 @@
+"""A live slave beside a tracking system: pose in, one sealed datagram out, reports meanwhile, until told to stop."""
+
+import gc
+import threading
+from collections.abc import Callable
+
+from msgspec.structs import replace
+
+from common.clock import Clock
+from common.zenoh_bus import ZenohBus
+from slave.app import Barrier, Sender
+from slave.objects.source import TrackerSource
+from slave.objects.tally import PoseTally
+from slave.report import Reporter
+from slave.uplink import Uplink
+
+LOOK_S = 0.5e-3  # between two poses it is looked whether the master has started
+
+
+def wait_for_start(source: TrackerSource, barrier: Barrier, stop: threading.Event) -> bool:
+    """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
+
+    Poses are read meanwhile, and forgotten, so that none grows old in a buffer.
+
+    Raises:
+        TrackerError: The tracking system is gone.
+    """
+    while not stop.is_set():
+        if barrier.wait_for_start(LOOK_S):
+            return True
+        if source.read() is None:
+            return False
+    return False
+
+
+def run(source: TrackerSource, sender: Sender, tally: PoseTally, stop: threading.Event) -> None:
+    """Send every pose until the source ends or `stop` is set.
+
+    Raises:
+        TrackerError: The tracking system is gone.
+    """
+    while not stop.is_set() and (pose := source.read()) is not None:
+        sender.send(replace(pose, session=sender.session))
+        tally.pose(pose)
+
+
+def run_live(
+    name: str,
+    source: TrackerSource,
+    uplink: Uplink,
+    clock: Clock,
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> None:
+    """Wait for the master, then send until `stop` is set or the source ends; closes source and uplink.
+
+    Args:
+        name: The `tracker` of an object of the rig.
+        source: The open tracker.
+        uplink: Where poses go.
+        clock: The slave's clock.
+        stop: Set by a signal handler, or by the command "stop" on the bus.
+        say: Told one line when it is ready, and one at the end.
+
+    Raises:
+        TrackerError: The tracking system is gone.
+    """
+    tally = PoseTally(source)
+    reporter = Reporter(name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set)
+    try:
+        gc.collect()
+        gc.freeze()  # what lives until the end is never walked again: no pause in the loop
+        say("ready, waiting for the master")
+        if wait_for_start(source, uplink, stop):
+            run(source, uplink, tally, stop)
+    finally:
+        reporter.close()
+        uplink.close()
+        source.close()
+    counts = tally.counts()
+    say(f"{counts['poses']} poses, {counts['nowhere']} of them nowhere, sent {uplink.counts['sent']}")

@@ -1,0 +1,195 @@
+"""A Vive tracker by SteamVR, through openvr.
+
+SteamVR is asked some hundred times a second where the tracker is at the very moment of the call: it leads its newest
+measurement over the milliseconds since (position by velocity, and the same for the turn), so a pose holds when it was
+asked for and needs no stamp of the device. Poses are in the raw frame of the base stations, y up: to set the room's
+floor or middle anew moves nothing, to move a base station does.
+
+A pose counts only where SteamVR says that it is valid, of a connected device, and tracked by light (`Running_OK`);
+what it leads by the gyroscope alone is NaN here. It is told when SteamVR ends, acknowledges, and lets go: a program
+that holds on is ended by SteamVR (ValveSoftware/openvr, issues 878 and 1490).
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from common.arrays import Float
+from common.clock import Clock
+from common.errors import TrackerChoiceError, TrackerError
+from common.geometry import matrix_to_quaternion
+from common.messages import TrackerPose
+from slave.objects.openvr_library import Library, VrSystem, connect, load_library
+
+RATE_HZ = 120.0
+LOST_EVERY = 30  # poses of NaN: four a second suffice
+LOOK_NS = 1_000_000_000  # between two searches for the device
+_UNIT_WITHIN = 1e-3
+_NOTHING = (np.full(3, np.nan), np.full(4, np.nan))
+
+
+class OpenVrTracker:
+    """A `TrackerSource`. Holds the connection to SteamVR, which device is ours, and when it is asked next."""
+
+    def __init__(
+        self,
+        name: str,
+        serial: str | None,
+        clock: Clock,
+        stop: threading.Event,
+        loader: Callable[[], Library] = load_library,
+        rate_hz: float = RATE_HZ,
+    ) -> None:
+        """Connect to SteamVR.
+
+        Args:
+            name: Of the device in our messages.
+            serial: Its serial number (LHR-...); None: there is one tracker only.
+            clock: The slave's clock.
+            stop: Set when the slave is to end.
+            loader: Imports the library.
+            rate_hz: How often SteamVR is asked.
+
+        Raises:
+            TrackerError: The library is missing, or SteamVR does not answer.
+        """
+        self._name, self._serial, self._clock, self._stop = name, serial, clock, stop
+        self._library = loader()
+        self._system: VrSystem | None = connect(self._library)
+        self._period_ns = round(1e9 / rate_hz)
+        self._next_ns = clock.now_ns()
+        self._index: int | None = None
+        self._looked_ns: int | None = None
+        self._seq = -1
+        self._lost = 0
+        self._counts = {"lost_itself": 0, "absent": 0}
+
+    def read(self) -> TrackerPose | None:
+        """Ask where it is when that is due; None once stopped or closed.
+
+        Raises:
+            TrackerError: SteamVR is ending.
+            TrackerChoiceError: There are several trackers, and nobody said which one is meant.
+        """
+        while not self._stop.is_set() and self._system is not None:
+            left_ns = self._next_ns - self._clock.now_ns()
+            if left_ns > 0:
+                self._stop.wait(left_ns * 1e-9)
+                continue
+            self._next_ns += self._period_ns * (1 + (-left_ns) // self._period_ns)
+            self._heed(self._system)
+            pose = self._ask(self._system)
+            if pose is not None:
+                return pose
+        return None
+
+    def close(self) -> None:
+        """Let go of SteamVR. Safe to call twice."""
+        system, self._system = self._system, None
+        if system is not None:
+            self._library.shutdown()
+
+    def counts(self) -> Mapping[str, int]:
+        """`lost_itself`: asked while it saw no base station; `absent`: while it was switched off."""
+        return dict(self._counts)
+
+    def gauges(self) -> Mapping[str, float]:
+        """Nothing."""
+        return {}
+
+    def _heed(self, system: VrSystem) -> None:
+        event = self._library.VREvent_t()
+        while system.pollNextEvent(event):
+            if event.eventType == self._library.VREvent_Quit:
+                system.acknowledgeQuit_Exiting()
+                self.close()
+                raise TrackerError("SteamVR ends: start it again")
+
+    def _ask(self, system: VrSystem) -> TrackerPose | None:
+        """One pose; None: it is lost, and that has been said just now."""
+        before_ns = self._clock.now_ns()
+        poses = system.getDeviceToAbsoluteTrackingPose(
+            self._library.TrackingUniverseRawAndUncalibrated, 0.0, None
+        )
+        t_ns = (before_ns + self._clock.now_ns()) // 2
+        index = self._found(system, t_ns)
+        found = None if index is None else self._valid(poses[index])
+        if found is None:
+            self._lost += 1
+            if self._lost % LOST_EVERY != 1:
+                return None
+        else:
+            self._lost = 0
+        self._seq += 1
+        place, turn = _NOTHING if found is None else found
+        return TrackerPose(self._name, 0, self._seq, t_ns, place, turn)
+
+    def _found(self, system: VrSystem, now_ns: int) -> int | None:
+        """The device's number, which stays while SteamVR runs; searched again once a second until it is there."""
+        if self._index is None and (self._looked_ns is None or now_ns - self._looked_ns >= LOOK_NS):
+            self._looked_ns = now_ns
+            self._index = self._search(system)
+        if self._index is None:
+            self._counts["absent"] += 1
+        return self._index
+
+    def _search(self, system: VrSystem) -> int | None:
+        serials = self._devices(system)
+        if self._serial is not None:
+            for index, (kind, serial) in serials.items():
+                if serial == self._serial and kind != self._library.TrackedDeviceClass_HMD:
+                    return index
+            return None
+        trackers = {
+            index: serial
+            for index, (kind, serial) in serials.items()
+            if kind == self._library.TrackedDeviceClass_GenericTracker
+        }
+        if len(trackers) > 1:
+            there = ", ".join(trackers.values())
+            raise TrackerChoiceError(
+                f"SteamVR has several trackers, {there}: say with --serial which one sits on the object"
+            )
+        return next(iter(trackers), None)
+
+    def _devices(self, system: VrSystem) -> dict[int, tuple[int, str]]:
+        """Number -> kind and serial number of all devices that move."""
+        kinds = (
+            self._library.TrackedDeviceClass_GenericTracker,
+            self._library.TrackedDeviceClass_Controller,
+            self._library.TrackedDeviceClass_HMD,
+        )
+        found: dict[int, tuple[int, str]] = {}
+        for index in range(self._library.k_unMaxTrackedDeviceCount):
+            kind = system.getTrackedDeviceClass(index)
+            if kind not in kinds:
+                continue
+            try:
+                serial = system.getStringTrackedDeviceProperty(index, self._library.Prop_SerialNumber_String)
+            except self._library.OpenVRError:
+                continue
+            found[index] = (kind, serial)
+        return found
+
+    def _valid(self, pose: object) -> tuple[Float, Float] | None:
+        """Place and turn of a `TrackedDevicePose_t`, if it is one to rely on."""
+        if not getattr(pose, "bDeviceIsConnected", False):
+            self._counts["absent"] += 1
+            return None
+        tracked = getattr(pose, "eTrackingResult", None) == self._library.TrackingResult_Running_OK
+        if not (tracked and getattr(pose, "bPoseIsValid", False)):
+            self._counts["lost_itself"] += 1
+            return None
+        return matrix34(getattr(pose, "mDeviceToAbsoluteTracking", None))
+
+
+def matrix34(matrix: object) -> tuple[Float, Float] | None:
+    """Place (3,) [m] and quaternion (4,) wxyz of an `HmdMatrix34_t`, row by row; None: it is no pose."""
+    rows = np.array([list(row) for row in getattr(matrix, "m", ())], float)
+    if rows.shape != (3, 4) or not np.isfinite(rows).all():
+        return None
+    turned = rows[:, :3]
+    if not np.allclose(turned @ turned.T, np.eye(3), atol=_UNIT_WITHIN) or np.linalg.det(turned) < 0.0:
+        return None
+    return rows[:, 3], matrix_to_quaternion(turned)
