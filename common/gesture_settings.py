@@ -62,7 +62,7 @@ class HoldSettings(Part, frozen=True):
     still_deg_s: Positive = 90.0
     slow_s: NonNegative = 0.25
     lost_s: NonNegative = 0.5
-    known_share: Score = 0.6
+    known_share: Score = 0.5
 
 
 def _most(high: float, soft: float) -> Span:
@@ -82,10 +82,10 @@ def study_poses() -> dict[Name, PoseShape]:
     return {
         "open_palm": PoseShape(
             ranges={
-                "index_bend_deg": _most(16.0, 8.0),
-                "middle_bend_deg": _most(16.0, 8.0),
-                "ring_bend_deg": _most(16.0, 8.0),
-                "little_bend_deg": _most(16.0, 8.0),
+                "index_bend_deg": _most(18.0, 9.0),
+                "middle_bend_deg": _most(18.0, 9.0),
+                "ring_bend_deg": _most(18.0, 9.0),
+                "little_bend_deg": _most(18.0, 9.0),
                 "thumb_across": _between(0.4, 3.0, 0.1),
             }
         ),
@@ -140,7 +140,6 @@ def study_poses() -> dict[Name, PoseShape]:
                 "ring_bend_deg": _most(75.0, 12.0),
                 "little_bend_deg": _most(75.0, 12.0),
             },
-            needs=("thumb", "index"),
         ),
     }
 

@@ -28,7 +28,9 @@ class HandFeatures:
         hand: Name of the hand profile.
         t_ns: The instant [ns], that of the pose.
         known: (5,) the finger's tip is known to `KNOWN_SIGMA_M` or better.
+        seen: (5,) a sensor observes the finger's tip now.
         sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
+        shape_sigma_m: (5,) the same without what the wrist's place has of it, which moves the whole hand.
         angles_rad: (5, 4) of the pose, zero in the profile's rest pose.
         bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line; of the
             thumb the first is how far its metacarpal stands out of the palm's plane, then MCP and IP.
@@ -48,7 +50,9 @@ class HandFeatures:
     hand: str
     t_ns: int
     known: Bool
+    seen: Bool
     sigma_m: Float
+    shape_sigma_m: Float
     angles_rad: Float
     bend_rad: Float
     curl: Float
@@ -76,7 +80,7 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
     bend = _bends(joints[CHAINS], rotation[CHAINS], palm)
     total = bend.sum(axis=1)
     total[0] -= bend[0, 0]
-    sigma = _sigma_m(pose)
+    sigma, wrist = _sigma_m(pose)
     known = pose.valid[TIPS] & (sigma <= KNOWN_SIGMA_M)
     last = CHAINS[:, 2]
     along = joints[last] + _PAD_SHARE * (joints[TIPS] - joints[last])
@@ -85,7 +89,9 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         hand=pose.hand,
         t_ns=pose.t_ns,
         known=known,
+        seen=pose.tracked[TIPS],
         sigma_m=sigma,
+        shape_sigma_m=np.sqrt(np.maximum(sigma**2 - wrist**2, 0.0)),
         angles_rad=pose.angles_rad,
         bend_rad=bend,
         curl=np.clip(total / _CURLED_RAD, 0.0, 1.0),
@@ -103,12 +109,14 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
     )
 
 
-def _sigma_m(pose: HandPose) -> Float:
-    """Standard deviations (5,) [m] of the tips along their worst axis; inf where they are not known."""
-    cov = pose.cov_m2[TIPS]
-    told = np.isfinite(cov).all(axis=(1, 2)) & pose.valid[TIPS]
-    worst = np.linalg.eigvalsh(np.where(told[:, None, None], cov, 0.0))[:, 2]
-    return np.where(told, np.sqrt(np.maximum(worst, 0.0)), np.inf)
+def _sigma_m(pose: HandPose) -> tuple[Float, float]:
+    """Standard deviations (5,) [m] of the tips along their worst axis, inf where not known; and that of the wrist along
+    its best, 0 where not known."""
+    which = np.append(TIPS, WRIST)
+    cov = pose.cov_m2[which]
+    told = np.isfinite(cov).all(axis=(1, 2)) & pose.valid[which]
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.where(told[:, None, None], cov, 0.0)), 0.0))
+    return np.where(told[:5], spread[:5, 2], np.inf), float(spread[5, 0])
 
 
 def _bends(chain: Float, rotation: Float, palm: Float) -> Float:

@@ -1,0 +1,230 @@
+"""Which pose the hand is held in: the six of the Digits study, and those that were taught.
+
+Every pose says which quantities are to lie in which range (`common.gesture_settings`). It fits by
+
+    s = exp(-1/2 sum z^2),   z = distance to the range / sqrt(border^2 + sigma^2)
+
+with sigma the doubt of the quantity itself: a hidden finger speaks neither for nor against. That alone would make a
+hand of which little is known fit everything, so a pose is believed as far as it stands out of the others,
+
+    confidence = s . s / (sum of all s)
+
+and only where most of its quantities are known. None is an answer: a hand that fits nothing has no pose.
+
+A hand that goes from one pose to another may pass through a third. So a pose begins where the fingers are nearly at
+rest, or once it has lasted a while; the end of a natural movement is slow, so that this costs no time.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.gesture_settings import GestureSettings, HoldSettings, PoseShape
+from common.hand_model import FINGERS
+from common.messages import Gesture, Phase
+from master.gestures.features import HandFeatures
+from master.gestures.quantities import QUANTITIES, Quantities
+
+_RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
+_VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
+_MEMORY_S = 0.15  # older frames tell nothing of how fast a finger is now
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """How well each pose fits one hand, in the order of `PoseTable.names`.
+
+    Attributes:
+        score: (P,) 0..1, each for itself, by what is known.
+        confidence: (P,) 0..1, against the others.
+        known: (P,) enough of its quantities are known, and the fingers that it needs.
+    """
+
+    score: Float
+    confidence: Float
+    known: Bool
+
+    def best(self) -> int | None:
+        """The most confident pose of which enough is known."""
+        if not self.known.any():
+            return None
+        return int(np.argmax(np.where(self.known, self.confidence, -1.0)))
+
+
+class PoseTable:
+    """The poses of a settings file as arrays."""
+
+    def __init__(self, settings: GestureSettings) -> None:
+        self.names: tuple[str, ...] = tuple(settings.poses)
+        poses = list(settings.poses.values())
+        shape = (len(poses), len(QUANTITIES))
+        self._low, self._high, self._soft = np.full(shape, -np.inf), np.full(shape, np.inf), np.ones(shape)
+        self._asked = np.zeros(shape, np.bool_)
+        self._needs = np.array([[finger in pose.needs for finger in FINGERS] for pose in poses], np.bool_)
+        self._needs = self._needs.reshape(len(poses), len(FINGERS))
+        self._share = settings.hold.known_share
+        for row, pose in enumerate(poses):
+            self._fill(row, pose)
+
+    def misfit(self, quantities: Quantities) -> Float:
+        """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
+        value = np.where(np.isfinite(quantities.value), quantities.value, 0.0)
+        outside = np.maximum(np.maximum(self._low - value, value - self._high), 0.0)
+        return np.where(self._asked, outside / np.hypot(self._soft, self._doubt(quantities)), 0.0)
+
+    def fit(self, quantities: Quantities, known: Bool) -> Fit:
+        """How well each pose fits.
+
+        Args:
+            quantities: Of the hand.
+            known: (5,) which fingers are.
+        """
+        score = np.exp(-0.5 * (self.misfit(quantities) ** 2).sum(axis=1))
+        weight = np.where(
+            self._asked, 1.0 / (1.0 + (self._doubt(quantities) / (_VAGUE * self._soft)) ** 2), 0.0
+        )
+        share = weight.sum(axis=1) / np.maximum(self._asked.sum(axis=1), 1)
+        total = float(score.sum())
+        confidence = score * score / total if total > 0.0 else score
+        return Fit(score, confidence, (share >= self._share) & (known | ~self._needs).all(axis=1))
+
+    def _doubt(self, quantities: Quantities) -> Float:
+        told = np.isfinite(quantities.value) & np.isfinite(quantities.sigma)
+        return np.where(told, quantities.sigma, 1e9)
+
+    def _fill(self, row: int, pose: PoseShape) -> None:
+        for name, span in pose.ranges.items():
+            column = QUANTITIES.index(name)
+            self._asked[row, column] = True
+            self._low[row, column], self._high[row, column] = span.low, span.high
+            self._soft[row, column] = span.soft
+
+
+class FingerSpeed:
+    """How fast the fingers bend. The state it holds is the bends of the last frames."""
+
+    def __init__(self) -> None:
+        self._past: deque[tuple[int, Float, Bool]] = deque()
+
+    def push(self, t_ns: int, bend_deg: Float, known: Bool) -> float:
+        """Speed [deg/s], root mean square over the fingers known then and now; inf where no frame tells.
+
+        Args:
+            t_ns: The instant [ns].
+            bend_deg: (4,) bends of index ... little, MCP and PIP together.
+            known: (4,) which of them are.
+        """
+        while self._past and t_ns - self._past[0][0] > 1e9 * _MEMORY_S:
+            self._past.popleft()
+        self._past.append((t_ns, bend_deg, known))
+        for then_ns, before, told in reversed(self._past):
+            if t_ns - then_ns >= 1e9 * _RATE_S:
+                both = told & known
+                if not both.any():
+                    return np.inf
+                change = (bend_deg - before)[both] / (1e-9 * (t_ns - then_ns))
+                return float(np.sqrt((change**2).mean()))
+        return np.inf
+
+
+class PoseRecogniser:
+    """From the features of a hand to the pose it is held in: begin, update, end.
+
+    The state it holds is the pose that is held, since when which pose would be the one, since when the held one is not,
+    when it was last known, and the speed of the fingers.
+    """
+
+    def __init__(self, settings: GestureSettings) -> None:
+        self._hold: HoldSettings = settings.hold
+        self._table = PoseTable(settings)
+        self._speed = FingerSpeed()
+        self._held: int | None = None
+        self._began_ns = self._seen_ns = 0
+        self._confidence = 0.0
+        self._coming: int | None = None
+        self._coming_ns = 0
+        self._going_ns: int | None = None
+
+    @property
+    def held(self) -> str | None:
+        """Name of the pose that is held."""
+        return None if self._held is None else self._table.names[self._held]
+
+    def push(self, features: HandFeatures) -> list[Gesture]:
+        """What is to be said of a hand; instants rise."""
+        quantities = Quantities.of(features)
+        fit = self._table.fit(quantities, features.known)
+        bend = np.degrees(features.bend_rad[1:, :2].sum(axis=1))
+        speed = self._speed.push(features.t_ns, bend, features.known[1:])
+        begins = self._beginning(features.t_ns, fit, speed)
+        if begins is not None and begins != self._held:
+            return self._begin(features, begins, float(fit.confidence[begins]))
+        return self._go_on(features.hand, features.t_ns, fit)
+
+    def lose(self, hand: str, t_ns: int) -> list[Gesture]:
+        """What is to be said where the hand itself is not known at `t_ns`."""
+        self._coming = None
+        return [] if self._held is None else self._unsure(hand, t_ns)
+
+    def _beginning(self, t_ns: int, fit: Fit, speed: float) -> int | None:
+        """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
+        best = fit.best()
+        if best is None or fit.confidence[best] < self._hold.begin:
+            self._coming = None
+            return None
+        if best != self._coming:
+            self._coming, self._coming_ns = best, t_ns
+        lasted_s = 1e-9 * (t_ns - self._coming_ns)
+        rests = lasted_s >= self._hold.begin_s and speed <= self._hold.still_deg_s
+        return best if rests or lasted_s >= self._hold.slow_s else None
+
+    def _begin(self, features: HandFeatures, pose: int, confidence: float) -> list[Gesture]:
+        t_ns = features.t_ns
+        out = [] if self._held is None else [self._said(features.hand, t_ns, "end", 0.0)]
+        self._held, self._began_ns, self._seen_ns, self._confidence = pose, t_ns, t_ns, confidence
+        self._going_ns = None
+        return [*out, self._said(features.hand, t_ns, "begin", confidence)]
+
+    def _go_on(self, hand: str, t_ns: int, fit: Fit) -> list[Gesture]:
+        held = self._held
+        if held is None:
+            return []
+        confidence = float(fit.confidence[held])
+        # Of a hand of which too little is known it may well be held, unless what is known speaks against it.
+        if not fit.known[held] and fit.score[held] >= self._hold.end:
+            return self._unsure(hand, t_ns)
+        if confidence >= self._hold.end:
+            self._going_ns, self._seen_ns, self._confidence = None, t_ns, confidence
+            return [self._said(hand, t_ns, "update", confidence)]
+        if self._going_ns is None:
+            self._going_ns = t_ns
+        if t_ns - self._going_ns >= 1e9 * self._hold.end_s:
+            return self._end(hand, t_ns)
+        return [self._said(hand, t_ns, "update", confidence)]
+
+    def _unsure(self, hand: str, t_ns: int) -> list[Gesture]:
+        """The held pose goes on for a while, ever less sure."""
+        left = 1.0 - 1e-9 * (t_ns - self._seen_ns) / max(self._hold.lost_s, 1e-9)
+        if left <= 0.0:
+            return self._end(hand, t_ns)
+        return [self._said(hand, t_ns, "update", min(left, 1.0) * self._confidence)]
+
+    def _end(self, hand: str, t_ns: int) -> list[Gesture]:
+        out = [self._said(hand, t_ns, "end", 0.0)]
+        self._held, self._going_ns = None, None
+        return out
+
+    def _said(self, hand: str, t_ns: int, phase: Phase, confidence: float) -> Gesture:
+        assert self._held is not None
+        name = self._table.names[self._held]
+        return Gesture(
+            hand=hand,
+            t_ns=t_ns,
+            kind="pose",
+            name=name,
+            phase=phase,
+            began_t_ns=self._began_ns,
+            confidence=min(max(confidence, 0.0), 1.0),
+        )
