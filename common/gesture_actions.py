@@ -28,8 +28,8 @@ class PinchSettings(Part, frozen=True):
     closed_gap_m: NonNegative = 0.001
     open_gap_m: Positive = 0.040
     clear_m: NonNegative = 0.006
-    apart_rad: Positive = math.radians(80.0)
-    fist_curl: Positive = 0.72
+    apart_rad: Positive = math.radians(105.0)
+    fist_curl: Positive = 0.75
     sigma_most_m: Positive = 0.012
     lost_s: NonNegative = 0.35
 
@@ -37,22 +37,26 @@ class PinchSettings(Part, frozen=True):
 class DialSettings(Part, frozen=True):
     """A grip about something round, thumb against fingers, that turns.
 
-    `hold_s`: how long the grip is held until it begins, its tips moving less than `still_m_s` against each other.
-    `radius_low_m`, `radius_high_m`: of the circle on which the tips lie. `fingers_least`: how many of the four lie on
-    it. `round_m`: how far from it they may be; `opposed_rad`: at least so far round it is the thumb from each of them.
-    `slack`: by how much all these are wider for a grip that has begun. `regrip_s`: how long an open hand may take to
-    grip again; the angle goes on where it was. `lost_s`: how long tips may be unknown. `sigma_most_m`: of a tip, above
-    which it is.
+    `hold_s`: how long the grip is held until it begins, no tip going in or out by more than `still_m`; `again_s`: the
+    same for a hand that grips again. `radius_low_m`, `radius_high_m`: of the circle on which the middles of the tips
+    lie; `curl_least`: of 0..1, the four fingers together are curled at least: others are a relaxed hand.
+    `fingers_least`: how many of the four lie on it. `round_m`: how far from it they may be; `opposed_rad`: at least
+    so far round it is the thumb from each of them. `loose_m`: a grip that is wider by this turns nothing; `open_m`:
+    one that is wider, or narrower, by this is none. `regrip_s`: how long an open hand may take to grip again; the
+    angle goes on where it was. `lost_s`: how long tips may be unknown; `sigma_most_m`: of a tip, above which it is.
     """
 
-    hold_s: NonNegative = 0.25
-    still_m_s: Positive = 0.06
+    hold_s: NonNegative = 0.2
+    again_s: NonNegative = 0.08
+    still_m: Positive = 0.004
     radius_low_m: Positive = 0.014
-    radius_high_m: Positive = 0.050
+    radius_high_m: Positive = 0.042
+    curl_least: NonNegative = 0.3
     fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
     round_m: Positive = 0.012
     opposed_rad: Positive = math.radians(75.0)
-    slack: Positive = 1.35
+    loose_m: Positive = 0.004
+    open_m: Positive = 0.009
     regrip_s: NonNegative = 0.8
     lost_s: NonNegative = 0.5
     sigma_most_m: Positive = 0.015
@@ -62,20 +66,26 @@ class TapSettings(Part, frozen=True):
     """The thumb's tip on a segment of a finger: twelve keys, while the fingers lie side by side as a pad.
 
     Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
-    `touch_gap_m`, `leave_gap_m`: between the skins of thumb and segment at which it touches and leaves.
-    `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between two taps. `level_rad`: how differently the
-    fingers of a pad are bent at most; `curl_most`: of 0..1, how far at most. `nearer_m`: how much nearer the thumb must
-    be to this key than to another. `sigma_most_m`: of thumb and finger, above which nothing is told.
+    `touch_gap_m`, `leave_gap_m`: between the skins of thumb and finger at which it touches and leaves; it leaves
+    earlier where it has gone away by `rise_m` from where it was nearest. `approach_s`: within so long it comes from
+    beyond `leave_gap_m`; slower is no tap. `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between
+    two taps. `level_rad`: how differently the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of
+    0..1, how far at most. `quiet_rad`: how far the four may bend together while the thumb touches: more is a hand
+    that closes. `nearer_m`: how much nearer the thumb is to the finger of this key than to another. `sigma_most_m`:
+    of the tips of thumb and finger, above which nothing is told.
     """
 
-    touch_gap_m: Positive = 0.005
-    leave_gap_m: Positive = 0.011
+    touch_gap_m: Positive = 0.006
+    leave_gap_m: Positive = 0.012
+    rise_m: Positive = 0.006
+    approach_s: Positive = 0.4
     shortest_s: NonNegative = 0.03
     longest_s: Positive = 0.6
     apart_s: NonNegative = 0.08
-    level_rad: Positive = math.radians(40.0)
-    curl_most: Positive = 0.6
-    nearer_m: NonNegative = 0.001
+    level_rad: Positive = math.radians(50.0)
+    curl_most: Positive = 0.8
+    quiet_rad: Positive = math.radians(25.0)
+    nearer_m: NonNegative = 0.0015
     sigma_most_m: Positive = 0.012
 
 
@@ -106,6 +116,7 @@ def check_actions(
         ("pinch.end_gap_m", pinch.begin_gap_m, pinch.end_gap_m, "begin_gap_m"),
         ("pinch.open_gap_m", pinch.closed_gap_m, pinch.open_gap_m, "closed_gap_m"),
         ("dial.radius_high_m", dial.radius_low_m, dial.radius_high_m, "radius_low_m"),
+        ("dial.open_m", dial.loose_m, dial.open_m, "loose_m"),
         ("tap.leave_gap_m", tap.touch_gap_m, tap.leave_gap_m, "touch_gap_m"),
         ("tap.longest_s", tap.shortest_s, tap.longest_s, "shortest_s"),
         ("point.bent_rad", point.stretched_rad, point.bent_rad, "stretched_rad"),
@@ -113,5 +124,3 @@ def check_actions(
     for key, low, high, other in rising:
         if not high > low:
             raise CalibrationError(f"{where}: {key}: {high:g} must be more than {other}, {low:g}")
-    if dial.slack < 1.0:
-        raise CalibrationError(f"{where}: dial.slack: {dial.slack:g} must be 1 or more")

@@ -1,0 +1,208 @@
+"""Postures in which a hand pinches, grips a knob or lays its thumb on a key: found on the hand itself, skin on skin.
+
+What a posture must do is a handful of residuals, each over the width that it may miss by; the angles that meet them
+best and stay nearest to a natural posture are found by damped Gauss-Newton steps with differences for derivatives.
+Some tenths of a second for all of them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.hand_model import CHAINS, TIPS, HandModel
+from common.sim.motion import POSES, angles_of
+from common.skin_gaps import RoundCones, gaps_between
+
+PAD_DEG = ((18, 8, 14), (2, 68, 34), (0, 68, 34), (-1, 68, 34), (-2, 68, 34))
+# Thumb, then MCP and PIP of all fingers, from which a key is reached for.
+_REACH_DEG = (
+    ((-10, 12, 30), (72, 36)),
+    ((0, 25, 25), (72, 40)),
+    ((-12, 35, 40), (78, 25)),
+    ((-5, 42, 42), (80, 32)),
+)
+KNOB_DEG = ((26, 22, 18), (8, 38, 44), (2, 42, 46), (-6, 42, 46), (-12, 38, 44))
+PRESSED_M = 0.0005
+KNOB_M = (0.020, 0.026)  # radius of knobs
+_STEPS, _DAMPING, _NUDGE_DEG = 30, 0.05, 0.25
+_OTHERS_CLEAR_M = 0.016
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Knob:
+    """A grip of a knob.
+
+    Attributes:
+        posture_deg: (5, 3) of the hand round it.
+        centre_m, axis: (3,) of the knob, palm frame; the axis goes from the back of the hand through the palm.
+        radius_m: Of the knob.
+    """
+
+    posture_deg: Float
+    centre_m: Float
+    axis: Float
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Posed:
+    """Candidate postures as geometry, palm frame.
+
+    Attributes:
+        posture_deg: (N, 5, 3).
+        joints_m: (N, 26, 3) [m].
+        rotation: (N, 26, 3, 3).
+        cones: (N, 5, 3) segments.
+    """
+
+    posture_deg: Float
+    joints_m: Float
+    rotation: Float
+    cones: RoundCones
+
+    @classmethod
+    def of(cls, model: HandModel, posture_deg: Float, wobble: Float) -> "Posed":
+        """Of postures (N, 5, 3) [deg] with the wobble (5, 4) of `angles_of`."""
+        found = model.joints(np.eye(4), model.chains(angles_of(model, posture_deg, wobble)))
+        cones = RoundCones.of_segments(found.position_m, model.radius_m)
+        return cls(posture_deg, found.position_m, found.rotation, cones)
+
+    def palmar(self, finger: int, segment: int) -> Float:
+        """Unit vectors (N, 3) out of the palmar side of a segment: -y of the joint it begins at."""
+        return -self.rotation[:, CHAINS[finger, segment], :, 1]
+
+
+def pinch_posture(model: HandModel, finger: int, wobble: Float) -> Float:
+    """Posture (5, 3) [deg] in which the pads of the thumb and of finger 1 ... 4 meet, the others well away."""
+    start = np.array(POSES["pinch"], dtype=np.float64)
+    start[1:, 1:] = (12.0, 18.0)
+    start[finger, 1:] = (46.0, 44.0)
+    others = [f for f in range(1, 5) if f != finger]
+
+    def misses(posed: Posed) -> Float:
+        found = gaps_between(posed.cones.part(slice(0, 1), 2), posed.cones.part(slice(1, 5), 2))
+        way, gap = found.a_to_b[:, finger - 1], found.gap_m[:, finger - 1]
+        face = np.stack(
+            [1.0 - np.vecdot(way, posed.palmar(0, 2)), 1.0 + np.vecdot(way, posed.palmar(finger, 2))], axis=1
+        )
+        clear = np.maximum(_OTHERS_CLEAR_M - found.gap_m[:, [f - 1 for f in others]], 0.0)
+        return np.concatenate([(gap[:, None] + PRESSED_M) / 2e-4, face / 0.4, clear / 2e-3], axis=1)
+
+    free = np.array([0, 1, 2, *range(3 * finger, 3 * finger + 3)])
+    return _solved(model, start, free, np.array([12.0, 12.0, 15.0, 5.0, 15.0, 15.0]), misses, wobble)[0]
+
+
+def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> Float:
+    """Posture (5, 3) [deg] in which the thumb's tip lies on segment 0 ... 2, from the knuckle, of finger 1 ... 4.
+
+    All fingers bend alike, as far as the thumb needs to reach the key, and that finger a little on its own.
+    """
+    mine = slice(3 * (finger - 1), 3 * finger)
+
+    def misses(posed: Posed) -> Float:
+        found = gaps_between(
+            posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+        )
+        count = len(posed.joints_m)
+        gap, way = found.gap_m.reshape(count, 12), found.a_to_b[:, finger - 1, segment]
+        own = gap[:, mine][:, segment]
+        on = np.stack(
+            [found.on_b[:, finger - 1, segment] - 0.5, 0.5 * found.on_a[:, finger - 1, segment] - 0.5], axis=1
+        )
+        side = 0.6 - np.maximum(-np.vecdot(way, posed.palmar(finger, segment)), -1.0)
+        others = np.delete(gap, range(3 * (finger - 1), 3 * finger), axis=1)
+        clear = np.maximum(0.004 - others, 0.0)
+        posture = posed.posture_deg
+        alike = (posture[:, 1:, 1:] - posture[:, 1:, 1:].mean(axis=1, keepdims=True)).reshape(count, -1)
+        return np.concatenate(
+            [
+                (own[:, None] + PRESSED_M) / 2e-4,
+                on / 0.12,
+                np.maximum(side, 0.0)[:, None] / 0.2,
+                clear / 1e-3,
+                alike / 7.0,
+            ],
+            axis=1,
+        )
+
+    free = np.array([0, 1, 2, *(3 * f + k for f in range(1, 5) for k in (1, 2))])
+    width = np.array([25.0, 25.0, 25.0, *[25.0] * 8])
+    found = [_solved(model, _pad(*start), free, width, misses, wobble) for start in _REACH_DEG]
+    return min(found, key=lambda one: one[1])[0]
+
+
+def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
+    """How five tips lie about a knob of that radius, in one plane across its axis."""
+    start = np.array(KNOB_DEG, dtype=np.float64)
+    reach_m = radius_m + model.radius_m[TIPS]
+
+    def misses(posed: Posed) -> Float:
+        tips = posed.joints_m[:, TIPS]
+        centre, axis = _middle_and_axis(tips)
+        off = tips - centre[:, None]
+        along = np.vecdot(off, axis[:, None])
+        round_m = np.linalg.norm(off - along[..., None] * axis[:, None], axis=-1)
+        return np.concatenate([(round_m - reach_m) / 5e-4, along / 1e-3], axis=1)
+
+    posture, _ = _solved(model, start, np.arange(15), np.tile([8.0, 15.0, 15.0], 5), misses, wobble)
+    centre, axis = _middle_and_axis(Posed.of(model, posture[None], wobble).joints_m[:, TIPS])
+    return Knob(posture, centre[0], axis[0], radius_m)
+
+
+def _middle_and_axis(tips_m: Float) -> tuple[Float, Float]:
+    """Middle (N, 3) between the tip of the thumb and those of the fingers (N, 5, 3), and their plane's normal."""
+    middle = 0.5 * tips_m[:, 0] + 0.5 * tips_m[:, 1:].mean(axis=1)
+    across = tips_m[:, 0] - middle
+    along = tips_m[:, 1] - tips_m[:, 4]
+    axis: Float = np.asarray(np.cross(across, along), dtype=np.float64)
+    axis = axis / np.linalg.norm(axis, axis=1, keepdims=True)
+    return middle, np.where(axis[:, 1:2] > 0.0, -axis, axis)
+
+
+def _solved(
+    model: HandModel,
+    start_deg: Float,
+    free: Int,
+    width_deg: Float,
+    misses: Callable[[Posed], Float],
+    wobble: Float,
+) -> tuple[Float, float]:
+    """The posture (5, 3) [deg] that misses least and strays least, over the widths, in the angles that are free, and
+    by how much, squared.
+    """
+
+    def residuals(x: Float) -> Float:
+        posture = np.tile(start_deg.ravel(), (len(x), 1))
+        posture[:, free] += x
+        out = misses(Posed.of(model, posture.reshape(-1, 5, 3), wobble))
+        return np.concatenate([out, x / width_deg], axis=1)
+
+    x = np.zeros(len(free))
+    steps = np.concatenate([np.zeros((1, len(free))), _NUDGE_DEG * np.eye(len(free))])
+    here = residuals(x + steps)
+    best_x, best, damping = x, float(here[0] @ here[0]), _DAMPING
+    for _ in range(_STEPS):
+        slope = (here[1:] - here[0]) / _NUDGE_DEG
+        square = slope @ slope.T
+        move: Float = np.asarray(
+            np.linalg.solve(square + damping * np.diag(np.diag(square)), slope @ here[0]), np.float64
+        )
+        x = best_x - np.clip(move, -15.0, 15.0)
+        found = residuals(x + steps)
+        cost = float(found[0] @ found[0])
+        if cost < best:
+            here, best_x, best, damping = found, x, cost, max(0.3 * damping, 1e-4)
+        else:
+            damping *= 8.0
+    posture = start_deg.ravel().copy()
+    posture[free] += best_x
+    return posture.reshape(5, 3), best
+
+
+def _pad(thumb: tuple[float, float, float], bend: tuple[float, float]) -> Float:
+    """Posture (5, 3) [deg] of a pad of fingers that are all bent like that."""
+    posture = np.array(PAD_DEG, dtype=np.float64)
+    posture[0], posture[1:, 1:] = thumb, bend
+    return posture

@@ -1,0 +1,56 @@
+"""Which action a hand does: its shape when it begins chooses, and until it ends there is no other.
+
+    thumb and one finger meet, that finger bent out of the row      pinch
+    the thumb meets a finger of four that lie side by side          tap
+    all tips about a circle, thumb across                           dial
+    index finger stretched, the others bent                         point
+
+So a thumb on the index finger's tip is the key 1 over a row of fingers that are bent alike, and a pinch where the
+finger has come to meet the thumb; and a finger that is stretched while a dial turns points at nothing.
+"""
+
+from common.arrays import Float
+from common.gesture_settings import GestureSettings
+from common.messages import Gesture
+from master.gestures.dial import DialWatch, still_frame
+from master.gestures.features import HandFeatures
+from master.gestures.pinch import PinchWatch
+from master.gestures.point import PointWatch
+from master.gestures.taps import TapWatch, is_pad
+from master.gestures.touch import thumb_touch
+
+
+class ActionWatch:
+    """Push machine. Holds the four watches, of which one at most is active."""
+
+    def __init__(self, settings: GestureSettings, radius_m: Float) -> None:
+        """Of a hand whose joints have the radii (26,) [m]."""
+        self._radius_m, self._taps = radius_m, settings.tap
+        self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
+        self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
+
+    def push(self, seen: HandFeatures, *, worn_only: bool = False) -> list[Gesture]:
+        """What is to be told at the instant of the features.
+
+        Args:
+            seen: The hand.
+            worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
+        """
+        pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
+        touch = thumb_touch(seen, self._radius_m)
+        others = dial.active or tap.active or point.active
+        told = pinch.push(seen, touch, may_begin=not others and not is_pad(seen, self._taps))
+        if pinch.active or dial.active or point.active:
+            tap.drop()
+        else:
+            told += tap.push(seen, touch, may_begin=True)
+        others = pinch.active or tap.active
+        told += dial.push(
+            seen, still_frame(seen, worn_only=worn_only), may_begin=not others and not point.active
+        )
+        return told + point.push(seen, may_begin=not others and not dial.active)
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """What is to be told at an instant at which there is no hand."""
+        self.tap.drop()
+        return self.pinch.lost(t_ns) + self.dial.lost(t_ns) + self.point.lost(t_ns)

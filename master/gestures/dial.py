@@ -1,0 +1,194 @@
+"""A dial: a grip about something round, by how much it is turned, over as many grips as it takes.
+
+The angle is that of the tips, turned as one in the room, about the axis of the knob: palm and fingers both turn a knob,
+and the tips are what a hand is measured by best. Where a tip is not seen it goes with the palm, and counts less. The
+axis begins as that of the circle through the tips; a turn tells its own axis better the farther it goes, and what is
+known of it is the mean of both (`_axis_of`). Within one grip the angle is against the grip's beginning, not summed up
+from step to step, so that neither noise nor a moment of loss adds up; a hand that opens stops the dial where it was,
+and goes on from there when it grips again.
+
+Where the only place is that of a wrist device (no markers, the palm stands still in its own camera's frame) the tips
+are turned by the palm in the world of its IMU.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import quaternion_to_matrix
+from common.gesture_actions import DialSettings
+from common.messages import Gesture, Phase
+from master.gestures.features import HandFeatures
+from master.gestures.grip import Circle, Tips, grip_of, spread_m, turned_by
+from master.gestures.lasting import Lasting
+
+_AXIS_RAD = np.radians(15.0)  # how well the circle of the tips tells the axis of the knob
+_SWAY_RAD = np.radians(4.0)  # about other axes, by which a hand sways while it turns a knob
+_EYE = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Grip:
+    """One grip of the dial.
+
+    Attributes:
+        tips: As they were when it closed.
+        circle: Theirs.
+        base_rad: By how much the dial had been turned then.
+        farthest: (3,) rotation vector [rad] of its largest turn so far.
+    """
+
+    tips: Tips
+    circle: Circle
+    base_rad: float
+    farthest: Float
+
+
+class DialWatch:
+    """Push machine. Holds the dial that has begun, its grip and its angle, and the grip that may become one."""
+
+    def __init__(self, settings: DialSettings) -> None:
+        self._settings = settings
+        self._dial: Lasting | None = None
+        self._grip: _Grip | None = None
+        self._maybe: tuple[int, Tips] | None = None  # since when a grip is held still, and as it was then
+        self._angle = 0.0
+        self._closed_ns = self._known_ns = 0  # when the dial was gripped, and tips were known, last
+        self._last: Gesture | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether a dial has begun, gripped or about to be gripped again."""
+        return self._dial is not None
+
+    def push(self, seen: HandFeatures, turn: Float, *, may_begin: bool) -> list[Gesture]:
+        """What is to be told at the instant of the features.
+
+        Args:
+            seen: The hand.
+            turn: (3, 3) from the rig frame to one that stands still in the room.
+            may_begin: Whether a dial may begin.
+        """
+        tips = _tips_of(seen, turn, self._settings.sigma_most_m)
+        if self._dial is None:
+            circle = self._held(seen.t_ns, tips, self._settings.hold_s) if may_begin else None
+            if circle is None:
+                self._maybe = self._maybe if may_begin else None
+                return []
+            self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
+            self._angle, self._grip = 0.0, _Grip(tips, circle, 0.0, np.zeros(3))
+            self._maybe, self._closed_ns, self._known_ns = None, seen.t_ns, seen.t_ns
+            return [self._tell(self._dial, "begin", seen, turn, tips)]
+        self._follow(seen.t_ns, tips)
+        own = self._settings
+        opened = self._grip is None and (seen.t_ns - self._closed_ns) * 1e-9 > own.regrip_s
+        if opened or (seen.t_ns - self._known_ns) * 1e-9 > own.lost_s:
+            return self._end(self._tell(self._dial, "end", seen, turn, tips))
+        return [self._tell(self._dial, "update", seen, turn, tips)]
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """What is to be told at an instant at which there is no hand."""
+        self._maybe = None
+        last = self._last
+        if self._dial is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
+            return []
+        told = self._dial.told(
+            "end", t_ns, 0.0, angle_rad=self._angle, origin_m=last.origin_m, direction=last.direction
+        )
+        return self._end(told)
+
+    def _end(self, told: Gesture) -> list[Gesture]:
+        self._dial = self._grip = self._maybe = self._last = None
+        return [told]
+
+    def _held(self, t_ns: int, tips: Tips, hold_s: float) -> Circle | None:
+        """The grip, if it has been held for so long."""
+        circle = grip_of(tips, self._settings)
+        if circle is None:
+            self._maybe = None
+            return None
+        if self._maybe is None or not _most(spread_m(tips, self._maybe[1])) <= self._settings.still_m:
+            self._maybe = (t_ns, tips)
+        return circle if (t_ns - self._maybe[0]) * 1e-9 >= hold_s else None
+
+    def _follow(self, t_ns: int, tips: Tips) -> None:
+        """Turn the dial, let it go, or grip it again."""
+        own, grip = self._settings, self._grip
+        if tips.known.sum() >= 3:
+            self._known_ns = t_ns
+        if grip is None:
+            circle = self._held(t_ns, tips, own.again_s)
+            if circle is None or self._maybe is None:
+                return
+            # What was turned since the hand closed counts.
+            self._grip = grip = _Grip(self._maybe[1], circle, self._angle, np.zeros(3))
+            self._maybe = None
+        wider = spread_m(tips, grip.tips)
+        by = 0.0 if np.isnan(wider).all() else float(np.nanmean(wider))
+        if abs(by) > own.open_m:
+            self._grip, self._closed_ns = None, t_ns
+            return
+        self._closed_ns = t_ns
+        if abs(by) > own.loose_m:
+            return
+        turn = turned_by(tips, grip.tips)
+        if float(turn @ turn) > float(grip.farthest @ grip.farthest):
+            self._grip = grip = replace(grip, farthest=turn)
+        twist = _twist(turn, _axis_of(grip)) + grip.base_rad
+        self._angle = twist + 2.0 * np.pi * round((self._angle - twist) / (2.0 * np.pi))
+
+    def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, turn: Float, tips: Tips) -> Gesture:
+        grip = self._grip
+        origin = turn.T @ (0.5 * tips.place_m[0] + 0.5 * tips.place_m[1:].mean(axis=0))
+        way = turn.T @ (tips.palmar if grip is None else _axis_of(grip))
+        confidence = float(tips.known.mean()) * (0.5 if grip is None else 1.0)
+        self._last = dial.told(
+            phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
+        )
+        return self._last
+
+
+def _most(lengths: Float) -> float:
+    """The largest of those that are known, inf where none is."""
+    known = np.abs(lengths[np.isfinite(lengths)])
+    return float(known.max()) if len(known) else np.inf
+
+
+def still_frame(seen: HandFeatures, *, worn_only: bool) -> Float:
+    """(3, 3) from the rig frame to one that stands still in the room: another one where all that sees is worn."""
+    if not worn_only or np.isnan(seen.palm_world_wxyz).any():
+        return _EYE
+    return quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
+
+
+def _tips_of(seen: HandFeatures, turn: Float, sigma_most_m: float) -> Tips:
+    pads = seen.pads_m - seen.tips_m
+    inwards = pads / np.linalg.norm(pads, axis=1, keepdims=True)
+    return Tips(
+        place_m=seen.tips_m @ turn.T,
+        sigma_m=seen.sigma_m,
+        inwards=inwards @ turn.T,
+        palmar=turn @ seen.palmar,
+        curl=float(seen.curl[1:].mean()),
+        known=seen.sigma_m <= sigma_most_m,
+    )
+
+
+def _axis_of(grip: _Grip) -> Float:
+    """The axis (3,) of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is far.
+
+    A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of the two
+    directions go with one over the square, and the best axis is the first of the sum of both, as a tensor.
+    """
+    prior = (_SWAY_RAD / _AXIS_RAD) ** 2
+    both = prior * np.outer(grip.circle.axis, grip.circle.axis) + np.outer(grip.farthest, grip.farthest)
+    axis: Float = np.linalg.eigh(both)[1][:, 2]
+    return axis if float(axis @ grip.circle.axis) > 0.0 else -axis
+
+
+def _twist(turn: Float, axis: Float) -> float:
+    """The part about an axis (3,) of a turn, a rotation vector (3,) [rad]: its twist (Dobrowolski, 2015)."""
+    angle = float(np.linalg.norm(turn))
+    along = float(turn @ axis) / max(angle, 1e-12)
+    return 2.0 * float(np.arctan2(along * np.sin(0.5 * angle), np.cos(0.5 * angle)))

@@ -1,0 +1,92 @@
+"""Pinches: thumb and one finger pad to pad, how far apart their skins are and how firmly they close.
+
+A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the gap to
+it is the least of the four, the pads face each other (the thumb over a fist lies on the backs of the fingers) and not
+all others are curled in. A finger that is not known neither begins nor ends a pinch: one that has begun goes on, its
+confidence falling, until `lost_s` are over.
+"""
+
+import numpy as np
+
+from common.gesture_actions import PinchSettings
+from common.hand_model import FINGERS
+from common.messages import Gesture, Phase
+from master.gestures.features import HandFeatures
+from master.gestures.lasting import Lasting, below
+from master.gestures.touch import ThumbTouch
+
+_ALIKE = 0.7  # of the doubt of two tips: part of it is the palm's, and moves both
+
+
+class PinchWatch:
+    """Push machine. Holds the pinch that has begun, and when its fingers were known last."""
+
+    def __init__(self, settings: PinchSettings) -> None:
+        self._settings = settings
+        self._pinch: Lasting | None = None
+        self._finger, self._known_ns = 0, 0
+        self._last: Gesture | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether one has begun."""
+        return self._pinch is not None
+
+    def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
+        """What is to be told at the instant of the features; a pinch begins only where it may."""
+        if self._pinch is None:
+            finger = self._begins(seen, touch) if may_begin else None
+            if finger is None:
+                return []
+            self._finger, self._known_ns = finger, seen.t_ns
+            self._pinch = Lasting(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
+            return [self._tell(self._pinch, "begin", seen, touch)]
+        if self._known(seen, self._finger):
+            self._known_ns = seen.t_ns
+            if touch.gap_m[self._finger] > self._settings.end_gap_m:
+                return self._end(self._tell(self._pinch, "end", seen, touch))
+        elif (seen.t_ns - self._known_ns) * 1e-9 > self._settings.lost_s:
+            return self._end(self._tell(self._pinch, "end", seen, touch))
+        return [self._tell(self._pinch, "update", seen, touch)]
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """What is to be told at an instant at which there is no hand."""
+        last = self._last
+        if self._pinch is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
+            return []
+        return self._end(
+            self._pinch.told("end", t_ns, 0.0, distance_m=last.distance_m, strength=last.strength)
+        )
+
+    def _end(self, told: Gesture) -> list[Gesture]:
+        self._pinch = self._last = None
+        return [told]
+
+    def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
+        own = self._settings
+        finger = int(np.argmin(touch.gap_m))
+        if touch.gap_m[finger] > own.begin_gap_m or not self._known(seen, finger):
+            return None
+        others = np.delete(np.arange(4), finger)
+        if touch.gap_m[others].min() - touch.gap_m[finger] < own.clear_m:
+            return None
+        if touch.pads_face[finger] < np.cos(own.apart_rad):
+            return None
+        return finger if float(seen.curl[1:][others].min()) < own.fist_curl else None
+
+    def _known(self, seen: HandFeatures, finger: int) -> bool:
+        return bool(max(seen.sigma_m[0], seen.sigma_m[finger + 1]) <= self._settings.sigma_most_m)
+
+    def _tell(self, pinch: Lasting, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
+        own, gap = self._settings, float(touch.gap_m[self._finger])
+        sigma = _ALIKE * float(np.hypot(seen.sigma_m[0], seen.sigma_m[self._finger + 1]))
+        strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
+        self._last = pinch.told(
+            phase,
+            seen.t_ns,
+            below(gap, own.end_gap_m, sigma),
+            distance_m=gap,
+            strength=float(np.clip(strength, 0.0, 1.0)),
+            origin_m=touch.middle_m[self._finger],
+        )
+        return self._last

@@ -1,0 +1,106 @@
+"""Pointing: the index finger stretched, the three after it bent, and the ray that goes on where it points.
+
+The ray goes from the knuckle through the tip and begins at the tip. Both ends are what a hand is fitted to best, the
+tip by its own marker and the knuckle by the palm, and they are as far apart as anything that points: the same
+millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is habit more than
+measurement (the DIP follows the PIP). It begins at the tip because there is no hand beyond it.
+
+Nothing is smoothed here: the markers are already, by the 1 EUR filter with a cut-off that rises with speed, and a
+hand at rest is held still by the hand's own filter. A second filter would only add its lag.
+"""
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.gesture_actions import PointSettings
+from common.hand_model import CHAINS
+from common.messages import Gesture, Phase
+from master.gestures.features import HandFeatures
+from master.gestures.lasting import Lasting
+
+_KNUCKLE, _TIP = CHAINS[1, 0], CHAINS[1, 3]
+
+
+class PointWatch:
+    """Push machine. Holds the pointing that has begun, and since when its shape is there or was lost."""
+
+    def __init__(self, settings: PointSettings) -> None:
+        self._settings = settings
+        self._point: Lasting | None = None
+        self._since_ns: int | None = None  # of the shape before it begins; of its loss after
+        self._last: Gesture | None = None
+
+    @property
+    def active(self) -> bool:
+        """Whether the finger points."""
+        return self._point is not None
+
+    def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
+        """What is to be told at the instant of the features; it begins only where it may."""
+        own, point = self._settings, self._point
+        shape = self._shape(seen)
+        if point is None:
+            if not (shape and may_begin):
+                self._since_ns = None
+                return []
+            if self._since_ns is None:
+                self._since_ns = seen.t_ns
+            if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s:
+                return []
+            self._point, self._since_ns = Lasting(seen.hand, "point", "point", self._since_ns), None
+            return [self._tell(self._point, "begin", seen)]
+        if shape:
+            self._since_ns = None
+        elif self._over(seen.t_ns):
+            return self._end(self._tell(point, "end", seen))
+        return [self._tell(point, "update", seen)]
+
+    def lost(self, t_ns: int) -> list[Gesture]:
+        """What is to be told at an instant at which there is no hand."""
+        last = self._last
+        if self._point is None or last is None or not self._over(t_ns):
+            return []
+        return self._end(self._point.told("end", t_ns, 0.0, origin_m=last.origin_m, direction=last.direction))
+
+    def _over(self, t_ns: int) -> bool:
+        """Whether the shape has been lost for long; counts from the first time it is asked."""
+        if self._since_ns is None:
+            self._since_ns = t_ns
+        return (t_ns - self._since_ns) * 1e-9 >= self._settings.hold_s
+
+    def _end(self, told: Gesture) -> list[Gesture]:
+        self._point, self._since_ns, self._last = None, None, None
+        return [told]
+
+    def _shape(self, seen: HandFeatures) -> bool:
+        """Whether the index finger is stretched and the others are bent, as far as these are known."""
+        own = self._settings
+        slack = own.slack_rad if self.active else 0.0
+        bend = _bends(seen)
+        known = self._known(seen)
+        if not known[1] and not self.active:
+            return False
+        bent = bend[2:] >= own.bent_rad - slack
+        if self.active:
+            bent |= ~known[2:]
+        stretched = bend[1] <= own.stretched_rad + slack or not known[1]
+        return bool(stretched and bent.all())
+
+    def _known(self, seen: HandFeatures) -> Bool:
+        return seen.sigma_m <= self._settings.sigma_most_m
+
+    def _tell(self, point: Lasting, phase: Phase, seen: HandFeatures) -> Gesture:
+        tip = seen.joints_m[_TIP]
+        way = tip - seen.joints_m[_KNUCKLE]
+        bend = _bends(seen)
+        middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
+        clear = np.clip((bend[2:] - middle) / middle, 0.0, 1.0).mean() * (0.5 + 0.5 * self._known(seen)[1])
+        self._last = point.told(
+            phase, seen.t_ns, float(clear), origin_m=tip, direction=way / np.linalg.norm(way)
+        )
+        return self._last
+
+
+def _bends(seen: HandFeatures) -> Float:
+    """How far each finger is bent beyond its knuckle (5,) [rad]."""
+    return seen.bend_rad[:, 1:].sum(axis=1)

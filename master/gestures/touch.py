@@ -1,0 +1,67 @@
+"""Where the thumb is to the fingers, skin to skin, and which sides face each other: what pinches and taps are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import CHAINS
+from common.skin_gaps import RoundCones, gaps_between
+from master.gestures.features import HandFeatures
+
+_PAD_SHARE = 0.75  # where along the last bone the features have the pad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ThumbTouch:
+    """The thumb's last segment against index ... little.
+
+    Attributes:
+        gap_m: (4,) to the last segment of each finger, skin to skin [m], negative: pressed.
+        middle_m: (4, 3) half way between them [m], rig frame.
+        pads_face: (4,) cosine by which the pads of both face each other, the worse of the two; 1: pad to pad.
+        key_gap_m: (4, 3) from the thumb's last segment to each segment of each finger, from the knuckle on [m].
+        key_on: (4, 3) where along the segment that is, 0 at the joint before it.
+        key_palmar: (4, 3) cosine between the way to the thumb there and the palmar side of the segment.
+    """
+
+    gap_m: Float
+    middle_m: Float
+    pads_face: Float
+    key_gap_m: Float
+    key_on: Float
+    key_palmar: Float
+
+
+def thumb_touch(features: HandFeatures, radius_m: Float) -> ThumbTouch:
+    """The gaps of a hand whose joints have the radii (26,) [m]."""
+    cones = RoundCones.of_segments(features.joints_m, radius_m)
+    found = gaps_between(cones.part(slice(0, 1), slice(2, 3)), cones.part(slice(1, 5), slice(0, 3)))
+    palmar = _palmar(features)
+    last_way = found.a_to_b[:, 2]
+    face = np.minimum(last_way @ palmar[0, 2], -np.vecdot(last_way, palmar[1:, 2]))
+    return ThumbTouch(
+        gap_m=found.gap_m[:, 2],
+        middle_m=found.middle_m[:, 2],
+        pads_face=face,
+        key_gap_m=found.gap_m,
+        key_on=found.on_b,
+        key_palmar=-np.vecdot(found.a_to_b, palmar[1:]),
+    )
+
+
+def _palmar(features: HandFeatures) -> Float:
+    """Unit vectors (5, 3, 3) out of the palmar side of each segment, rig frame: across it, in the plane of its bend.
+
+    The pad says it for the last one; the others are turned back by the bends between.
+    """
+    chain = features.joints_m[CHAINS]
+    bone = np.diff(chain, axis=1)
+    bone = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+    out = np.empty((5, 3, 3))
+    pad = features.pads_m - (chain[:, 2] + _PAD_SHARE * (chain[:, 3] - chain[:, 2]))
+    out[:, 2] = pad / np.linalg.norm(pad, axis=1, keepdims=True)
+    hinge = np.cross(bone[:, 2], out[:, 2])  # across the finger, the same for all its segments but for twist
+    across = np.cross(hinge[:, None], bone[:, :2])
+    out[:, :2] = across / np.linalg.norm(across, axis=-1, keepdims=True)
+    return out
