@@ -1,0 +1,1 @@
+"""Rigid objects that the cameras see: where they are, and how near the hand is to them."""

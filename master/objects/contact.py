@@ -1,0 +1,187 @@
+"""How near the fingers of a hand are to objects, and which of them touch.
+
+The skin of a finger is round cones from joint to joint with the radii of the profile (`common.round_cones`). The
+distance that is published is that of the last segment; a finger *touches* with any of its three, since whoever grasps a
+bar often holds it with the middle ones. The object's poses around the hand's instant are brought to it: between two of
+them by interpolation, behind the last by its motion, a tenth of a second at most.
+
+How sure a distance is follows from the covariances along the normal of the surface: that of the joints, that of the
+object's place, that of its turn by the lever from its origin, and flesh that gives way. A finger touches from a
+distance `NEAR_M` on that noise alone does not explain, and lets go beyond `FAR_M` (and as much): so it does not
+flicker.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.geometry import (
+    invert,
+    matrix_to_rotation_vector,
+    quaternion_to_matrix,
+    rigid,
+    rotation_vector_to_matrix,
+    transform,
+)
+from common.hand_model import CHAINS, METACARPALS, HandModel
+from common.messages import Contact, HandPose, ObjectPose
+from common.object_profile import ObjectProfile
+from common.round_cones import Cones
+from master.objects.surface import Nearest, Surface
+
+NEAR_M, FAR_M = 2.5e-3, 5.0e-3
+FLESH_M = 1.0e-3  # standard deviation of the skin about the profile's radii
+LED_S = 0.1  # by which an object's pose is led on, at most
+_POSES = 6
+_SURE_M = 0.02  # a distance less sure than this tells of no touch
+_DOUBT = 0.5  # of a standard deviation by which touching may begin early
+_LED_M_S2, _LED_RAD_S2 = 5.0, 50.0  # what a hand does to what it holds while nobody sees it
+_BONES: Int = np.concatenate(
+    [
+        np.stack([CHAINS[:, :-1], CHAINS[:, 1:]], axis=-1).reshape(-1, 2),
+        np.array([[joint, joint + 1] for joint in METACARPALS]),
+    ]
+)
+_SEGMENTS = 15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Placed:
+    """An object at an instant: `T_rig_object` (4, 4) and covariance (6, 6)."""
+
+    T: Float
+    cov: Float
+
+
+class ContactWatch:
+    """Push machine of one hand. Holds the last poses of each object, and which finger touches which."""
+
+    def __init__(self, model: HandModel, objects: Sequence[ObjectProfile]) -> None:
+        """Take the hand and the objects near it; those without a shape have no contact."""
+        self._hand = model.profile.name
+        self._surfaces = {profile.name: Surface(profile.shape) for profile in objects if profile.shape}
+        self._poses: dict[str, deque[ObjectPose]] = {name: deque(maxlen=_POSES) for name in self._surfaces}
+        self._touching: dict[str, Bool] = {name: np.zeros(6, np.bool_) for name in self._surfaces}
+
+    def push_object(self, pose: ObjectPose) -> None:
+        """Take a pose of an object; of one that is not watched, or not after the last, nothing is kept."""
+        poses = self._poses.get(pose.object)
+        if poses is None or (poses and pose.t_ns <= poses[-1].t_ns):
+            return
+        if np.isnan(pose.position_m).any():
+            poses.clear()
+        else:
+            poses.append(pose)
+
+    def push(self, pose: HandPose) -> list[Contact]:
+        """How near the hand is to each object that has a surface, in their order."""
+        if pose.hand != self._hand:
+            return []
+        return [self._contact(pose, name, surface) for name, surface in self._surfaces.items()]
+
+    def _contact(self, pose: HandPose, name: str, surface: Surface) -> Contact:
+        placed = _at(self._poses[name], pose.t_ns)
+        if placed is None:
+            self._touching[name] = np.zeros(6, np.bool_)
+            return _unknown(pose, name)
+        found, sigma = _gaps(pose, surface, placed)
+        # Fingers (5, 3) and the palm's four bones as a sixth of its own.
+        distance, bone_sigma = found.distance_m, sigma
+        segments = distance[:_SEGMENTS].reshape(5, 3)
+        palm = int(np.argmin(np.nan_to_num(distance[_SEGMENTS:], nan=np.inf))) + _SEGMENTS
+        nearest: Int = np.argmin(np.nan_to_num(segments, nan=np.inf), axis=1) + 3 * np.arange(5)
+        bones = np.append(nearest, palm)
+        touching = _touches(distance[bones], bone_sigma[bones], self._touching[name])
+        self._touching[name] = touching
+        last = 3 * np.arange(5) + 2
+        return Contact(
+            hand=pose.hand,
+            object=name,
+            t_ns=pose.t_ns,
+            distance_m=distance[last],
+            sigma_m=bone_sigma[last],
+            point_m=transform(placed.T, found.point_m[last]),
+            touching=touching[:5],
+            palm_distance_m=float(distance[palm]),
+            held=bool((touching[0] or touching[5]) and touching[1:5].any()),
+        )
+
+
+def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
+    """(N,) what touches, by distances and standard deviations (N,) [m] and what touched before; NaN: not known."""
+    sure = sigma < _SURE_M
+    begins = distance < NEAR_M + _DOUBT * np.minimum(sigma, FAR_M)
+    stays = before & (distance < FAR_M + _DOUBT * np.minimum(sigma, FAR_M))
+    return sure & (begins | stays)
+
+
+def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, Float]:
+    """Distances of all bones (19,), object frame, and their standard deviations; NaN where a joint is not valid."""
+    points = transform(invert(placed.T), np.nan_to_num(pose.position_m))
+    start, stop = _BONES.T
+    cones = Cones(points[start], points[stop], pose.radius_m[start], pose.radius_m[stop])
+    found = surface.nearest_to_cones(cones)
+    usable = (pose.valid & np.isfinite(pose.position_m).all(axis=1))[_BONES].all(axis=1)
+    middle = cones.start_m + found.along[:, None] * (cones.stop_m - cones.start_m)
+    out = middle - found.point_m
+    length = np.linalg.norm(out, axis=1)
+    R = placed.T[:3, :3]
+    normal = (out / np.maximum(length, 1e-9)[:, None]) @ R.T
+    lever = found.point_m @ R.T
+    along = found.along[:, None, None]
+    # Neighbouring joints err alike, so variances mix by shares and not by their squares.
+    cov = (1.0 - along) * pose.cov_m2[start] + along * pose.cov_m2[stop]
+    hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
+    pull = np.concatenate([normal, np.cross(lever, normal)], axis=1)
+    own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
+    sigma = np.sqrt(hand + own + FLESH_M**2)
+    nan = np.where(usable, 0.0, np.nan)
+    return Nearest(found.distance_m + nan, found.point_m + nan[:, None], found.along), sigma + nan
+
+
+def _at(poses: Sequence[ObjectPose], t_ns: int) -> _Placed | None:
+    """Where an object was at an instant, by its last poses; None: nobody knows."""
+    if not poses or t_ns - poses[-1].t_ns > LED_S * 1e9 or poses[0].t_ns - t_ns > LED_S * 1e9:
+        return None
+    if len(poses) == 1:
+        one = poses[0]
+        dt = (t_ns - one.t_ns) * 1e-9
+        return _Placed(_pose_of(one), one.cov + _led(dt))
+    after = next((k for k, one in enumerate(poses) if one.t_ns >= t_ns), len(poses) - 1)
+    a, b = poses[max(after, 1) - 1], poses[max(after, 1)]
+    share = (t_ns - a.t_ns) / (b.t_ns - a.t_ns)
+    T_a, T_b = _pose_of(a), _pose_of(b)
+    turn = matrix_to_rotation_vector(T_b[:3, :3] @ T_a[:3, :3].T)
+    R = rotation_vector_to_matrix(share * turn) @ T_a[:3, :3]
+    T = rigid(R, T_a[:3, 3] + share * (T_b[:3, 3] - T_a[:3, 3]))
+    near = b if share > 0.5 else a
+    beyond_s = max(t_ns - b.t_ns, a.t_ns - t_ns, 0) * 1e-9
+    return _Placed(T, near.cov + _led(beyond_s))
+
+
+def _led(dt_s: float) -> Float:
+    """Covariance (6, 6) of what an object may do beyond its motion in so long a time."""
+    way = 0.5 * dt_s * dt_s
+    return np.diag([(_LED_M_S2 * way) ** 2] * 3 + [(_LED_RAD_S2 * way) ** 2] * 3)
+
+
+def _pose_of(pose: ObjectPose) -> Float:
+    return rigid(quaternion_to_matrix(pose.orientation_wxyz), pose.position_m)
+
+
+def _unknown(pose: HandPose, name: str) -> Contact:
+    nothing = np.full(5, np.nan)
+    return Contact(
+        hand=pose.hand,
+        object=name,
+        t_ns=pose.t_ns,
+        distance_m=nothing,
+        sigma_m=nothing,
+        point_m=np.full((5, 3), np.nan),
+        touching=np.zeros(5, np.bool_),
+        palm_distance_m=np.nan,
+        held=False,
+    )

@@ -1,0 +1,75 @@
+"""Which features of an object something hides: what each camera should see of it, against what it sees.
+
+A feature that a camera should see and does not is hidden, and so is a bead that shows much less of its disc than it has
+shown: how much of a ball counts as painted depends on light and colour, so each bead in each camera is compared with
+what it shows when it is whole, which is learnt as the larger part of what it has shown.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.camera_model import CameraModel
+from master.objects.features import Features
+from master.objects.window import Sighting, Window
+
+_PART = 0.72  # of what a bead shows when it is whole
+_LEARN, _FORGET = 0.3, 0.002  # towards more, towards less, from frame to frame
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """How many features are seen, how many should be, and whether something hides a part."""
+
+    seen: int
+    expected: int
+    occluded: bool
+
+
+class Hidden:
+    """Push machine. Holds how much of its disc each bead shows in each camera when it is whole."""
+
+    def __init__(self, features: Features, cameras: tuple[CameraModel, ...]) -> None:
+        """Set up."""
+        self._features, self._cameras = features, cameras
+        self._whole = np.full((len(cameras), features.beads), np.nan)
+
+    def look(self, window: Window, T_rig_object: Float, used: Bool) -> Seen:
+        """Judge an instant.
+
+        Args:
+            window: What was looked for.
+            T_rig_object: (4, 4) the pose.
+            used: (C, F) what the pose rests on in the nearest frames.
+        """
+        beads = self._features.beads
+        expected, occluded = np.zeros(used.shape, np.bool_), False
+        for c, camera in enumerate(self._cameras):
+            markers, tags = window.near(c, 0), window.near(c, 1)
+            if markers is None and tags is None:
+                continue
+            should = self._features.expected(T_rig_object, camera)
+            should[:beads] &= markers is not None
+            should[beads:] &= tags is not None
+            expected[c] = should
+            occluded |= bool((should & ~used[c]).any())
+            if markers is not None and beads:
+                occluded |= self._partly(c, camera, T_rig_object, markers, should[:beads] & used[c, :beads])
+        return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
+
+    def _partly(self, c: int, camera: CameraModel, T: Float, markers: Sighting, seen: Bool) -> bool:
+        """Whether a bead that is seen shows too little; learns what they show."""
+        rows = np.arange(self._features.beads)
+        points = self._features.points[rows] @ T[:3, :3].T + T[:3, 3]
+        away = np.linalg.norm(points - camera.centre, axis=1)
+        disc = np.pi * (self._features.radius_m[rows] * camera.matrix[0, 0] / away) ** 2
+        share = np.where(seen, markers.area_px2 / disc, np.nan)
+        whole = self._whole[c]
+        partly = bool((share < _PART * whole).any())
+        known = np.isfinite(share)
+        pull = np.where(share > whole, _LEARN, _FORGET)
+        self._whole[c] = np.where(
+            known, np.where(np.isnan(whole), share, whole + pull * (share - whole)), whole
+        )
+        return partly

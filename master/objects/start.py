@@ -1,0 +1,125 @@
+"""Poses of an object from nothing but what is seen now: what a fit starts from while there is no past.
+
+Tags: each tag in each camera has two poses that show it nearly alike, tilted one way or the other (Collins, Bartoli,
+"Infinitesimal Plane-Based Pose Estimation", 2014); both are named. Beads: those that two cameras see are points, and
+three of them whose distances are the object's give a pose. Where a slave named two places of a colour, both are tried.
+Which of all these is right the fit decides, with all that is seen.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Int
+from common.camera_model import CameraModel
+from common.geometry import fit_rigid, invert, rigid
+from common.object_profile import tag_corners
+from master.objects.features import Features
+from master.stereo.triangulate import Triangulator
+
+_NEAR_S = 0.012  # frames of several cameras that are taken for one moment without bringing them there
+_DISTANCE_M, _DISTANCE_SHARE = 8e-3, 0.08  # by which distances between beads may be wrong
+_MISS_PX = 6.0  # by which rays of a bead may miss each other
+_POSES, _TRIPLES, _COMBINATIONS = 6, 40, 16
+_SIGMA_PX = 0.3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighted:
+    """One feature in one camera, at the instant as well as two frames tell.
+
+    Attributes:
+        camera: Which.
+        feature: Which.
+        uv: (K, n, 2) [px] n points; K places it may be: one, or two where the slave named a rival.
+    """
+
+    camera: int
+    feature: int
+    uv: Float
+
+
+def poses_of_tags(
+    sighted: Sequence[Sighted], features: Features, cameras: tuple[CameraModel, ...]
+) -> list[Float]:
+    """Poses `T_rig_object` (4, 4), two for each tag in each camera, the likelier first."""
+    poses: list[tuple[float, Float]] = []
+    for seen in sighted:
+        if seen.feature >= features.beads:
+            camera = cameras[seen.camera]
+            own = features.points[features.corners_of(seen.feature - features.beads)]
+            poses += [
+                (miss, camera.T_rig_camera @ T) for miss, T in two_poses(own, camera.undistort(seen.uv[0]))
+            ]
+    poses.sort(key=lambda pose: pose[0])
+    return [T for _, T in poses]
+
+
+def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
+    """How a tag seen at normalised points (4, 2) may lie: misfit of the corners and `T_camera_object` of each way.
+
+    Args:
+        corners: (4, 3) [m] of the tag, object frame, as printed top left, top right, bottom right, bottom left.
+        xy: Where they are seen, undistorted (x/z, y/z).
+    """
+    edge = 0.25 * float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
+    flat = tag_corners(edge)
+    T_tag_object = invert(fit_rigid(corners, flat))
+    count, turns, shifts, misses = cv2.solvePnPGeneric(
+        flat, np.ascontiguousarray(xy), np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE_SQUARE
+    )
+    out: list[tuple[float, Float]] = []
+    for k in range(int(count)):
+        turn, shift = np.asarray(turns[k], np.float64), np.asarray(shifts[k], np.float64).ravel()
+        T = rigid(np.asarray(cv2.Rodrigues(turn)[0], np.float64), shift) @ T_tag_object
+        if np.isfinite(T).all() and shift[2] > 0.0:
+            out.append((float(np.ravel(misses)[k]), T))
+    return out
+
+
+def poses_of_beads(sighted: Sequence[Sighted], features: Features, triangulator: Triangulator) -> list[Float]:
+    """Poses `T_rig_object` (4, 4) of three beads or more whose distances are right, the best first."""
+    places = [_points(sighted, bead, triangulator) for bead in range(features.beads)]
+    seen = [bead for bead, found in enumerate(places) if len(found)]
+    poses: list[tuple[float, Float]] = []
+    for triple in list(combinations(seen, 3))[:_TRIPLES]:
+        own = features.points[list(triple)]
+        if np.linalg.norm(np.cross(own[1] - own[0], own[2] - own[0])) < 1e-4:  # [m^2]: nearly in one line
+            continue
+        wanted = _sides(own)
+        for chosen in list(product(*(range(len(places[bead])) for bead in triple)))[:_COMBINATIONS]:
+            points = np.array([places[bead][k] for bead, k in zip(triple, chosen, strict=True)])
+            off = np.abs(_sides(points) - wanted)
+            if (off < _DISTANCE_M + _DISTANCE_SHARE * wanted).all():
+                poses.append((float(off.sum()), fit_rigid(points, own)))
+    poses.sort(key=lambda pose: pose[0])
+    return [T for _, T in poses[:_POSES]]
+
+
+def _points(sighted: Sequence[Sighted], bead: int, triangulator: Triangulator) -> Float:
+    """Where a bead may be (K, 3) [m], rig frame: of all choices of its places, those whose rays meet."""
+    views = [seen for seen in sighted if seen.feature == bead]
+    if len(views) < 2:
+        return np.empty((0, 3))
+    choices = list(product(*(range(len(seen.uv)) for seen in views)))[:_COMBINATIONS]
+    uv = np.full((len(triangulator.cameras), len(choices), 2), np.nan)
+    for seen, chosen in zip(views, np.array(choices, np.int64).T, strict=True):
+        uv[seen.camera] = seen.uv[chosen, 0]
+    found = triangulator.triangulate(uv, _SIGMA_PX)
+    return found.points[found.residual_px < _MISS_PX]
+
+
+def _sides(points: Float) -> Float:
+    """Distances (3,) between three points (3, 3)."""
+    return np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1)
+
+
+def reach(taus: Float) -> Int:
+    """Which two of the times (n,) from an instant [s] a place is brought there by, the nearest first; or which one."""
+    order: Int = np.argsort(np.abs(taus))
+    if len(order) < 2 or abs(float(taus[order[1]])) > 4 * _NEAR_S:
+        return order[:1]
+    return order[:2]

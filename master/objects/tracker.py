@@ -1,0 +1,173 @@
+"""The line of one object's tracker: poses of a device that tracks itself in, the object's pose in the rig out.
+
+    T_rig_object(t) = T_rig_tracking T_tracking_device(t) inv(T_object_tracker)
+
+No cameras, and so no instants of theirs: each pose of the device is one of the object, at its own time, which is the
+stamp and `stamp_offset_us`. How sure it is the registration knows: what was left of it against the cameras, which has
+the device's jitter in it, and how sure it is itself; both are of the object's own frame, the lever from the device to it
+included. Cameras were not better than that, so the covariance is rather too large than too small.
+
+**It has lost itself**, or its base stations: the last pose is held, ever less sure, for half a second; then there is
+none. **It leaps**, as it does by a mirror: a pose that no hand could have carried it to is passed over, unless it stays
+there. Nothing measures how the pose misses anything, so `residual_m` is NaN.
+"""
+
+from collections import Counter
+
+import numpy as np
+from msgspec.structs import replace
+
+from common.arrays import Float
+from common.calibration import RigCalibration
+from common.errors import CalibrationError
+from common.geometry import invert, matrix_to_quaternion, quaternion_to_matrix
+from common.messages import ObjectPose, ObjectSource, TrackerPose
+from common.object_profile import ObjectProfile
+from master.objects.line import HELD_S, SolvedObject
+
+LEAP_M, LEAP_M_S, LEAP_S = 0.08, 8.0, 0.15  # a leap: farther and faster than that; and how long it is doubted
+_UNKNOWN_M, _UNKNOWN_RAD = (
+    5e-3,
+    np.radians(1.5),
+)  # of a registration without figures, such as one made by hand
+_WANDERS_M_S, _WANDERS_RAD_S = 0.3, 2.0  # what a held pose may have become wrong by
+_UNIT_WITHIN = 1e-2
+_NOWHERE = (np.full(3, np.nan), np.full(4, np.nan), np.full((6, 6), np.nan))
+
+
+def registered(profile: ObjectProfile, rig: RigCalibration) -> bool:
+    """Whether an object has a tracker whose poses mean something in the rig."""
+    known = profile.T_object_tracker is not None and rig.T_rig_tracking is not None
+    return profile.tracker is not None and known
+
+
+class TrackerLine:
+    """Push machine. Holds the last pose, since when there is none, and a leap that is doubted.
+
+    Attributes:
+        counts: Poses that were `lost`, and those passed over as a `leap`, or because they were `late` or broken.
+    """
+
+    def __init__(self, profile: ObjectProfile, rig: RigCalibration) -> None:
+        """Set up.
+
+        Args:
+            profile: The object; it has a tracker, and says where that sits.
+            rig: It says where the tracking system lies.
+
+        Raises:
+            CalibrationError: The tracker is not registered yet.
+        """
+        if profile.tracker is None or profile.T_object_tracker is None or rig.T_rig_tracking is None:
+            missing = "T_rig_tracking" if rig.T_rig_tracking is None else "T_object_tracker"
+            raise CalibrationError(
+                f"object {profile.name!r}: its tracker {profile.tracker!r} is not registered to rig {rig.name!r},"
+                f" {missing} is missing: phalanx-master calibrate tracker {profile.name}"
+            )
+        self.name, self.source = profile.name, profile.tracker
+        self._T_rig_tracking = np.array(rig.T_rig_tracking, dtype=np.float64)
+        self._T_device_object = invert(np.array(profile.T_object_tracker, dtype=np.float64))
+        self._late_ns = round(1e3 * profile.stamp_offset_us)
+        self._cov = covariance_of(profile)
+        self._last: ObjectPose | None = None
+        self._session: int | None = None
+        self._newest_ns: int | None = None
+        self._leapt_ns: int | None = None
+        self.counts: Counter[str] = Counter()
+
+    def push(self, message: TrackerPose) -> list[SolvedObject]:
+        """Take one pose of the device, on the master's clock; return that of the object, or none if it came too late.
+
+        Raises:
+            ValueError: It is of another device.
+        """
+        if message.source != self.source:
+            raise ValueError(f"tracker {message.source!r}, this is the line of {self.source!r}")
+        if message.session != self._session:  # its clock, or its system, may be another one
+            self._session, self._newest_ns = message.session, None
+        t_ns = message.t_ns + self._late_ns
+        if self._newest_ns is not None and t_ns <= self._newest_ns:
+            self.counts["late"] += 1
+            return []
+        self._newest_ns = t_ns
+        pose = self._measured(t_ns, message)
+        return [SolvedObject(self._held(t_ns) if pose is None else pose, message.t_ns)]
+
+    def flush(self) -> list[SolvedObject]:
+        """At the end of a recording: nothing waits."""
+        return []
+
+    def _measured(self, t_ns: int, message: TrackerPose) -> ObjectPose | None:
+        """The object's pose; None: the device has lost itself, or what it says cannot be."""
+        place, turn = message.position_m, message.orientation_wxyz
+        if np.isnan(place).any() or np.isnan(turn).any():
+            self.counts["lost"] += 1
+            return None
+        if abs(float(np.linalg.norm(turn)) - 1.0) > _UNIT_WITHIN:
+            self.counts["broken"] += 1
+            return None
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = quaternion_to_matrix(turn), place
+        T = self._T_rig_tracking @ T @ self._T_device_object
+        if self._leaps(t_ns, T[:3, 3]):
+            self.counts["leap"] += 1
+            return None
+        pose = ObjectPose(
+            object=self.name,
+            t_ns=t_ns,
+            position_m=T[:3, 3],
+            orientation_wxyz=matrix_to_quaternion(T[:3, :3]),
+            cov=self._cov,
+            residual_m=float("nan"),
+            source=ObjectSource.TRACKER,
+            tracked=True,
+            seen=1,
+            expected=1,
+            occluded=False,
+        )
+        self._last = pose
+        return pose
+
+    def _leaps(self, t_ns: int, place_m: Float) -> bool:
+        """Whether no hand could have carried it there since the last pose; for a while, then it is believed."""
+        if self._last is not None:
+            since_s = max(1e-9 * (t_ns - self._last.t_ns), 1e-3)
+            way = float(np.linalg.norm(place_m - self._last.position_m))
+            if way > LEAP_M and way > LEAP_M_S * since_s:
+                if self._leapt_ns is None:
+                    self._leapt_ns = t_ns
+                if 0 <= t_ns - self._leapt_ns < round(1e9 * LEAP_S):
+                    return True
+        self._leapt_ns = None
+        return False
+
+    def _held(self, t_ns: int) -> ObjectPose:
+        """Where it was, for a while; then nowhere."""
+        last = self._last
+        since_s = 0.0 if last is None else 1e-9 * (t_ns - last.t_ns)
+        if last is None or not 0.0 <= since_s <= HELD_S:
+            place, turn, cov = _NOWHERE
+            source = ObjectSource.NONE
+            return ObjectPose(self.name, t_ns, place, turn, cov, float("nan"), source, False, 0, 1, True)
+        spread = np.repeat([_WANDERS_M_S * since_s, _WANDERS_RAD_S * since_s], 3) ** 2
+        return replace(
+            last,
+            t_ns=t_ns,
+            cov=self._cov + np.diag(spread),
+            source=ObjectSource.HELD,
+            tracked=False,
+            seen=0,
+            occluded=True,
+        )
+
+
+def covariance_of(profile: ObjectProfile) -> Float:
+    """Covariance (6, 6) of an object's pose by its tracker, of place and small turn, by its registration's figures."""
+    how = profile.provenance.get("T_object_tracker")
+    told = {} if how is None else how.residual
+    place_m = np.hypot(told.get("position_mm", 0.0), told.get("position_sigma_mm", 0.0)) * 1e-3
+    turn_rad = np.radians(np.hypot(told.get("turn_deg", 0.0), told.get("turn_sigma_deg", 0.0)))
+    # The figures are of the whole offset: a third of its square belongs to each axis.
+    place_m = place_m / np.sqrt(3.0) if place_m > 0.0 else _UNKNOWN_M
+    turn_rad = turn_rad / np.sqrt(3.0) if turn_rad > 0.0 else _UNKNOWN_RAD
+    return np.diag(np.repeat([place_m, turn_rad], 3) ** 2)

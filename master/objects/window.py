@@ -1,0 +1,258 @@
+"""What the cameras of a rig saw of one object around an instant, and when an instant has all it will get.
+
+An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
+`master.stereo.pairing`. It is complete when every other camera has delivered a frame at or after it, its tags included
+where the object has tags: those of a frame have come, or never will, when the markers of the next are there. It is due
+when the message time has passed its deadline. Message time is the newest capture time: no clock is read.
+
+Nothing is carried to the instant here: every point keeps the time of its own row (`master.objects.fit`).
+"""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.camera_model import CameraModel
+from common.messages import MarkerDetections, TagDetections
+from master.objects.features import Features
+from master.stereo.blob_bias import LensShift
+from master.stereo.tracks import SIGHTINGS
+
+HISTORY = 8
+SILENT_FRAMES = 12
+_PERIOD_NS = 16_666_667  # until frames have told
+_DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighting:
+    """What one camera saw of the object in one frame, by markers or by tags; K points that it looked for.
+
+    Attributes:
+        centre_ns: When its centre row was exposed.
+        ready_t_ns: When the frame was handed to its slave.
+        point: (K,) rows of `Features.points`.
+        uv: (K, 2) [px] as from a lens that keeps blobs in their place; NaN: not seen.
+        rival_uv: (K, 2) [px] second places; NaN: none.
+        t_ns: (K,) when the rows were exposed [ns], from the first frame of all.
+        sigma_px: (K,), t_sigma_s: the same for all.
+        area_px2: (K,) of blobs; NaN: a corner.
+    """
+
+    centre_ns: int
+    ready_t_ns: int
+    point: Int
+    uv: Float
+    rival_uv: Float
+    t_ns: Float
+    sigma_px: Float
+    t_sigma_s: float
+    area_px2: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """All sightings around an instant.
+
+    Attributes:
+        t_ns: The instant, master's clock.
+        origin_ns: The first frame of all, to which the times of sightings count.
+        views: Of each camera up to four sightings by markers and four by tags, each kind the nearest first.
+        ready_t_ns: When the last contributing frame was handed to its slave.
+        period_ns: From frame to frame, of the slowest camera.
+    """
+
+    t_ns: int
+    origin_ns: int
+    views: tuple[tuple[tuple[Sighting, ...], tuple[Sighting, ...]], ...]
+    ready_t_ns: int
+    period_ns: int
+
+    def near(self, camera: int, kind: int) -> Sighting | None:
+        """The sighting that tells what a camera sees at the instant; None: it did not look."""
+        views = self.views[camera][kind]
+        if not views or abs(views[0].centre_ns - self.t_ns) > _DEADLINE * self.period_ns:
+            return None
+        return views[0]
+
+
+class Windows:
+    """Push machine. Holds the last sightings of each camera and the instants that wait."""
+
+    def __init__(
+        self,
+        cameras: Mapping[str, CameraModel],
+        features: Features,
+        *,
+        predict: bool = False,
+        late_ns: Mapping[str, int] | None = None,
+    ) -> None:
+        """Take the cameras in the rig's order.
+
+        Args:
+            cameras: Camera name -> model.
+            features: Of the object.
+            predict: Do not wait for a camera whose last frame is nearer to the instant than its next.
+            late_ns: Camera -> how much later its frames are than their stamps.
+        """
+        self._names, self._cameras = tuple(cameras), tuple(cameras.values())
+        self._features, self._predict, self._late_ns = features, predict, dict(late_ns or {})
+        self._shift = [LensShift((camera,)) for camera in self._cameras]
+        self._seen = [(_line(), _line()) for _ in self._names]
+        self._frames: list[deque[int]] = [deque(maxlen=2) for _ in self._names]  # centres, of markers
+        self._newest_of = [-(2**63)] * len(self._names)
+        self._period_ns = [_PERIOD_NS] * len(self._names)
+        self._waiting = [0] * len(self._names)
+        self._pending: deque[int] = deque()
+        self._origin_ns: int | None = None
+        self._newest_ns = self._emitted_ns = -(2**63)
+
+    def push(self, message: MarkerDetections | TagDetections) -> list[Window]:
+        """Take what one camera found; return the instants that became complete or due, oldest first.
+
+        Raises:
+            ValueError: The camera is not of this rig.
+        """
+        if message.camera not in self._names:
+            raise ValueError(f"camera {message.camera!r} is not of this rig: {', '.join(self._names)}")
+        c = self._names.index(message.camera)
+        t_ns = message.t_ns + self._late_ns.get(message.camera, 0)
+        if self._origin_ns is None:
+            self._origin_ns = t_ns
+        camera = self._cameras[c]
+        centre_ns = t_ns + round(0.5 * (camera.height_px - 1) * camera.row_time_ns)
+        tags = isinstance(message, TagDetections)
+        line = self._seen[c][tags]
+        if line and centre_ns <= line[-1].centre_ns:
+            return []  # a restarted slave's first clock estimate may step back
+        line.append(self._sighting(message, c, t_ns, centre_ns))
+        self._frame(c, centre_ns, tags)
+        return self._emit(flush=False)
+
+    def flush(self) -> list[Window]:
+        """At the end of a recording: what still waits."""
+        return self._emit(flush=True)
+
+    def _frame(self, c: int, centre_ns: int, tags: bool) -> None:
+        """Keep the books of what each camera has delivered, and note a new instant."""
+        self._newest_ns = max(self._newest_ns, centre_ns)
+        if not tags:
+            self._frames[c].append(centre_ns)
+        if centre_ns <= self._newest_of[c]:
+            return
+        step = centre_ns - self._newest_of[c]
+        # The shortest step is a frame, those between are lost frames; it may become longer by and by.
+        self._period_ns[c] = max(min(step, round(1.02 * self._period_ns[c])), 1_000_000)
+        self._newest_of[c] = centre_ns
+        self._waiting = [0 if k == c else count + 1 for k, count in enumerate(self._waiting)]
+        if c == self._leader() and centre_ns > max(
+            self._emitted_ns, self._pending[-1] if self._pending else -(2**63)
+        ):
+            self._pending.append(centre_ns)
+
+    def _leader(self) -> int:
+        return next(
+            (c for c in range(len(self._names)) if self._newest_of[c] > -(2**63) and not self._silent(c)), 0
+        )
+
+    def _silent(self, c: int) -> bool:
+        return self._waiting[c] >= SILENT_FRAMES * len(self._names)
+
+    def _sighting(
+        self, message: MarkerDetections | TagDetections, c: int, t_ns: int, centre_ns: int
+    ) -> Sighting:
+        assert self._origin_ns is not None
+        if isinstance(message, TagDetections):
+            point, uv, sigma = self._corners(message)
+            area, rival = np.full(len(point), np.nan), np.full((len(point), 2), np.nan)
+        else:
+            rows = self._features.rows
+            point, sigma, area = np.arange(len(rows)), message.sigma_px[rows], message.area[rows]
+            both = np.stack([message.uv[rows], message.rival_uv[rows]])
+            if self._shift[c].any and len(rows):
+                # Of a rival the area is not told: about that of the marker.
+                both = (
+                    self._shift[c]
+                    .centres(both.reshape(1, -1, 2), np.tile(area, 2)[None])[0]
+                    .reshape(both.shape)
+                )
+            uv, rival = both
+        return Sighting(
+            centre_ns=centre_ns,
+            ready_t_ns=message.ready_t_ns,
+            point=point,
+            uv=uv,
+            rival_uv=rival,
+            t_ns=(t_ns - self._origin_ns) + self._cameras[c].row_time_ns * uv[:, 1],
+            sigma_px=sigma,
+            t_sigma_s=message.t_sigma_ns * 1e-9,
+            area_px2=area,
+        )
+
+    def _corners(self, message: TagDetections) -> tuple[Int, Float, Float]:
+        """Points (4 N), their places (4 N, 2) and sigmas of the object's tags that a frame shows."""
+        found = [
+            (
+                self._features.corners_of(self._features.tag_ids.index(number)),
+                message.uv[k],
+                message.sigma_px[k],
+            )
+            for k, number in enumerate(message.ids.tolist())
+            if number in self._features.tag_ids
+        ]
+        if not found:
+            return np.empty(0, np.int64), np.empty((0, 2)), np.empty(0)
+        point, uv, sigma = zip(*found, strict=True)
+        return np.concatenate(point), np.concatenate(uv), np.repeat(sigma, 4)
+
+    def _emit(self, *, flush: bool) -> list[Window]:
+        out: list[Window] = []
+        tagged = bool(self._features.tag_ids)
+        while self._pending:
+            t_ns = self._pending[0]
+            period_ns = max(self._period_ns)
+            due = self._newest_ns - t_ns > (_TAG_DEADLINE if tagged else _DEADLINE) * period_ns
+            if not (flush or due or all(self._told(c, t_ns, tagged) for c in range(len(self._names)))):
+                break
+            self._pending.popleft()
+            self._emitted_ns = t_ns
+            out.append(self._at(t_ns, period_ns))
+        return out
+
+    def _told(self, c: int, t_ns: int, tagged: bool) -> bool:
+        """Whether a camera has told all it knows of an instant, or is silent."""
+        if self._silent(c):
+            return True
+        slack_ns = self._period_ns[c] // 2 if self._predict else 0
+        newest = self._newest_of[c]
+        if tagged:
+            tags, frames = self._seen[c][1], self._frames[c]
+            newest = max(tags[-1].centre_ns if tags else -(2**63), frames[0] if len(frames) > 1 else -(2**63))
+        return newest + slack_ns >= t_ns
+
+    def _at(self, t_ns: int, period_ns: int) -> Window:
+        assert self._origin_ns is not None
+        reach_ns = round((SIGHTINGS + 0.25) * period_ns)
+        views = tuple(
+            (_around(markers, t_ns, reach_ns), _around(tags, t_ns, reach_ns)) for markers, tags in self._seen
+        )
+        ready = [
+            s.ready_t_ns for both in views for line in both for s in line if s.centre_ns - t_ns < period_ns
+        ]
+        return Window(t_ns, self._origin_ns, views, max(ready, default=t_ns), period_ns)
+
+
+def _line() -> deque[Sighting]:
+    return deque(maxlen=HISTORY)
+
+
+def _around(line: deque[Sighting], t_ns: int, reach_ns: int) -> tuple[Sighting, ...]:
+    """Up to four sightings about an instant, the nearest first; of those after it one, or two where none is before."""
+    known = list(line)
+    before = sum(s.centre_ns < t_ns for s in known)
+    chosen = known[max(before - SIGHTINGS, 0) : max(before + 1, 2)]
+    near = [s for s in chosen if abs(s.centre_ns - t_ns) <= reach_ns]
+    return tuple(sorted(near, key=lambda s: abs(s.centre_ns - t_ns))[:SIGHTINGS])
