@@ -19,6 +19,8 @@ FIXED_BITS = 4
 SUPER = 6
 HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 ARC_POINTS = 8
+BLUR_STEP_PX = 1.2
+MAX_STEPS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,6 +123,12 @@ def cover(
     fine = cv2.resize(total, tuple(high - low), interpolation=cv2.INTER_AREA)
     alpha = fine.astype(np.float32) * np.float32(1.0 / (level * len(offsets_s)))
     return Coverage(int(low[0]), int(low[1]), alpha, seen / own if own else 0.0)
+
+
+def moments(shape: Shape, exposure_s: float) -> Float:
+    """Moments (n,) of an exposure, from its middle [s], at which a shape is drawn: about one per pixel of way."""
+    n = int(np.clip(np.ceil(np.hypot(*shape.velocity) * exposure_s / BLUR_STEP_PX), 1, MAX_STEPS))
+    return ((np.arange(n) + 0.5) / n - 0.5) * exposure_s
 
 
 def centroid(coverage: Coverage) -> Float:

@@ -110,6 +110,7 @@ class SceneTake:
             clicks=clicks,
             continuous=continuous,
             note=f"rendered scene, seed {scene.seed}",
+            objects={name: scene.objects[name] for name in scene.rig.objects},
         )
 
     def frames(self) -> Iterator[TakenFrame]:
@@ -140,7 +141,17 @@ class SceneTake:
             "angles": np.array([named_angles(self._scene.model, truth.angles_rad) for truth in truths]),
             "T_palm": np.array([truth.T_rig_palm for truth in truths]),
             "bend": np.array([row.bend_rad for row in rows]),
-        }
+        } | self._truth_of_objects()
+
+    def _truth_of_objects(self) -> Arrays:
+        """Of every tracked object its poses, what each camera saw of its features, and the corners of its tags."""
+        arrays: Arrays = {}
+        for name in self._scene.rig.objects:
+            seen = [[view.objects[name] for view in row.views] for row in self._rows]
+            arrays[f"object_{name}"] = np.array([row.reference.objects[name] for row in self._rows])
+            arrays[f"object_{name}_visible"] = np.array([[one.visible for one in row] for row in seen])
+            arrays[f"object_{name}_corners"] = np.array([[one.corners_uv for one in row] for row in seen])
+        return arrays
 
     def meta(self) -> dict[str, object]:
         """What the columns of the truth are."""
@@ -152,8 +163,14 @@ class SceneTake:
             "joints": WEBXR_JOINTS,
             "angles": ANGLE_NAMES,
             "seed": scene.seed,
-            "paint_reflectance_linear_srgb": {name: paint(name) for name in scene.rig.markers},
+            "paint_reflectance_linear_srgb": {name: paint(name) for name in self._painted()},
+            "objects": {name: scene.tracked.features(k) for k, name in enumerate(scene.rig.objects)},
         }
+
+    def _painted(self) -> tuple[str, ...]:
+        """Markers that are on a hand or on an object of this scene."""
+        rig, beads = self._scene.rig, self._scene.tracked.beads
+        return tuple(name for m, name in enumerate(rig.markers) if name not in rig.free_markers or m in beads)
 
 
 def record_scene(

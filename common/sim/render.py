@@ -17,6 +17,7 @@ import numpy as np
 from common.arrays import Float, Image
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX, NoiseTiles, desk_image
+from common.sim.objects_seen import SeenPart
 from common.sim.paint import MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
@@ -24,6 +25,8 @@ from common.sim.surface import CAPSULES, PALM_HULL, WEB_HULL
 from common.sim.things import SeenThing
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 from common.srgb import relit_bytes
+
+Box = tuple[int, int, int, int]
 
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
 ROUND_LAYER = 2
@@ -89,6 +92,7 @@ class Renderer:
         self._draw_hand(image, snapshot)
         box = self._hand_box(snapshot, cards)
         self._smear(image, box, snapshot)
+        box = self._with_objects(box, snapshot)
         for card in cards:
             raster.fill(image, raster.fixed(card.corners), self._card)
         windows = [self._painter.window(image, group, snapshot) for group in self._painter.clusters(painted)]
@@ -108,8 +112,9 @@ class Renderer:
         corners = raster.fixed(snapshot.outlines[:PHALANGES])
         depth = snapshot.points[:, 2]
         palm_depth = float(depth[list(PALM_HULL)].mean())
-        parts: list[tuple[float, tuple[int, ...] | SeenThing]] = [(palm_depth, ())]
+        parts: list[tuple[float, tuple[int, ...] | SeenThing | SeenPart]] = [(palm_depth, ())]
         parts += [(float(thing.ends_depth.mean()), thing) for thing in snapshot.things]
+        parts += [(float(part.ends_depth.mean()), part) for part in snapshot.tracked.parts]
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
             grown = part[0] in ROOTS
@@ -123,6 +128,9 @@ class Renderer:
         for _, part in sorted(parts, key=lambda item: -item[0]):
             if isinstance(part, SeenThing):
                 self._draw_thing(image, part)
+                continue
+            if isinstance(part, SeenPart):
+                self._draw_part(image, part, snapshot)
                 continue
             for layer in range(LAYERS):
                 shapes = [corners[k, layer] for k in part] if part else [hull[layer] for hull in palm]
@@ -139,11 +147,32 @@ class Renderer:
         face, cosine = thing.face
         raster.fill(image, raster.fixed(face), light.face_shade(light.THING_LINEAR_RGB, cosine))
 
+    def _draw_part(self, image: Image, part: SeenPart, snapshot: Snapshot) -> None:
+        """A part of a tracked object, as blurred by its motion as that is more than the hand's, which follows."""
+        own = part.shape.velocity
+        speed = float(np.hypot(*own))
+        smeared = float(np.hypot(*self._way(snapshot))) / self._view.exposure_s
+        left = 1.0 - min(smeared / max(speed, 1e-9), 1.0)
+        moments = left * raster.moments(Shape(part.outline, left * own), self._view.exposure_s)
+        margin = 2.0 + np.abs(moments).max() * np.abs(part.ends_speed).max(axis=0)
+        low = np.clip(np.floor(part.outline.min(axis=0) - margin), 0, self._size).astype(int)
+        high = np.clip(np.ceil(part.outline.max(axis=0) + margin) + 1, 0, self._size).astype(int)
+        if (low >= high).any():
+            return
+        under = image[low[1] : high[1], low[0] : high[0]]
+        total = np.zeros(under.shape, np.float32)
+        for moment in moments:
+            drawn = under.copy()
+            for outline, colour in part.fills:
+                raster.fill(drawn, raster.fixed(part.moved(outline, float(moment)) - low), colour)
+            cv2.accumulate(drawn, total)
+        under[:] = np.rint(total / len(moments))
+
     def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
         for layer in range(LAYERS):
             raster.fill(image, raster.fixed(self._view.sleeve(snapshot, layer)), self._sleeve[layer])
 
-    def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> tuple[int, int, int, int]:
+    def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Box:
         """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""
         spread = snapshot.discs_px[:, 0, None] + 6.0
         corners = [
@@ -157,9 +186,28 @@ class Renderer:
         x1, y1 = np.clip(np.ceil(points.max(axis=0)), 1, self._size).astype(int)
         return int(x0), int(y0), max(int(x1), int(x0) + 1), max(int(y1), int(y0) + 1)
 
-    def _smear(self, image: Image, box: tuple[int, int, int, int], snapshot: Snapshot) -> None:
+    def _with_objects(self, box: Box, snapshot: Snapshot) -> Box:
+        """The box and all that is drawn of tracked objects."""
+        outlines = snapshot.tracked.outlines()
+        if not outlines:
+            return box
+        points = np.vstack(outlines)
+        low = np.clip(np.floor(points.min(axis=0) - 6.0), 0, np.array(self._size) - 1).astype(int)
+        high = np.clip(np.ceil(points.max(axis=0) + 6.0), 1, self._size).astype(int)
+        return (
+            min(box[0], int(low[0])),
+            min(box[1], int(low[1])),
+            max(box[2], int(high[0])),
+            max(box[3], int(high[1])),
+        )
+
+    def _way(self, snapshot: Snapshot) -> Float:
+        """How far (2,) [px] the palm moves during the exposure."""
+        return snapshot.speed_uv[list(PALM_HULL)].mean(axis=0) * self._view.exposure_s
+
+    def _smear(self, image: Image, box: Box, snapshot: Snapshot) -> None:
         """Motion blur of the skin: halves of the palm's way averaged, twice."""
-        way = snapshot.speed_uv[list(PALM_HULL)].mean(axis=0) * self._view.exposure_s
+        way = self._way(snapshot)
         roi = image[box[1] : box[3], box[0] : box[2]]
         for share in (0.5, 0.25):
             dx, dy = round(float(way[0]) * share), round(float(way[1]) * share)

@@ -14,9 +14,13 @@ from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
+from common.hand_model import HandJoints
 from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
+from common.sim.motion import HandState
+from common.sim.object_surface import ObjectSurface
+from common.sim.objects_seen import Looks, Points, SeenObjects
 from common.sim.raster import Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
@@ -57,6 +61,7 @@ class Snapshot:
         shine_uv: (C, 2) [px] where the paint mirrors the lamp.
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
         things: What the hand takes, before it is drawn or hides anything.
+        tracked: The tracked objects, likewise.
     """
 
     points: Float
@@ -72,6 +77,7 @@ class Snapshot:
     shine_uv: Float
     cuff_uv: Float
     things: tuple[SeenThing, ...]
+    tracked: SeenObjects
 
 
 class View:
@@ -106,7 +112,9 @@ class View:
         self._from = np.concatenate([CAPSULES[:, 0], first])
         self._to = np.concatenate([CAPSULES[:, 1], first + 1])
         self._fine_circle = unit_circle(32)
-        count = self.surface.count
+        self.objects = ObjectSurface.of(scene.tracked, scene.rig.markers)
+        self._looks = Looks(self.to_light, self.circle, self.focal_px, self.project)
+        count = self.surface.count + len(self.objects.local)
         # Points of one marker share the moment of the marker's centroid: row k weighs the rows for point k.
         together = np.eye(count)
         for box in self.surface.boxes:
@@ -163,6 +171,7 @@ class View:
             shine_uv=shine_uv,
             cuff_uv=cuff_uv,
             things=self._things(t_s, things),
+            tracked=self._tracked(points, uv, speed_uv, when),
         )
 
     def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
@@ -227,7 +236,7 @@ class View:
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
         joints = self.scene.joints_of(states)
-        before, now, after = transform(self.T_camera_rig, self.surface.key_points(joints))
+        before, now, after = transform(self.T_camera_rig, self._key_points(joints, states))
         slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
         points = now
@@ -239,6 +248,21 @@ class View:
         z = np.maximum(points[:, 2:], NEAREST_M)
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
         return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])
+
+    def _key_points(self, joints: HandJoints, states: tuple[HandState, ...]) -> Float:
+        """Key points (S, K, 3) [m], rig frame, of the hand, then of the tracked objects."""
+        hand = self.surface.key_points(joints)
+        if not self.objects.local.size:
+            return hand
+        poses = np.array([self.scene.object_poses(state) for state in states])
+        return np.concatenate([hand, self.objects.key_points(poses)], axis=1)
+
+    def _tracked(self, points: Float, uv: Float, speed_uv: Float, when: Float) -> SeenObjects:
+        """The tracked objects, of the key points."""
+        if not self.objects.local.size:
+            return SeenObjects()
+        own = slice(self.surface.count, None)
+        return self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own]))
 
     def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
         """Each thing at the moment of the row of its middle; `things` is where they are halfway through the frame."""
