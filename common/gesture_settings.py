@@ -40,10 +40,14 @@ class Span(Part, frozen=True):
 
 
 class PoseShape(Part, frozen=True):
-    """One pose: its quantities, and the fingers that must be known for it to begin."""
+    """One pose: its quantities, and the fingers that must be known for it to begin.
+
+    `weight`: of two poses that fit alike, how much rather it is this one; more than 1 for a special case of another.
+    """
 
     ranges: Annotated[dict[Quantity, Span], Meta(min_length=1)]
     needs: tuple[Finger, ...] = ()
+    weight: Positive = 1.0
 
 
 class HoldSettings(Part, frozen=True):
@@ -113,10 +117,10 @@ def study_poses() -> dict[Name, PoseShape]:
         ),
         "small_grasp": PoseShape(
             ranges={
-                "index_bend_deg": _least(115.0, 8.0),
-                "middle_bend_deg": _least(115.0, 8.0),
-                "ring_bend_deg": _least(115.0, 8.0),
-                "little_bend_deg": _least(110.0, 8.0),
+                "index_bend_deg": _least(102.0, 8.0),
+                "middle_bend_deg": _least(102.0, 8.0),
+                "ring_bend_deg": _least(102.0, 8.0),
+                "little_bend_deg": _least(102.0, 8.0),
                 "thumb_across": _between(-2.0, 0.4, 0.08),
             },
         ),

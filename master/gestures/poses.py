@@ -7,9 +7,10 @@ Every pose says which quantities are to lie in which range (`common.gesture_sett
 with sigma the doubt of the quantity itself: a hidden finger speaks neither for nor against. That alone would make a
 hand of which little is known fit everything, so a pose is believed as far as it stands out of the others,
 
-    confidence = s . s / (sum of all s)
+    confidence = s . w s / (sum of all w s)
 
-and only where most of its quantities are known. None is an answer: a hand that fits nothing has no pose.
+with w its weight (1 but for a special case of another pose), and only where most of its quantities are known. None is
+an answer: a hand that fits nothing has no pose.
 
 A hand that goes from one pose to another may pass through a third. So a pose begins where the fingers are nearly at
 rest, or once it has lasted a while; the end of a natural movement is slow, so that this costs no time.
@@ -25,7 +26,7 @@ from common.gesture_settings import GestureSettings, HoldSettings, PoseShape
 from common.hand_model import FINGERS
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
-from master.gestures.quantities import QUANTITIES, Quantities
+from master.gestures.quantities import QUANTITIES, Quantities, known_bends
 
 _RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
 _VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
@@ -64,6 +65,7 @@ class PoseTable:
         self._asked = np.zeros(shape, np.bool_)
         self._needs = np.array([[finger in pose.needs for finger in FINGERS] for pose in poses], np.bool_)
         self._needs = self._needs.reshape(len(poses), len(FINGERS))
+        self._weight = np.array([pose.weight for pose in poses])
         self._share = settings.hold.known_share
         for row, pose in enumerate(poses):
             self._fill(row, pose)
@@ -86,8 +88,9 @@ class PoseTable:
             self._asked, 1.0 / (1.0 + (self._doubt(quantities) / (_VAGUE * self._soft)) ** 2), 0.0
         )
         share = weight.sum(axis=1) / np.maximum(self._asked.sum(axis=1), 1)
-        total = float(score.sum())
-        confidence = score * score / total if total > 0.0 else score
+        weighed = self._weight * score
+        total = float(weighed.sum())
+        confidence = score * weighed / total if total > 0.0 else score
         return Fit(score, confidence, (share >= self._share) & (known | ~self._needs).all(axis=1))
 
     def _doubt(self, quantities: Quantities) -> Float:
@@ -156,8 +159,7 @@ class PoseRecogniser:
         """What is to be said of a hand; instants rise."""
         quantities = Quantities.of(features)
         fit = self._table.fit(quantities, features.known)
-        bend = np.degrees(features.bend_rad[1:, :2].sum(axis=1))
-        speed = self._speed.push(features.t_ns, bend, features.known[1:])
+        speed = self._speed.push(features.t_ns, *known_bends(features))
         begins = self._beginning(features.t_ns, fit, speed)
         if begins is not None and begins != self._held:
             return self._begin(features, begins, float(fit.confidence[begins]))

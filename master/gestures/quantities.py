@@ -86,6 +86,11 @@ def _spreads(chain: Float, features: HandFeatures) -> Float:
     return np.degrees(heading[:-1] - heading[1:])
 
 
+def known_bends(features: HandFeatures) -> tuple[Float, Bool]:
+    """Bends (4,) [deg] of index ... little, MCP and PIP together, and which of these fingers are known."""
+    return np.degrees(features.bend_rad[1:, :2].sum(axis=1)), features.known[1:]
+
+
 def known_of(quantities: Quantities) -> Bool:
     """(Q,) which of them are known at all."""
     return np.isfinite(quantities.value) & np.isfinite(quantities.sigma)
