@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Meta
 
 from common.arrays import Float
-from common.calibration_parts import Matrix4, Part, Positive, Provenance, Vector3
+from common.calibration_parts import Matrix4, Number, Part, Positive, Provenance, Vector3
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, MAX_TAGS, Name
 
@@ -71,8 +71,8 @@ class ObjectProfile(Part, frozen=True):
 
     `markers`: three or more, not in one line; the rig lists their names in `free_markers`, the camera files have their
     colours. `tracker`: name of a device that tracks itself and sits on the object at `T_object_tracker`, which
-    `phalanx-master calibrate tracker` measures. `shape`: parts of its surface, which distances and contact are measured
-    to.
+    `phalanx-master calibrate tracker` measures, with `stamp_offset_us`: how much later its poses hold than their stamps
+    say. `shape`: parts of its surface, which distances and contact are measured to.
     """
 
     version: Literal[1]
@@ -81,6 +81,7 @@ class ObjectProfile(Part, frozen=True):
     tags: Tags | None = None
     tracker: Name | None = None
     T_object_tracker: Matrix4 | None = None
+    stamp_offset_us: Number = 0.0
     shape: Annotated[tuple[Shape, ...], Meta(max_length=16)] = ()
     provenance: dict[str, Provenance] = {}
 

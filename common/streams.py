@@ -52,6 +52,7 @@ STREAMS = {
     "tracker": Stream(TrackerPose, Path.DATAGRAM, None, True),
     "imu": Stream(ImuSample, Path.DATAGRAM, None, True),
     "hand": Stream(HandPose, Path.ZENOH, "phalanx/hand/{name}", True),
+    "device": Stream(TrackerPose, Path.ZENOH, "phalanx/device/{name}", False),  # on the master's clock
     "object": Stream(ObjectPose, Path.ZENOH, "phalanx/object/{name}", True),
     "contact": Stream(Contact, Path.ZENOH, "phalanx/contact/{name}", True),
     "gesture": Stream(Gesture, Path.ZENOH, "phalanx/gesture/{name}", True),

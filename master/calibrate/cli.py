@@ -12,6 +12,7 @@ from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
 from master.calibrate.mounting.command import mounting
 from master.calibrate.time.commands import time_command
+from master.calibrate.tracker.command import tracker
 from master.calibrate.wrist.curl_command import curl
 from master.calibrate.wrist.flat_command import flat_field
 from master.calibrate.wrist.laser_command import laser_plane
@@ -33,6 +34,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "palm": palm,
     "wearer": wearer,
     "mounting": mounting,
+    "tracker": tracker,
 }
 
 
@@ -45,4 +47,4 @@ def calibrate_app() -> typer.Typer:
 
 
 def _about() -> None:
-    """Measure a rig or a hand: each result is a new file with date, residual and source."""
+    """Measure a rig, a hand or an object: each result is a new file with date, residual and source."""

@@ -4,8 +4,8 @@
 
 No cameras, and so no instants of theirs: each pose of the device is one of the object, at its own time, which is the
 stamp and `stamp_offset_us`. How sure it is the registration knows: what was left of it against the cameras, which has
-the device's jitter in it, and how sure it is itself; both are of the object's own frame, the lever from the device to it
-included. Cameras were not better than that, so the covariance is rather too large than too small.
+the device's jitter in it, and how sure it is itself; both are of the object's own frame, the lever from the device to
+it included. The cameras' errors are in it, too, so the covariance is rather too large than too small.
 
 **It has lost itself**, or its base stations: the last pose is held, ever less sure, for half a second; then there is
 none. **It leaps**, as it does by a mirror: a pose that no hand could have carried it to is passed over, unless it stays

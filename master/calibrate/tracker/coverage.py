@@ -1,0 +1,113 @@
+"""Whether a motion tells a registration: turns about which of the object's axes, way, pace; and what is missing."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import matrix_to_rotation_vector
+from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+
+LEAST_S, LEAST_TURN_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
+LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
+_ENDS = (0.03, 0.97)  # quantiles: a stray pose is no motion
+_PACE_S = 0.2
+_ADVICE = {
+    "seconds": "keep the object before the cameras, where the tracker sees a base station",
+    "turn": "turn it about its {axes} axis as well, a quarter turn and back",
+    "way": "carry it a hand's width and more to all sides, nearer and farther",
+    "pace": "move it faster, about once to and fro in two seconds: nothing else tells the lag of the clocks",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Coverage:
+    """What was seen of a motion by cameras and tracker together.
+
+    Attributes:
+        seen_s, tracked_s: How long cameras saw the object, and the tracker knew where it was [s].
+        shared_s: How long both [s].
+        turn_rad: By how much it was turned about its own x, y, z, from one end to the other.
+        way_m: How far it was carried along the rig's x, y, z, from one end to the other.
+        pace_rad_s, pace_m_s: Its speeds, root of the mean square.
+    """
+
+    seen_s: float
+    tracked_s: float
+    shared_s: float
+    turn_rad: tuple[float, float, float]
+    way_m: tuple[float, float, float]
+    pace_rad_s: float
+    pace_m_s: float
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What to do besides, for a person; nothing: it is enough."""
+        wanting: list[str] = []
+        if self.shared_s < LEAST_S:
+            wanting.append(_ADVICE["seconds"])
+        poor = [axis for axis, turn in zip("xyz", self.turn_rad, strict=True) if turn < LEAST_TURN_RAD]
+        if poor:
+            wanting.append(_ADVICE["turn"].format(axes=" and its ".join(poor)))
+        if max(self.way_m) < LEAST_WAY_M:
+            wanting.append(_ADVICE["way"])
+        if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < LEAST_PACE_M_S:
+            wanting.append(_ADVICE["pace"])
+        return tuple(wanting)
+
+    @property
+    def share(self) -> float:
+        """How much of all that is wanted is there, 0 .. 1."""
+        parts = [self.shared_s / LEAST_S, max(self.way_m) / LEAST_WAY_M]
+        parts += [turn / LEAST_TURN_RAD for turn in self.turn_rad]
+        return float(np.mean(np.minimum(parts, 1.0)))
+
+    def line(self) -> str:
+        """One line for a person."""
+        x, y, z = np.degrees(self.turn_rad)
+        return (
+            f"both {self.shared_s:.0f} s (cameras {self.seen_s:.0f}, tracker {self.tracked_s:.0f}); turned about its x"
+            f" {x:.0f}, y {y:.0f}, z {z:.0f} deg; carried {100 * max(self.way_m):.0f} cm"
+        )
+
+
+def coverage_of(seen: PoseTrack, tracker: PoseTrack, late_s: float = 0.0) -> Coverage:
+    """What cameras and tracker saw together, at a lag that is right to a tenth of a second."""
+    rows = shared_instants(seen, tracker, late_s, len(seen))
+    times = (_known_s(seen.t_s), _known_s(tracker.t_s), _known_s(seen.t_s[rows]))
+    if len(rows) < 3:
+        return Coverage(*times, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0, 0.0)
+    R, p = seen.R[rows], seen.p_m[rows]
+    total = R.sum(axis=0)
+    left, _, right = np.linalg.svd(total)
+    mean = left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right
+    turns = matrix_to_rotation_vector(mean.T @ R)
+    pace = _pace(seen, seen.t_s[rows])
+    return Coverage(*times, _span(turns), _span(p), *pace)
+
+
+def _known_s(t_s: Float) -> float:
+    """How much time is between poses that follow each other [s]; gaps of a tenth of a second and more are none."""
+    steps: Float = np.diff(t_s)
+    return float(steps[steps < 0.1].sum())
+
+
+def _span(values: Float) -> tuple[float, float, float]:
+    low, high = (np.asarray(np.quantile(values, end, axis=0), np.float64) for end in _ENDS)
+    x, y, z = (high - low).tolist()
+    return x, y, z
+
+
+def _pace(track: PoseTrack, t_s: Float) -> tuple[float, float]:
+    first, begun, known = track.at(t_s - 0.5 * _PACE_S)
+    last, ended, also = track.at(t_s + 0.5 * _PACE_S)
+    both = known & also
+    if not both.any():
+        return 0.0, 0.0
+    turned = matrix_to_rotation_vector(first[both].swapaxes(1, 2) @ last[both]) / _PACE_S
+    moved = (ended[both] - begun[both]) / _PACE_S
+    return _rms(turned), _rms(moved)
+
+
+def _rms(vectors: Float) -> float:
+    return float(np.sqrt((vectors * vectors).sum(axis=1).mean()))

@@ -1,0 +1,219 @@
+"""The most probable registration: weighted least squares over all shared instants, strays weighed down.
+
+Thirteen unknowns, as small changes of what is there: a turn a and shift d of the tracking system about the middle c of
+what was seen, a turn b and shift e of the device in the object's frame, and the lag. With P, R the foretold pose:
+
+    P' = P + a x (P - c) + d + R e - v dt        turn' = a + R b - w dt
+
+Each instant counts by the covariance that the object's pose has, with what a tracker's jitter is; all of these are
+scaled by one factor, so that half of the instants lie within what is foretold. How sure the result is comes from the
+leaving out of blocks of time, since neighbours in time share their errors (jackknife), and where the motion tells
+nothing of an unknown, from the normal equations; the larger counts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.geometry import invert, matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, skew
+from master.calibrate.tracker.start import Placed, foretold
+from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+
+MOST = 900  # instants
+BLOCKS = 12
+TRACKER_M, TRACKER_RAD = 1e-3, np.radians(0.15)
+UNTOLD_M, UNTOLD_RAD = 3e-3, np.radians(1.5)  # of an object's pose without covariance
+STRAY = (
+    4.1  # times sigma: 0.999 of chi with six degrees of freedom is within 4.7, at the scale of the good half
+)
+_HALF = 5.348  # median of chi square with six degrees of freedom
+_STEPS, _ROUNDS = 6, 4
+_DT_S = 4e-3
+_UNKNOWNS = 13
+_PRIOR = (
+    np.array([1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [1.0] * 3 + [0.5]) ** -2
+)  # rad, m, rad, m, s: hardly any
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """A registration, and what is left of what was seen (N instants).
+
+    Attributes:
+        placed: The registration.
+        middle_m: (3,) middle of the object's places, rig frame.
+        t_s: (N,) instants [s].
+        R, p_m: The object as the tracker foretells it, rig frame.
+        off: (N, 6) what cameras saw against that: place [m], turn [rad], rig axes.
+        stray: (N,) which instants no registration explains.
+        scale: By how much more than foretold the good half is off.
+        cov: (13, 13) of the unknowns, by the normal equations.
+        left_out: (B, 13) how the unknowns change when a block of time is left out.
+    """
+
+    placed: Placed
+    middle_m: Float
+    t_s: Float
+    R: Float
+    p_m: Float
+    off: Float
+    stray: Bool
+    scale: float
+    cov: Float
+    left_out: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Lines:
+    """The equations at a registration: what is left (N, 6), how it follows the unknowns (N, 6, 13)."""
+
+    R: Float
+    p_m: Float
+    off: Float
+    slope: Float
+
+
+class _Problem:
+    """What was seen at the instants that count."""
+
+    def __init__(self, seen: PoseTrack, tracker: PoseTrack, rows: Int) -> None:
+        self._tracker = tracker
+        self.t_s, self.R, self.p_m = seen.t_s[rows], seen.R[rows], seen.p_m[rows]
+        self.middle_m = self.p_m.mean(axis=0)
+        untold = np.diag(np.repeat([UNTOLD_M, UNTOLD_RAD], 3) ** 2)
+        told = np.isfinite(seen.cov[rows].sum(axis=(1, 2)))[:, None, None]
+        jitter = np.diag(np.repeat([TRACKER_M, TRACKER_RAD], 3) ** 2)
+        cov = np.where(told, seen.cov[rows], untold) + jitter
+        self.weight: Float = np.asarray(np.linalg.inv(cov), np.float64)
+
+    def lines(self, placed: Placed) -> _Lines:
+        at = self.t_s - placed.late_s
+        R, p = self._foretold(placed, at)
+        before, after = (self._foretold(placed, at + dt) for dt in (-_DT_S, _DT_S))
+        v = (after[1] - before[1]) / (2.0 * _DT_S)
+        w = matrix_to_rotation_vector(after[0] @ before[0].swapaxes(1, 2)) / (2.0 * _DT_S)
+        off = np.concatenate([self.p_m - p, matrix_to_rotation_vector(self.R @ R.swapaxes(1, 2))], axis=1)
+        slope = np.zeros((len(at), 6, _UNKNOWNS))
+        slope[:, :3, 0:3] = -skew(p - self.middle_m)
+        slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
+        slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
+        slope[:, :3, 12], slope[:, 3:, 12] = -v, -w
+        return _Lines(R, p, off, slope)
+
+    def _foretold(self, placed: Placed, at_s: Float) -> tuple[Float, Float]:
+        turned, place, _ = self._tracker.at(at_s)
+        return foretold(placed.T_rig_tracking, placed.T_object_tracker, turned, place)
+
+    def moved(self, placed: Placed, by: Float) -> Placed:
+        turn = rotation_vector_to_matrix(by[:3])
+        X = rigid(turn, self.middle_m - turn @ self.middle_m + by[3:6]) @ placed.T_rig_tracking
+        Z = invert(placed.T_object_tracker) @ rigid(rotation_vector_to_matrix(by[6:9]), by[9:12])
+        return Placed(X, invert(Z), placed.late_s + float(by[12]))
+
+
+def fit_registration(seen: PoseTrack, tracker: PoseTrack, first: Placed) -> Fit:
+    """Fit the registration to all instants that both know.
+
+    Args:
+        seen: The object, by the cameras.
+        tracker: The device, by its system.
+        first: Right to some centimetres, degrees and ten milliseconds.
+    """
+    rough = _Problem(seen, tracker, shared_instants(seen, tracker, first.late_s, MOST))
+    better, _ = _refined(rough, first)
+    # Again, because the lag decides which instants are known.
+    problem = _Problem(seen, tracker, shared_instants(seen, tracker, better.late_s, MOST))
+    placed, scale = _refined(problem, better)
+    lines = problem.lines(placed)
+    sizes = _sizes(problem.weight, lines.off) / scale
+    counts = _counts(sizes)
+    normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
+    left_out = [_without(problem, lines, counts / scale**2, block) for block in _blocks(problem.t_s)]
+    return Fit(
+        placed,
+        problem.middle_m,
+        problem.t_s,
+        lines.R,
+        lines.p_m,
+        lines.off,
+        sizes > STRAY,
+        scale,
+        np.asarray(np.linalg.inv(normal), np.float64),
+        np.array(left_out).reshape(-1, _UNKNOWNS),
+    )
+
+
+def sigma_at(fit: Fit, R: Float, p_m: Float) -> tuple[float, float]:
+    """How sure an object's pose by the tracker is at poses (T, 3, 3), (T, 3) of the rig: place [m], turn [rad].
+
+    Root of the mean square over the poses, all axes together.
+    """
+    slope = np.zeros((len(R), 6, _UNKNOWNS))
+    slope[:, :3, 0:3] = -skew(p_m - fit.middle_m)
+    slope[:, :3, 3:6] = slope[:, 3:, 0:3] = np.eye(3)
+    slope[:, 3:, 6:9] = slope[:, :3, 9:12] = R
+    formal = np.einsum("tij,jk,tik->ti", slope, fit.cov, slope)
+    count = len(fit.left_out)
+    change = np.einsum("tij,bj->tbi", slope, fit.left_out - fit.left_out.mean(axis=0))
+    left = (count - 1) / count * (change**2).sum(axis=1) if count > 1 else np.zeros_like(formal)
+    both = np.maximum(formal, left)
+    place, turn = both[:, :3].sum(axis=1).mean(), both[:, 3:].sum(axis=1).mean()
+    return float(np.sqrt(place)), float(np.sqrt(turn))
+
+
+def late_sigma_s(fit: Fit) -> float:
+    """Standard deviation of the lag [s]."""
+    count = len(fit.left_out)
+    off = fit.left_out[:, 12] - fit.left_out[:, 12].mean()
+    left = (count - 1) / count * float((off**2).sum()) if count > 1 else 0.0
+    return float(np.sqrt(max(left, fit.cov[12, 12])))
+
+
+def _refined(problem: _Problem, placed: Placed) -> tuple[Placed, float]:
+    scale = 1.0
+    for _ in range(_ROUNDS):
+        sizes = _sizes(problem.weight, problem.lines(placed).off)
+        scale = max(float(np.sqrt(np.median(sizes**2) / _HALF)), 1e-3)
+        for _ in range(_STEPS):
+            lines = problem.lines(placed)
+            counts = _counts(_sizes(problem.weight, lines.off) / scale)
+            normal = _normal(problem.weight, lines, counts) / scale**2 + np.diag(_PRIOR)
+            pull = _pull(problem.weight, lines, counts) / scale**2
+            by = np.asarray(np.linalg.solve(normal, pull), np.float64)
+            placed = problem.moved(placed, by)
+            if np.abs(by).max() < 1e-7:
+                break
+    return placed, scale
+
+
+def _sizes(weight: Float, off: Float) -> Float:
+    """(N,) how far off, in sigmas of six dimensions."""
+    return np.sqrt(np.einsum("ni,nij,nj->n", off, weight, off))
+
+
+def _counts(sizes: Float) -> Float:
+    """(N,) how much an instant counts: Tukey's biweight, nothing where it strays by twice as much as strays do."""
+    return np.clip(1.0 - (sizes / (2.0 * STRAY)) ** 2, 0.0, 1.0) ** 2
+
+
+def _normal(weight: Float, lines: _Lines, counts: Float) -> Float:
+    return np.einsum("n,nia,nij,njb->ab", counts, lines.slope, weight, lines.slope, optimize=True)
+
+
+def _pull(weight: Float, lines: _Lines, counts: Float) -> Float:
+    return np.einsum("n,nia,nij,nj->a", counts, lines.slope, weight, lines.off, optimize=True)
+
+
+def _blocks(t_s: Float) -> list[Bool]:
+    """(N,) each: which instants are in a block of time."""
+    share = (t_s - t_s[0]) / (t_s[-1] - t_s[0] + 1e-9)
+    number = (BLOCKS * share).astype(np.int64)
+    return [number == k for k in range(BLOCKS) if (number == k).any()]
+
+
+def _without(problem: _Problem, lines: _Lines, counts: Float, block: Bool) -> Float:
+    """The change of the unknowns (13,) when a block is left out: one step from the whole."""
+    kept = np.where(block, 0.0, counts)
+    normal = _normal(problem.weight, lines, kept) + np.diag(_PRIOR)
+    return np.asarray(np.linalg.solve(normal, _pull(problem.weight, lines, kept)), np.float64)

@@ -1,0 +1,38 @@
+"""The guided motion with the master that runs: opens its bus."""
+
+from collections.abc import Callable
+
+from common.clock import SystemClock
+from common.messages import ObjectPose, TrackerPose
+from common.object_profile import ObjectProfile
+from common.zenoh_bus import ZenohBus
+from master.calibrate.tracker.session import Session, lead
+
+_DEPTH = 1024  # poses that may wait while a line is printed
+
+
+def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callable[[str], None]) -> Session:
+    """Lead the user through the motion.
+
+    Args:
+        bus: Endpoint of the running master's bus.
+        profile: The object; it has a tracker.
+        longest_s: How long the motion may take [s].
+        say: Told one line at a time.
+
+    Raises:
+        BusError: Nobody listens there.
+        FitError: Cameras or tracker said nothing.
+    """
+    link = ZenohBus(None, bus, beyond=True)
+    try:
+        objects = link.subscribe("object", profile.name, _DEPTH)
+        devices = link.subscribe("device", profile.tracker or profile.name, _DEPTH)
+
+        def receive(timeout_s: float) -> ObjectPose | TrackerPose | None:
+            message = objects.get(0.0) or devices.get(timeout_s)
+            return message if isinstance(message, ObjectPose | TrackerPose) else None
+
+        return lead(receive, SystemClock(), say, longest_s)
+    finally:
+        link.close()

@@ -1,0 +1,47 @@
+"""Picture of a registration: the way of the object by cameras and by tracker, and what is left over time."""
+
+from pathlib import Path
+
+import numpy as np
+
+from master.calibrate.tracker.registration import Registration
+from master.calibrate.wrist.picture import BLUE, GREY, ORANGE, figure_of, saved
+
+_GREEN = "#2f855a"
+
+
+def draw_registration(path: Path, found: Registration) -> None:
+    """From above and from the side (dots: cameras; lines: tracker), offsets of place and turn over time. PNG.
+
+    Raises:
+        RecordingError: The file cannot be written.
+    """
+    fit = found.fit
+    figure = figure_of((17.0, 8.4))
+    figure.suptitle("\n".join(found.report[:2]))
+    above, side, place, turn = figure.subplots(2, 2).ravel()
+    seen = 1e3 * (fit.p_m + fit.off[:, :3])
+    told = 1e3 * fit.p_m.copy()
+    told[np.diff(fit.t_s, prepend=fit.t_s[0]) > 0.2] = np.nan  # a gap is no way
+    for axes, (a, b), title in (
+        (above, (0, 2), "from above [mm]"),
+        (side, (2, 1), "from the side [mm]"),
+    ):
+        axes.plot(told[:, a], told[:, b], "-", color=GREY, linewidth=0.8, label="tracker")
+        axes.plot(seen[~fit.stray, a], seen[~fit.stray, b], ".", color=BLUE, markersize=3, label="cameras")
+        axes.plot(seen[fit.stray, a], seen[fit.stray, b], "x", color=ORANGE, markersize=4, label="stray")
+        axes.set(title=f"{title}: rig {'xyz'[a]}, {'xyz'[b]}")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.legend(fontsize=8)
+    side.invert_yaxis()  # y of the rig points down
+    for axes, columns, unit, title in (
+        (place, slice(0, 3), 1e3, "cameras against tracker: place [mm]"),
+        (turn, slice(3, 6), np.degrees(1.0), "cameras against tracker: turn [deg]"),
+    ):
+        left = unit * np.where(fit.stray[:, None], np.nan, fit.off[:, columns])
+        for values, colour, name in zip(left.T, (BLUE, ORANGE, _GREEN), "xyz", strict=True):
+            axes.plot(fit.t_s, values, ".", color=colour, markersize=3, label=name)
+        axes.axhline(0.0, color=GREY, linewidth=0.8)
+        axes.set(title=title, xlabel="time [s]")
+        axes.legend(fontsize=8)
+    saved(figure, path)

@@ -1,0 +1,108 @@
+"""The guided motion with a person: what was seen so far is told every second, and what is still missing.
+
+The machine that counts is `Session`; `lead` gives it what comes and talks.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from common.clock import Clock
+from common.errors import FitError
+from common.messages import ObjectPose, ObjectSource, TrackerPose
+from master.calibrate.tracker.coverage import Coverage, coverage_of
+from master.calibrate.tracker.registration import MOTION
+from master.calibrate.tracker.start import first_lag
+from master.calibrate.tracker.tracks import object_track, tracker_track
+
+TELL_NS = 1_000_000_000
+SILENT_S = 3.0
+ENOUGH_S = 15.0  # of both, when all turns are there: more of it makes the result surer
+_LAG_AFTER_S = 5.0
+_WAIT_S = 0.02
+
+Receive = Callable[[float], ObjectPose | TrackerPose | None]
+
+
+class Session:
+    """Push machine. Holds all poses of the motion, and when each side was heard last."""
+
+    def __init__(self) -> None:
+        """Begin."""
+        self.objects: list[ObjectPose] = []
+        self.tracked: list[TrackerPose] = []
+        self._lag_s: float | None = None
+
+    def push(self, message: ObjectPose | TrackerPose) -> None:
+        """Take one pose, of the object by cameras or of the device."""
+        if isinstance(message, TrackerPose):
+            self.tracked.append(message)
+        elif message.tracked and message.source in (ObjectSource.MARKERS, ObjectSource.TAGS):
+            self.objects.append(message)
+
+    def coverage(self) -> Coverage | None:
+        """What there is; None: one side has said nothing yet."""
+        if not (self.objects and self.tracked):
+            return None
+        zero_ns = min(self.objects[0].t_ns, self.tracked[0].t_ns)
+        seen, device = object_track(self.objects, zero_ns), tracker_track(self.tracked, zero_ns)
+        if len(seen) < 2 or len(device) < 2:
+            return None
+        found = coverage_of(seen, device, self._lag_s or 0.0)
+        if self._lag_s is None and found.shared_s > _LAG_AFTER_S:
+            self._lag_s = first_lag(seen, device)
+        return found
+
+    def silent(self, now_ns: int) -> str:
+        """Who says nothing just now, and what to look at; empty: both speak."""
+        if not _recent([one.t_ns for one in self.tracked[-1:]], now_ns):
+            return "no tracker is heard: is `phalanx-slave tracker` running, and does the master know it?"
+        if not np.isfinite([one.position_m for one in self.tracked[-20:]]).any():
+            return "the tracker does not know where it is: let it see a base station"
+        if not _recent([one.t_ns for one in self.objects[-1:]], now_ns):
+            return "the cameras do not see the object: markers or tags to the cameras"
+        return ""
+
+
+def lead(receive: Receive, clock: Clock, say: Callable[[str], None], longest_s: float) -> Session:
+    """Lead a person through the motion until it is enough, or the time is over.
+
+    Args:
+        receive: The next pose of object or device, waiting at most so long [s].
+        clock: The master's clock.
+        say: Told one line at a time.
+        longest_s: How long the motion may take [s].
+
+    Raises:
+        FitError: Cameras or tracker said nothing all the time.
+    """
+    session = Session()
+    say(MOTION)
+    begin_ns = told_ns = clock.now_ns()
+    enough = False
+    while not enough and clock.now_ns() - begin_ns < longest_s * 1e9:
+        message = receive(_WAIT_S)
+        if message is not None:
+            session.push(message)
+        now_ns = clock.now_ns()
+        if now_ns - told_ns < TELL_NS:
+            continue
+        told_ns = now_ns
+        coverage, silent = session.coverage(), ""
+        if now_ns - begin_ns > SILENT_S * 1e9:
+            silent = session.silent(now_ns)
+        if coverage is None:
+            say(silent or "waiting for cameras and tracker")
+            continue
+        enough = not coverage.missing and coverage.shared_s >= ENOUGH_S
+        hint = silent or (
+            coverage.missing[0] if coverage.missing else "go on like this" if not enough else "done"
+        )
+        say(f"{100 * coverage.share:3.0f} %  {coverage.line()}. {hint}")
+    if not (session.objects and session.tracked):
+        raise FitError(session.silent(clock.now_ns()) or f"nothing was seen: {MOTION}")
+    return session
+
+
+def _recent(t_ns: list[int], now_ns: int) -> bool:
+    return bool(t_ns) and now_ns - t_ns[0] < SILENT_S * 1e9

@@ -1,0 +1,155 @@
+"""A first registration from nothing: the lag by how fast both turn, the places in closed form, strays outvoted.
+
+Cameras and tracker sit in frames that nobody knows yet, but by how much the object turned within a fifth of a second
+is the same number in all frames. So the lag is where the two courses of that number differ least.
+
+The closed form is that of robot-world/hand-eye calibration, A Y = X B for all instants (Shah, "Solving the
+robot-world/hand-eye calibration problem using the Kronecker product", J. Mechanisms Robotics 5, 2013): the turns of X
+and Y are the first singular vectors of the sum of R_B (x) R_A, their shifts then a linear least squares.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.geometry import matrix_to_rotation_vector, rigid
+from master.calibrate.tracker.tracks import PoseTrack, shared_instants
+
+MOST_LAG_S = 0.5
+_GRID_S, _CHORD_S = 0.01, 0.2
+_LEAST_OVERLAP = 100  # of the grid: one second
+_INSTANTS, _DRAWS, _DRAWN = 240, 120, 6
+_NEAR_M, _NEAR_RAD = 0.03, np.radians(6.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Placed:
+    """A registration: A(t) = X B(t - late) inv(Y).
+
+    Attributes:
+        T_rig_tracking: X (4, 4).
+        T_object_tracker: Y (4, 4).
+        late_s: How much later the tracker's poses hold than they say [s].
+    """
+
+    T_rig_tracking: Float
+    T_object_tracker: Float
+    late_s: float
+
+
+def first_lag(seen: PoseTrack, tracker: PoseTrack) -> float | None:
+    """How much later the tracker's poses hold than they say [s], to some milliseconds; None: they hardly overlap."""
+    begin = min(seen.t_s[0], tracker.t_s[0]) - MOST_LAG_S
+    grid = np.arange(begin, max(seen.t_s[-1], tracker.t_s[-1]) + MOST_LAG_S, _GRID_S)
+    ours, theirs = _turned(seen, grid), _turned(tracker, grid)
+    steps = round(MOST_LAG_S / _GRID_S)
+    costs: list[float] = []
+    for lag in range(-steps, steps + 1):
+        moved = np.full_like(theirs, np.nan)
+        if lag >= 0:
+            moved[lag:] = theirs[: len(theirs) - lag]
+        else:
+            moved[:lag] = theirs[-lag:]
+        off = np.abs(ours - moved)
+        off = off[np.isfinite(off)]
+        costs.append(float(np.mean(np.minimum(off, 0.3))) if len(off) >= _LEAST_OVERLAP else np.inf)
+    best = int(np.argmin(costs))
+    if not np.isfinite(costs[best]):
+        return None
+    fine = 0.0
+    if 0 < best < len(costs) - 1 and np.isfinite([costs[best - 1], costs[best + 1]]).all():
+        before, here, after = costs[best - 1 : best + 2]
+        bent = before - 2.0 * here + after
+        fine = 0.5 * (before - after) / bent if bent > 0.0 else 0.0
+    return (best - steps + fine) * _GRID_S
+
+
+def _turned(track: PoseTrack, t_s: Float) -> Float:
+    """By how much it turned about each instant [rad]; NaN where that is not known."""
+    first, _, known = track.at(t_s - 0.5 * _CHORD_S)
+    last, _, also = track.at(t_s + 0.5 * _CHORD_S)
+    angle = np.linalg.norm(matrix_to_rotation_vector(first.swapaxes(1, 2) @ last), axis=1)
+    return np.where(known & also, angle, np.nan)
+
+
+def first_places(seen: PoseTrack, tracker: PoseTrack, late_s: float, seed: int = 0) -> Placed | None:
+    """A registration that most instants agree with; None: too few instants are shared.
+
+    Args:
+        seen: The object, by the cameras.
+        tracker: The device, by its system.
+        late_s: How much later its poses hold than they say [s].
+        seed: Of the draws.
+    """
+    rows = shared_instants(seen, tracker, late_s, _INSTANTS)
+    if len(rows) < 2 * _DRAWN:
+        return None
+    RA, pA = seen.R[rows], seen.p_m[rows]
+    RB, pB, _ = tracker.at(seen.t_s[rows] - late_s)
+    rng = np.random.default_rng(seed)
+    best: Bool | None = None
+    for _ in range(_DRAWS):
+        drawn = rng.choice(len(rows), _DRAWN, replace=False)
+        agree = _agree(*closed_form(RA[drawn], pA[drawn], RB[drawn], pB[drawn]), RA, pA, RB, pB)
+        if best is None or agree.sum() > best.sum():
+            best = agree
+    if best is None or best.sum() < _DRAWN:
+        return None
+    for _ in range(3):
+        X, Y = closed_form(RA[best], pA[best], RB[best], pB[best])
+        agree = _agree(X, Y, RA, pA, RB, pB)
+        if agree.sum() < _DRAWN:
+            break
+        best = agree
+    X, Y = closed_form(RA[best], pA[best], RB[best], pB[best])
+    return Placed(X, Y, late_s)
+
+
+def _agree(X: Float, Y: Float, RA: Float, pA: Float, RB: Float, pB: Float) -> Bool:
+    turn, place = foretold(X, Y, RB, pB)
+    off = np.linalg.norm(matrix_to_rotation_vector(RA @ turn.swapaxes(1, 2)), axis=1)
+    return (off < _NEAR_RAD) & (np.linalg.norm(pA - place, axis=1) < _NEAR_M)
+
+
+def foretold(X: Float, Y: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
+    """The object's turns (N, 3, 3) and places (N, 3) in the rig where the device is at (RB, pB): X B inv(Y)."""
+    turn = X[:3, :3] @ RB @ Y[:3, :3].T
+    device = pB @ X[:3, :3].T + X[:3, 3]
+    return turn, device - turn @ Y[:3, 3]
+
+
+def closed_form(RA: Float, pA: Float, RB: Float, pB: Float) -> tuple[Float, Float]:
+    """X and Y (4, 4) of A Y = X B, least squares, no weights (Shah, 2013).
+
+    Args:
+        RA, pA: The object in the rig (N, 3, 3), (N, 3).
+        RB, pB: The device in its system's frame.
+    """
+    total = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
+    left, _, right = np.linalg.svd(total)
+    RX, RY = _rotation(left[:, 0]), _rotation(right[0])
+    if _misfit(RX, RY, RA, RB) > _misfit(-RX, RY, RA, RB):  # the sign of singular vectors means nothing
+        RX = -RX
+    RX, RY = (RX, RY) if np.linalg.det(RX) > 0.0 else (-RX, -RY)
+    RX, RY = _nearest(RX), _nearest(RY)
+    lines = np.concatenate([RA, np.broadcast_to(-np.eye(3), RA.shape)], axis=2).reshape(-1, 6)
+    shifts: Float = np.asarray(np.linalg.lstsq(lines, (pB @ RX.T - pA).ravel(), rcond=None)[0], np.float64)
+    return rigid(RX, shifts[3:]), rigid(RY, shifts[:3])
+
+
+def _rotation(stacked: Float) -> Float:
+    """The matrix (3, 3) whose columns were stacked, scaled to a determinant of 1 or -1."""
+    matrix = stacked.reshape(3, 3).T
+    size = float(np.cbrt(np.linalg.det(matrix)))
+    return matrix / (abs(size) if abs(size) > 1e-9 else 1.0)
+
+
+def _misfit(RX: Float, RY: Float, RA: Float, RB: Float) -> float:
+    return float(((RA @ RY - RX @ RB) ** 2).sum())
+
+
+def _nearest(matrix: Float) -> Float:
+    """The rotation nearest to a matrix (3, 3)."""
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ np.diag([1.0, 1.0, float(np.linalg.det(left @ right))]) @ right)
