@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Float, Int
 from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion, matrix_to_rotation_vector
@@ -43,6 +43,8 @@ _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
 _PUSHED_M_S2, _PUSHED_RAD_S2 = 5.0, 40.0  # what may happen to its speed meanwhile
+_UNSEEN_M_S2, _ARM_M = 1.5, 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
+_TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
 _FRESH_PERIODS = 2.25  # an observation older than this is not now
 _FLIP_RAD = np.radians(8.0)  # poses of a tag nearer than this are one
 _BETTER = 12.0  # chi square, summed over frames, by which the other pose of a tag must be better
@@ -95,6 +97,7 @@ class ObjectLine:
         self._steady = Steady(middle, rig.filter.jitter_m)
         self._known: deque[_Known] = deque(maxlen=16)
         self._doubt = 0.0
+        self._sure_ns = -(2**63)
         self._last_ns = -(2**63)
 
     def push(self, message: MarkerDetections | TagDetections) -> list[SolvedObject]:
@@ -131,6 +134,12 @@ class ObjectLine:
             return self._held(window, predicted)
         oldest = window.t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
         self._known.append(_Known(window.t_ns, fitted, oldest))
+        if not _poor(fitted, _POOR_M, _POOR_RAD):
+            self._sure_ns = window.t_ns
+        elif window.t_ns - self._sure_ns > HELD_S * 1e9:
+            self._known.clear()
+            return self._none(window.t_ns)
+        tracked = not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
         features = self._features.feature[seen.seen.point[fitted.used]]
@@ -142,26 +151,28 @@ class ObjectLine:
             orientation_wxyz=matrix_to_quaternion(T[:3, :3]),
             cov=fitted.cov[:6, :6],
             residual_m=float(np.sqrt((fitted.residual_m[near] ** 2).mean())) if near.any() else np.nan,
-            source=int(
-                ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
-            ),
-            tracked=True,
+            source=int(self._source(features) if tracked else ObjectSource.HELD),
+            tracked=tracked,
             seen=shown.seen,
             expected=shown.expected,
             occluded=shown.occluded,
         )
 
+    def _source(self, features: Int) -> ObjectSource:
+        """What a pose that rests on these features comes from; both are called markers."""
+        return ObjectSource.MARKERS if (features < self._features.beads).any() else ObjectSource.TAGS
+
     def _found(self, window: Window, seen: Chosen, predicted: Motion | None) -> Fitted | None:
         """The pose at the instant; None: what is seen is not it, or does not tell."""
         if predicted is not None:
             past = self._past(window.t_ns, seen)
-            led = self._fitted(seen, predicted, past)
+            led = self._fitted(seen, predicted, past, window.t_ns)
             if led is not None and self._holds(seen, led):
                 return self._of_two(window, seen, led, past)
         best: tuple[Fitted, Chosen] | None = None
         for T in self._starts(window):
             again = Chosen.of(window, self._features, self._cameras, T)
-            if again is None or (fitted := self._fitted(again, Motion.still(T), None)) is None:
+            if again is None or (fitted := self._fitted(again, Motion.still(T), None, window.t_ns)) is None:
                 continue
             good = self._holds(again, fitted) and self._begins(again, fitted)
             if good and (best is None or fitted.cost < best[0].cost):
@@ -173,12 +184,15 @@ class ObjectLine:
         self._doubt = 0.0
         return self._of_two(window, best[1], best[0], None)
 
-    def _fitted(self, seen: Chosen, start: Motion, past: Past | None) -> Fitted | None:
-        """The fit, with the past where the present does not tell enough."""
+    def _fitted(self, seen: Chosen, start: Motion, past: Past | None, t_ns: int) -> Fitted | None:
+        """The fit, with the past where the present does not tell enough; how it may have moved since is then in it."""
         alone = self._fit(seen.seen, start, feature=seen.feature)
-        if past is None or (alone is not None and not _poor(alone, _POOR_M, _POOR_RAD)):
+        if alone is not None and not _poor(alone, _POOR_M, _POOR_RAD):
             return alone
-        return self._fit(seen.seen, start, past, feature=seen.feature)
+        if past is None or alone is None:
+            return alone if past is None else self._fit(seen.seen, start, past, feature=seen.feature)
+        both = self._fit(seen.seen, start, past, feature=seen.feature)
+        return None if both is None else _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
 
     def _holds(self, seen: Chosen, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
@@ -321,6 +335,20 @@ def _poor(fitted: Fitted, most_m: float, most_rad: float) -> bool:
     place = np.linalg.eigvalsh(fitted.cov[:3, :3])[-1]
     turn = np.linalg.eigvalsh(fitted.cov[3:6, 3:6])[-1]
     return not (place < most_m**2 and turn < most_rad**2)
+
+
+def _unheeded(fitted: Fitted, alone: Fitted, since_s: float) -> Fitted:
+    """A fit with what may have happened in directions that what is seen alone does not tell, for so long [s].
+
+    A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
+    rest on: its doubt grows as that of a thing that nobody sees.
+    """
+    scale = np.array([1.0] * 3 + [_ARM_M] * 3)
+    size, axes = np.linalg.eigh(alone.cov[:6, :6] * np.outer(scale, scale))
+    blind = axes[:, size > _POOR_M**2] / scale[:, None]
+    cov = fitted.cov.copy()
+    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (blind @ blind.T)
+    return replace(fitted, cov=cov)
 
 
 def _turned(T: Float, other: Float) -> float:
