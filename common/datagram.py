@@ -145,6 +145,12 @@ class ReplayWindow:
         """How many counters up to the highest never came: datagrams that were sent and lost."""
         return self._highest - self._count
 
+    def missing_between(self, after: int, before: int) -> int:
+        """How many counters between these two, both taken, never came; of what is too old to be known, all."""
+        newer, span = self._highest - before + 1, before - after - 1  # where it begins in bits; its length
+        known = min(span, max(WINDOW - newer, 0))
+        return span - ((self._taken >> newer) & ((1 << known) - 1)).bit_count()
+
     def take(self, counter: int) -> Refusal | bool:
         """Take `counter` once: whether a later one came before it, or why it is refused."""
         ahead = counter - self._highest
@@ -175,6 +181,10 @@ class Opener:
     def missing(self) -> int:
         """How many datagrams the sender sealed and this side never saw, up to the newest one."""
         return self._window.missing
+
+    def missing_between(self, after: int, before: int) -> int:
+        """How many datagrams between two that came (their counters) the sender sealed and this side never saw."""
+        return self._window.missing_between(after, before)
 
     def open(self, header: Header, datagram: bytes) -> Opened | Refusal:
         """Return the body of a datagram whose header `parse` returned, or why it is refused."""

@@ -1,44 +1,69 @@
-"""The live loop: messages in, poses out to every sink; and the figures of a run."""
+"""The live loop: messages in; hands, objects, contact and gestures out to every sink; and the figures of a run."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol, TypeVar
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
 
 from common.clock import Clock
-from common.messages import Detections, Health, ImuSample
+from common.messages import (
+    Contact,
+    Detections,
+    Gesture,
+    HandPose,
+    Health,
+    ImuSample,
+    ObjectPose,
+    TagDetections,
+    Told,
+    TrackerPose,
+)
 from master.outputs.sink import Sink
 from master.rates import CameraRates
-from master.stereo.pipeline import SolvedPose
 
 _NAME = 64  # characters of a name in `Health`
 _KEPT = 18_000  # latencies kept, five minutes at 60 Hz: quantiles of an hour would halt the loop 3 ms every second
-
+_OBJECT_KEPT = 2_000  # and of objects, some seconds of each
 
 SeenT = TypeVar("SeenT", bound=Detections)
 SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
 SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
+Beside: TypeAlias = TagDetections | ImuSample | TrackerPose  # what comes beside the frames of cameras
+
+
+class SolvedT(Protocol):
+    """A hand or an object at an instant, and when the last frame that contributed was handed to its slave [ns]."""
+
+    @property
+    def pose(self) -> HandPose | ObjectPose:
+        """Where it is."""
+        ...
+
+    @property
+    def ready_t_ns(self) -> int:
+        """When the last frame of it was there, master's clock."""
+        ...
+
+
+Solved: TypeAlias = SolvedT | Contact | Gesture
 
 
 class Source(Protocol[SeenT_co]):
-    """Where detections and samples come from: the network, or a test."""
+    """Where detections, samples and poses come from: the network, or a test."""
 
-    def get(self, timeout_s: float) -> SeenT_co | ImuSample | None:
+    def get(self, timeout_s: float) -> SeenT_co | Beside | None:
         """The next message, or None when none came in time."""
         ...
 
 
 class Solver(Protocol[SeenT_contra]):
-    """What makes poses of detections: the hands of a master."""
+    """What is made of all that comes: the world of a master."""
 
-    def push(self, message: SeenT_contra) -> list[SolvedPose]:
-        """Take one camera's detections; return the poses they complete, of each hand oldest first."""
-        ...
-
-    def push_sample(self, sample: ImuSample) -> None:
-        """Take what an IMU measured."""
+    def push(self, message: SeenT_contra | Beside) -> Iterable[Solved]:
+        """Take one message; give what it completes: each is out before the next is worked out."""
         ...
 
 
@@ -47,13 +72,27 @@ class RunFigures:
 
     def __init__(self) -> None:
         self.poses = 0
+        # All keys from the beginning: a report on another thread never sees it grow.
+        self.told = Counter(objects=0, contacts=0, gestures=0)
         self.rates = CameraRates()
         # A ring of fixed size: the report of every second reads it in one copy, however long the run.
         self._latency_ms = np.zeros(_KEPT)
+        self._object_ms = np.zeros(_OBJECT_KEPT)
         self._first_ns = self._last_ns = 0
 
+    def count(self, t_ns: int, message: Told) -> None:
+        """Count what was published at `t_ns`."""
+        if isinstance(message, HandPose):
+            self.add(t_ns, message.latency_ns)
+        elif isinstance(message, ObjectPose):
+            if message.tracked:  # what is held waits for nothing that was seen
+                self._object_ms[self.told["objects"] % _OBJECT_KEPT] = message.latency_ns * 1e-6
+                self.told["objects"] += 1
+        else:
+            self.told["contacts" if isinstance(message, Contact) else "gestures"] += 1
+
     def add(self, t_ns: int, latency_ns: int) -> None:
-        """Count one published pose."""
+        """Count one published pose of a hand."""
         if self.poses == 0:
             self._first_ns = t_ns
         self._last_ns = t_ns
@@ -61,7 +100,10 @@ class RunFigures:
         self.poses += 1
 
     def summary(self) -> dict[str, float]:
-        """poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms."""
+        """poses, poses_per_s (over the span of the poses), latency_p50_ms, latency_p99_ms: of hands.
+
+        Of objects that were tracked object_latency_p50_ms, object_latency_p99_ms.
+        """
         span_s = (self._last_ns - self._first_ns) * 1e-9
         out = {"poses": float(self.poses)}
         if self.poses > 1 and span_s > 0:
@@ -69,34 +111,47 @@ class RunFigures:
         if self.poses:
             p50, p99 = np.percentile(self._latency_ms[: self.poses], [50, 99])
             out |= {"latency_p50_ms": round(float(p50), 3), "latency_p99_ms": round(float(p99), 3)}
+        if tracked := self.told["objects"]:
+            p50, p99 = np.percentile(self._object_ms[:tracked], [50, 99])
+            out |= {
+                "object_latency_p50_ms": round(float(p50), 3),
+                "object_latency_p99_ms": round(float(p99), 3),
+            }
         return out
 
 
 def run(
     source: Source[SeenT],
-    hands: Solver[SeenT],
+    world: Solver[SeenT],
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,
     stop: threading.Event,
     watch: Callable[[SeenT], None] = lambda _message: None,
 ) -> None:
-    """Solve and publish until `stop` is set; `watch` is shown every camera's message once its poses are out."""
+    """Solve and publish until `stop` is set; `watch` is shown every camera's message once all that it tells is out."""
     while not stop.is_set():
         message = source.get(timeout_s=0.1)
         if message is None:
             continue
-        if isinstance(message, ImuSample):
-            hands.push_sample(message)
-            continue
-        figures.rates.push(message)
-        for solved in hands.push(message):
+        beside = isinstance(message, TagDetections | ImuSample | TrackerPose)
+        if not beside:
+            figures.rates.push(message)
+        for solved in world.push(message):
             now = clock.now_ns()
-            pose = msgspec.structs.replace(solved.pose, latency_ns=now - solved.ready_t_ns)
+            told = told_at(solved, now)
             for sink in sinks:
-                sink.write(pose)
-            figures.add(now, pose.latency_ns)
-        watch(message)
+                sink.write(told)
+            figures.count(now, told)
+        if not beside:
+            watch(message)
+
+
+def told_at(solved: Solved, t_ns: int) -> Told:
+    """The message that is published at `t_ns`: a pose says how long it took."""
+    if isinstance(solved, Contact | Gesture):
+        return solved
+    return msgspec.structs.replace(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
 
 
 def health(
@@ -110,4 +165,5 @@ def health(
     gauges = {name: value for name, value in figures.summary().items() if name != "poses"}
     gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     gauges |= times or {}
-    return Health("master", session, clock.now_ns(), {"poses": figures.poses} | counts, gauges)
+    told = {name: number for name, number in figures.told.items() if number}
+    return Health("master", session, clock.now_ns(), {"poses": figures.poses} | told | counts, gauges)

@@ -29,6 +29,10 @@ class Line(Protocol):
         """Take what the hand's IMU says of its own orientation (4,)."""
         ...
 
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for something."""
+        ...
+
 
 class Hands:
     """Push machine over all hands of a master. Holds who is sent what."""
@@ -60,6 +64,10 @@ class Hands:
         """Take one camera's detections; return the poses they complete, hand by hand, oldest first."""
         known = self._cameras.get(message.camera, [])
         return [solved for setup, line in known for solved in line.push(setup.own(message))]
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait, hand by hand."""
+        return [solved for _, line in self._hands for solved in line.flush()]
 
     def push_sample(self, sample: ImuSample) -> None:
         """Take a sample of an IMU; only the hand that wears it is told."""

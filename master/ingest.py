@@ -1,8 +1,9 @@
 """Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
 
 A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
-pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Samples of an IMU go
-before frames: there may be ten to a frame, and each tells less.
+pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Samples of an IMU and
+poses of a tracker go before frames: there may be ten to a frame, and each tells less. So do tags, without which an
+object is held for a while.
 """
 
 import os
@@ -15,7 +16,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
-from common.messages import ImuSample
+from common.messages import ImuSample, TagDetections, TrackerPose
 from common.session import Random
 from common.udp import UdpSocket
 from master.link import MasterLink, Taken
@@ -42,6 +43,7 @@ class Ingest:
         random: Random = os.urandom,
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
+        trackers: tuple[str, ...] = (),
     ) -> None:
         """Begin to call the slaves.
 
@@ -56,6 +58,7 @@ class Ingest:
             random: Source of nonces.
             imus: Names of IMUs that may take part.
             wrists: Those of `cameras` that belong to a wrist device.
+            trackers: Names of devices that track themselves and may take part.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
@@ -65,8 +68,10 @@ class Ingest:
         _check_address(beacon[0])
         self._clock = clock
         timeout_ns = round(start_timeout_s * 1e9)
-        self._link = MasterLink(cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists)
-        self._cameras, self._senders = cameras, (*cameras, *imus)
+        self._link = MasterLink(
+            cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists, trackers
+        )
+        self._cameras, self._senders = cameras, (*cameras, *imus, *trackers)
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
         self._queue: deque[Taken] = deque()
@@ -89,7 +94,7 @@ class Ingest:
 
     @property
     def connected(self) -> frozenset[str]:
-        """The cameras and IMUs heard within the last second."""
+        """The cameras, IMUs and trackers heard within the last second."""
         with self._lock:
             return self._link.connected()
 
@@ -111,7 +116,10 @@ class Ingest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, queue.*"""
+        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, queue.*
+
+        Of tags <camera>.tags_received and <camera>.tags_late, once there were any.
+        """
         counts = {
             "queue.dropped": self._overflowed,
             "would_block": self._socket.would_block,
@@ -123,10 +131,13 @@ class Ingest:
             counts |= {f"{sender}.{event}": number for event, number in of.items()}
             with self._lock:
                 counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
+                tags = self._link.tag_counts_of(sender)
+            if tags is not None and tags.received:
+                counts |= {f"{sender}.tags_received": tags.received, f"{sender}.tags_late": tags.late}
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def counts_of(self, sender: str) -> CameraCounts:
-        """Return what became of the frames or samples of `sender`.
+        """Return what became of the frames, samples or poses of `sender`.
 
         Raises:
             KeyError: The rig has no such sender.
@@ -174,9 +185,16 @@ class Ingest:
             self._queue.append(message)
             if len(self._queue) > QUEUE:
                 self._overflowed += 1
-                samples = (k for k, waiting in enumerate(self._queue) if isinstance(waiting, ImuSample))
-                del self._queue[next(samples, 0)]
+                del self._queue[self._least()]
             self._changed.notify()
+
+    def _least(self) -> int:
+        """Which waiting message is dropped."""
+        for kinds in ((ImuSample, TrackerPose), TagDetections):
+            found = next((k for k, waiting in enumerate(self._queue) if isinstance(waiting, kinds)), None)
+            if found is not None:
+                return found
+        return 0
 
 
 def _check_address(host: str) -> None:

@@ -5,8 +5,9 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
   something with the new keys. So a replayed or late hello never ends a live session.
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
-  first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU.
-- A sender says one kind of message: a camera markers, that of a wrist device its triples, an IMU samples.
+  first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
+- A camera says markers and, when it looked for them, tags; that of a wrist device its triples, an IMU samples, a
+  tracker poses. Each kind of message has numbers of its own.
 - Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
 
@@ -21,7 +22,15 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
-from common.messages import Detections, ImuSample, MarkerDetections, WristDetections, decode
+from common.messages import (
+    Detections,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+    decode,
+)
 from common.session import (
     MAX_CAMERAS,
     NONCE_BYTES,
@@ -38,7 +47,7 @@ from common.session import (
     read,
     seal,
 )
-from master.sequence import TRIPLE, CameraCounts, Sequence
+from master.sequence import TRIPLE, CameraCounts, Counted, Sequence
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
@@ -52,7 +61,7 @@ START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it i
 START_AGAIN_NS = 50_000_000
 OLD_NONCES = 64
 
-Taken: TypeAlias = Detections | ImuSample
+Taken: TypeAlias = Detections | TagDetections | ImuSample | TrackerPose
 
 
 @dataclass(slots=True)
@@ -76,21 +85,30 @@ class _Session:
 
 @dataclass(slots=True)
 class _Sender:
-    """What is kept of one camera or IMU of the rig, and the one kind of message that it sends."""
+    """What is kept of one camera, IMU or tracker, and the kinds of message that it sends, the main one first."""
 
-    sends: type[Taken]
-    sequence: Sequence
+    kinds: dict[type[Taken], Counted]
     live: _Session | None = None
     pending: _Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
-    missing_before: int = 0  # datagrams lost in sessions that are over
-    steps_before: int = 0  # and steps of the clock
+    steps_before: int = 0  # of the clock in sessions that are over
+
+    @property
+    def main(self) -> Counted:
+        """What it sends all the time."""
+        return next(iter(self.kinds.values()))
+
+    def fill(self, counter: int, own: Counted | None = None) -> None:
+        """A datagram came late, of kind `own` or of none: in the gaps of other kinds it is no loss."""
+        for kind in self.kinds.values():
+            if kind is not own:
+                kind.losses.late(counter, 0)
 
 
 class MasterLink:
     """Takes datagrams, gives what they brought on the master's clock, and says what to send.
 
-    Holds the sessions of the rig's cameras and IMUs, the moment of the start, the counters of refusals.
+    Holds the sessions of the rig's cameras, IMUs and trackers, the moment of the start, the counters of refusals.
     """
 
     def __init__(
@@ -104,20 +122,27 @@ class MasterLink:
         random: Random,
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
+        trackers: tuple[str, ...] = (),
     ) -> None:
         """Begin a new life of the master, with a nonce from `random`.
 
-        `imus` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a wrist device:
-        they send strobed triples, the others markers.
+        `imus` and `trackers` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a
+        wrist device: they send strobed triples, the others markers and tags.
 
         Raises:
-            ValueError: Key of wrong length, no camera, more than 32 senders, an IMU with the name of a camera, or a
+            ValueError: Key of wrong length, no camera, more than 32 senders, one name for two kinds of sender, or a
                 wrist's camera that is none of the cameras.
         """
-        if not cameras or not len({*cameras, *imus}) <= MAX_CAMERAS:
-            raise ValueError(f"{len({*cameras, *imus})} cameras and IMUs, expected 1 to {MAX_CAMERAS}")
-        if both := set(cameras) & set(imus):
-            raise ValueError(f"{min(both)!r} is a camera and an IMU")
+        everybody = {*cameras, *imus, *trackers}
+        if not cameras or not len(everybody) <= MAX_CAMERAS:
+            raise ValueError(f"{len(everybody)} cameras, IMUs and trackers, expected 1 to {MAX_CAMERAS}")
+        for one, ones, other, others in (
+            ("a camera", cameras, "an IMU", imus),
+            ("a camera", cameras, "a tracker", trackers),
+            ("an IMU", imus, "a tracker", trackers),
+        ):
+            if both := set(ones) & set(others):
+                raise ValueError(f"{min(both)!r} is {one} and {other}")
         if strange := set(wrists) - set(cameras):
             raise ValueError(f"{min(strange)!r} of a wrist device is none of the cameras")
         self._keys = RigKeys(key)
@@ -128,10 +153,17 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
-        self._senders = {name: _Sender(MarkerDetections, Sequence()) for name in cameras}
-        self._senders |= {name: _Sender(WristDetections, Sequence(TRIPLE)) for name in wrists}
-        self._senders |= {name: _Sender(ImuSample, Sequence()) for name in imus}
-        self._awaited, self._imus = tuple(self._senders[name] for name in cameras), frozenset(imus)
+        self._senders = {
+            name: _Sender({MarkerDetections: Counted(Sequence()), TagDetections: Counted(Sequence(None))})
+            for name in cameras
+        }
+        self._senders |= {name: _Sender({WristDetections: Counted(Sequence(TRIPLE))}) for name in wrists}
+        self._senders |= {name: _Sender({ImuSample: Counted(Sequence())}) for name in imus}
+        self._senders |= {name: _Sender({TrackerPose: Counted(Sequence())}) for name in trackers}
+        self._awaited, self._extra = (
+            tuple(self._senders[name] for name in cameras),
+            frozenset((*imus, *trackers)),
+        )
         self._sessions: dict[int, _Session] = {}
         self._first_ns: int | None = None
         self._start_ns: int | None = None
@@ -200,10 +232,14 @@ class MasterLink:
 
     def counts_of(self, sender: str) -> CameraCounts:
         """Return what was counted of `sender` since this master began."""
-        of = self._senders[sender]
-        gaps = of.sequence.counts.lost
-        lost = min(gaps, of.missing_before + (of.live.opener.missing if of.live is not None else 0))
-        return replace(of.sequence.counts, lost=lost, skipped=gaps - lost)
+        kind = self._senders[sender].main
+        counts, lost = kind.sequence.counts, kind.losses.lost
+        return replace(counts, lost=lost, skipped=counts.lost - lost)
+
+    def tag_counts_of(self, camera: str) -> CameraCounts | None:
+        """Return what was counted of the tags of `camera`, of which none is ever missing; None: it sends no tags."""
+        kind = self._senders[camera].kinds.get(TagDetections)
+        return None if kind is None else kind.sequence.counts
 
     def _beacon(self) -> Beacon:
         live = {name: sender.live for name, sender in self._senders.items()}
@@ -254,15 +290,17 @@ class MasterLink:
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
-                sender.sequence.duplicate()
+                sender.main.sequence.duplicate()
             return opened
         session.heard_ns = t_ns
         if sender.pending is session:
             self._confirm(sender, session, t_ns)
         if opened.reordered:
-            sender.sequence.reordered()
+            sender.main.sequence.reordered()
         if header.kind is Kind.DATA:
-            return self._take_data(session, sender, opened)
+            return self._take_data(session, sender, opened, header.counter)
+        if opened.reordered:
+            sender.fill(header.counter)
         message = read(header.kind, opened.body)
         if isinstance(message, EchoAnswer):
             session.clock.push(message.t1_ns, message.t2_ns, message.t3_ns, t_ns)
@@ -274,33 +312,39 @@ class MasterLink:
 
     def _confirm(self, sender: _Sender, session: _Session, t_ns: int) -> None:
         if sender.live is not None:
-            sender.missing_before += sender.live.opener.missing
             sender.steps_before += sender.live.clock.steps
             del self._sessions[sender.live.key_id]
         sender.live, sender.pending = session, None
+        for kind in sender.kinds.values():
+            kind.begin_session()
         sender.old_nonces.append(session.hello.slave_nonce)
-        if self._first_ns is None and session.name not in self._imus:
+        if self._first_ns is None and session.name not in self._extra:
             self._first_ns = t_ns
 
-    def _take_data(self, session: _Session, sender: _Sender, opened: Opened) -> Taken | Refusal | None:
+    def _take_data(
+        self, session: _Session, sender: _Sender, opened: Opened, counter: int
+    ) -> Taken | Refusal | None:
         try:
             message = decode(opened.body)
         except MessageError:
             return Refusal.UNDECODABLE
         if not isinstance(message, Taken):
             return Refusal.UNDECODABLE
-        name = message.source if isinstance(message, ImuSample) else message.camera
-        if name != session.name or not isinstance(message, sender.sends):
+        name = message.source if isinstance(message, ImuSample | TrackerPose) else message.camera
+        kind = sender.kinds.get(type(message))
+        if name != session.name or kind is None:
             return Refusal.IMPOSTOR
         session.started = True
-        if not sender.sequence.take(message.session, message.seq):
+        if opened.reordered:
+            sender.fill(counter, kind)
+        if not kind.take(message.session, message.seq, counter, session.opener.missing_between):
             return None
         clock = session.clock.estimate()
         if clock is None:  # data before the start, of a slave that did not wait for it
             self.unsynchronised += 1
             return None
         t_ns = clock.to_local(message.t_ns)
-        if isinstance(message, ImuSample):
+        if isinstance(message, ImuSample | TrackerPose):
             return msgspec.structs.replace(message, t_ns=t_ns)
         return msgspec.structs.replace(
             message,

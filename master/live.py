@@ -14,17 +14,17 @@ from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
-from master.hands import Hands
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
-from master.outputs.files import PosesFiles
+from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
 from master.rig import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.world import World
 
 _REPORT_S = 1.0
 _JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
@@ -39,7 +39,8 @@ class LiveSettings:
         bind: Own UDP address and port for data (0: any).
         bus: Endpoint on which the zenoh bus listens, for example tcp/127.0.0.1:47802.
         start_timeout_s: How long the first slave waits for the others.
-        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name.
+        poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and objects,
+            contact and gestures in its folder.
         summary: Where to write the summary, or None.
         files: Where the setups were read: what changes there is used at once. None: they stay as they are.
     """
@@ -79,7 +80,7 @@ def run_live(
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
     pipelines = [LivePipeline(setup, stages) for setup in setups]
-    hands = Hands(setups, pipelines)
+    world = World(setups, pipelines)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say)
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
@@ -89,21 +90,22 @@ def run_live(
         sinks: list[Sink] = [BusSink(bus)]
         if settings.poses is not None:
             counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
-            sinks.append(PosesFiles(settings.poses, counts))
+            objects = [one.name for setup in setups for one in setup.objects]
+            sinks.append(RunFiles(settings.poses, counts, objects))
         for sink in sinks:
             stack.callback(sink.close)
         watch = TimeWatch(setups)
         odd = [OddWatch(setup.rig.cameras) for setup in setups]
         watched = list(zip(odd, pipelines, strict=True))
         reporter = _Reporter(
-            cameras_of(setups), clock, bus, ingest, hands, watched, tuning, watch, figures, stop, say
+            cameras_of(setups), clock, bus, ingest, world, watched, tuning, watch, figures, stop, say
         )
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        run(ingest, hands, sinks, clock, figures, stop, watch.push)
+        run(ingest, world, sinks, clock, figures, stop, watch.push)
         stop.set()
         thread.join(_JOIN_S)
         summary: dict[str, object] = {
@@ -126,7 +128,7 @@ def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
 
 
 def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: LiveSettings) -> Ingest:
-    """Where all cameras and IMUs of these hands are heard.
+    """Where all cameras, IMUs and trackers of these hands and objects are heard.
 
     Raises:
         BusError: The address cannot be bound, or the beacon's is no IPv4 address.
@@ -141,6 +143,7 @@ def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: Li
         settings.start_timeout_s,
         imus=tuple(name for setup in setups for name in setup.imus),
         wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
+        trackers=tuple(name for setup in setups for name in setup.trackers),
     )
 
 
@@ -156,7 +159,7 @@ class _Reporter:
         clock: Clock,
         bus: Bus,
         ingest: Ingest,
-        hands: Hands,
+        world: World,
         odd: Sequence[tuple[OddWatch, LivePipeline]],
         tuning: RigTuning | None,
         watch: TimeWatch,
@@ -167,7 +170,7 @@ class _Reporter:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self._session = secrets.randbits(63)
         self._cameras, self._clock, self._bus = cameras, clock, bus
-        self._ingest, self._hands, self._figures = ingest, hands, figures
+        self._ingest, self._world, self._figures = ingest, world, figures
         self._tuning, self._watch, self._odd = tuning, watch, odd
         self._stop, self._say = stop, say
         bus.announce(MASTER)
@@ -178,7 +181,7 @@ class _Reporter:
         events = self._ingest.counts.items()
         told = {name: number for name, number in events if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._hands.counts) | told | changes
+        counts = dict(self._world.counts) | told | changes
         times = self._watch.gauges(self._ingest.clock_of)
         return health(self._session, self._clock, self._figures, counts, times)
 

@@ -1,4 +1,4 @@
-"""From JSON to pipeline: reads rigs, cameras and hands of a calibration folder and joins the parts they name."""
+"""From JSON to pipeline: reads rigs and what they name of a calibration folder, and joins the parts."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -16,13 +16,16 @@ from common.calibration import CameraCalibration, HandProfile, RigCalibration, l
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import cross
+from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import Detections, MarkerDetections
+from common.object_profile import ObjectProfile
 from master.filters import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
-from master.rig_merge import merged_rig, refuse_shared_senders, rigs_by_hand
+from master.rig_merge import gestures_named, merged_rig, refuse_shared_senders, rigs_by_hand
+from master.rig_objects import load_gestures, load_objects, objects_of, refuse_shared_objects
 from master.stereo.depth import depth_law
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
@@ -63,6 +66,8 @@ class RigSetup:
         wrist: Laser plane and palm of a wrist device; None: there is none.
         wrist_rig: The rig file of that device.
         rows: Camera -> which rows of its messages are `markers`, where it watches another hand as well.
+        objects: What else its marker cameras watch, in the order of the rig; of a rig of several hands with the first.
+        gestures: What counts as a gesture of this hand.
     """
 
     rig: RigCalibration
@@ -72,6 +77,8 @@ class RigSetup:
     wrist: WristSetup | None = None
     wrist_rig: RigCalibration | None = None
     rows: dict[str, tuple[int, ...]] = field(default_factory=dict[str, tuple[int, ...]])
+    objects: tuple[ObjectProfile, ...] = ()
+    gestures: GestureSettings = field(default_factory=default_gestures)
 
     @property
     def has_markers(self) -> bool:
@@ -104,6 +111,11 @@ class RigSetup:
         rigs = (self.rig,) if self.wrist_rig in (None, self.rig) else (self.rig, self.wrist_rig)
         return tuple(rig.imu.name for rig in rigs if rig.imu is not None)
 
+    @property
+    def trackers(self) -> tuple[str, ...]:
+        """The devices that track themselves and sit on its objects."""
+        return tuple(one.tracker for one in self.objects if one.tracker is not None)
+
     def own(self, message: Detections) -> Detections:
         """The message with the markers of this hand alone."""
         rows = self.rows.get(message.camera)
@@ -120,13 +132,25 @@ class RigSetup:
         )
 
     @classmethod
-    def of(cls, rig: RigCalibration, cameras: Mapping[str, CameraCalibration], hand: HandModel) -> "RigSetup":
+    def of(
+        cls,
+        rig: RigCalibration,
+        cameras: Mapping[str, CameraCalibration],
+        hand: HandModel,
+        objects: Mapping[str, ObjectProfile] | None = None,
+    ) -> "RigSetup":
         """Join the files of a rig that watches one hand.
+
+        Args:
+            rig: The rig.
+            cameras: Camera files by name; more than its own do not matter.
+            hand: The hand.
+            objects: Object files by name; None: its objects are left out, only the hand is wanted.
 
         Raises:
             CalibrationError: A camera of the rig is missing or has no intrinsics; of a marker rig: fewer than two
-                cameras, several hands, or a marker the hand does not mount and that is not free; of a wrist device: no
-                laser plane or no palm pose.
+                cameras, several hands, a marker the hand does not mount and that is not free, or as of
+                `rig_objects.objects_of`; of a wrist device: no laser plane or no palm pose.
         """
         if rig.kind == "markers" and len(rig.cameras) < 2:
             raise CalibrationError(f"rig {rig.name!r}: cameras: two or more are needed")
@@ -145,7 +169,8 @@ class RigSetup:
         for name in rig.markers:
             if name not in rig.free_markers:
                 hand.mount(name)
-        return cls(rig, ordered, models, hand)
+        watched = () if objects is None else objects_of(rig, objects)
+        return cls(rig, ordered, models, hand, objects=watched)
 
     @classmethod
     def joined(cls, setups: Sequence["RigSetup"]) -> "RigSetup":
@@ -157,23 +182,33 @@ class RigSetup:
 
         Raises:
             CalibrationError: They are of different hands, two are wrist devices, two have a camera or IMU of the same
-                name or two IMUs, or the marker rigs cannot be merged (`merged_rig`).
+                name or two IMUs, name two files of gestures, or the marker rigs cannot be merged (`merged_rig`).
         """
         marked = [setup for setup in setups if setup.has_markers]
         worn = [setup for setup in setups if not setup.has_markers]
         rigs = [setup.rig for setup in setups]
         _refuse_two(setups, worn)
         refuse_shared_senders(rigs)
+        gestures_named(rigs)
         if not marked:
             return worn[0]
         cameras = {name: file for setup in marked for name, file in setup.cameras.items()}
-        out = cls.of(merged_rig([setup.rig for setup in marked]), cameras, setups[0].hand)
+        objects = {one.name: one for setup in marked for one in setup.objects}
+        merged = merged_rig([setup.rig for setup in marked])
+        out = cls.of(merged, cameras, setups[0].hand, objects or None)
+        out = with_fields(out, gestures=_gestures(setups))
         rows = {name: which for setup in marked for name, which in setup.rows.items()}
         if not worn:
             return with_fields(out, rows=rows)
         return with_fields(
             out, cameras=cameras | worn[0].cameras, wrist=worn[0].wrist, wrist_rig=worn[0].rig, rows=rows
         )
+
+
+def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:
+    """Those of the rig that names a file, where one does."""
+    named = (setup.gestures for setup in setups if setup.rig.gestures is not None)
+    return next(named, setups[0].gestures)
 
 
 def _refuse_two(setups: Sequence[RigSetup], worn: Sequence[RigSetup]) -> None:
@@ -205,24 +240,36 @@ def setups_of(
     rigs: Sequence[RigCalibration],
     cameras: Mapping[str, CameraCalibration],
     hand_named: Callable[[str], HandModel],
+    objects: Mapping[str, ObjectProfile] | None = None,
+    gestures_of: Callable[[str | None], GestureSettings] = lambda _name: default_gestures(),
 ) -> tuple[RigSetup, ...]:
     """What watches each hand of these rigs, in the order in which they name the hands.
 
     A marker rig with `other_hands` watches several: each of its markers is that of the hand that mounts it. Free
-    markers stay with the rig's first hand.
+    markers and objects stay with the rig's first hand.
+
+    Args:
+        rigs: One or more.
+        cameras: Camera files by name.
+        hand_named: The hand of a name.
+        objects: Object files by name; None: objects are left out.
+        gestures_of: What a rig's `gestures` stands for, or none.
 
     Raises:
-        CalibrationError: As of `RigSetup.joined`; of a rig of several hands a marker is mounted by none or by two.
+        CalibrationError: As of `RigSetup.joined`; of a rig of several hands a marker is mounted by none or by two; two
+            hands' rigs have the same object.
     """
     refuse_shared_senders(rigs)
     found: dict[str, list[RigSetup]] = {}
     for rig in rigs:
         hands = {name: hand_named(name) for name in (rig.hand, *rig.other_hands)}
         for name, own, chosen in rigs_by_hand(rig, hands):
-            setup = RigSetup.of(own, cameras, hands[name])
+            setup = RigSetup.of(own, cameras, hands[name], objects)
             rows = dict.fromkeys(rig.cameras, chosen) if rig.other_hands else {}
-            found.setdefault(name, []).append(with_fields(setup, rows=rows))
+            setup = with_fields(setup, rows=rows, gestures=gestures_of(rig.gestures))
+            found.setdefault(name, []).append(setup)
     joined = tuple(RigSetup.joined(setups) for setups in found.values())
+    refuse_shared_objects([(setup.rig.name, setup.objects) for setup in joined])
     names = [setup.hand.profile.name for setup in joined]
     if twice := [name for name in names if names.count(name) > 1]:
         raise CalibrationError(f"hands {', '.join(found)}: two files call their hand {twice[0]!r}")
@@ -232,7 +279,8 @@ def setups_of(
 def load_setups(
     calibration: Path, rig_names: Sequence[str], hand_file: Path | None = None
 ) -> tuple[RigSetup, ...]:
-    """Read rigs/<rig>.json of each rig, their cameras and hands from a calib_json tree: a setup for each hand.
+    """Read rigs/<rig>.json of each rig, their cameras, hands, objects and gestures from a calib_json tree: a setup for
+    each hand.
 
     Args:
         calibration: The tree.
@@ -256,21 +304,25 @@ def setups_with_hands(
     cameras: Mapping[str, CameraCalibration],
     calibration: Path | None,
     hand_file: Path | None,
+    objects: Mapping[str, ObjectProfile] | None = None,
 ) -> tuple[RigSetup, ...]:
-    """As `setups_of`, each hand as `load_hand` finds it; `hand_file` is the hand of all rigs.
+    """As `setups_of`, each hand, object and gesture as `load_hand`, `load_objects` and `load_gestures` find it.
+
+    `hand_file` is the hand of all rigs; `objects` are those of a recording, before those of the tree.
 
     Raises:
-        CalibrationError: As of `setups_of` and `load_hand`; the rigs are of several hands and `hand_file` is one.
+        CalibrationError: As of all these; the rigs are of several hands and `hand_file` is one.
     """
     names = tuple(dict.fromkeys(name for rig in rigs for name in (rig.hand, *rig.other_hands)))
     if hand_file is not None and len(names) > 1:
         raise CalibrationError(f"--hand {hand_file}: is one hand; the rigs are of {', '.join(names)}")
     hands = {name: load_hand(calibration, name, hand_file) for name in names}
-    return setups_of(rigs, cameras, hands.__getitem__)
+    watched = load_objects(calibration, rigs, objects or {})
+    return setups_of(rigs, cameras, hands.__getitem__, watched, lambda name: load_gestures(calibration, name))
 
 
 def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) -> RigSetup:
-    """Read rigs/<rig>.json, its cameras and its hand from a calib_json tree.
+    """Read rigs/<rig>.json, its cameras, hand, objects and gestures from a calib_json tree.
 
     Raises:
         CalibrationError: A file is missing, broken or contradicts another.
@@ -279,7 +331,10 @@ def load_setup(calibration: Path, rig_name: str, hand_file: Path | None = None) 
     cameras = {
         name: load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in rig.cameras
     }
-    return RigSetup.of(rig, cameras, load_hand(calibration, rig.hand, hand_file))
+    setup = RigSetup.of(
+        rig, cameras, load_hand(calibration, rig.hand, hand_file), load_objects(calibration, [rig], {})
+    )
+    return with_fields(setup, gestures=load_gestures(calibration, rig.gestures))
 
 
 def load_hand(calibration: Path | None, name: str, hand_file: Path | None) -> HandModel:

@@ -1,5 +1,5 @@
 """Rigs by the hand that they watch: several marker rigs of one hand become one of N cameras, and a rig of several hands
-becomes one for each.
+becomes one for each. Objects are those of all of them together.
 
 Each pair of cameras is calibrated in a frame of its own; `T_world_rig` says where that lies in the one they share. What
 rigs of one hand say twice must be said alike: a silent choice between two filters would be nobody's.
@@ -25,7 +25,7 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
     """One marker rig with the cameras of all of them, in their order and in the frame that they share.
 
     Its residual is that of the rig that was measured worst. It states the first volume that a rig states, where that
-    is a box along the axes of the shared frame.
+    is a box along the axes of the shared frame, and the first place of a tracking system and file of gestures.
 
     Raises:
         CalibrationError: One depth model is not "stereo", they share a camera, or markers, filter or pairing differ.
@@ -55,7 +55,25 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
         volume=next((rig.volume for rig in placed if rig.volume is not None), None),
         provenance=_worst_places(placed),
         imu=next((rig.imu for rig in placed if rig.imu is not None), None),
+        objects=tuple(dict.fromkeys(name for rig in placed for name in rig.objects)),
+        T_rig_tracking=next((rig.T_rig_tracking for rig in placed if rig.T_rig_tracking is not None), None),
+        gestures=gestures_named(placed),
     )
+
+
+def gestures_named(rigs: Sequence[RigCalibration]) -> str | None:
+    """Which file of gestures rigs of one hand name; None: none does.
+
+    Raises:
+        CalibrationError: They name two.
+    """
+    named = [rig for rig in rigs if rig.gestures is not None]
+    for rig in named[1:]:
+        if rig.gestures != named[0].gestures:
+            raise CalibrationError(
+                f"rigs {named[0].name!r} and {rig.name!r}: gestures: differ, and both watch hand {rig.hand!r}"
+            )
+    return named[0].gestures if named else None
 
 
 def refuse_shared_senders(rigs: Sequence[RigCalibration]) -> None:
@@ -81,7 +99,7 @@ def rigs_by_hand(
     """Of each hand: its name, the rig as if it watched that hand alone, and which of the rig's markers those are.
 
     A rig with `other_hands` watches several; each of its markers is that of the hand that mounts it, and free markers
-    stay with its first hand.
+    and objects stay with its first hand.
 
     Raises:
         CalibrationError: A marker is mounted by none of the hands or by two, or a hand mounts none.
@@ -110,14 +128,15 @@ def rigs_by_hand(
             other_hands=(),
             markers=tuple(rig.markers[m] for m in chosen),
             free_markers=rig.free_markers if name == rig.hand else (),
+            objects=rig.objects if name == rig.hand else (),
         )
         parts.append((name, own, chosen))
     return parts
 
 
 def in_world(rig: RigCalibration) -> RigCalibration:
-    """The marker rig in the frame that several rigs share: cameras, world of its IMU, and volume; one without
-    `T_world_rig` as it is.
+    """The marker rig in the frame that several rigs share: cameras, world of its IMU, tracking system, and volume; one
+    without `T_world_rig` as it is.
 
     A volume that the shared frame's axes turn away from is no box there, and is not stated any more.
     """
@@ -131,6 +150,9 @@ def in_world(rig: RigCalibration) -> RigCalibration:
         T_rig_camera=poses,
         imu=_imu(rig.imu, T_world_rig),
         volume=_volume(rig.volume, T_world_rig),
+        T_rig_tracking=None
+        if rig.T_rig_tracking is None
+        else _matrix(T_world_rig @ np.array(rig.T_rig_tracking)),
     )
 
 

@@ -1,14 +1,17 @@
 """Counts what becomes of one camera's frames on the way: received, lost, skipped, late, duplicate, reordered.
 
 A frame is *lost* when it was sent and never came, *skipped* when nothing was sent under its number: numbers
-alone cannot tell, so `Sequence` counts both as lost and `MasterLink.counts_of` parts them. It is *late* when it
-came after a newer one, and is dropped then, because the newer one was used already. So received + lost + skipped
-+ late is the number of frames between the first and the last. A restarted slave is a new sequence.
+alone cannot tell, so `Sequence` counts both as lost and `Losses` parts them by the counters of the datagrams. It is
+*late* when it came after a newer one, and is dropped then, because the newer one was used already. So received + lost +
+skipped + late is the number of frames between the first and the last. A restarted slave is a new sequence.
 
 The camera of a wrist device sends one message for three frames, numbered by its laser frame. There all of this counts
-triples: numbers three apart miss nothing, and one more or less, after a frame that slipped, neither.
+triples: numbers three apart miss nothing, and one more or less, after a frame that slipped, neither. Tags are looked
+for in some frames only: their numbers rise as they like, and nothing is missing between two.
 """
 
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 REMEMBERED = 1024
@@ -39,10 +42,14 @@ class CameraCounts:
 class Sequence:
     """Push machine over frame numbers. Holds the last one, and the newest skipped ones (<= 1024)."""
 
-    def __init__(self, step: int = 1) -> None:
-        """Begin with nothing received; `step` is how much the number rises from one message to the next."""
+    def __init__(self, step: int | None = 1) -> None:
+        """Begin with nothing received; `step` is how much the number rises from one message to the next.
+
+        None: as it likes, and nothing is ever missing.
+        """
         self.counts = CameraCounts()
-        self._step, self._slip = step, step // 2
+        self._regular, self._step = step is not None, step or 1
+        self._slip = self._step // 2
         self._session: int | None = None
         self._last = -1
         self._missing: dict[int, None] = {}
@@ -60,7 +67,7 @@ class Sequence:
                 del self._missing[found]
             self.counts = replace(counts, late=counts.late + 1, lost=counts.lost - (found is not None))
             return False
-        else:
+        elif self._regular:
             skipped = range(self._last + self._step, seq - self._slip, self._step)
             counts = replace(counts, lost=counts.lost + len(skipped))
             self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
@@ -77,3 +84,83 @@ class Sequence:
     def reordered(self) -> None:
         """Count a datagram that came after a later one."""
         self.counts = replace(self.counts, reordered=self.counts.reordered + 1)
+
+
+@dataclass(slots=True)
+class _Gap:
+    """Between two messages that came, by the counters of their datagrams: how many numbers and datagrams did not."""
+
+    after: int
+    before: int
+    numbers: int
+    datagrams: int
+
+    @property
+    def lost(self) -> int:
+        """As many messages were lost as datagrams can have carried them."""
+        return min(self.numbers, self.datagrams)
+
+
+class Losses:
+    """Parts messages lost on the way from those never sent, though datagrams of other kinds are lost beside them.
+
+    A message that was lost left a hole in the counters of its session between the messages around it. So a lost tag
+    or echo is no lost frame, unless a frame was never sent in the same gap. Holds the newest gaps of the session
+    (<= 1024), since what is late fills them, and the sum.
+    """
+
+    def __init__(self) -> None:
+        self.lost = 0
+        self._gaps: deque[_Gap] = deque(maxlen=REMEMBERED)
+
+    def gap(self, after: int, before: int, numbers: int, datagrams: int) -> None:
+        """Between datagrams `after` and `before` so many numbers were missed, and so many datagrams did not come."""
+        self._gaps.append(new := _Gap(after, before, numbers, datagrams))
+        self.lost += new.lost
+
+    def late(self, counter: int, numbers: int) -> None:
+        """A datagram came after later ones; it was `numbers` (1 or 0) of those that were missed."""
+        for gap in reversed(self._gaps):
+            if gap.after < counter < gap.before:
+                was = gap.lost
+                gap.datagrams -= 1
+                gap.numbers -= numbers
+                self.lost += gap.lost - was
+                return
+
+    def begin_session(self) -> None:
+        """Counters begin again: what was missing before stays so."""
+        self._gaps.clear()
+
+
+class Counted:
+    """One kind of message of a sender: its `sequence`, and its `losses`. Holds the counter of the newest datagram."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.sequence, self.losses = sequence, Losses()
+        self._counter = 0
+
+    def take(self, session: int, seq: int, counter: int, missing: Callable[[int, int], int]) -> bool:
+        """Count message `seq` of the process `session`, which came in datagram `counter`; whether it is to be used.
+
+        Args:
+            session: Of the message.
+            seq: Of the message.
+            counter: Of the datagram, in its session of the link.
+            missing: How many datagrams between two that came did not (`Opener.missing_between`).
+        """
+        before = self.sequence.counts.lost
+        used = self.sequence.take(session, seq)
+        missed = self.sequence.counts.lost - before
+        if not used:
+            self.losses.late(counter, -missed)
+            return False
+        if missed:
+            self.losses.gap(self._counter, counter, missed, missing(self._counter, counter))
+        self._counter = counter
+        return True
+
+    def begin_session(self) -> None:
+        """The counters of the datagrams begin again."""
+        self.losses.begin_session()
+        self._counter = 0

@@ -118,6 +118,10 @@ class LivePipeline:
         self._recent.append((self._number, _Turn(t_ns, orientation_wxyz, heading_sigma_rad)))
         self._now.push_orientation(t_ns, orientation_wxyz, heading_sigma_rad)
 
+    def flush(self) -> list[SolvedPose]:
+        """Nothing comes any more: the poses that still wait for something."""
+        return self._now.flush()
+
     def change(self, setup: RigSetup) -> None:
         """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.
 

@@ -1,22 +1,30 @@
-"""Publishes every solved hand on the bus, for the viewer and for any program of the user."""
+"""Publishes hands, objects, contact and gestures on the bus, for the viewer and for any program of the user."""
 
 from common.bus import Bus
-from common.messages import HandPose
+from common.messages import Contact, Gesture, HandPose, Told
+
+_STREAM = {HandPose: "hand", Contact: "contact", Gesture: "gesture"}
 
 
 class BusSink:
-    """A `Sink` that publishes stream "hand" under the name of the hand. The bus belongs to the caller."""
+    """A `Sink` that publishes each message on the stream of its type, under the name of its hand or object.
+
+    The bus belongs to the caller.
+    """
 
     def __init__(self, bus: Bus) -> None:
         self._bus = bus
 
-    def write(self, pose: HandPose) -> None:
-        """Publish the pose; a slow or absent reader never delays the master.
+    def write(self, message: Told) -> None:
+        """Publish the message; a slow or absent reader never delays the master.
 
         Raises:
             BusError: The bus is closed.
         """
-        self._bus.publish("hand", pose.hand, pose)
+        if isinstance(message, HandPose | Contact | Gesture):
+            self._bus.publish(_STREAM[type(message)], message.hand, message)
+        else:
+            self._bus.publish("object", message.object, message)
 
     def close(self) -> None:
         """Nothing to finish: the bus is closed by whoever opened it."""

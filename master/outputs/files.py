@@ -1,28 +1,23 @@
-"""Writes and reads poses.npz, the record of a run that anybody can open with numpy.
+"""Writes and reads poses.npz, the record of a run that anybody can open with numpy; and all files of a run at once.
 
-Rows are spooled to a nameless file beside the target, so memory stays constant for a run of any
-length and a full disk shows while tracking, not at the end. `close` turns the spool into the .npz:
-uncompressed, with fixed time stamps, hence byte-identical for identical poses; it appears under
-its name complete or not at all.
+Each appears under its name complete or not at all, and identical poses make identical bytes (`table_file`).
 """
 
-import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import IO, Any, cast
-
-import numpy as np
-import numpy.typing as npt
+from typing import Any, cast
 
 from common.errors import RecordingError
-from common.messages import HandPose
-from common.npz import read_npz, write_npz
+from common.messages import Gesture, HandPose, ObjectPose, Told
+from common.npz import read_npz
 from master.outputs.poses import Poses, record
+from master.outputs.table_file import TableFile
+from master.outputs.told_files import GesturesFile, contact_file, object_file
 
 
 class PosesFile:
-    """A `Sink` that becomes poses.npz; holds the spool of rows written so far."""
+    """poses.npz of one hand; holds the spool of rows written so far."""
 
     def __init__(self, path: Path, hand: str, marker_count: int) -> None:
         """Open the spool in the folder of `path`.
@@ -35,16 +30,9 @@ class PosesFile:
         Raises:
             RecordingError: The folder is missing or read-only.
         """
-        self._path = path
-        self._hand = hand
-        self._dtype = record(marker_count)
-        self._rows = 0
-        self._closed = False
-        try:
-            # Its name is gone at once: a killed process leaves nothing behind.
-            self._spool: IO[bytes] = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115
-        except OSError as error:
-            raise _cannot_write(path, error) from error
+        self._path, self._hand = path, hand
+        self._markers = (marker_count, 3)
+        self._file = TableFile(path, record(marker_count), {"hand": hand})
 
     def write(self, pose: HandPose) -> None:
         """Append one row.
@@ -53,20 +41,10 @@ class PosesFile:
             RecordingError: Disk full; the run's file is given up, see `close`.
             ValueError: Another hand or marker count than the file was opened for, or it is closed.
         """
-        if self._closed:
-            raise ValueError(f"{self._path}: already closed")
-        if pose.hand != self._hand or pose.markers_m.shape != self._dtype["markers_m"].shape:
+        if pose.hand != self._hand or pose.markers_m.shape != self._markers:
             what = f"{pose.hand!r} with {len(pose.markers_m)} markers"
             raise ValueError(f"{self._path}: a pose of {what} does not fit, opened for {self._hand!r}")
-        row = np.empty((), self._dtype)
-        for name in self._dtype.names or ():
-            row[name] = getattr(pose, name)
-        try:
-            self._spool.write(row.tobytes())
-        except OSError as error:
-            self._give_up()
-            raise _cannot_write(self._path, error) from error
-        self._rows += 1
+        self._file.write(pose)
 
     def close(self) -> None:
         """Write the .npz; an older file of that name is replaced only by a complete one.
@@ -74,66 +52,72 @@ class PosesFile:
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.
         """
-        if self._closed:
-            return
-        try:
-            self._spool.flush()
-            table = self._table()
-            columns = {name: table[name] for name in self._dtype.names or ()}
-            write_npz(self._path, {**columns, "hand": np.array(self._hand)})
-        except OSError as error:
-            raise _cannot_write(self._path, error) from error
-        finally:
-            self._give_up()
-
-    def _table(self) -> npt.NDArray[np.void]:
-        if self._rows == 0:  # an empty file cannot be mapped
-            return np.empty(0, self._dtype)
-        return np.memmap(self._spool, self._dtype, "r", shape=(self._rows,))
-
-    def _give_up(self) -> None:
-        self._closed = True
-        try:
-            self._spool.close()
-        except OSError:
-            # Closing flushes what a full disk refused before; that error was already raised.
-            return
+        self._file.close()
 
 
-class PosesFiles:
-    """A `Sink` that becomes a poses.npz for each hand: the first at the path itself, others beside it."""
+class RunFiles:
+    """A `Sink` that becomes the files of a run: a poses.npz for each hand, and beside it what else was told.
 
-    def __init__(self, path: Path, marker_counts: Mapping[str, int]) -> None:
-        """Open the spools; `marker_counts`: name of the hand profile -> M.
+    The first hand's poses stand at the path itself, those of others beside it under their names; objects, contact and
+    gestures in the same folder (`told_files`).
+    """
+
+    def __init__(self, path: Path, marker_counts: Mapping[str, int], objects: Sequence[str] = ()) -> None:
+        """Open the spools.
+
+        Args:
+            path: Of the first hand's poses.
+            marker_counts: Name of the hand profile -> M.
+            objects: Names of the objects.
 
         Raises:
             RecordingError: The folder is missing or read-only.
         """
-        first = next(iter(marker_counts))
-        self._files = {
+        first, folder = next(iter(marker_counts)), path.parent
+        self._hands = {
             hand: PosesFile(path if hand == first else path_of_hand(path, hand), hand, count)
             for hand, count in marker_counts.items()
         }
+        self._objects = {name: object_file(folder, name) for name in objects}
+        self._contacts = {
+            (hand, name): contact_file(folder, hand, name) for hand in marker_counts for name in objects
+        }
+        self._gestures = GesturesFile(folder)
 
-    def write(self, pose: HandPose) -> None:
-        """Append one row to the file of its hand.
+    def write(self, message: Told) -> None:
+        """Append a row to the file of its hand or object.
 
         Raises:
-            RecordingError: Disk full; the hand's file is given up.
-            ValueError: A hand that the files were not opened for, or another marker count, or they are closed.
+            RecordingError: Disk full; the file is given up.
+            ValueError: A hand or object that they were not opened for, or another marker count, or they are closed.
         """
-        if pose.hand not in self._files:
-            raise ValueError(f"a pose of {pose.hand!r} does not fit, opened for {', '.join(self._files)}")
-        self._files[pose.hand].write(pose)
+        if isinstance(message, Gesture):
+            self._gestures.write(message)
+        elif isinstance(message, HandPose):
+            if message.hand not in self._hands:
+                raise ValueError(
+                    f"a pose of {message.hand!r} does not fit, opened for {', '.join(self._hands)}"
+                )
+            self._hands[message.hand].write(message)
+        elif isinstance(message, ObjectPose):
+            if message.object not in self._objects:
+                opened = ", ".join(self._objects) or "none"
+                raise ValueError(f"a pose of object {message.object!r} does not fit, opened for {opened}")
+            self._objects[message.object].write(message)
+        else:
+            if (message.hand, message.object) not in self._contacts:
+                raise ValueError(f"contact of {message.hand!r} and {message.object!r} does not fit")
+            self._contacts[message.hand, message.object].write(message)
 
     def close(self) -> None:
-        """Write each .npz.
+        """Write each file; one that cannot be completed keeps no other from being written.
 
         Raises:
             RecordingError: Disk full or folder gone; no part of a file is left.
         """
         with ExitStack() as all_of_them:
-            for file in self._files.values():
+            files = (*self._hands.values(), *self._objects.values(), *self._contacts.values(), self._gestures)
+            for file in files:
                 all_of_them.callback(file.close)
 
 
@@ -167,8 +151,3 @@ def load_poses(path: Path) -> Poses:
         return Poses(hand=hand, **cast(dict[str, Any], arrays))
     except (ValueError, AttributeError) as error:
         raise RecordingError(f"{path}: not a poses.npz: {error}") from error
-
-
-def _cannot_write(path: Path, error: OSError) -> RecordingError:
-    fix = "free the disk or choose another folder"
-    return RecordingError(f"{path}: cannot write: {error.strerror or error}; {fix}")

@@ -1,15 +1,15 @@
-"""The seam through which a solved hand leaves the master: a file, the bus, whatever comes next."""
+"""The seam through which hands, objects, contact and gestures leave the master: a file, the bus, what comes next."""
 
 from typing import Protocol
 
-from common.messages import HandPose
+from common.messages import Told
 
 
 class Sink(Protocol):
-    """Takes every pose in the order of its time. Opened by its constructor."""
+    """Takes what the master tells, of each hand and object in the order of its time. Opened by its constructor."""
 
-    def write(self, pose: HandPose) -> None:
-        """Take one pose.
+    def write(self, message: Told) -> None:
+        """Take one message. What a sink is not for, it leaves alone.
 
         Raises:
             PhalanxError: The sink cannot take it (disk full, bus gone); the text names sink and fix.

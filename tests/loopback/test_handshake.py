@@ -12,7 +12,14 @@ import pytest
 
 from common.clock import SkewedClock
 from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
-from common.messages import Command, Detections, ImuSample, encode
+from common.messages import (
+    Command,
+    Detections,
+    ImuSample,
+    TagDetections,
+    TrackerPose,
+    encode,
+)
 from common.session import Hello, RigKeys, seal
 from master.link import MasterLink
 from slave.link import SlaveLink
@@ -38,6 +45,8 @@ class Wires:
     seen: list[tuple[bytes, Address, Address]] = field(default_factory=list[tuple[bytes, Address, Address]])
     got: list[Detections] = field(default_factory=list[Detections])
     samples: list[ImuSample] = field(default_factory=list[ImuSample])
+    tags: list[TagDetections] = field(default_factory=list[TagDetections])
+    tracked: list[TrackerPose] = field(default_factory=list[TrackerPose])
     lives: int = 0
 
     def __post_init__(self) -> None:
@@ -49,11 +58,12 @@ class Wires:
         timeout_s: float = 5.0,
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
+        trackers: tuple[str, ...] = (),
     ) -> MasterLink:
         self.lives += 1
-        source = seeded(1000 * self.seed + self.lives)
+        source, timeout_ns = seeded(1000 * self.seed + self.lives), round(timeout_s * S)
         self.master = MasterLink(
-            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", round(timeout_s * S), source, imus, wrists
+            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", timeout_ns, source, imus, wrists, trackers
         )  # fmt: skip
         return self.master
 
@@ -81,6 +91,10 @@ class Wires:
             message = self.master.receive(datagram, source, t_ns)
             if isinstance(message, ImuSample):
                 self.samples.append(message)
+            elif isinstance(message, TagDetections):
+                self.tags.append(message)
+            elif isinstance(message, TrackerPose):
+                self.tracked.append(message)
             elif message is not None:
                 self.got.append(message)
         elif to in self.slaves:
@@ -108,7 +122,9 @@ class Wires:
     def all_started(self) -> bool:
         return all(slave.started for slave in self.slaves.values())
 
-    def send(self, slave: SlaveLink, message: Detections | ImuSample | Command) -> bytes | None:
+    def send(
+        self, slave: SlaveLink, message: Detections | TagDetections | ImuSample | TrackerPose | Command
+    ) -> bytes | None:
         sealed = slave.seal(message)
         if sealed is None:
             return None

@@ -130,7 +130,7 @@ def test_one_name_is_not_for_two() -> None:
     with pytest.raises(ValueError, match="'left' is a camera and an IMU"):
         MasterLink(("left",), KEY, wires.clock, BROADCAST, "", S, seeded(1), ("left",))
     names = tuple(f"c{k}" for k in range(32))
-    with pytest.raises(ValueError, match="33 cameras and IMUs"):
+    with pytest.raises(ValueError, match="33 cameras, IMUs and trackers"):
         MasterLink(names, KEY, wires.clock, BROADCAST, "", S, seeded(1), ("imu",))
 
 

@@ -10,12 +10,12 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
-from common.messages import HandPose, ImuSample, MarkerDetections
+from common.messages import HandPose, ImuSample, MarkerDetections, Told
 from master.app import RunFigures, health, run
-from master.hands import Hands
 from master.live import cameras_line
 from master.rig import RigSetup, pipeline_of
 from master.stages import StageTimes
+from master.world import World
 from tests.hand_helpers import detections
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
@@ -47,16 +47,20 @@ class ScriptedClock:
 class Collector:
     def __init__(self) -> None:
         self.poses: list[HandPose] = []
+        self.others: list[Told] = []
 
-    def write(self, pose: HandPose) -> None:
-        self.poses.append(pose)
+    def write(self, message: Told) -> None:
+        if isinstance(message, HandPose):
+            self.poses.append(message)
+        else:
+            self.others.append(message)
 
     def close(self) -> None:
         raise AssertionError("the loop does not own its sinks")
 
 
-def hands_of(*setups: RigSetup) -> Hands:
-    return Hands(setups, [pipeline_of(setup, StageTimes()) for setup in setups])
+def world_of(*setups: RigSetup) -> World:
+    return World(setups, [pipeline_of(setup, StageTimes()) for setup in setups])
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +76,7 @@ def test_every_pose_reaches_every_sink_with_its_latency(short_run: SyntheticRun)
     ]
     source = ScriptedSource(script, stop)
     clock.t_ns = short_run.messages[-1].t_ns + 3_000_000
-    run(source, hands_of(short_run.setup), sinks, clock, figures, stop)
+    run(source, world_of(short_run.setup), sinks, clock, figures, stop)
     assert figures.poses == len(sinks[0].poses) >= 5
     assert [p.t_ns for p in sinks[0].poses] == [p.t_ns for p in sinks[1].poses]
     last = sinks[0].poses[-1]
@@ -95,7 +99,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     samples = [turned(t_ns, off) for t_ns in range(first, last, 8_000_000)]
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
-    hands, watched = hands_of(setup), list[MarkerDetections]()
+    hands, watched = world_of(setup), list[MarkerDetections]()
     run(ScriptedSource([*script], stop), hands, [sink], ScriptedClock(), figures, stop, watched.append)
     assert watched == short_run.messages
     assert set(figures.rates.camera_hz) == {"left", "right"}
@@ -108,7 +112,7 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
 
 def test_samples_of_an_imu_that_has_no_place_are_counted(short_run: SyntheticRun) -> None:
     unplaced = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=ImuCalibration()))
-    stop, hands = threading.Event(), hands_of(unplaced)
+    stop, hands = threading.Event(), world_of(unplaced)
     run(ScriptedSource([turned(0, np.eye(3))], stop), hands, [], ScriptedClock(), RunFigures(), stop)
     assert hands.counts == {"orientation.unplaced": 1}
 
@@ -118,7 +122,7 @@ def test_a_loop_told_to_stop_does_nothing(short_run: SyntheticRun) -> None:
     stop.set()
     sink = Collector()
     source = ScriptedSource(list(short_run.messages), stop)
-    run(source, hands_of(short_run.setup), [sink], ScriptedClock(), RunFigures(), stop)
+    run(source, world_of(short_run.setup), [sink], ScriptedClock(), RunFigures(), stop)
     assert sink.poses == []
 
 

@@ -15,7 +15,7 @@ from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
 from master.hands import Hands
 from master.needs_restart import refuse_restart
-from master.outputs.files import PosesFiles, load_poses
+from master.outputs.files import RunFiles, load_poses
 from master.rig import load_setup, pipeline_of
 from master.stages import StageTimes
 from master.stereo.pipeline import SolvedPose
@@ -44,6 +44,9 @@ class Told:
     def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
         del orientation_wxyz, heading_sigma_rad
         self.samples.append(t_ns)
+
+    def flush(self) -> list[SolvedPose]:
+        return []
 
 
 def sample(source: str, t_ns: int) -> ImuSample:
@@ -99,7 +102,7 @@ def test_messages_and_samples_go_to_their_own_hand(short_run: SyntheticRun, root
 
 
 def test_each_hand_has_a_poses_file(tmp_path: Path) -> None:
-    files = PosesFiles(tmp_path / "poses.npz", {"a": 6, "b": 0})
+    files = RunFiles(tmp_path / "poses.npz", {"a": 6, "b": 0})
     for hand, markers in (("b", 0), ("a", 6), ("b", 0)):
         files.write(random_pose(0, markers, hand))
     with pytest.raises(ValueError, match="'c' does not fit, opened for a, b"):

@@ -117,8 +117,8 @@ def test_full_disk_is_a_clear_error_and_leaves_nothing_half_written(
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_disk_that_fills_while_tracking_is_reported_by_write(tmp_path: Path) -> None:
     sink = PosesFile(tmp_path / "poses.npz", "default-right", 6)
-    sink._spool.close()
-    sink._spool = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115
+    sink._file._spool.close()
+    sink._file._spool = Path("/dev/full").open("r+b", buffering=0)  # noqa: SIM115
     with pytest.raises(RecordingError, match="No space left"):
         sink.write(random_pose(0))
     sink.close()  # the run may still end in good order
