@@ -44,19 +44,18 @@ def sleeve_before(view: View, snapshot: Snapshot, marker: Shape, depth_m: float)
 
 
 def things_before(
-    snapshot: Snapshot, uv: Float, depth_m: float, but: tuple[SeenPart | None, ...] = ()
+    snapshot: Snapshot, marker: Shape, uv: Float, depth_m: float, but: SeenPart | None = None
 ) -> list[Shape]:
-    """Outlines of things and parts of tracked objects that pass before a marker at that pixel (2,) and depth.
+    """Outlines of things and of tracked objects that pass before a marker at a pixel (2,) and a depth.
 
     Args:
         snapshot: The image.
-        uv: (2,) [px].
-        depth_m: How far away the marker is.
-        but: Parts that cannot hide it.
+        marker: Its outline.
+        uv: Its middle [px].
+        depth_m: How far away it is.
+        but: What cannot hide it: its own bead, or what it is stuck on.
     """
     found = [thing.shape for thing in snapshot.things if float(thing.depth(uv)) < depth_m]
-    tracked = snapshot.tracked
-    for part in (*tracked.parts, *(bead.part for bead in tracked.beads)):
-        if not any(part is other for other in but) and float(part.depth(uv)) < depth_m:
-            found.append(part.shape)
-    return found
+    low, high = marker.corners.min(axis=0) - REACH_PX, marker.corners.max(axis=0) + REACH_PX
+    tracked = snapshot.tracked.before(uv, depth_m, low, high)
+    return found + [part.shape for part in tracked if part is not but]

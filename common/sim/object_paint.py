@@ -85,7 +85,7 @@ class ObjectPainter:
         found: list[PaintedFeature] = []
         for feature, own in features:
             shape, depth = feature.shape, float(feature.at[2])
-            nearer = things_before(snapshot, shape.corners.mean(axis=0), depth - TOUCHING_M, (own,))
+            nearer = things_before(snapshot, shape, shape.corners.mean(axis=0), depth - TOUCHING_M, own)
             nearer += [*self._hand_before(snapshot, feature, hand, palm), *cards]
             found.append(PaintedFeature(feature, self._cover(shape, nearer)))
         return found

@@ -1,21 +1,16 @@
-"""Tracked objects as one camera sees them: outlines, shading, and how far away each part is behind a pixel."""
+"""Tracked objects in one image: outlines, shading, and how far away each part is behind a pixel."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import cross
-from common.sim import light, raster
-from common.sim.object_surface import BLOCK_FACES, Ball, Block, ObjectSurface, Rod, Sheet
+from common.sim import raster
+from common.sim.object_surface import Ball, Sheet
 from common.sim.raster import Shape
-from common.sim.surface import rim, unit
-from common.sim.things import LAYER_SINES, tube_rims
 
 Colour = tuple[int, int, int]
-Project = Callable[[Float], Float]
-FACING_LEAST = 0.02  # cosine to the line of sight from which on a sheet shows its front
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,21 +33,12 @@ class SeenPart:
     @property
     def shape(self) -> Shape:
         """Its outline, moving as its middle does."""
-        return Shape(self.outline, self.ends_speed.mean(axis=0))
+        return Shape(self.outline, 0.5 * (self.ends_speed[0] + self.ends_speed[1]))
 
-    def depth(self, uv: Float) -> Float:
-        """Depth (...) [m] of its axis where that passes nearest to pixels (..., 2)."""
-        share = self._share(uv)
-        return self.ends_depth[0] * (1.0 - share) + self.ends_depth[1] * share
-
-    def moved(self, corners: Float, seconds: float) -> Float:
-        """Corners (N, 2) [px] of one of its outlines some time [s] later: each end goes its own way."""
-        share = self._share(corners)[:, None]
-        return corners + seconds * ((1.0 - share) * self.ends_speed[0] + share * self.ends_speed[1])
-
-    def _share(self, uv: Float) -> Float:
-        start, along = self.ends_uv[0], self.ends_uv[1] - self.ends_uv[0]
-        return np.clip((uv - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)
+    def speed(self, uv: Float) -> Float:
+        """How fast (N, 2) [px/s] it moves at pixels (N, 2): each end goes its own way."""
+        share = _share(uv, self.ends_uv[0], self.ends_uv[1])[:, None]
+        return (1.0 - share) * self.ends_speed[0] + share * self.ends_speed[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,11 +99,52 @@ class SeenSheet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SeenObjects:
-    """All tracked objects in one image."""
+    """All tracked objects in one image.
 
-    parts: tuple[SeenPart, ...] = ()
-    beads: tuple[SeenBead, ...] = ()
-    sheets: tuple[SeenSheet, ...] = ()
+    Attributes:
+        parts, beads, sheets: In the order of `ObjectSurface`.
+        solid: The parts, and those of the beads: whatever may hide something. S of them.
+        low, high: (S, 2) [px] boxes about their outlines.
+        ends_uv, ends_depth: (S, 2, 2) [px], (S, 2) [m] as theirs.
+    """
+
+    parts: tuple[SeenPart, ...]
+    beads: tuple[SeenBead, ...]
+    sheets: tuple[SeenSheet, ...]
+    solid: tuple[SeenPart, ...]
+    low: Float
+    high: Float
+    ends_uv: Float
+    ends_depth: Float
+
+    @classmethod
+    def of(
+        cls, parts: Sequence[SeenPart], beads: Sequence[SeenBead], sheets: Sequence[SeenSheet]
+    ) -> "SeenObjects":
+        """Put them together."""
+        solid = (*parts, *(bead.part for bead in beads))
+        return cls(
+            tuple(parts),
+            tuple(beads),
+            tuple(sheets),
+            solid,
+            np.array([part.outline.min(axis=0) for part in solid]).reshape(-1, 2),
+            np.array([part.outline.max(axis=0) for part in solid]).reshape(-1, 2),
+            np.array([part.ends_uv for part in solid]).reshape(-1, 2, 2),
+            np.array([part.ends_depth for part in solid]).reshape(-1, 2),
+        )
+
+    def before(self, uv: Float, depth_m: float, low: Float, high: Float) -> list[SeenPart]:
+        """What passes before a pixel (2,) nearer than a depth, and reaches into the box `low`, `high` (2,) [px].
+
+        Its depth is that of its axis where that passes nearest to the pixel.
+        """
+        if not self.solid:
+            return []
+        share = _share(uv, self.ends_uv[:, 0], self.ends_uv[:, 1])
+        depth = self.ends_depth[:, 0] * (1.0 - share) + self.ends_depth[:, 1] * share
+        chosen = (depth < depth_m) & raster.overlaps(self.low, self.high, low, high)
+        return [self.solid[k] for k in np.flatnonzero(chosen)]
 
     def outlines(self) -> list[Float]:
         """Everything that can be seen of them (N, 2) [px]."""
@@ -128,111 +155,12 @@ class SeenObjects:
         ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Points:
-    """Key points of the objects at their moments: (K, 3) [m] camera frame, (K, 2) [px], (K, 2) [px/s], (K,) [s]."""
-
-    at: Float
-    uv: Float
-    speed_uv: Float
-    t_s: Float
+def _share(uv: Float, start: Float, stop: Float) -> Float:
+    """Where (...) between `start` and `stop` (..., 2) pixels (..., 2) lie, 0 to 1."""
+    along = stop - start
+    return np.clip(
+        ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9), 0.0, 1.0
+    )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Looks:
-    """How one camera looks: towards the light (3,), camera frame; `unit_circle`s; points (..., 3) [m] to pixels."""
-
-    to_light: Float
-    circle: Float
-    focal_px: float
-    project: Project
-    thing: tuple[Colour, ...] = field(default_factory=lambda: light.shades(light.THING_LINEAR_RGB))
-
-    def seen(self, surface: ObjectSurface, points: Points) -> SeenObjects:
-        """What a camera sees of the objects whose key points are there."""
-        parts = tuple(self._part(part, points) for part in surface.parts)
-        beads = tuple(self._bead(bead, points) for bead in surface.beads)
-        return SeenObjects(parts, beads, tuple(self._sheet(sheet, points) for sheet in surface.sheets))
-
-    def _part(self, part: Rod | Block | Ball, points: Points) -> SeenPart:
-        if isinstance(part, Rod):
-            return self._rod(part, points)
-        if isinstance(part, Block):
-            return self._block(part, points)
-        outline, bands = self._ball(points.at[part.middle][0], part.radius_m)
-        return self._whole(part.middle, outline, tuple(zip(bands, self.thing, strict=True)), points)
-
-    def _rod(self, rod: Rod, points: Points) -> SeenPart:
-        ends = points.at[rod.ends]
-        axis = unit(ends[1] - ends[0])
-        rims = self.project(
-            np.stack([tube_rims(end, axis, rod.radius_m, self.to_light, self.circle) for end in ends])
-        )
-        layers = [raster.hull(rims[:, k].reshape(-1, 2)) for k in range(rims.shape[1])]
-        front = 0 if float(axis @ ends[0]) > 0.0 else 1  # whose outward normal points to the camera
-        cosine = float(axis @ self.to_light) * (1.0 if front else -1.0)
-        face = rims[front, 0], light.face_shade(light.THING_LINEAR_RGB, cosine)
-        fills = (*zip(layers, self.thing, strict=True), face)
-        return SeenPart(layers[0], fills, points.uv[rod.ends], ends[:, 2], points.speed_uv[rod.ends])
-
-    def _block(self, block: Block, points: Points) -> SeenPart:
-        corners, uv = points.at[block.corners], points.uv[block.corners]
-        middle = corners.mean(axis=0)
-        fills: list[tuple[Float, Colour]] = []
-        for face in BLOCK_FACES:
-            ring = corners[list(face)]
-            normal = unit(cross(ring[1] - ring[0], ring[3] - ring[0]))
-            out = normal if float(normal @ (ring.mean(axis=0) - middle)) > 0.0 else -normal
-            if float(out @ ring[0]) < 0.0:
-                shade = light.face_shade(light.THING_LINEAR_RGB, float(out @ self.to_light))
-                fills.append((uv[list(face)], shade))
-        return self._whole(block.corners, raster.hull(uv), tuple(fills), points)
-
-    def _whole(
-        self, place: slice, outline: Float, fills: tuple[tuple[Float, Colour], ...], points: Points
-    ) -> SeenPart:
-        """A part without ends: its middle stands for both."""
-        uv, speed = points.uv[place].mean(axis=0), points.speed_uv[place].mean(axis=0)
-        depth = np.full(2, points.at[place, 2].mean())
-        return SeenPart(outline, fills, np.stack([uv, uv]), depth, np.stack([speed, speed]))
-
-    def _ball(self, middle: Float, radius_m: float) -> tuple[Float, Float]:
-        """Outline (N, 2) [px] of a ball at (3,) [m], and its shading (LAYERS, N, 2)."""
-        d2 = float(middle @ middle)
-        shrink = 1.0 - radius_m**2 / d2  # the circle in which the rays touch the ball
-        edge = middle * shrink + rim(middle / np.sqrt(d2), np.array(radius_m * np.sqrt(shrink)), self.circle)
-        outline = self.project(edge)
-        lit = self.project(middle + (radius_m * light.LAYER_COSINES)[:, None] * self.to_light)
-        size = self.focal_px * radius_m / float(middle[2]) * LAYER_SINES
-        bands = lit[:, None] + size[:, None, None] * self.circle
-        bands[0] = outline
-        return outline, bands
-
-    def _bead(self, bead: Ball, points: Points) -> SeenBead:
-        middle = points.at[bead.middle][0]
-        outline, bands = self._ball(middle, bead.radius_m)
-        half = unit(self.to_light - unit(middle))
-        return SeenBead(
-            bead,
-            middle,
-            self._whole(bead.middle, outline, (), points),
-            bands,
-            self.project(middle + bead.radius_m * half),
-            self.focal_px * bead.radius_m / float(middle[2]),
-            float(points.t_s[bead.middle][0]),
-        )
-
-    def _sheet(self, sheet: Sheet, points: Points) -> SeenSheet:
-        at, uv = points.at[sheet.corners], points.uv[sheet.corners]
-        middle = at[:4].mean(axis=0)
-        out = unit(cross(at[1] - at[0], at[3] - at[0])) * -1.0  # corners go clockwise as it is printed
-        return SeenSheet(
-            sheet,
-            middle,
-            uv[:4],
-            uv[4:],
-            points.speed_uv[sheet.corners].mean(axis=0),
-            -float(out @ middle) / float(np.linalg.norm(middle)) > FACING_LEAST,
-            float(out @ self.to_light),
-            float(points.t_s[sheet.corners].mean()),
-        )
+NOTHING = SeenObjects.of((), (), ())

@@ -160,11 +160,12 @@ class Renderer:
         if (low >= high).any():
             return
         under = image[low[1] : high[1], low[0] : high[0]]
+        fills = [(outline - low, part.speed(outline), colour) for outline, colour in part.fills]
         total = np.zeros(under.shape, np.float32)
         for moment in moments:
             drawn = under.copy()
-            for outline, colour in part.fills:
-                raster.fill(drawn, raster.fixed(part.moved(outline, float(moment)) - low), colour)
+            for corners, speed_uv, colour in fills:
+                raster.fill(drawn, raster.fixed(corners + moment * speed_uv), colour)
             cv2.accumulate(drawn, total)
         under[:] = np.rint(total / len(moments))
 

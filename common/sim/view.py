@@ -19,8 +19,9 @@ from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
 from common.sim.motion import HandState
+from common.sim.object_looks import Looks, Points
 from common.sim.object_surface import ObjectSurface
-from common.sim.objects_seen import Looks, Points, SeenObjects
+from common.sim.objects_seen import SeenObjects
 from common.sim.raster import Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
@@ -156,7 +157,7 @@ class View:
             self._cuff(points),
         )
         discs_uv, cap_uv, rim_uv, shine_uv, cuff_uv = self._project_all(parts)
-        a, b = self._from, self._to
+        a, b, own = self._from, self._to, slice(self.surface.count, None)
         return Snapshot(
             points=points,
             uv=uv,
@@ -171,7 +172,7 @@ class View:
             shine_uv=shine_uv,
             cuff_uv=cuff_uv,
             things=self._things(t_s, things),
-            tracked=self._tracked(points, uv, speed_uv, when),
+            tracked=self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own])),
         )
 
     def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
@@ -256,13 +257,6 @@ class View:
             return hand
         poses = np.array([self.scene.object_poses(state) for state in states])
         return np.concatenate([hand, self.objects.key_points(poses)], axis=1)
-
-    def _tracked(self, points: Float, uv: Float, speed_uv: Float, when: Float) -> SeenObjects:
-        """The tracked objects, of the key points."""
-        if not self.objects.local.size:
-            return SeenObjects()
-        own = slice(self.surface.count, None)
-        return self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own]))
 
     def _things(self, t_s: float, things: tuple[Cylinder, ...]) -> tuple[SeenThing, ...]:
         """Each thing at the moment of the row of its middle; `things` is where they are halfway through the frame."""
