@@ -25,7 +25,7 @@ Rig = Annotated[str, typer.Option("--rig", help="Rig whose cameras see the objec
 Tracker = Annotated[
     str | None, typer.Option(help="Name of the device on it; default: `tracker` of the object's file.")
 ]
-Seconds = Annotated[float, typer.Option(min=10.0, help="How long a live motion may take at most [s].")]
+Seconds = Annotated[float, typer.Option(min=10.0, help="How many seconds a live motion may take at most.")]
 Keep = Annotated[Path | None, typer.Option(help="Keep the live motion in this .npz.")]
 Picture = Annotated[Path | None, typer.Option(help="Write a picture of what was seen and left to this .png.")]
 

@@ -1,0 +1,188 @@
+"""The loop of a tracker's slave, the synthetic tracker, and what its command says of what is missing."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from common.calibration import RigCalibration, load, save
+from common.clock import SkewedClock, SystemClock
+from common.errors import CalibrationError, TrackerError
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.messages import Message, TrackerPose
+from common.object_profile import ObjectProfile
+from common.sim.tracker import SET_UP_TRACKER, SET_UP_TRACKING, SimulatedTracker
+from slave.__main__ import main
+from slave.objects.live import run, wait_for_start
+from slave.objects.synthetic import SyntheticTracker
+from slave.objects.tally import PoseTally
+from slave.simulated import tracker_of
+
+CALIB = Path(__file__).resolve().parents[3] / "calib_json"
+KEY = "11" * 32
+
+
+def pose(seq: int, known: bool = True) -> TrackerPose:
+    place, turn = (
+        (np.zeros(3), np.array([1.0, 0, 0, 0])) if known else (np.full(3, np.nan), np.full(4, np.nan))
+    )
+    return TrackerPose("tracker", 0, seq, 10_000_000 * seq, place, turn)
+
+
+class Source:
+    """A tracker with a list of poses; an exception in the list is raised."""
+
+    def __init__(self, poses: list[TrackerPose | TrackerError]) -> None:
+        self.poses = poses
+
+    def read(self) -> TrackerPose | None:
+        if not self.poses:
+            return None
+        one = self.poses.pop(0)
+        if isinstance(one, TrackerError):
+            raise one
+        return one
+
+    def close(self) -> None:
+        self.poses = []
+
+    def counts(self) -> dict[str, int]:
+        return {"lost": 2}
+
+    def gauges(self) -> dict[str, float]:
+        return {"away_s": 0.5}
+
+
+class Wire:
+    """Stands for the uplink."""
+
+    session = 77
+
+    def __init__(self, waits: int = 0) -> None:
+        self.sent: list[TrackerPose] = []
+        self.waits = waits
+
+    def wait_for_start(self, timeout_s: float) -> bool:
+        self.waits -= 1
+        return self.waits < 0
+
+    def send(self, message: Message) -> None:
+        assert isinstance(message, TrackerPose)
+        self.sent.append(message)
+
+
+def test_every_pose_is_sent_in_the_name_of_this_process_and_counted() -> None:
+    source = Source([pose(0), pose(1, known=False), pose(4)])
+    wire, tally = Wire(), PoseTally(source)
+    run(source, wire, tally, threading.Event())
+    assert [(one.session, one.seq) for one in wire.sent] == [(77, 0), (77, 1), (77, 4)]
+    assert tally.counts() == {"poses": 3, "skipped": 2, "nowhere": 1, "lost": 2}
+    gauges = tally.gauges()
+    assert gauges.pop("rate_hz") > 0.0
+    assert gauges == {"tracked": 1.0, "away_s": 0.5}
+    with pytest.raises(TrackerError, match="gone"):
+        run(Source([TrackerError("gone")]), wire, PoseTally(), threading.Event())
+
+
+def test_poses_before_the_start_are_forgotten() -> None:
+    source = Source([pose(k) for k in range(9)])
+    assert wait_for_start(source, Wire(waits=3), threading.Event())
+    assert [one.seq for one in source.poses if isinstance(one, TrackerPose)] == [3, 4, 5, 6, 7, 8]
+    assert not wait_for_start(Source([]), Wire(waits=3), threading.Event())
+
+
+def tree(folder: Path) -> Path:
+    """A calibration tree whose cube has a tracker that is not registered yet."""
+    (folder / "objects").mkdir()
+    for kind in ("rigs", "cameras", "hands"):
+        (folder / kind).symlink_to(CALIB / kind)
+    cube = load(CALIB / "objects" / "cube.json", ObjectProfile)
+    save(folder / "objects" / "cube.json", replace(cube, tracker="tracker", T_object_tracker=None))
+    return folder
+
+
+def test_a_synthetic_tracker_is_where_the_object_is_in_a_frame_of_its_own(tmp_path: Path) -> None:
+    folder = tree(tmp_path)
+    rig = load(folder / "rigs" / "desk-cube.json", RigCalibration)
+    profile = load(folder / "objects" / "cube.json", ObjectProfile)
+    tracker = tracker_of(folder, rig, "object", 3, profile)
+    off: list[np.ndarray] = []
+    lost = 0
+    for t_s in np.arange(0.0, 40.0, 0.25):
+        told = tracker.pose(float(t_s))
+        if told is None:
+            lost += 1
+            continue
+        found = SET_UP_TRACKING @ told @ np.linalg.inv(SET_UP_TRACKER)
+        truth = tracker.scene.truth(float(t_s)).objects["cube"]
+        turn = matrix_to_rotation_vector(found[:3, :3] @ truth[:3, :3].T)
+        off.append(np.array([np.linalg.norm(found[:3, 3] - truth[:3, 3]), np.linalg.norm(turn)]))
+    worst = np.max(off, axis=0)
+    assert 0 < lost < 20  # some half seconds behind something
+    assert 2e-4 < worst[0] < 4e-3
+    assert np.radians(0.02) < worst[1] < np.radians(0.4)
+    again = SimulatedTracker.of(tracker.scene, profile, 3).pose(1.5)
+    np.testing.assert_array_equal(again, tracker.pose(1.5))
+    np.testing.assert_allclose(
+        SET_UP_TRACKING[:3, 1], [0.0, -1.0, 0.0], atol=1e-12
+    )  # y of the stations is up, that of the rig down
+
+
+def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None:
+    folder = tree(tmp_path)
+    rig = load(folder / "rigs" / "desk-cube.json", RigCalibration)
+    profile = load(folder / "objects" / "cube.json", ObjectProfile)
+    tracker = tracker_of(folder, rig, "object", 3, profile)
+    true_clock = SystemClock()
+    epoch_ns = true_clock.now_ns()
+    clock = SkewedClock(5_000_000_000, 40.0, true_clock)
+    source = SyntheticTracker("tracker", tracker, epoch_ns, clock, threading.Event())
+    poses = [one for one in (source.read() for _ in range(12)) if one is not None]
+    source.close()
+    assert source.read() is None
+    assert len(poses) == 12
+    for one in poses:
+        assert one.t_ns <= clock.now_ns()
+        truth = tracker.pose((clock.to_true(one.t_ns) - epoch_ns) * 1e-9)
+        if truth is not None:
+            np.testing.assert_allclose(one.position_m, truth[:3, 3], atol=1e-12)
+            np.testing.assert_allclose(quaternion_to_matrix(one.orientation_wxyz), truth[:3, :3], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "device", "code", "text"),
+    [
+        ("tracker", "survive", 1, "cannot start"),
+        ("tracker", "survive:nowhere.rec", 1, "nowhere.rec: cannot read"),
+        ("tracker", "magic", 1, "no such system; there are openvr | survive | survive:FILE | synthetic"),
+        ("somebody", "survive", 1, "no object has the tracker 'somebody'; there is 'tracker' on cube"),
+    ],
+)
+def test_the_command_says_in_one_line_what_is_missing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, name: str, device: str,
+    code: int, text: str,
+) -> None:  # fmt: skip
+    monkeypatch.setenv("PHALANX_RIG_KEY", KEY)
+    arguments = [
+        "tracker",
+        name,
+        "--rig",
+        "desk-cube",
+        "--calibration",
+        str(tree(tmp_path)),
+        "--device",
+        device,
+    ]
+    assert main([*arguments, "--program", str(tmp_path / "survive-cli"), "--bind", "127.0.0.1"]) == code
+    [line] = capsys.readouterr().err.splitlines()
+    assert text in line
+
+
+def test_an_object_without_a_tracker_is_said_to_have_none() -> None:
+    from slave.objects.opening import object_with
+
+    rig = load(CALIB / "rigs" / "desk-wand.json", RigCalibration)
+    with pytest.raises(CalibrationError, match="no object has the tracker 'tracker'; there is none"):
+        object_with(CALIB, rig, "tracker")
