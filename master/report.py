@@ -53,9 +53,10 @@ class Played:
             PhalanxError: There is no such scene for this kind of rig, or it is not one motion for both kinds.
         """
         moves, hand = name.partition("@")[0], setup.hand.profile
+        watched = {one.name: one for one in setup.objects}
         together = moves in TOGETHER
         if setup.wrist_rig is None:
-            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed), None, together)
+            return cls(scene_by_name(name, setup.rig, setup.cameras, hand, seed, watched), None, together)
         worn = WristScene.by_name(name, setup.wrist_rig, setup.cameras, hand, seed)
         if not setup.has_markers:
             return cls(None, worn, together)
@@ -63,7 +64,7 @@ class Played:
             raise PhalanxError(
                 f"scene {name!r}: cameras and wrist device see one hand only in {', '.join(TOGETHER)}"
             )
-        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed), worn, together)
+        return cls(scene_by_name(moves, setup.rig, setup.cameras, hand, seed, watched), worn, together)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
