@@ -24,6 +24,14 @@ SOURCE_MEANING: dict[Source, str] = {
 TRUTH_RGB: Rgb = (170, 170, 178)
 LIMIT_RGB: Rgb = (213, 60, 40)
 RAY_RGB: Rgb = (240, 228, 66)
+TOUCH_RGB: dict[bool, Rgb] = {False: (240, 228, 66), True: (213, 60, 40)}  # whether a finger touches
+GESTURE_RGB: dict[str, Rgb] = {
+    "pose": (235, 235, 240),
+    "pinch": (204, 121, 167),
+    "dial": (240, 228, 66),
+    "tap": (230, 159, 0),
+    "point": (86, 180, 233),
+}
 _SERIES: tuple[Rgb, ...] = (
     (230, 159, 0),
     (86, 180, 233),

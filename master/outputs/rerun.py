@@ -1,4 +1,4 @@
-"""The viewer, in a process of its own: reads hands and health from the bus and never slows the tracking.
+"""The viewer, in a process of its own: reads what a master tells from the bus and never slows the tracking.
 
 It subscribes, and a subscription drops its oldest message when it is full, so a slow screen loses pictures,
 not poses; the only thing it says is "preview" to the cameras, which then show themselves for three seconds.
@@ -10,6 +10,7 @@ import logging
 import os
 import tempfile
 import threading
+from bisect import bisect_right
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from common.arrays import Image
 from common.bus import Bus, Subscription
 from common.clock import now_ns
 from common.errors import PhalanxError, RecordingError
-from common.messages import Detections, HandPose, Health, Message, Preview
+from common.messages import Detections, HandPose, Health, Message, Preview, Told
 from common.streams import MASTER
 from master.outputs.poses import Poses
 from master.outputs.previews import PreviewAsker
@@ -52,6 +53,7 @@ class _Feeds:
     """What comes from the bus."""
 
     hands: Subscription
+    told: tuple[Subscription, ...]  # objects, contact, gestures
     reports: Subscription
     pictures: Subscription
 
@@ -59,12 +61,13 @@ class _Feeds:
     def of(cls, bus: Bus) -> "_Feeds":
         return cls(
             bus.subscribe("hand", depth=_DEPTH),
+            tuple(bus.subscribe(stream, depth=_DEPTH) for stream in ("object", "contact", "gesture")),
             bus.subscribe("health", depth=_DEPTH),
             bus.subscribe("preview", depth=_PREVIEW_DEPTH),
         )
 
     def close(self) -> None:
-        for feed in (self.hands, self.reports, self.pictures):
+        for feed in (self.hands, *self.told, self.reports, self.pictures):
             feed.close()
 
 
@@ -118,6 +121,7 @@ def write_rrd(
     detections: Mapping[str, Iterable[Detections]] | None = None,
     truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
+    told: Sequence[Told] = (),
 ) -> None:
     """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.
 
@@ -128,6 +132,7 @@ def write_rrd(
         detections: Camera -> its frames in the order of time, on the clock of the poses.
         truth: Row by row with `poses`.
         images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
+        told: Objects, contact and gestures of the run, each in the order of time.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -135,9 +140,14 @@ def write_rrd(
     with _saved(path) as recording:
         recording.send_blueprint(blueprint([setup], live=False, with_truth=truth is not None))
         scene = RerunScene(recording, [setup])
+        rest = sorted(told, key=lambda one: one.t_ns)
         for start in range(0, len(poses), _ROWS_A_CHUNK):
             stop = min(start + _ROWS_A_CHUNK, len(poses))
             scene.log_poses(poses.rows(start, stop), truth.rows(start, stop) if truth is not None else None)
+            count = bisect_right(rest, int(poses.t_ns[stop - 1]), key=lambda one: one.t_ns)
+            scene.log_told(rest[:count])
+            rest = rest[count:]
+        scene.log_told(rest)
         for frames in (detections or {}).values():
             scene.log_detections(frames)
         for camera, t_ns, image in images:
@@ -158,6 +168,9 @@ def _pump(scene: RerunScene, recording: rr.RecordingStream, feeds: _Feeds, go_on
             scene.log_poses(poses)
             shown += len(poses)
             at_ns = scene.last_t_ns
+        scene.log_told(
+            [one for feed in feeds.told for one in _waiting(feed, Message) if isinstance(one, Told)]
+        )
         if at_ns is not None:  # the slaves' clocks are their own: what they send stands at the master's time
             for health in reports:
                 scene.log_health(health, at_ns)

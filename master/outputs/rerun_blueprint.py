@@ -7,11 +7,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from common.messages import Source
+from master.outputs.object_look import OBJECT_RGB, ObjectLook
 from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB
 from master.rig import RigSetup
 
 TIMELINE = "capture"
 WORLD = "world"
+STATES, EVENTS = "states", "events"  # what lasts, as lanes; what happened, as lines of text
 
 _RATE = "Rate [poses/s]"
 # title, entity, range of the axis (None: as the data is), whether its lines need a legend
@@ -19,6 +21,7 @@ _PLOTS: tuple[tuple[str, str, tuple[float, float] | None, bool], ...] = (
     ("Latency [ms]", "plots/latency_ms", (0.0, 60.0), False),
     (_RATE, "plots/rate_hz", None, False),
     ("Error against the truth [mm]", "plots/error_mm", (0.0, 20.0), True),
+    ("Fingers to object [mm]", "plots/contact_mm", (-10.0, 60.0), True),
     ("Bend of the wrist [deg]", "plots/wrist_bend_deg", (-60.0, 60.0), True),
     ("PIP flexion (thumb: MCP) [deg]", "plots/pip_deg", (-10.0, 120.0), True),
     ("Marker: raw to filtered [mm]", "plots/jitter_mm", (0.0, 5.0), True),
@@ -72,14 +75,15 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
     views = [
         rrb.Spatial2DView(
             origin=camera_path(name),
-            contents=["$origin/**", f"{WORLD}/hand/**", *hidden],
+            contents=["$origin/**", f"{WORLD}/hand/**", f"{WORLD}/objects/**", *hidden],
             name=f"Camera {name}",
             background=_BACKGROUND,
         )
         for name in cameras
     ]
     left_out = {name for name, there in (
-        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend)
+        ("plots/jitter_mm", with_markers), ("plots/error_mm", with_truth), ("plots/wrist_bend_deg", with_bend),
+        ("plots/contact_mm", any(setup.objects for setup in setups)),
     ) if not there}  # fmt: skip
     rows = [
         (n, p, (0.0, 1.25 * rate_hz) if n == _RATE else r, several)
@@ -97,13 +101,17 @@ def blueprint(setups: Sequence[RigSetup], *, live: bool, with_truth: bool) -> rr
         for name, path, fixed, several in rows
     ]
     legend_view = rrb.TextDocumentView(origin="about", name="Colours")
-    tabs = rrb.Tabs(*plots[-_TABS:], legend_view, active_tab=0)
+    events = rrb.TextLogView(origin=EVENTS, name="Events")
+    tabs = rrb.Tabs(*plots[-_TABS:], events, legend_view, active_tab=0)
+    lanes = rrb.StateTimelineView(
+        origin=STATES, name="What the hand says and holds", time_ranges=span if live else None
+    )
     return rrb.Blueprint(
         rrb.Horizontal(
             rrb.Vertical(
                 scene, rrb.Grid(*views, grid_columns=min(len(views), _CAMERAS_A_ROW)), row_shares=[3, 2]
             ),
-            rrb.Vertical(tabs, *plots[:-_TABS], row_shares=[1.5] + [1] * (len(plots) - _TABS)),
+            rrb.Vertical(tabs, *plots[:-_TABS], lanes, row_shares=[1.5] + [1] * (len(plots) - _TABS) + [1.4]),
             column_shares=[3, 2],
         ),
         rrb.TimePanel(state="collapsed", timeline=TIMELINE),
@@ -136,6 +144,13 @@ def legend() -> str:
         "- **pink bar behind the wrist**: the forearm that wears the device, beside cameras of markers; **pink ring**: "
         "where its end is at 2 sigma of the wrist's bend\n"
         "- **small dim / large bright markers**: before / after the filter\n"
+        + "".join(
+            f"- **object** rgb{OBJECT_RGB[look]}: {look.value}\n"
+            for look in ObjectLook
+            if look is not ObjectLook.GONE
+        )
+        + "- **red, yellow spots on it**: where a finger touches it, or is nearer than 3 cm, with the distance in mm\n"
+        "- **pink line**: a pinch; **yellow circle**: a dial, by how much it was turned; **blue arrow**: pointing\n"
         "- **ellipsoids**: 2 sigma of the finger tips, where that is less than 3 cm\n"
         "- **grey box**: the volume that the rig states; outside it, accuracy was not tested\n"
         "- camera views: dots are the markers as triangulated, the hand is drawn without lens distortion"

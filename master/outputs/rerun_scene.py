@@ -13,6 +13,8 @@ style.
     world/hand/HAND/uncertainty          2 sigma ellipsoids of the tips, up to 3 cm
     world/markers/raw, filtered          caps before and after the filter
     world/rays/CAM                       camera centre to each cap
+    world/objects, contact               what else is tracked, and where fingers touch it: see `rerun_objects`
+    world/gestures; states; events       what the hands say: see `rerun_gestures`
     world/laser, ...                     of a wrist device, alone or beside the markers: see `rerun_wrist`
     world/truth/skeleton, markers        where a truth is known
     plots/...                            latency, rate, jitter, error, PIP angles, bend of the wrist, counts, health
@@ -33,13 +35,14 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.hand_limits import FLEXION
 from common.hand_model import FINGER_JOINTS, FINGERS, TIPS, WRIST, HandModel
-from common.messages import Detections, Health, MarkerDetections, Source, WristDetections
+from common.messages import Detections, Health, MarkerDetections, Source, Told, WristDetections
 from master.outputs.laser_fan import fan_rays
 from master.outputs.palette import LIMIT_RGB, RAY_RGB, SOURCE_RGB, TRUTH_RGB, dim, pack, series_rgb
 from master.outputs.poses import Poses
 from master.outputs.rerun_blueprint import WORLD, camera_path, legend
 from master.outputs.rerun_columns import PIXEL_CENTRE, Columns, seen
 from master.outputs.rerun_images import CameraImages
+from master.outputs.rerun_told import ToldLayer
 from master.outputs.rerun_wrist import WristLayer
 from master.outputs.truth import PosesTruth, distance_m, mean_known
 from master.rig import RigSetup
@@ -73,6 +76,8 @@ class RerunScene:
         self._setups = {setup.hand.profile.name: setup for setup in setups}
         self._models = {name: model for setup in setups for name, model in setup.models.items()}
         self._devices: dict[str, WristLayer] = {}
+        objects = {profile.name: profile for setup in setups for profile in setup.objects}
+        self._told = ToldLayer(recording, list(objects.values()))
         self._recent_ns: Int = np.empty(0, np.int64)
         self._styled: set[str] = set()
         recording.log(WORLD, rr.ViewCoordinates.RDF, static=True)
@@ -119,6 +124,11 @@ class RerunScene:
         self._log_plots(poses, setup)
         if truth is not None:
             self._log_truth(poses, truth)
+        self._told.remember(poses)
+
+    def log_told(self, told: Sequence[Told]) -> None:
+        """Log objects, contact and gestures, each in the order of time; after the poses of the hands they are of."""
+        self._told.log(told)
 
     def log_detections(self, detections: Iterable[Detections]) -> None:
         """Log what one camera saw, in its image; frames in the order of time."""

@@ -1,0 +1,44 @@
+"""Everything but hands that a master tells, into one Rerun recording: objects, contact and gestures."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import rerun as rr
+
+from common.arrays import Float
+from common.hand_model import PALM, TIPS
+from common.messages import Contact, Gesture, ObjectPose, Told
+from common.object_profile import ObjectProfile
+from master.outputs.poses import Poses
+from master.outputs.rerun_gestures import GesturesLayer
+from master.outputs.rerun_objects import ObjectsLayer
+from master.outputs.rerun_states import States
+
+_NAMED = [*TIPS.tolist(), PALM]
+_REMEMBERED = 1024  # poses
+
+
+class ToldLayer:
+    """Logs to a recording that belongs to the caller; holds tips and palm of the last poses.
+
+    Contact and gestures are drawn at the joints of their own instant.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, objects: Sequence[ObjectProfile]) -> None:
+        states = States(recording)
+        self._objects = ObjectsLayer(recording, states, objects)
+        self._gestures = GesturesLayer(recording, states)
+        self._joints: dict[tuple[str, int], Float] = {}
+
+    def remember(self, poses: Poses) -> None:
+        """Take the poses of a hand, before what is told of them."""
+        at = np.where(poses.valid[..., None], poses.position_m, np.nan)[:, _NAMED]
+        self._joints |= {(poses.hand, t): row for t, row in zip(poses.t_ns.tolist(), at, strict=True)}
+        for old in list(self._joints)[: -max(_REMEMBERED, len(poses))]:
+            del self._joints[old]
+
+    def log(self, told: Sequence[Told]) -> None:
+        """Log a batch, each kind in the order of time; hands are passed over."""
+        self._objects.log_poses([one for one in told if isinstance(one, ObjectPose)])
+        self._objects.log_contacts([one for one in told if isinstance(one, Contact)], self._joints)
+        self._gestures.log([one for one in told if isinstance(one, Gesture)], self._joints)
