@@ -1,0 +1,126 @@
+"""A registration from simulated motions: right, sure of itself as it is right, and refused where it cannot be."""
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from common.errors import FitError
+from common.geometry import rigid, rotation_vector_to_matrix
+from common.messages import ObjectSource
+from master.calibrate.tracker.registration import register
+from master.calibrate.tracker.start import Placed, closed_form, first_lag
+from master.calibrate.tracker.tracks import object_track, tracker_track
+from tests.master.calibrate.tracker.simulated import ZERO_NS, Motion, errors_of
+
+
+def test_without_noise_it_is_exact() -> None:
+    motion = Motion(3, seconds=10.0, noise=1e-6, strays=0.0, lost_s=0.0)
+    found = register(motion.objects(), motion.tracked())
+    placed = found.fit.placed
+    mm, deg = errors_of(motion, placed)
+    assert mm < 0.03  # the way between two poses of the tracker is no straight line
+    assert deg < 0.01
+    assert abs(placed.late_s - motion.late_s) < 2e-5
+
+
+def test_closed_form_of_three_poses_by_hand() -> None:
+    # The device sits 10 cm along the object's x; the system's frame is the rig's, a quarter turned about z, 1 m aside.
+    X = rigid(np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 0, 0]))
+    Y = rigid(np.eye(3), np.array([0.1, 0, 0]))
+    turns = rotation_vector_to_matrix(np.array([[0.0, 0, 0], [0.9, 0, 0], [0, 0.8, 0], [0, 0, 0.7]]))
+    A = [rigid(R, np.array([0.0, 0.1 * k, 0.5])) for k, R in enumerate(turns)]
+    B = [np.linalg.inv(X) @ one @ Y for one in A]
+    np.testing.assert_allclose(B[0][:3, 3], [0.0, 0.9, 0.5], atol=1e-12)  # inv(X): x - 1, then a quarter back
+    RA, pA = np.array([one[:3, :3] for one in A]), np.array([one[:3, 3] for one in A])
+    RB, pB = np.array([one[:3, :3] for one in B]), np.array([one[:3, 3] for one in B])
+    found = closed_form(RA, pA, RB, pB)
+    np.testing.assert_allclose(found[0], X, atol=1e-9)
+    np.testing.assert_allclose(found[1], Y, atol=1e-9)
+
+
+def test_over_seeds_it_is_right_and_as_sure_as_it_is_right() -> None:
+    millimetres, degrees, late_ms, place_sigmas, turn_sigmas = ([] for _ in range(5))
+    for seed in range(8):
+        motion = Motion(seed, late_s=0.06 * np.sin(5.0 * seed))
+        found = register(motion.objects(), motion.tracked())
+        mm, deg = errors_of(motion, found.fit.placed)
+        millimetres.append(mm)
+        degrees.append(deg)
+        late_ms.append(1e3 * (found.fit.placed.late_s - motion.late_s) / found.figures["late_sigma_ms"])
+        place_sigmas.append(mm / found.figures["position_sigma_mm"])
+        turn_sigmas.append(deg / found.figures["turn_sigma_deg"])
+        assert 0.03 < found.figures["strays"] < 0.1
+        assert 1.5 < found.figures["position_mm"] < 3.5  # the cameras' noise, nothing else
+    assert max(millimetres) < 1.5
+    assert max(degrees) < 0.25
+    for ratios in (place_sigmas, turn_sigmas):
+        assert 0.5 < float(np.median(ratios)) < 1.6
+        assert max(ratios) < 3.0
+    assert np.abs(late_ms).max() < 4.0
+
+
+def test_the_lag_is_found_from_nothing_however_far_it_is() -> None:
+    for late_s in (-0.4, -0.05, 0.0, 0.31):
+        motion = Motion(2, seconds=12.0, late_s=late_s)
+        found = first_lag(object_track(motion.objects(), ZERO_NS), tracker_track(motion.tracked(), ZERO_NS))
+        assert found is not None
+        assert abs(found - late_s) < 0.01
+
+
+def test_what_was_held_or_told_by_a_tracker_does_not_count() -> None:
+    motion = Motion(4, seconds=10.0)
+    objects = motion.objects()
+    wrong = [
+        replace(one, position_m=np.zeros(3), source=source, tracked=tracked, t_ns=one.t_ns + 3_000_000)
+        for one in objects
+        for source, tracked in ((ObjectSource.HELD, False), (ObjectSource.TRACKER, True))
+    ]
+    alone = register(objects, motion.tracked()).fit.placed
+    among = register([*wrong, *objects], motion.tracked()).fit.placed
+    np.testing.assert_array_equal(alone.T_rig_tracking, among.T_rig_tracking)
+
+
+@pytest.mark.parametrize(
+    ("motion", "text"),
+    [
+        (Motion(1, turns=(1.0, 0.0, 0.0)), r"poses would be known to .*about its y and its z axis as well"),
+        (Motion(1, turns=(0.02, 0.02, 0.02)), "axis as well"),
+        (Motion(1, seconds=0.8), "at least 60 of each are needed"),
+        (Motion(1, lost_s=6.0), "the tracker 0; at least 60"),
+        (Motion(1, late_s=1.7), "hardly saw|no registration explains"),
+        (Motion(1, strays=1.0), "hardly saw|no registration explains"),
+    ],
+)
+def test_what_does_not_tell_it_is_refused_with_what_to_do(motion: Motion, text: str) -> None:
+    with pytest.raises(FitError, match=text):
+        register(motion.objects(), motion.tracked())
+
+
+def test_a_tracker_that_slipped_meanwhile_is_refused() -> None:
+    before, after = Motion(6), Motion(6)
+    slipped = rigid(rotation_vector_to_matrix(np.array([0.5, 0.0, 0.0])), np.array([0.04, 0.0, 0.0]))
+    object.__setattr__(after, "Y", after.Y @ slipped)
+    first, then = before.tracked(), after.tracked()
+    half = len(first) // 2
+    with pytest.raises(FitError, match="Does the tracker sit firmly"):
+        register(before.objects(), [*first[:half], *then[half:]])
+
+
+def test_the_other_systems_frame_is_found_as_well() -> None:
+    """Lighthouse by SteamVR is y up, by libsurvive z up: a fixed turn of the frame, which X takes up."""
+    motion = Motion(5)
+    other = rigid(rotation_vector_to_matrix(np.array([np.pi / 2, 0.0, 0.0])), np.array([0.3, -1.0, 2.0]))
+    placed = register(motion.objects(), motion.tracked()).fit.placed
+    object.__setattr__(motion, "X", motion.X @ np.linalg.inv(other))
+    turned = register(motion.objects(), motion.tracked()).fit.placed
+    same = Placed(turned.T_rig_tracking @ other, turned.T_object_tracker, turned.late_s)
+    np.testing.assert_allclose(same.T_rig_tracking, placed.T_rig_tracking, atol=2e-3)
+    np.testing.assert_allclose(same.T_object_tracker, placed.T_object_tracker, atol=2e-3)
+
+
+def test_nothing_at_all_is_refused() -> None:
+    motion = Motion(1, seconds=3.0)
+    with pytest.raises(FitError, match="the tracker told nothing"):
+        register(motion.objects(), [])
+    with pytest.raises(FitError, match="the cameras told nothing"):
+        register([], motion.tracked())
