@@ -72,7 +72,7 @@ class TrackerLine:
         self._last: ObjectPose | None = None
         self._session: int | None = None
         self._newest_ns: int | None = None
-        self._leapt_ns: int | None = None
+        self._leapt: tuple[int, Float] | None = None  # when the doubt began, and where
         self.counts: Counter[str] = Counter()
 
     def push(self, message: TrackerPose) -> list[SolvedObject]:
@@ -130,15 +130,21 @@ class TrackerLine:
 
     def _leaps(self, t_ns: int, place_m: Float) -> bool:
         """Whether no hand could have carried it there since the last pose; for a while, then it is believed."""
-        if self._last is not None:
-            since_s = max(1e-9 * (t_ns - self._last.t_ns), 1e-3)
-            way = float(np.linalg.norm(place_m - self._last.position_m))
-            if way > LEAP_M and way > LEAP_M_S * since_s:
-                if self._leapt_ns is None:
-                    self._leapt_ns = t_ns
-                if 0 <= t_ns - self._leapt_ns < round(1e9 * LEAP_S):
-                    return True
-        self._leapt_ns = None
+        if self._last is None:
+            return False
+        way = _distance(place_m, self._last.position_m)
+        since_s = max(1e-9 * (t_ns - self._last.t_ns), 1e-3)
+        if self._leapt is not None:
+            leapt_ns, where = self._leapt
+            recent = 0 <= t_ns - leapt_ns < round(1e9 * LEAP_S)
+            if recent and way > LEAP_M and _distance(place_m, where) < way:
+                return True
+            self._leapt = None
+            if not recent:
+                return False
+        if way > LEAP_M and way > LEAP_M_S * since_s:
+            self._leapt = t_ns, place_m
+            return True
         return False
 
     def _held(self, t_ns: int) -> ObjectPose:
@@ -159,6 +165,10 @@ class TrackerLine:
             seen=0,
             occluded=True,
         )
+
+
+def _distance(one_m: Float, other_m: Float) -> float:
+    return float(np.linalg.norm(one_m - other_m))
 
 
 def covariance_of(profile: ObjectProfile) -> Float:

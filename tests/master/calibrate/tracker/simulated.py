@@ -73,7 +73,10 @@ class Motion:
         t_s = np.arange(0.0, self.seconds, 1.0 / 60.0)
         R, p = self.truth(t_s)
         white = rng.normal(size=(len(t_s), 6))
-        smooth = np.stack([np.convolve(one, np.ones(15) / np.sqrt(15.0), "same") for one in rng.normal(size=(6, len(t_s)))], axis=1)  # fmt: skip
+        slow = [
+            np.convolve(one, np.ones(15) / np.sqrt(15.0), "same") for one in rng.normal(size=(6, len(t_s)))
+        ]
+        smooth = np.stack(slow, axis=1)
         off = self.noise * CAMERA_SIGMA * (white + smooth) / np.sqrt(2.0)
         astray = rng.random(len(t_s)) < self.strays
         off[astray] += rng.normal(size=(int(astray.sum()), 6)) * np.repeat([0.05, 1.0], 3)

@@ -1,0 +1,40 @@
+"""Publishes what trackers say, on the master's clock, for who registers one: `phalanx-master calibrate tracker --live`.
+
+A tracker's poses come as datagrams, to the master alone, and mean nothing in the rig until it is registered. So that
+the registration can see them beside the objects' poses without being a master itself, they go on the bus as they came.
+"""
+
+from typing import Generic, Protocol, TypeVar
+
+from common.bus import Bus
+from common.messages import TrackerPose
+
+TakenT = TypeVar("TakenT")
+TakenT_co = TypeVar("TakenT_co", covariant=True)
+
+
+class Taking(Protocol[TakenT_co]):
+    """Where messages come from; an `Ingest`."""
+
+    def get(self, timeout_s: float) -> TakenT_co | None:
+        """The next message, or None when none came in time."""
+        ...
+
+
+class DevicePoses(Generic[TakenT]):
+    """A source of messages that publishes poses of trackers as they pass. The bus belongs to the caller."""
+
+    def __init__(self, source: Taking[TakenT], bus: Bus) -> None:
+        """Stand between a source and who reads it."""
+        self._source, self._bus = source, bus
+
+    def get(self, timeout_s: float) -> TakenT | None:
+        """The next message; one of a tracker is on the bus, too, stream `device`.
+
+        Raises:
+            BusError: The bus is closed.
+        """
+        message = self._source.get(timeout_s)
+        if isinstance(message, TrackerPose):
+            self._bus.publish("device", message.source, message)
+        return message
