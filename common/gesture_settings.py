@@ -53,17 +53,19 @@ class PoseShape(Part, frozen=True):
 class HoldSettings(Part, frozen=True):
     """When a pose begins and ends.
 
-    It begins at a confidence of `begin` that has lasted `begin_s`, while the fingers turn by no more than `still_deg_s`
+    It begins at a confidence of `begin` that has lasted `begin_s` (`doubt_s` where fewer than three of the four fingers
+    are known), while the fingers turn by no more than `still_deg_s`
     (a hand on its way through a pose does not hold it), or, at any speed, that has lasted `slow_s`. It ends below `end`
     that has lasted `end_s`, when another begins, or `lost_s` after the hand, or too much of it, was last known.
     `known_share`: of the weight of a pose's quantities, how much must be known.
     """
 
-    begin: Score = 0.5
-    end: Score = 0.25
+    begin: Score = 0.45
+    end: Score = 0.22
     begin_s: NonNegative = 0.012
+    doubt_s: NonNegative = 0.1
     end_s: NonNegative = 0.04
-    still_deg_s: Positive = 90.0
+    still_deg_s: Positive = 60.0
     slow_s: NonNegative = 0.25
     lost_s: NonNegative = 0.5
     known_share: Score = 0.5
@@ -86,10 +88,10 @@ def study_poses() -> dict[Name, PoseShape]:
     return {
         "open_palm": PoseShape(
             ranges={
-                "index_bend_deg": _most(18.0, 9.0),
-                "middle_bend_deg": _most(18.0, 9.0),
-                "ring_bend_deg": _most(18.0, 9.0),
-                "little_bend_deg": _most(18.0, 9.0),
+                "index_bend_deg": _most(13.0, 7.0),
+                "middle_bend_deg": _most(13.0, 7.0),
+                "ring_bend_deg": _most(13.0, 7.0),
+                "little_bend_deg": _most(13.0, 7.0),
                 "thumb_across": _between(0.4, 3.0, 0.1),
             }
         ),
@@ -140,9 +142,9 @@ def study_poses() -> dict[Name, PoseShape]:
                 "index_bend_deg": _between(65.0, 135.0, 10.0),
                 "index_ahead_deg": _least(25.0, 10.0),
                 "thumb_index_gap_mm": _most(42.0, 6.0),
-                "middle_bend_deg": _most(75.0, 12.0),
-                "ring_bend_deg": _most(75.0, 12.0),
-                "little_bend_deg": _most(75.0, 12.0),
+                "middle_bend_deg": _most(62.0, 10.0),
+                "ring_bend_deg": _most(62.0, 10.0),
+                "little_bend_deg": _most(62.0, 10.0),
             },
         ),
     }

@@ -1,4 +1,4 @@
-"""Command line of the master: `phalanx-master run | solve | view | report | camera | calibrate | evaluate`."""
+"""Command line of the master: `phalanx-master run | solve | view | report | camera | gestures | calibrate | ...`."""
 
 import logging
 import os
@@ -22,6 +22,7 @@ from common.sim.wrist.scene import WRIST_NAMES
 from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
+from master.gestures.command import gestures_app
 from master.live import LiveSettings, run_live
 from master.options import (
     CALIB_JSON,
@@ -148,7 +149,7 @@ def solve_command(
     """
     opened = open_recording(recording)
     rigs = rigs_to_solve(opened.manifest, rig_names or [], only, level)
-    setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand)
+    setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand, opened.manifest.objects)
     out.mkdir(parents=True, exist_ok=True)
     solve_hands(opened, setups, detections, out, lambda done, total: _progress("solving", done, total))
     _say(f"wrote {out / 'poses.npz'} and {out / 'summary.json'}")
@@ -240,6 +241,7 @@ def main() -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     app.add_typer(calibrate_app(), name="calibrate")
     app.add_typer(evaluate_app(), name="evaluate")
+    app.add_typer(gestures_app(), name="gestures")
     app.command()(camera)
     try:
         app()

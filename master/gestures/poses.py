@@ -30,6 +30,7 @@ from master.gestures.quantities import QUANTITIES, Quantities, known_bends
 
 _RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
 _VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
+_ENOUGH = 3  # fingers of index ... little: what is told by fewer must last longer
 _MEMORY_S = 0.15  # older frames tell nothing of how fast a finger is now
 
 
@@ -112,7 +113,8 @@ class FingerSpeed:
         self._past: deque[tuple[int, Float, Bool]] = deque()
 
     def push(self, t_ns: int, bend_deg: Float, known: Bool) -> float:
-        """Speed [deg/s], root mean square over the fingers known then and now; inf where no frame tells.
+        """Speed [deg/s], root mean square over the fingers known then and now, or over all where none is; inf where no
+        frame tells.
 
         Args:
             t_ns: The instant [ns].
@@ -125,9 +127,8 @@ class FingerSpeed:
         for then_ns, before, told in reversed(self._past):
             if t_ns - then_ns >= 1e9 * _RATE_S:
                 both = told & known
-                if not both.any():
-                    return np.inf
-                change = (bend_deg - before)[both] / (1e-9 * (t_ns - then_ns))
+                moved = (bend_deg - before)[both] if both.any() else bend_deg - before
+                change = moved / (1e-9 * (t_ns - then_ns))
                 return float(np.sqrt((change**2).mean()))
         return np.inf
 
@@ -160,7 +161,7 @@ class PoseRecogniser:
         quantities = Quantities.of(features)
         fit = self._table.fit(quantities, features.known)
         speed = self._speed.push(features.t_ns, *known_bends(features))
-        begins = self._beginning(features.t_ns, fit, speed)
+        begins = self._beginning(features, fit, speed)
         if begins is not None and begins != self._held:
             return self._begin(features, begins, float(fit.confidence[begins]))
         return self._go_on(features.hand, features.t_ns, fit)
@@ -170,16 +171,20 @@ class PoseRecogniser:
         self._coming = None
         return [] if self._held is None else self._unsure(hand, t_ns)
 
-    def _beginning(self, t_ns: int, fit: Fit, speed: float) -> int | None:
+    def _beginning(self, features: HandFeatures, fit: Fit, speed: float) -> int | None:
         """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
-        best = fit.best()
+        best, t_ns = fit.best(), features.t_ns
         if best is None or fit.confidence[best] < self._hold.begin:
             self._coming = None
             return None
         if best != self._coming:
             self._coming, self._coming_ns = best, t_ns
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
-        rests = lasted_s >= self._hold.begin_s and speed <= self._hold.still_deg_s
+        enough = features.known[1:].sum() >= _ENOUGH
+        rests = (
+            lasted_s >= (self._hold.begin_s if enough else self._hold.doubt_s)
+            and speed <= self._hold.still_deg_s
+        )
         return best if rests or lasted_s >= self._hold.slow_s else None
 
     def _begin(self, features: HandFeatures, pose: int, confidence: float) -> list[Gesture]:
