@@ -17,6 +17,7 @@ from master.app import RunFigures, health, run
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
+from master.outputs.devices import DevicePoses
 from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
 from master.rig import RigSetup
@@ -80,8 +81,8 @@ def run_live(
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
     pipelines = [LivePipeline(setup, stages) for setup in setups]
-    world = World(setups, pipelines)
-    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say)
+    world = World(setups, pipelines, stages)
+    tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
         stack.callback(bus.close)
@@ -98,14 +99,27 @@ def run_live(
         odd = [OddWatch(setup.rig.cameras) for setup in setups]
         watched = list(zip(odd, pipelines, strict=True))
         reporter = _Reporter(
-            cameras_of(setups), clock, bus, ingest, world, watched, tuning, watch, figures, stop, say
+            cameras_of(setups),
+            trackers_of(setups),
+            clock,
+            bus,
+            ingest,
+            world,
+            watched,
+            tuning,
+            watch,
+            figures,
+            stop,
+            say,
         )
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
+        for one in world.unplaced:
+            say(unplaced_line(one.name, one.tracker or ""))
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        run(ingest, world, sinks, clock, figures, stop, watch.push)
+        run(DevicePoses(ingest, bus), world, sinks, clock, figures, stop, watch.push)
         stop.set()
         thread.join(_JOIN_S)
         summary: dict[str, object] = {
@@ -127,6 +141,11 @@ def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
 
 
+def trackers_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All trackers that sit on objects."""
+    return tuple(name for setup in setups for name in setup.trackers)
+
+
 def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: LiveSettings) -> Ingest:
     """Where all cameras, IMUs and trackers of these hands and objects are heard.
 
@@ -143,7 +162,7 @@ def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: Li
         settings.start_timeout_s,
         imus=tuple(name for setup in setups for name in setup.imus),
         wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
-        trackers=tuple(name for setup in setups for name in setup.trackers),
+        trackers=trackers_of(setups),
     )
 
 
@@ -156,6 +175,7 @@ class _Reporter:
     def __init__(
         self,
         cameras: tuple[str, ...],
+        trackers: tuple[str, ...],
         clock: Clock,
         bus: Bus,
         ingest: Ingest,
@@ -169,7 +189,7 @@ class _Reporter:
     ) -> None:
         """Be there on the bus from now on; `work` belongs to a thread."""
         self._session = secrets.randbits(63)
-        self._cameras, self._clock, self._bus = cameras, clock, bus
+        self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
         self._ingest, self._world, self._figures = ingest, world, figures
         self._tuning, self._watch, self._odd = tuning, watch, odd
         self._stop, self._say = stop, say
@@ -215,7 +235,7 @@ class _Reporter:
             heard = self._ingest.connected
             if heard != connected:
                 connected = heard
-                self._say(cameras_line(self._cameras, connected))
+                self._say(cameras_line(self._cameras, connected, self._trackers))
             if self._ingest.started and not started:
                 started = True
                 self._say("started")
@@ -228,10 +248,20 @@ class _Reporter:
             poses = self._figures.poses
 
 
-def cameras_line(cameras: tuple[str, ...], connected: frozenset[str]) -> str:
-    """What a person is told when a camera or an IMU comes or goes: who is there, and who is waited for."""
+def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
+    """What a person is told when a sender comes or goes: who is there, and which cameras are waited for."""
     here = ", ".join(name for name in cameras if name in connected) or "none yet"
     absent = ", ".join(name for name in cameras if name not in connected)
     line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
-    imus = ", ".join(sorted(connected.difference(cameras)))
-    return f"{line}; IMU: {imus}" if imus else line
+    others = connected.difference(cameras)
+    for kind, names in (("IMU", others.difference(trackers)), ("tracker", others.intersection(trackers))):
+        line += f"; {kind}: {', '.join(sorted(names))}" if names else ""
+    return line
+
+
+def unplaced_line(name: str, tracker: str) -> str:
+    """What a person is told of a tracker whose poses mean nothing in the rig."""
+    return (
+        f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
+        f" `phalanx-master calibrate tracker {name}`"
+    )

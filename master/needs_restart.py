@@ -38,6 +38,11 @@ def refuse_restart(old: RigSetup, new: RigSetup) -> None:
             raise _refusal(f"{where}: {key}", was, now, _ALL)
     if old.rows != new.rows:
         raise CalibrationError(f"{where}: markers: cannot stand in another order while it runs: {_ALL}")
+    was, now = (tuple(one.name for one in setup.objects) for setup in (old, new))
+    if was != now:
+        raise _refusal(f"{where}: objects", was, now, _ALL)
+    if old.trackers != new.trackers:
+        raise _refusal(f"{where}: tracker of its objects", old.trackers, new.trackers, _MASTER)
     if old.imus != new.imus:
         raise _refusal(f"{where}: imu.name", old.imus, new.imus, _MASTER)
     for name, camera in new.cameras.items():

@@ -1,11 +1,12 @@
-"""The same line offline: detections of every camera and a recording's calibration -> poses, scores, summary.
+"""The same line offline: detections of every camera and a recording's calibration -> all that a `World` tells, scored.
 
 No clock is read for the poses: messages are pushed in the order of their capture times, so two runs write the
 same bytes. Only the stage times of the summary are measured.
 """
 
 import heapq
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -15,18 +16,33 @@ import numpy as np
 from common.calibration import RigCalibration
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import MANIFEST, FrameRecording, Manifest
-from common.messages import Detections, HandPose, ImuSample, WristDetections
-from master.outputs.files import PosesFile, path_of_hand
+from common.messages import (
+    Contact,
+    Detections,
+    Gesture,
+    HandPose,
+    ImuSample,
+    ObjectPose,
+    TagDetections,
+    Told,
+    WristDetections,
+)
+from master.app import Solved
+from master.object_score import load_object_truth, score_object, score_objects
+from master.outputs.files import RunFiles, path_of_hand
 from master.outputs.poses import Poses
+from master.outputs.told_files import ObjectPoses
 from master.rates import CameraRates
 from master.recorded import recorded_detections, recorded_triples
 from master.recorded_imu import recorded_samples
+from master.recorded_tags import recorded_tags
 from master.rig import RigSetup, pipeline_of
 from master.score import load_truth, score, score_hidden
 from master.sequence import TRIPLE
 from master.sequence import Sequence as FrameSequence
 from master.stages import StageTimes
 from master.summary import write_summary
+from master.world import World
 from master.wrist_score import load_wrist_truth, score_tips, score_triples, score_wrist, triples_missed
 
 
@@ -69,13 +85,61 @@ def solve_hands(
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, object]:
-    """Solve every hand of a recording, as `solve`; poses and summary of the others are named poses-HAND.npz and
-    summary-HAND.json. The summary of the first.
+    """Solve all hands and objects of a recording and write what they did, and summary.json, into `out`.
+
+    That is poses.npz of the first hand, poses-HAND.npz and summary-HAND.json of the others, object_NAME.npz,
+    contact_HAND_NAME.npz and gestures.jsonl.
+
+    Args:
+        recording: The raw frames' manifest; gives `continuous`, clicks and, where there are, the IMU and the truth.
+        setups: Of each hand rigs, cameras and hand: of markers, of a wrist device, or of both.
+        detections: Folder with detections_<camera>.npz of every camera, and tags_<camera>.npz where objects have tags.
+        out: Existing folder for the results.
+        progress: Told how many of how many messages are done.
+
+    Returns:
+        The summary of the first hand and of the objects.
+
+    Raises:
+        RecordingError: A detections file is missing or broken, imu.csv is, or the results cannot be written.
+        CalibrationError: The depth model does not fit the rig, or an object does not.
     """
-    first = solve(recording, setups[0], detections, out, progress)
-    for setup in setups[1:]:
-        solve(recording, setup, detections, out, progress, beside=True)
-    return first
+    continuous = recording.manifest.continuous
+    sensed = [recorded_samples(recording, setup) for setup in setups]
+    setups = [setup for _, setup in sensed]
+    stages = [StageTimes() for _ in setups]
+    pipelines = [
+        pipeline_of(setup, stage, continuous=continuous) for setup, stage in zip(setups, stages, strict=True)
+    ]
+    world = World(setups, pipelines, stages[0], gestures=continuous)
+    counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+    files = RunFiles(out / "poses.npz", counts, [one.name for setup in setups for one in setup.objects])
+    told = _Told({name: [] for name in counts})
+    messages = _messages(recording, setups, detections)
+    done = 0
+    for message in heapq.merge(*(samples for samples, _ in sensed), messages, key=lambda one: one.t_ns):
+        told.take(world.push(message), files)
+        if not isinstance(message, ImuSample):
+            if not isinstance(message, TagDetections):
+                told.rates.push(message)
+            progress(done := done + 1, len(messages))
+    told.take(world.flush(), files)
+    files.close()
+    summaries: list[dict[str, object]] = []
+    for number, (setup, pipeline, stage) in enumerate(zip(setups, pipelines, stages, strict=True)):
+        beside = dict[str, int]() if number else world.counts_beside
+        own = [one for one in messages if not isinstance(one, TagDetections) and one.camera in setup.cameras]
+        summary = _summarise(recording, setup, own, told.poses[setup.hand.profile.name]) | {
+            "camera_hz": {name: hz for name, hz in told.rates.camera_hz.items() if name in setup.cameras},
+            "lost": _lost(setup, own),
+            "counts": dict(sorted((dict(pipeline.counts) | beside).items())),
+            "stage_us": stage.mean_us(),
+        }
+        summary |= score_objects(_object_scores(recording, setup, told.objects))
+        path = out / "summary.json"
+        write_summary(path_of_hand(path, setup.hand.profile.name) if number else path, summary)
+        summaries.append(summary)
+    return summaries[0]
 
 
 def solve(
@@ -84,57 +148,40 @@ def solve(
     detections: Path,
     out: Path,
     progress: Callable[[int, int], None] = lambda done, total: None,
-    *,
-    beside: bool = False,
 ) -> dict[str, object]:
-    """Solve one hand of a recording and write poses.npz and summary.json into `out`.
+    """As `solve_hands`, of one hand."""
+    return solve_hands(recording, [setup], detections, out, progress)
 
-    Args:
-        recording: The raw frames' manifest; gives `continuous`, clicks and, where there are, the IMU and the truth.
-        setup: Rigs, cameras and hand: of markers, of a wrist device, or of both.
-        detections: Folder with detections_<camera>.npz of every camera of the setup.
-        out: Existing folder for the results.
-        progress: Told how many of how many messages are done.
-        beside: The hand is another than the first: the results carry its name.
 
-    Returns:
-        The summary.
+@dataclass(slots=True)
+class _Told:
+    """What came out: of each hand its poses, of each object its own; and how fast the cameras ran."""
 
-    Raises:
-        RecordingError: A detections file is missing or broken, imu.csv is, or the results cannot be written.
-        CalibrationError: The depth model does not fit the rig.
-    """
-    stages = StageTimes()
-    samples, setup = recorded_samples(recording, setup)
-    pipeline = pipeline_of(setup, stages, continuous=recording.manifest.continuous)
-    messages = _messages(recording, setup, detections)
-    poses: list[HandPose] = []
-    rates = CameraRates()
-    hand = setup.hand.profile.name
-    file, figures = out / "poses.npz", out / "summary.json"
-    if beside:
-        file, figures = path_of_hand(file, hand), path_of_hand(figures, hand)
-    sink = PosesFile(file, hand, len(setup.markers))
-    done = 0
-    for message in heapq.merge(samples, messages, key=lambda message: message.t_ns):
-        if isinstance(message, ImuSample):
-            pipeline.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
-            continue
-        poses += [solved.pose for solved in pipeline.push(setup.own(message))]
-        rates.push(message)
-        progress(done := done + 1, len(messages))
-    poses += [solved.pose for solved in pipeline.flush()]
-    for pose in poses:
-        sink.write(pose)
-    sink.close()
-    summary = _summarise(recording, setup, messages, poses) | {
-        "camera_hz": rates.camera_hz,
-        "lost": _lost(setup, messages),
-        "counts": dict(sorted(pipeline.counts.items())),
-        "stage_us": stages.mean_us(),
-    }
-    write_summary(figures, summary)
-    return summary
+    poses: dict[str, list[HandPose]]
+    objects: dict[str, list[ObjectPose]] = field(default_factory=dict[str, list[ObjectPose]])
+    rates: CameraRates = field(default_factory=CameraRates)
+
+    def take(self, solved: Iterable[Solved], files: RunFiles) -> None:
+        """Write it and keep what is scored."""
+        for one in solved:
+            message: Told = one if isinstance(one, Contact | Gesture) else one.pose
+            files.write(message)
+            if isinstance(message, HandPose):
+                self.poses[message.hand].append(message)
+            elif isinstance(message, ObjectPose):
+                self.objects.setdefault(message.object, []).append(message)
+
+
+def _object_scores(
+    recording: FrameRecording, setup: RigSetup, told: Mapping[str, Sequence[ObjectPose]]
+) -> dict[str, dict[str, float]]:
+    """Of each object of this setup whose truth the recording carries."""
+    scores: dict[str, dict[str, float]] = {}
+    for one in setup.objects:
+        truth = load_object_truth(recording.folder, one.name)
+        if truth is not None:
+            scores[one.name] = score_object(ObjectPoses.of(one.name, told.get(one.name, ())), truth)
+    return scores
 
 
 def _summarise(
@@ -186,17 +233,26 @@ def fingers_of(setup: RigSetup) -> tuple[int, ...]:
     return tuple(-1 if finger is None else finger for finger in fingers)
 
 
-def _messages(recording: FrameRecording, setup: RigSetup, folder: Path) -> list[Detections]:
-    """All cameras' detections in the order of their capture times; ties in the order of the cameras."""
+def _messages(
+    recording: FrameRecording, setups: Sequence[RigSetup], folder: Path
+) -> list[Detections | TagDetections]:
+    """All cameras' detections in the order of their capture times; ties in the order of the cameras, tags last."""
     shown = {name: len(rig.markers) for rig in recording.manifest.all_rigs for name in rig.cameras}
-    messages: list[Detections] = []
-    for camera in setup.camera_names:
-        if camera in setup.wrist_cameras:
-            messages += recorded_triples(folder, camera)
-        else:
-            messages += recorded_detections(folder, camera, shown.get(camera, len(setup.markers)))
-    order = {camera: index for index, camera in enumerate(setup.camera_names)}
-    return sorted(messages, key=lambda message: (message.t_ns, order[message.camera]))
+    messages: list[Detections | TagDetections] = []
+    order: dict[str, int] = {}
+    for setup in setups:
+        for camera in setup.camera_names:
+            if camera in order:
+                continue  # it watches two hands
+            order[camera] = len(order)
+            if camera in setup.wrist_cameras:
+                messages += recorded_triples(folder, camera)
+            else:
+                messages += recorded_detections(folder, camera, shown.get(camera, len(setup.markers)))
+    tagged = [setup for setup in setups if any(one.tags is not None for one in setup.objects)]
+    for camera in dict.fromkeys(name for setup in tagged for name in setup.models):
+        messages += recorded_tags(folder, camera)
+    return sorted(messages, key=lambda one: (one.t_ns, isinstance(one, TagDetections), order[one.camera]))
 
 
 def _lost(setup: RigSetup, messages: Sequence[Detections]) -> int:

@@ -1,6 +1,7 @@
-"""Other geometry, depth model, filter or hand while the master tracks: a new pipeline takes the old one's place.
+"""Other geometry, depth model, filter, hand, object or gestures while the master tracks: a new pipeline takes the old
+one's place.
 
-Each hand has a pipeline, and only those change whose files did.
+Each hand has a pipeline, and only those change whose files did; objects and gestures change together (`master.world`).
 
 The new pipeline is built on another thread and shown the last messages, so that its tracks, filter and hand stand when
 it takes over, between two messages. An instant is never solved twice: poses go on with rising times.
@@ -21,7 +22,9 @@ from common.watching import WatchedFiles
 from master.ik.tracker import HandTracker
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
+from master.rig_objects import gestures_file
 from master.stereo.pipeline import SolvedPose, Stage
+from master.world import World
 
 _WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (6 Hz at rest) has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
@@ -51,7 +54,16 @@ class RigFiles:
             self.calibration / "cameras" / f"{name}.json" for setup in setups for name in setup.camera_names
         ]
         hands = [self.hand or self.calibration / "hands" / f"{setup.rig.hand}.json" for setup in setups]
-        return tuple(dict.fromkeys([*rigs, *cameras, *hands]))
+        objects = [
+            self.calibration / "objects" / f"{one.name}.json" for setup in setups for one in setup.objects
+        ]
+        gestures = [
+            gestures_file(self.calibration, rig.gestures)
+            for setup in setups
+            for rig in (setup.rig, setup.wrist_rig)
+            if rig is not None
+        ]
+        return tuple(dict.fromkeys([*rigs, *cameras, *hands, *objects, *gestures]))
 
 
 class _WhenOpen:
@@ -188,9 +200,13 @@ class RigTuning:
         setups: Sequence[RigSetup],
         pipelines: Sequence[LivePipeline],
         say: Callable[[str], None],
+        world: World | None = None,
     ) -> None:
-        """Follow `files`, which say `setups`, and change `pipelines`; `say` is told one line for each change."""
-        self._files, self._say = files, say
+        """Follow `files`, which say `setups`, and change `pipelines`; `say` is told one line for each change.
+
+        Objects and gestures are those of `world`; None: nobody asks for any.
+        """
+        self._files, self._say, self._world = files, say, world
         self._setups, self._pipelines = tuple(setups), tuple(pipelines)
         self._watched = WatchedFiles()
         self._turn = threading.Lock()
@@ -224,15 +240,17 @@ class RigTuning:
             try:
                 setups = self._files.load()
                 refuse_other_hands(self._setups, setups)
-                both = zip(self._setups, setups, self._pipelines, strict=True)
-                changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
-                for old, new, _ in changed:
+                both = list(zip(self._setups, setups, self._pipelines, strict=True))
+                for old, new, _ in both:
                     refuse_restart(old, new)
+                changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
                 switches = [line.prepare(new) for _, new, line in changed]
+                if self._world is not None and any(_beside(old) != _beside(new) for old, new, _ in both):
+                    switches.append(self._world.prepare(setups))
             except PhalanxError:
                 self._refused += 1
                 raise
-            if not changed:
+            if not switches:
                 return
             for switch in switches:
                 switch()
@@ -268,3 +286,7 @@ def _hand(setup: RigSetup) -> tuple[object, ...]:
 
 def _content(setup: RigSetup) -> tuple[object, ...]:
     return setup.rig, setup.wrist_rig, setup.cameras, setup.hand.profile, setup.rows
+
+
+def _beside(setup: RigSetup) -> tuple[object, ...]:
+    return setup.rig, setup.cameras, setup.hand.profile, setup.rows, setup.objects, setup.gestures

@@ -80,7 +80,10 @@ class RunFiles:
         }
         self._objects = {name: object_file(folder, name) for name in objects}
         self._contacts = {
-            (hand, name): contact_file(folder, hand, name) for hand in marker_counts for name in objects
+            (hand, name): contact_file(folder, hand, name)
+            for hand, count in marker_counts.items()
+            if count  # a wrist device alone tells of no contact
+            for name in objects
         }
         self._gestures = GesturesFile(folder)
 

@@ -4,6 +4,7 @@ They stand in the folder of poses.npz. A gesture is a line of JSON with the fiel
 """
 
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import nan
 from pathlib import Path
@@ -14,7 +15,7 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
 from common.errors import RecordingError
-from common.messages import FINGER_COUNT, Gesture
+from common.messages import FINGER_COUNT, Gesture, Message, ObjectPose
 from common.npz import read_npz
 from common.replacing import replacing
 from master.outputs.table_file import Row, TableFile, cannot_write
@@ -55,6 +56,16 @@ class ObjectPoses:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def rows(self, start: int, stop: int) -> "ObjectPoses":
+        """Rows start..stop-1, without copying."""
+        names = object_record().names or ()
+        return ObjectPoses(object=self.object, **{name: getattr(self, name)[start:stop] for name in names})
+
+    @classmethod
+    def of(cls, name: str, poses: Sequence[ObjectPose]) -> "ObjectPoses":
+        """Stack the poses of one object; also none."""
+        return cls(object=name, **_stacked(poses, object_record()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +128,15 @@ def contact_record() -> Row:
             ("held", "?"),
         ]
     )
+
+
+def _stacked(messages: Sequence[Message], dtype: Row) -> dict[str, Any]:
+    return {
+        name: np.array([getattr(message, name) for message in messages], dtype=dtype[name].base).reshape(
+            len(messages), *dtype[name].shape
+        )
+        for name in dtype.names or ()
+    }
 
 
 def object_path(folder: Path, name: str) -> Path:

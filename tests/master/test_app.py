@@ -60,7 +60,7 @@ class Collector:
 
 
 def world_of(*setups: RigSetup) -> World:
-    return World(setups, [pipeline_of(setup, StageTimes()) for setup in setups])
+    return World(setups, [pipeline_of(setup, StageTimes()) for setup in setups], StageTimes())
 
 
 @pytest.fixture(scope="module")

@@ -126,6 +126,7 @@ def test_a_joined_hand_follows_all_its_files(root: Path, tmp_path: Path) -> None
     assert names == {
         *("rigs/desk.json", "rigs/wrist.json", "hands/default-right.json"),
         *(f"cameras/{name}.json" for name in ("left", "right", "wrist")),
+        "gestures/default.json",
     }
     lines: list[str] = []
     pipeline = LivePipeline(setup, StageTimes())

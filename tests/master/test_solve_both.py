@@ -104,7 +104,11 @@ def test_both_streams_make_one_hand_that_is_scored_against_both_truths(
     assert summary["triples_missed"] <= 1.0  # type: ignore[operator]
     assert summary["lost"] == 0
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0, "wrist": 90.0}, rel=1e-3)
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"poses.npz", "summary.json"}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "poses.npz",
+        "summary.json",
+        "gestures.jsonl",
+    }
 
 
 def test_either_stream_is_solved_alone_from_the_same_detections(
@@ -142,7 +146,7 @@ def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
     first = RigSetup.of(worn, both.wrist.cameras, both.wrist.hand)
     second = RigSetup.of(left, both.markers.cameras, LEFT)
     solve_hands(recorded.opened, (first, second), recorded.opened.folder, tmp_path)
-    names = {"poses.npz", "summary.json", "poses-made-left.npz", "summary-made-left.json"}
+    names = {"poses.npz", "summary.json", "poses-made-left.npz", "summary-made-left.json", "gestures.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == names
     assert load_poses(tmp_path / "poses-made-left.npz").hand == "made-left"
     other = msgspec.json.decode((tmp_path / "summary-made-left.json").read_bytes())

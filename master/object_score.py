@@ -1,0 +1,140 @@
+"""Tracked objects against their truth: millimetres, degrees, how often they were tracked, and if doubt was honest."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import RecordingError
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
+from common.npz import read_npz
+from master.outputs.told_files import ObjectPoses
+
+_NEAR_NS = 100_000_000  # between truths farther apart nothing is interpolated
+_FIRST_NS = 1_000_000_000  # scene time 0 of a recording
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectTruth:
+    """Where an object truly was.
+
+    Attributes:
+        t_ns: (N,) rising, on the clock of the poses.
+        T_rig_object: (N, 4, 4) [m].
+    """
+
+    t_ns: Int
+    T_rig_object: Float
+
+    def at(self, t_ns: Int) -> Float:
+        """Poses (T, 4, 4) at other instants (T,), interpolated; NaN outside, and where truths are too far apart."""
+        out = np.full((len(t_ns), 4, 4), np.nan)
+        if len(self.t_ns) == 0:
+            return out
+        last = max(len(self.t_ns) - 2, 0)
+        before = np.clip(np.searchsorted(self.t_ns, t_ns, side="right") - 1, 0, last)
+        after = np.minimum(before + 1, len(self.t_ns) - 1)
+        span = np.maximum(self.t_ns[after] - self.t_ns[before], 1)
+        share = (t_ns - self.t_ns[before]) / span
+        a, b = self.T_rig_object[before], self.T_rig_object[after]
+        turn = matrix_to_rotation_vector(np.swapaxes(a[:, :3, :3], 1, 2) @ b[:, :3, :3])
+        out[:, :3, :3] = a[:, :3, :3] @ rotation_vector_to_matrix(share[:, None] * turn)
+        out[:, :3, 3] = a[:, :3, 3] + share[:, None] * (b[:, :3, 3] - a[:, :3, 3])
+        out[:, 3] = (0.0, 0.0, 0.0, 1.0)
+        out[(share < 0.0) | (share > 1.0) | (span > _NEAR_NS)] = np.nan
+        return out
+
+
+def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
+    """Truth of an object of a rendered recording; None where the folder holds none.
+
+    Raises:
+        RecordingError: truth.npz is broken, or its arrays do not fit together.
+    """
+    path = folder / "truth.npz"
+    if not path.exists():
+        return None
+    data = read_npz(path)
+    if f"object_{name}" not in data or "t_ref" not in data:
+        return None
+    poses = data[f"object_{name}"]
+    if poses.shape != (len(data["t_ref"]), 4, 4):
+        raise RecordingError(
+            f"{path}: object_{name} has shape {poses.shape}, expected ({len(data['t_ref'])}, 4, 4)"
+        )
+    t_ns = _FIRST_NS + np.round(1e9 * data["t_ref"]).astype(np.int64)
+    return ObjectTruth(t_ns, poses.astype(np.float64))
+
+
+def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:
+    """Distance [mm] of the origin and angle [deg] of each pose (T,) from the truth; NaN where either is not known."""
+    true = truth.at(poses.t_ns)
+    off_mm = 1e3 * np.linalg.norm(poses.position_m - true[:, :3, 3], axis=1)
+    turn = np.swapaxes(true[:, :3, :3], 1, 2) @ quaternion_to_matrix(poses.orientation_wxyz)
+    off_deg = np.degrees(np.linalg.norm(matrix_to_rotation_vector(turn), axis=1))
+    return np.asarray(off_mm, np.float64), np.asarray(off_deg, np.float64)
+
+
+def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
+    """Of one object.
+
+    Returns:
+        mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true instants at which a
+        tracked pose is there), occluded (share of the tracked poses that say so), nees (median of the squared error by
+        its covariance, six numbers: about 5.3 where that is honest). What has nothing to average is left out.
+    """
+    mm, deg = errors(poses, truth)
+    seen = poses.tracked & np.isfinite(mm) & np.isfinite(deg)
+    out = {"poses": float(len(poses)), "tracked": tracked_share(poses, truth)}
+    if not seen.any():
+        return out
+    out |= {
+        "mm": float(np.median(mm[seen])),
+        "deg": float(np.median(deg[seen])),
+        "mm_p95": float(np.percentile(mm[seen], 95.0)),
+        "deg_p95": float(np.percentile(deg[seen], 95.0)),
+        "mm_max": float(mm[seen].max()),
+        "occluded": float(poses.occluded[seen].mean()),
+        "nees": float(np.median(_nees(poses, truth)[seen])),
+    }
+    return {name: round(value, 4) for name, value in out.items()}
+
+
+def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
+    """Share of the true instants that have a tracked pose nearer than the next true instant."""
+    told = poses.t_ns[poses.tracked]
+    if len(truth.t_ns) == 0 or len(told) == 0:
+        return 0.0
+    period = np.median(np.diff(truth.t_ns)) if len(truth.t_ns) > 1 else _NEAR_NS
+    after = np.clip(np.searchsorted(told, truth.t_ns), 0, len(told) - 1)
+    before = np.maximum(after - 1, 0)
+    off = np.minimum(np.abs(told[after] - truth.t_ns), np.abs(told[before] - truth.t_ns))
+    return float((off < period).mean())
+
+
+def score_objects(scores: dict[str, dict[str, float]]) -> dict[str, object]:
+    """For a summary: `objects` (each by its name), and of all together object_mm, object_deg, object_tracked.
+
+    These are of the object that is worst in each.
+    """
+    if not scores:
+        return {}
+    out: dict[str, object] = {"objects": scores}
+    for name, worst in (("mm", max), ("deg", max), ("tracked", min)):
+        known = [one[name] for one in scores.values() if name in one]
+        if known:
+            out[f"object_{name}"] = worst(known)
+    return out
+
+
+def _nees(poses: ObjectPoses, truth: ObjectTruth) -> Float:
+    """Normalised squared errors (T,); NaN where something is not known."""
+    true = truth.at(poses.t_ns)
+    turn = quaternion_to_matrix(poses.orientation_wxyz) @ np.swapaxes(true[:, :3, :3], 1, 2)
+    off = np.concatenate([poses.position_m - true[:, :3, 3], matrix_to_rotation_vector(turn)], axis=1)
+    out = np.full(len(poses), np.nan)
+    known = np.isfinite(off).all(axis=1) & np.isfinite(poses.cov).all(axis=(1, 2))
+    off, cov = off[known], poses.cov[known]
+    out[known] = np.vecdot(off, np.linalg.solve(cov, off[..., None])[..., 0])
+    return out
