@@ -39,11 +39,13 @@ class DialSettings(Part, frozen=True):
 
     `hold_s`: how long the grip is held until it begins, no tip going in or out by more than `still_m`; `again_s`: the
     same for a hand that grips again. `radius_low_m`, `radius_high_m`: of the circle on which the middles of the tips
-    lie; `curl_least`: of 0..1, the four fingers together are curled at least: others are a relaxed hand.
-    `fingers_least`: how many of the four lie on it. `round_m`: how far from it they may be; `opposed_rad`: at least
-    so far round it is the thumb from each of them. `loose_m`: a grip that is wider by this turns nothing; `open_m`:
-    one that is wider, or narrower, by this is none. `regrip_s`: how long an open hand may take to grip again; the
-    angle goes on where it was. `lost_s`: how long tips may be unknown; `sigma_most_m`: of a tip, above which it is.
+    lie; `curl_least`: of 0..1, the four fingers together are curled at least: others are a relaxed hand. `across_m`:
+    between the skins of the thumb and any finger at least, and `aslant_rad`: between the circle and the plane of the
+    palm at most: others are a thumb over a row of fingers. `fingers_least`: how many of the four lie on it.
+    `round_m`: how far from it they may be; `opposed_rad`: at least so far round it is the thumb from each of them.
+    `loose_m`: in a grip that is wider or narrower by this the fingers turn nothing; `open_m`: by this it is none.
+    `regrip_s`: how long an open hand may take to grip again; the angle goes on where it was. `lost_s`: how long tips
+    may be unknown; `sigma_most_m`: of a tip, above which it is.
     """
 
     hold_s: NonNegative = 0.2
@@ -52,10 +54,12 @@ class DialSettings(Part, frozen=True):
     radius_low_m: Positive = 0.014
     radius_high_m: Positive = 0.042
     curl_least: NonNegative = 0.3
+    across_m: NonNegative = 0.018
+    aslant_rad: Positive = math.radians(38.0)
     fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
     round_m: Positive = 0.012
     opposed_rad: Positive = math.radians(75.0)
-    loose_m: Positive = 0.004
+    loose_m: Positive = 0.003
     open_m: Positive = 0.009
     regrip_s: NonNegative = 0.8
     lost_s: NonNegative = 0.5
@@ -70,14 +74,14 @@ class TapSettings(Part, frozen=True):
     earlier where it has gone away by `rise_m` from where it was nearest. `approach_s`: within so long it comes from
     beyond `leave_gap_m`; slower is no tap. `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between
     two taps. `level_rad`: how differently the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of
-    0..1, how far at most. `quiet_rad`: how far the four may bend together while the thumb touches: more is a hand
-    that closes. `nearer_m`: how much nearer the thumb is to the finger of this key than to another. `sigma_most_m`:
-    of the tips of thumb and finger, above which nothing is told.
+    0..1, how far at most. `quiet_rad`: how far the four may bend together from when the thumb comes until it goes:
+    more is a hand that closes. `nearer_m`: how much nearer the thumb is to the finger of this key than to another.
+    `sigma_most_m`: of the tips of thumb and finger, above which nothing is told.
     """
 
-    touch_gap_m: Positive = 0.006
-    leave_gap_m: Positive = 0.012
-    rise_m: Positive = 0.006
+    touch_gap_m: Positive = 0.005
+    leave_gap_m: Positive = 0.0085
+    rise_m: Positive = 0.005
     approach_s: Positive = 0.4
     shortest_s: NonNegative = 0.03
     longest_s: Positive = 0.6

@@ -24,10 +24,10 @@ _REACH_DEG = (
     ((-5, 42, 42), (80, 32)),
 )
 KNOB_DEG = ((26, 22, 18), (8, 38, 44), (2, 42, 46), (-6, 42, 46), (-12, 38, 44))
-PRESSED_M = 0.0005
+PRESSED_M, HOVER_M = 0.0005, 0.020
 KNOB_M = (0.020, 0.026)  # radius of knobs
-_STEPS, _DAMPING, _NUDGE_DEG = 30, 0.05, 0.25
-_OTHERS_CLEAR_M = 0.016
+_STEPS, _DAMPING, _NUDGE_DEG = 24, 0.05, 0.25
+_OTHERS_CLEAR_M, _KEY_CLEAR_M = 0.016, 0.0035
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,6 +44,15 @@ class Knob:
     centre_m: Float
     axis: Float
     radius_m: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Key:
+    """A thumb on a key: finger 1 ... 4, segment 0 ... 2 from the knuckle, and the posture (5, 3) [deg]."""
+
+    finger: int
+    segment: int
+    posture_deg: Float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +138,33 @@ def key_posture(model: HandModel, finger: int, segment: int, wobble: Float) -> F
 
     free = np.array([0, 1, 2, *(3 * f + k for f in range(1, 5) for k in (1, 2))])
     width = np.array([25.0, 25.0, 25.0, *[25.0] * 8])
-    found = [_solved(model, _pad(*start), free, width, misses, wobble) for start in _REACH_DEG]
-    return min(found, key=lambda one: one[1])[0]
+    starts = np.array([_pad(*start) for start in _REACH_DEG])
+    nearest = np.square(misses(Posed.of(model, starts, wobble))).sum(axis=1).argmin()
+    return _solved(model, starts[nearest], free, width, misses, wobble)[0]
+
+
+def hover_posture(model: HandModel, key: Key, wobble: Float) -> Float:
+    """The posture (5, 3) [deg] of a thumb that has gone back from a key, straight off the skin."""
+    there = Posed.of(model, key.posture_deg[None], wobble)
+    target = there.joints_m[0, TIPS[0]] + HOVER_M * there.palmar(key.finger, key.segment)[0]
+
+    def misses(posed: Posed) -> Float:
+        return (posed.joints_m[:, TIPS[0]] - target) / 2e-3
+
+    return _solved(model, key.posture_deg, np.arange(3), np.array([40.0, 40.0, 40.0]), misses, wobble)[0]
+
+
+def pad_before(model: HandModel, hover_deg: Float, wobble: Float) -> Float:
+    """The posture (5, 3) [deg] of the same fingers whose thumb is out of the way, and on no finger on its way."""
+    aside = [(across, bend, 6.0) for across in (0.0, 15.0, 30.0, 45.0) for bend in (-10.0, 5.0, 20.0)]
+    share = np.linspace(0.0, 1.0, 9)[:, None]
+    ways = np.tile(hover_deg, (len(aside), len(share), 1, 1))
+    for k, thumb in enumerate(aside):
+        ways[k, :, 0] = (1.0 - share) * np.array(thumb) + share * hover_deg[0]
+    posed = Posed.of(model, ways.reshape(-1, 5, 3), wobble)
+    thumb, fingers = posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+    nearest = gaps_between(thumb, fingers).gap_m.reshape(len(aside), -1).min(axis=1)
+    return ways[int(nearest.argmax()), 0]
 
 
 def knob_grip(model: HandModel, radius_m: float, wobble: Float) -> Knob:
@@ -206,3 +240,25 @@ def _pad(thumb: tuple[float, float, float], bend: tuple[float, float]) -> Float:
     posture = np.array(PAD_DEG, dtype=np.float64)
     posture[0], posture[1:, 1:] = thumb, bend
     return posture
+
+
+def reachable_keys(model: HandModel, wobble: Float) -> tuple[Key, ...]:
+    """Keys that the hand's thumb can lie on, and how.
+
+    A key counts where skin meets skin on its palmar side, near its middle, and no other finger is near. The model's
+    thumb does not turn about its own length as it goes across the palm, so it reaches fewer keys than a real one.
+    """
+    out: list[Key] = []
+    for finger in range(1, 5):
+        for segment in range(3):
+            posture = key_posture(model, finger, segment, wobble)
+            posed = Posed.of(model, posture[None], wobble)
+            found = gaps_between(
+                posed.cones.part(slice(0, 1), slice(2, 3)), posed.cones.part(slice(1, 5), slice(0, 3))
+            )
+            gap, on = found.gap_m[0], float(found.on_b[0, finger - 1, segment])
+            others = np.delete(gap, finger - 1, axis=0).min()
+            touches = abs(float(gap[finger - 1, segment])) < 1e-3 and float(gap[finger - 1].min()) > -1.5e-3
+            if touches and others > _KEY_CLEAR_M and 0.2 < on < 0.8:
+                out.append(Key(finger, segment, posture))
+    return tuple(out)

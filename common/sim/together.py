@@ -7,6 +7,7 @@ device sits on the forearm (`common.wrist_bend`; limits of the bend as flexion /
     both-poses    the six study poses, the palm in a new place and turned another way each (`poses`); +-8 / +-5
     both-curl     all fingers curl slowly from straight to PIP 105 degrees and back; +-8 / +-5
     both-travel   the hand goes to and fro at a peak of 1 m/s, its fingers slowly moving; +-8 / +-5
+    gestures      pinches, knobs, keys, pointing and free motion for 75 s (`gestures`); +-5 / +-3
     both-moves    10 s in which fingers bend one by one and together, the palm turns about all axes; +-25 / +-12
 """
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import HandModel
+from common.sim.gestures import Gestures
 from common.sim.grasp import Grasp
 from common.sim.motion import (
     FIST,
@@ -48,11 +50,13 @@ MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
 def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """The motion of that name (`TOGETHER`) about a place (3,) [m], rig frame; None: there is no such.
+    """The motion of that name (`TOGETHER`, `gestures`) about a place (3,) [m], rig frame; None: there is no such.
 
     The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the bend of
     the wrist and the shifts are the same.
     """
+    if name == "gestures":
+        return Gestures(model, centre_m, seed)
     if name == "grasp":
         return Grasp(model, centre_m, seed)
     if name == "both-poses":

@@ -45,9 +45,8 @@ class ActionWatch:
         else:
             told += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
-        told += dial.push(
-            seen, still_frame(seen, worn_only=worn_only), may_begin=not others and not point.active
-        )
+        still, across_m = still_frame(seen, worn_only=worn_only), float(touch.gap_m.min())
+        told += dial.push(seen, still, across_m, may_begin=not others and not point.active)
         return told + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:

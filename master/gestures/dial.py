@@ -1,30 +1,34 @@
 """A dial: a grip about something round, by how much it is turned, over as many grips as it takes.
 
-The angle is that of the tips, turned as one in the room, about the axis of the knob: palm and fingers both turn a knob,
-and the tips are what a hand is measured by best. Where a tip is not seen it goes with the palm, and counts less. The
-axis begins as that of the circle through the tips; a turn tells its own axis better the farther it goes, and what is
-known of it is the mean of both (`_axis_of`). Within one grip the angle is against the grip's beginning, not summed up
-from step to step, so that neither noise nor a moment of loss adds up; a hand that opens stops the dial where it was,
-and goes on from there when it grips again.
+Palm and fingers both turn a knob. The turn of a grip is that of the palm in the room and of the tips in the palm,
+together the turn of the tips in the room, which a hand is measured by best; a tip that is not seen goes with the palm,
+and counts less. It is against the grip's beginning, not summed up from step to step, so that neither noise nor a moment
+of loss adds up. A hand that lets go opens first: while its tips go in or out nothing that they do counts, back to a
+tenth of a second before, but the palm does; then the dial stands, and goes on when it is gripped again.
 
-Where the only place is that of a wrist device (no markers, the palm stands still in its own camera's frame) the tips
-are turned by the palm in the world of its IMU.
+The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
+what is known of it is the mean of both (`_axis_of`).
+
+Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
+the world of the IMU that turns.
 """
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import quaternion_to_matrix
+from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
-from master.gestures.grip import Circle, Tips, grip_of, spread_m, turned_by
+from master.gestures.grip import Circle, Tips, grip_of, spread_m, turned_in_palm
 from master.gestures.lasting import Lasting
 
 _AXIS_RAD = np.radians(15.0)  # how well the circle of the tips tells the axis of the knob
 _SWAY_RAD = np.radians(4.0)  # about other axes, by which a hand sways while it turns a knob
+_LOOSENS_S = 0.12  # in which a hand that lets go has become loose
 _EYE = np.eye(3)
 
 
@@ -34,15 +38,22 @@ class _Grip:
 
     Attributes:
         tips: As they were when it closed.
-        circle: Theirs.
+        palm: (3, 3) of the palm in the room, then or a little earlier.
+        axis: (3,) of the circle of the tips, in the room.
         base_rad: By how much the dial had been turned then.
         farthest: (3,) rotation vector [rad] of its largest turn so far.
     """
 
     tips: Tips
-    circle: Circle
+    palm: Float
+    axis: Float
     base_rad: float
     farthest: Float
+
+    @classmethod
+    def of(cls, tips: Tips, palm: Float, circle: Circle, base_rad: float) -> "_Grip":
+        """A grip that has just closed; what the palm has turned since `palm` counts."""
+        return cls(tips, palm, palm @ circle.axis, base_rad, np.zeros(3))
 
 
 class DialWatch:
@@ -54,6 +65,7 @@ class DialWatch:
         self._grip: _Grip | None = None
         self._maybe: tuple[int, Tips] | None = None  # since when a grip is held still, and as it was then
         self._angle = 0.0
+        self._fingers: deque[tuple[int, Float]] = deque()  # how tips were turned in the palm, of late
         self._closed_ns = self._known_ns = 0  # when the dial was gripped, and tips were known, last
         self._last: Gesture | None = None
 
@@ -62,22 +74,24 @@ class DialWatch:
         """Whether a dial has begun, gripped or about to be gripped again."""
         return self._dial is not None
 
-    def push(self, seen: HandFeatures, turn: Float, *, may_begin: bool) -> list[Gesture]:
+    def push(self, seen: HandFeatures, turn: Float, across_m: float, *, may_begin: bool) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
         Args:
             seen: The hand.
             turn: (3, 3) from the rig frame to one that stands still in the room.
+            across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
         """
-        tips = _tips_of(seen, turn, self._settings.sigma_most_m)
+        tips = _tips_of(seen, turn, across_m, self._settings.sigma_most_m)
         if self._dial is None:
             circle = self._held(seen.t_ns, tips, self._settings.hold_s) if may_begin else None
             if circle is None:
                 self._maybe = self._maybe if may_begin else None
                 return []
             self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
-            self._angle, self._grip = 0.0, _Grip(tips, circle, 0.0, np.zeros(3))
+            self._angle, self._grip = 0.0, _Grip.of(tips, tips.palm, circle, 0.0)
+            self._fingers.clear()
             self._maybe, self._closed_ns, self._known_ns = None, seen.t_ns, seen.t_ns
             return [self._tell(self._dial, "begin", seen, turn, tips)]
         self._follow(seen.t_ns, tips)
@@ -121,27 +135,38 @@ class DialWatch:
             circle = self._held(t_ns, tips, own.again_s)
             if circle is None or self._maybe is None:
                 return
-            # What was turned since the hand closed counts.
-            self._grip = grip = _Grip(self._maybe[1], circle, self._angle, np.zeros(3))
+            self._grip = grip = _Grip.of(tips, self._maybe[1].palm, circle, self._angle)
+            self._fingers.clear()
             self._maybe = None
         wider = spread_m(tips, grip.tips)
-        by = 0.0 if np.isnan(wider).all() else float(np.nanmean(wider))
-        if abs(by) > own.open_m:
+        by = 0.0 if np.isnan(wider).all() else abs(float(np.nanmean(wider)))
+        if by > own.open_m:
             self._grip, self._closed_ns = None, t_ns
             return
         self._closed_ns = t_ns
-        if abs(by) > own.loose_m:
-            return
-        turn = turned_by(tips, grip.tips)
+        fingers = self._turned_fingers(t_ns, tips, grip, loose=by > own.loose_m)
+        turn = matrix_to_rotation_vector(tips.palm @ fingers @ grip.palm.T)
         if float(turn @ turn) > float(grip.farthest @ grip.farthest):
             self._grip = grip = replace(grip, farthest=turn)
         twist = _twist(turn, _axis_of(grip)) + grip.base_rad
         self._angle = twist + 2.0 * np.pi * round((self._angle - twist) / (2.0 * np.pi))
 
+    def _turned_fingers(self, t_ns: int, tips: Tips, grip: _Grip, *, loose: bool) -> Float:
+        """Rotation (3, 3) of the tips in the palm, of a grip that is closed; of a loose one as it was a while
+        before."""
+        if not loose:
+            self._fingers.append((t_ns, turned_in_palm(tips, grip.tips)))
+            while len(self._fingers) > 2 and (t_ns - self._fingers[1][0]) * 1e-9 > _LOOSENS_S:
+                self._fingers.popleft()
+            return self._fingers[-1][1]
+        while len(self._fingers) > 1:
+            self._fingers.pop()
+        return self._fingers[0][1] if self._fingers else _EYE
+
     def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, turn: Float, tips: Tips) -> Gesture:
         grip = self._grip
-        origin = turn.T @ (0.5 * tips.place_m[0] + 0.5 * tips.place_m[1:].mean(axis=0))
-        way = turn.T @ (tips.palmar if grip is None else _axis_of(grip))
+        origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
+        way = seen.palmar if grip is None else turn.T @ _axis_of(grip)
         confidence = float(tips.known.mean()) * (0.5 if grip is None else 1.0)
         self._last = dial.told(
             phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
@@ -162,14 +187,15 @@ def still_frame(seen: HandFeatures, *, worn_only: bool) -> Float:
     return quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
 
 
-def _tips_of(seen: HandFeatures, turn: Float, sigma_most_m: float) -> Tips:
+def _tips_of(seen: HandFeatures, turn: Float, across_m: float, sigma_most_m: float) -> Tips:
+    rotation = seen.T_rig_palm[:3, :3]
     pads = seen.pads_m - seen.tips_m
-    inwards = pads / np.linalg.norm(pads, axis=1, keepdims=True)
     return Tips(
-        place_m=seen.tips_m @ turn.T,
+        palm=turn @ rotation,
+        place_m=(seen.tips_m - seen.T_rig_palm[:3, 3]) @ rotation,
         sigma_m=seen.sigma_m,
-        inwards=inwards @ turn.T,
-        palmar=turn @ seen.palmar,
+        inwards=pads @ rotation / np.linalg.norm(pads, axis=1, keepdims=True),
+        across_m=across_m,
         curl=float(seen.curl[1:].mean()),
         known=seen.sigma_m <= sigma_most_m,
     )
@@ -182,9 +208,9 @@ def _axis_of(grip: _Grip) -> Float:
     directions go with one over the square, and the best axis is the first of the sum of both, as a tensor.
     """
     prior = (_SWAY_RAD / _AXIS_RAD) ** 2
-    both = prior * np.outer(grip.circle.axis, grip.circle.axis) + np.outer(grip.farthest, grip.farthest)
+    both = prior * np.outer(grip.axis, grip.axis) + np.outer(grip.farthest, grip.farthest)
     axis: Float = np.linalg.eigh(both)[1][:, 2]
-    return axis if float(axis @ grip.circle.axis) > 0.0 else -axis
+    return axis if float(axis @ grip.axis) > 0.0 else -axis
 
 
 def _twist(turn: Float, axis: Float) -> float:

@@ -30,7 +30,7 @@ _NEVER_NS = -(2**61)
 
 @dataclass(slots=True)
 class _Touch:
-    """A touch that goes on: what it was like when the thumb was nearest, and how the fingers were bent at first."""
+    """A touch that goes on: what it was like when the thumb was nearest, and how the fingers were bent before."""
 
     began_ns: int
     gap_m: float
@@ -47,6 +47,7 @@ class TapWatch:
         self._settings = settings
         self._touch: _Touch | None = None
         self._clear_ns = self._tapped_ns = _NEVER_NS
+        self._clear_rad = 0.0  # how the fingers were bent then
 
     @property
     def active(self) -> bool:
@@ -65,10 +66,10 @@ class TapWatch:
         if not known:
             return []
         if gap >= own.leave_gap_m:
-            self._clear_ns = seen.t_ns
+            self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
         if gap > own.touch_gap_m or not may_begin or not self._begins(seen, touch, finger, gaps):
             return []
-        self._touch = self._as_it_is(seen.t_ns, seen, touch, finger, _bend_rad(seen))
+        self._touch = self._as_it_is(seen.t_ns, seen, touch, finger, self._clear_rad)
         return []
 
     def drop(self) -> None:
@@ -92,7 +93,7 @@ class TapWatch:
             return []
         if gap < min(own.leave_gap_m, max(going.gap_m + own.rise_m, own.touch_gap_m)):
             return []
-        self._touch, self._clear_ns = None, seen.t_ns
+        self._touch, self._clear_ns, self._clear_rad = None, seen.t_ns, _bend_rad(seen)
         if lasted < own.shortest_s:
             return []
         self._tapped_ns = seen.t_ns

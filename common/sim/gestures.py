@@ -1,0 +1,281 @@
+"""A hand that pinches, turns knobs, taps its keys and points, and moves freely between: with the truth of all it says.
+
+In 75 s two rounds of everything, in an order, at a pace, in places and with knobs that are drawn from the seed: each
+finger is pinched, a knob is turned to and fro, another is turned farther than a hand turns at once and gripped again,
+keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and says
+nothing. The palm faces the cameras, as that of somebody does who turns a knob on his screen: a knob hides the tips of
+a hand that is seen from behind.
+
+Skin meets skin: postures are found on the hand itself (`gesture_postures`). A hand that touches or grips stands still
+but for what it does, else it wanders as hands do. While a knob is turned the palm goes round its axis.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
+from common.hand_model import FINGERS, HandModel
+from common.messages import GestureKind
+from common.sim.gesture_postures import (
+    KNOB_M,
+    Knob,
+    hover_posture,
+    knob_grip,
+    pad_before,
+    pinch_posture,
+    reachable_keys,
+)
+from common.sim.motion import FIST, POSES, REST, WAVE_CREST, Drift, HandState, Waves, angles_of, smooth_step
+
+KEY_NAMES = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
+PERIOD_S = 75.0
+TILT_DEG, TURN_DEG = 15.0, 14.0
+REACH_M = np.array([0.04, 0.025, 0.04])
+BEND_DEG = np.array([5.0, 3.0])
+_FREE = (REST, POSES["open_palm"], FIST, WAVE_CREST, POSES["counting_two"], REST)
+_LOOSEN_DEG = np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """One thing that the hand says.
+
+    Attributes:
+        kind, name: As of a Gesture message.
+        start_s, stop_s: The hand begins to do it, and has done it [s].
+    """
+
+    kind: GestureKind
+    name: str
+    start_s: float
+    stop_s: float
+
+
+class Track:
+    """Values that go smoothly (C2) from one to the next, and rest between. It holds them."""
+
+    def __init__(self, first: Float) -> None:
+        self._start, self._stop, self._value = [-1.0], [0.0], [np.asarray(first, dtype=np.float64)]
+
+    @property
+    def last(self) -> Float:
+        """Where it ends so far."""
+        return self._value[-1]
+
+    def to(self, value: Float, start_s: float, stop_s: float) -> None:
+        """Go to a value from a time to a time [s], not before the last move is over."""
+        if start_s < self._stop[-1] - 1e-9 or stop_s <= start_s:
+            raise ValueError(f"a move from {start_s} to {stop_s} s after one until {self._stop[-1]} s")
+        self._start.append(start_s)
+        self._stop.append(stop_s)
+        self._value.append(np.asarray(value, dtype=np.float64))
+
+    def at(self, t_s: float) -> Float:
+        """The value at a time [s]."""
+        k = int(np.searchsorted(self._start, t_s, side="right")) - 1
+        if k <= 0:
+            return self._value[0]
+        share = smooth_step((t_s - self._start[k]) / (self._stop[k] - self._start[k]))
+        return self._value[k - 1] + share * (self._value[k] - self._value[k - 1])
+
+
+class Gestures:
+    """A minute of gestures. The state it holds is its script, fixed by the constructor.
+
+    Attributes:
+        said: Everything the hand says, in order.
+    """
+
+    def __init__(self, model: HandModel, centre_m: Float, seed: int) -> None:
+        """Write the script, and find its postures (about half a second).
+
+        Args:
+            model: Whose limits and coupling hold.
+            centre_m: Place (3,) of the middle of the open hand, rig frame [m].
+            seed: Same seed, same motion.
+        """
+        rng = np.random.default_rng([seed, 37])
+        self._model, self._centre, self._rng = model, np.asarray(centre_m, dtype=np.float64), rng
+        self._drift, self._sway = Drift(rng, PERIOD_S), Waves(rng, 2, PERIOD_S)
+        self._own = np.zeros((5, 4))  # how DIPs differ from their coupling while the hand is held
+        self._own[:, 3] = rng.uniform(-0.5, 0.5, 5)
+        self._posture, self._steady = Track(np.array(REST)), Track(np.zeros(1))
+        self._place, self._turned, self._knob_turned = (
+            Track(np.zeros(6)),
+            Track(np.zeros(1)),
+            Track(np.zeros(1)),
+        )
+        self._knobs: list[tuple[float, Knob]] = []
+        self._keys = reachable_keys(model, self._own)
+        self.said: tuple[Said, ...] = ()
+        self._now = 0.6
+        for _ in range(2):
+            self._round()
+        self._finish()
+
+    @property
+    def period_s(self) -> float:
+        """Time [s] after which the motion repeats."""
+        return PERIOD_S
+
+    def dial_rad(self, t_s: float) -> float:
+        """By how much knobs have been turned up to a time [s], clockwise as seen from the back of the hand."""
+        return float(self._knob_turned.at(max(t_s, 0.0) % PERIOD_S)[0])
+
+    def at(self, t_s: float) -> HandState:
+        """The hand at time `t_s` [s]; before 0 the pose of 0."""
+        t = max(t_s, 0.0) % PERIOD_S
+        wobble, shift, turn = self._drift.at(t)
+        steady = float(self._steady.at(t)[0])
+        angles = angles_of(self._model, self._posture.at(t), wobble + steady * (self._own - wobble))
+        place = self._place.at(t)
+        loose = 1.0 - steady
+        pose = self._pose(place[:3] + loose * shift, place[3:] + loose * turn)
+        knob = next((knob for start, knob in reversed(self._knobs) if t >= start), None)
+        if knob is not None:
+            pose = pose @ _about(knob, float(self._turned.at(t)[0]))
+        return HandState(pose, angles, np.radians(BEND_DEG) * self._sway.at(t))
+
+    def _pose(self, shift_m: Float, turn_rad: Float) -> Float:
+        """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
+        to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+        tilt = axis_rotation(0, np.radians(TILT_DEG))
+        rotation = rotation_vector_to_matrix(turn_rad) @ tilt @ to_cameras
+        middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
+        return rigid(rotation, self._centre + shift_m - rotation @ middle)
+
+    def _round(self) -> None:
+        acts: list[Callable[[], None]] = [
+            self._pinches,
+            self._dial,
+            self._dial_again,
+            self._taps,
+            self._point,
+        ]
+        for k in self._order(0, len(acts)):
+            acts[k]()
+            self._free()
+
+    def _finish(self) -> None:
+        """Back to how it began."""
+        if self._now > PERIOD_S - 0.7:
+            raise ValueError(f"the script lasts {self._now} s")
+        for track, value in ((self._posture, np.array(REST)), (self._place, np.zeros(6))):
+            track.to(value, self._now, self._now + 0.6)
+
+    def _go(self, posture: Float, seconds: float, rest_s: float, steady: float) -> None:
+        """To a posture in so many seconds, and stay."""
+        stop = self._now + seconds
+        self._posture.to(posture, self._now, stop)
+        if float(self._steady.last[0]) != steady:
+            self._steady.to(np.array([steady]), self._now, stop)
+        self._now = stop + rest_s
+
+    def _say(self, kind: GestureKind, name: str, start_s: float) -> None:
+        self.said = (*self.said, Said(kind, name, start_s, self._now))
+
+    def _order(self, first: int, end: int) -> list[int]:
+        """The numbers from one to before the other, shuffled."""
+        return [int(k) for k in self._rng.permutation(np.arange(first, end))]
+
+    def _some(self, low: float, high: float) -> float:
+        return float(self._rng.uniform(low, high))
+
+    def _pinches(self) -> None:
+        relaxed = np.array(REST) + np.array([[12.0, 4.0, 4.0], *[[0.0, 4.0, 6.0]] * 4])
+        for finger in self._order(1, 5):
+            start = self._now
+            posture = pinch_posture(self._model, finger, self._own)
+            self._go(posture, self._some(0.28, 0.5), self._some(0.25, 0.6), 1.0)
+            self._go(relaxed, self._some(0.28, 0.45), self._some(0.1, 0.2), 0.0)
+            self._say("pinch", FINGERS[finger], start)
+
+    def _dial(self) -> None:
+        knob, start = self._grip(), self._now
+        self._go(knob.posture_deg, self._some(0.4, 0.6), 0.35, 1.0)
+        self._turn_knob(np.radians(self._some(35.0, 55.0)) * self._rng.choice((-1.0, 1.0)), 0.2)
+        self._turn_knob(-0.6 * float(self._turned.last[0]), 0.3)
+        self._leave(knob, start)
+
+    def _dial_again(self) -> None:
+        knob, start = self._grip(), self._now
+        self._go(knob.posture_deg, self._some(0.4, 0.6), 0.35, 1.0)
+        way = float(self._rng.choice((-1.0, 1.0)))
+        self._turn_knob(way * np.radians(self._some(35.0, 50.0)), 0.1)
+        self._go(knob.posture_deg + _LOOSEN_DEG, 0.25, 0.0, 1.0)
+        self._turn_palm(-way * np.radians(self._some(20.0, 30.0)), 0.3)
+        self._go(knob.posture_deg, 0.22, 0.12, 1.0)
+        self._turn_knob(way * np.radians(self._some(55.0, 70.0)) - float(self._turned.last[0]), 0.3)
+        self._leave(knob, start)
+
+    def _grip(self) -> Knob:
+        knob = knob_grip(self._model, self._some(*KNOB_M), self._own)
+        self._knobs.append((self._now, knob))
+        return knob
+
+    def _leave(self, knob: Knob, start_s: float) -> None:
+        self._go(knob.posture_deg + 1.6 * _LOOSEN_DEG, 0.35, 0.0, 1.0)
+        self._turn_palm(0.0, 0.6)
+        self._go(np.array(REST), 0.4, 0.3, 0.0)
+        self._say("dial", "dial", start_s)
+
+    def _turn_palm(self, to_rad: float, seconds: float) -> None:
+        self._turned.to(np.array([to_rad]), self._now, self._now + seconds)
+        self._now += seconds
+
+    def _turn_knob(self, by_rad: float, rest_s: float) -> None:
+        """Turn palm and knob together, at a pace of up to two radians a second."""
+        seconds = max(abs(by_rad) / self._some(0.8, 1.4), 0.3)
+        self._knob_turned.to(self._knob_turned.last + by_rad, self._now, self._now + seconds)
+        self._turn_palm(float(self._turned.last[0]) + by_rad, seconds)
+        self._now += rest_s
+
+    def _taps(self) -> None:
+        """Some keys, one after another; the thumb comes and goes over the key that is nearest to it, touching none."""
+        door = hover_posture(self._model, self._keys[0], self._own)
+        aside = pad_before(self._model, door, self._own)
+        self._go(aside, 0.5, 0.2, 1.0)
+        self._go(door, 0.25, 0.05, 1.0)
+        for k in self._order(0, len(self._keys))[:4]:
+            key = self._keys[k]
+            hover = hover_posture(self._model, key, self._own)
+            self._go(hover, 0.25, 0.08, 1.0)
+            start = self._now
+            self._go(key.posture_deg, self._some(0.12, 0.18), self._some(0.04, 0.1), 1.0)
+            self._go(hover, self._some(0.12, 0.18), self._some(0.1, 0.2), 1.0)
+            self._say("tap", KEY_NAMES[key.finger - 1][key.segment], start)
+        self._go(door, 0.25, 0.05, 1.0)
+        self._go(aside, 0.25, 0.05, 1.0)
+        self._go(np.array(REST), 0.5, 0.1, 0.0)
+
+    def _point(self) -> None:
+        start = self._now
+        turn = np.append(np.zeros(3), np.radians([self._some(-10.0, 25.0), self._some(-15.0, 15.0), 0.0]))
+        self._place.to(turn, self._now, self._now + 0.6)
+        self._go(np.array(POSES["pointing"]), self._some(0.4, 0.6), self._some(1.0, 1.4), 0.0)
+        self._go(np.array(REST), self._some(0.4, 0.6), 0.2, 0.0)
+        self._say("point", "point", start)
+
+    def _free(self) -> None:
+        """Fingers from posture to posture, the palm from place to place."""
+        for _ in range(2):
+            seconds = self._some(0.45, 0.7)
+            place = np.concatenate(
+                [
+                    self._rng.uniform(-1.0, 1.0, 3) * REACH_M,
+                    np.radians(TURN_DEG) * self._rng.uniform(-1.0, 1.0, 3),
+                ]
+            )
+            self._place.to(place, self._now, self._now + seconds)
+            self._go(np.array(_FREE[int(self._rng.integers(len(_FREE)))]), seconds, 0.05, 0.0)
+        self._place.to(self._place.last * 0.3, self._now, self._now + 0.4)
+        self._go(np.array(REST), 0.4, 0.05, 0.0)
+
+
+def _about(knob: Knob, angle_rad: float) -> Float:
+    """(4, 4) by which the palm goes on when the knob is turned, palm frame."""
+    rotation = rotation_vector_to_matrix(knob.axis * angle_rad)
+    return rigid(rotation, knob.centre_m - rotation @ knob.centre_m)
