@@ -20,26 +20,26 @@ from common.arrays import Float
 from common.calibration import RigCalibration
 from common.errors import RecordingError
 from common.geometry import axis_rotation
-from common.hand_model import FINGER_JOINTS, TIPS, WRIST, HandModel
+from common.hand_model import TIPS, WRIST, HandModel
 from common.messages import Source
 from common.replacing import replacing
 from master.outputs.hand_render import View, render_hand
-from master.outputs.palette import RAY_RGB, SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
-from master.outputs.picture_panels import INK, PAPER, Colour, draw_panels, style, unit
+from master.outputs.palette import SOURCE_MEANING, SOURCE_RGB, TRUTH_RGB, Rgb, series_rgb
+from master.outputs.picture_panels import INK, PAPER, draw_panels, unit
+from master.outputs.picture_rig import STRIPS, draw_rig
+from master.outputs.picture_told import ToldPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.truth import PosesTruth
-from master.volume import edges
 
 WIDTH_PX, HEIGHT_PX = 1600, 900
 _DPI = 100
 _HAND_BOX = (0.19, 0.0, 0.43, 0.87)  # left, bottom, width, height of the figure
+_HAND_BOX_ABOVE = (0.19, 0.205, 0.43, 0.665)  # a strip of gestures
 _FILL = 0.90  # share of the box that the hand may take
 _SKIN = np.array([1.0, 0.79, 0.67])
 _YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
 _WRIST_YAW, _WRIST_PITCH = np.deg2rad(30.0), np.deg2rad(58.0)
-_RIG_YAW, _RIG_PITCH = np.deg2rad(52.0), np.deg2rad(-38.0)
-_STRIPS = (*((WRIST, *joints) for joints in FINGER_JOINTS), (7, 12, 17, 22))
 _LINE = 52  # letters of what was tracked that fit in one line beside the figures
 _HALF_LINE = 36  # and beside nine of them
 # Key figures of the summary, in the order of importance: key, what it says, format.
@@ -48,6 +48,9 @@ _FIGURES = (
     ("latency_p50_ms", "ms latency p50", "{:.1f}"),
     ("latency_p99_ms", "ms latency p99", "{:.1f}"),
     ("lost", "lost", "{:.0f}"),
+    ("object_mm", "mm object error", "{:.1f}"),
+    ("object_deg", "deg object error", "{:.1f}"),
+    ("gestures_right", "gestures right", "{:.0f}"),
     ("marker_mm", "mm marker error", "{:.1f}"),
     ("laser_mm", "mm laser error", "{:.2f}"),
     ("joint_mm", "mm joint error", "{:.1f}"),
@@ -67,6 +70,7 @@ def draw_summary(
     truth: PosesTruth | None = None,
     row: int | None = None,
     wrist: WristPicture | None = None,
+    told: ToldPicture | None = None,
 ) -> None:
     """Write the picture as PNG.
 
@@ -79,6 +83,7 @@ def draw_summary(
         truth: Row by row with `poses`; drawn as a ghost, and as error over time.
         row: The pose to show; None: an open hand with as many tracked joints as there are.
         wrist: The wrist device, alone or beside the rig of markers; None: there is none.
+        told: Objects and gestures of the run; a strip of the latter stands below the hand, if there are any.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -90,24 +95,29 @@ def draw_summary(
     if row is None:
         figure.text(0.3, 0.45, "no valid pose in this run", color=INK, size=20, ha="center")
     else:
-        _hand(figure, poses, row, model, truth, wrist)
+        _hand(figure, poses, row, model, truth, wrist, told)
         if wrist is None or wrist.in_rig:
-            _rig(figure, poses, row, rig, wrist)
+            draw_rig(figure, poses, row, rig, wrist)
         else:
             wrist.draw_camera(figure, poses, row, truth)
         draw_panels(figure, poses, row, model, truth)
     _save(figure, path)
 
 
-def best_row(poses: Poses) -> int | None:
-    """The row to show: all joints valid if possible, most of them tracked, fingers spread; None: none valid."""
+def best_row(poses: Poses, told: ToldPicture | None = None) -> int | None:
+    """The row to show: all joints valid if possible, an object held or known, most joints tracked, fingers spread.
+
+    None: none is valid. `told` has the objects.
+    """
     whole = poses.valid.sum(axis=1)
     if not whole.any():
         return None
     tips = poses.position_m[:, TIPS]
     reach = np.linalg.norm(tips - poses.position_m[:, WRIST, None], axis=-1).sum(axis=1)
     spread = np.linalg.norm(np.diff(tips, axis=1), axis=-1).sum(axis=1)
-    score = whole * 100.0 + poses.tracked.sum(axis=1) * 10.0 + np.nan_to_num(reach + spread)
+    score = 0.0 if told is None else 500.0 * told.worth(poses.t_ns)
+    score = score + whole * 100.0 + poses.tracked.sum(axis=1) * 10.0 + np.nan_to_num(reach + spread)
+    score = np.where(whole > 0, score, -1.0)
     return int(np.argmax(score))
 
 
@@ -142,14 +152,21 @@ def _hand(
     model: HandModel,
     truth: PosesTruth | None,
     wrist: WristPicture | None,
+    told: ToldPicture | None,
 ) -> None:
+    box = _HAND_BOX
+    if told is not None and told.gestures:
+        box = _HAND_BOX_ABOVE
+        told.draw_strip(figure, poses.t_ns, row)
     at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan)
     if wrist is None or wrist.in_rig:
         turned = axis_rotation(0, _PITCH) @ axis_rotation(1, _YAW * model.side_sign)  # thumb to the eye
     else:
         turned = axis_rotation(0, _WRIST_PITCH) @ axis_rotation(2, _WRIST_YAW * model.side_sign)
-    view = fit_view(at if wrist is None else np.concatenate([at, wrist.reach_m(poses, row)]), turned)
-    axes = figure.add_axes(_HAND_BOX)
+    shown = [at] if wrist is None else [at, wrist.reach_m(poses, row)]
+    t_ns = int(poses.t_ns[row])
+    view = fit_view(np.concatenate(shown if told is None else [*shown, told.points_m(t_ns)]), turned, box)
+    axes = figure.add_axes(box)
     axes.set_axis_off()
     axes.set_xlim(0, view.width_px)
     axes.set_ylim(view.height_px, 0)
@@ -179,14 +196,15 @@ def _hand(
     for m in range(poses.marker_count):
         ring = unit(series_rgb(m))
         axes.plot(caps[m, 0], caps[m, 1], "o", mfc="none", mec=ring, mew=2.4, ms=19, zorder=7)
-    laser = [] if wrist is None else wrist.draw_laser(axes, view, poses, row)
+    more = [] if wrist is None else wrist.draw_laser(axes, view, poses, row)
+    more += [] if told is None else told.draw(axes, view, t_ns)
     _scale_bar(axes, view)
-    _legend(figure, poses, truth, laser)
+    _legend(figure, poses, truth, more)
 
 
-def fit_view(at: Float, rotation: Float) -> View:
+def fit_view(at: Float, rotation: Float, box: tuple[float, float, float, float] = _HAND_BOX) -> View:
     """The view in which the points (N, 3) [m] fill the hand's box."""
-    width, height = round(_HAND_BOX[2] * WIDTH_PX), round(_HAND_BOX[3] * HEIGHT_PX)
+    width, height = round(box[2] * WIDTH_PX), round(box[3] * HEIGHT_PX)
     turned = at @ rotation.T
     low, high = np.nanmin(turned, axis=0), np.nanmax(turned, axis=0)
     margin_m = 0.027  # of flesh around the joints
@@ -199,7 +217,7 @@ def _bones(
     axes: Axes, pixels: Float, colours: list[Rgb], width: float, dashes: tuple[float, float] | None = None
 ) -> None:
     """Every bone in the colour of its far joint."""
-    for strip in _STRIPS:
+    for strip in STRIPS:
         for a, b in pairwise(strip):
             line = Line2D(pixels[[a, b], 0], pixels[[a, b], 1], lw=width, color=unit(colours[b]), zorder=5)
             line.set_solid_capstyle("round")
@@ -215,7 +233,7 @@ def _scale_bar(axes: Axes, view: View) -> None:
     axes.text(x + length / 2, y - 9, "5 cm", color=INK, size=11, ha="center", va="bottom")
 
 
-def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, laser: list[Line2D]) -> None:
+def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, more: list[Line2D]) -> None:
     used = [source for source in Source if (poses.source[poses.valid] == source).any()]
     entries = [
         Line2D([], [], color=unit(SOURCE_RGB[s]), marker="o", mfc=PAPER, mew=2, lw=3, label=SOURCE_MEANING[s])
@@ -226,7 +244,7 @@ def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, laser: list[
         entries.append(
             Line2D([], [], color=INK, marker="o", ms=13, mfc="none", mew=2, ls="", label="marker, filtered")
         )
-    entries += laser
+    entries += more
     if truth is not None:
         entries.append(Line2D([], [], color=unit(TRUTH_RGB), ls="--", lw=1.3, label="truth"))
     legend = figure.legend(
@@ -239,50 +257,6 @@ def _legend(figure: Figure, poses: Poses, truth: PosesTruth | None, laser: list[
     )
     for text in legend.get_texts():
         text.set_color(INK)
-
-
-def _rig(
-    figure: Figure, poses: Poses, row: int, rig: RigCalibration, wrist: WristPicture | None = None
-) -> None:
-    """Small view of the whole rig from the side: cameras, rays to the caps, hand, and the volume it states."""
-    axes = figure.add_axes((0.012, 0.02, 0.215, 0.33))
-    style(axes, "Rig, seen from the side")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.set_aspect("equal", adjustable="datalim")
-    rotation = axis_rotation(0, _RIG_PITCH) @ axis_rotation(1, _RIG_YAW)
-    at = np.where(poses.valid[row][:, None], poses.position_m[row], np.nan) @ rotation.T
-    for strip in _STRIPS:
-        axes.plot(at[list(strip), 0], at[list(strip), 1], color=unit((237, 184, 153)), lw=1.8)
-    caps = poses.markers_m[row] @ rotation.T
-    middle = np.mean([rig.camera_pose(name)[:3, 3] for name in rig.cameras], axis=0) @ rotation.T
-    if rig.volume is not None:
-        for edge in edges(rig.volume) @ rotation.T:
-            axes.plot(edge[:, 0], edge[:, 1], color=INK, lw=0.7, alpha=0.35)
-    for name in rig.cameras:
-        pose = rig.camera_pose(name)
-        centre = pose[:3, 3] @ rotation.T
-        for cap in caps:
-            axes.plot([centre[0], cap[0]], [centre[1], cap[1]], color=unit(RAY_RGB), lw=0.6, alpha=0.55)
-        _frustum(axes, pose, rotation)
-        away = (centre - middle)[:2] * [1.0, -1.0]
-        away = 17.0 * away / max(float(np.linalg.norm(away)), 1e-6)
-        axes.annotate(name, (float(centre[0]), float(centre[1])), (float(away[0]), float(away[1])),
-                      textcoords="offset points", color=INK, size=10, ha="center", va="center")  # fmt: skip
-    if wrist is not None:
-        _frustum(axes, wrist.pose(poses, row), rotation, unit(SOURCE_RGB[Source.WRIST]))
-    axes.invert_yaxis()
-    axes.margins(0.2)  # room for the names
-
-
-def _frustum(axes: Axes, pose: Float, rotation: Float, colour: Colour = INK) -> None:
-    d, w, h = 0.05, 0.03, 0.0225
-    corners = np.array([[-w, -h, d], [w, -h, d], [w, h, d], [-w, h, d], [-w, -h, d]])
-    image = (corners @ pose[:3, :3].T + pose[:3, 3]) @ rotation.T
-    centre = pose[:3, 3] @ rotation.T
-    axes.plot(image[:, 0], image[:, 1], color=colour, lw=1.2)
-    for corner in image[:4]:
-        axes.plot([centre[0], corner[0]], [centre[1], corner[1]], color=colour, lw=1.2)
 
 
 def _source_rgb(code: int) -> Rgb:

@@ -1,0 +1,176 @@
+"""What objects and gestures add to the picture of a run: the object in the hand, and a strip of what the hand said."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from common.arrays import Float, Int
+from common.geometry import quaternion_to_matrix, rigid, transform
+from common.messages import Gesture
+from common.object_profile import BoxShape, CylinderShape, ObjectProfile, Shape, tag_corners
+from master.outputs.hand_render import View
+from master.outputs.object_look import OBJECT_RGB, ObjectLook
+from master.outputs.palette import GESTURE_RGB
+from master.outputs.picture_panels import INK, PAPER, style, unit
+from master.outputs.told_files import Contacts, ObjectPoses
+
+STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the figure
+_NEAR_NS = 60_000_000  # an object is shown where it was this close to the instant
+_LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
+_TAP_S = 0.15
+_LETTER_SHARE = 0.0165  # of the strip's length that a letter takes
+_ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldPicture:
+    """What is drawn beside the hand.
+
+    Attributes:
+        profiles: The objects' files.
+        objects: Where they were.
+        contacts: How near the hand was to each.
+        gestures: What the hand said, in the order of time.
+    """
+
+    profiles: Sequence[ObjectProfile] = ()
+    objects: Sequence[ObjectPoses] = ()
+    contacts: Sequence[Contacts] = ()
+    gestures: Sequence[Gesture] = ()
+
+    def worth(self, t_ns: Int) -> Float:
+        """How much the instants (T,) show of the objects: 2 held, 1 known, 0 nothing."""
+        known = np.zeros(len(t_ns))
+        for poses in self.objects:
+            if len(poses):
+                rows = _nearest(poses.t_ns, t_ns)
+                near = np.abs(poses.t_ns[rows] - t_ns) < _NEAR_NS
+                known = np.maximum(known, near & poses.tracked[rows])
+        for near in self.contacts:
+            known += np.isin(t_ns, near.t_ns[near.held])
+        return known
+
+    def points_m(self, t_ns: int) -> Float:
+        """Outline (N, 3) [m] of the objects at an instant, which must be in the picture."""
+        found = [
+            transform(T, np.concatenate([_outline(part) for part in profile.shape]))
+            for profile, T, _ in self._placed(t_ns)
+            if profile.shape
+        ]
+        return np.concatenate(found) if found else np.empty((0, 3))
+
+    def draw(self, axes: Axes, view: View, t_ns: int) -> list[Line2D]:
+        """The objects at an instant; return the entries of the legend."""
+        entries: list[Line2D] = []
+        for profile, T, look in self._placed(t_ns):
+            colour = unit(OBJECT_RGB[look])
+            for part in profile.shape:
+                pixels = view.project(transform(T, _outline(part)))[:, :2]
+                hull = cv2.convexHull(pixels.astype(np.float32))[:, 0]
+                axes.fill(hull[:, 0], hull[:, 1], fc=(*colour, 0.30), ec=(*colour, 0.95), lw=1.6, zorder=4.5)
+            for tag in () if profile.tags is None else profile.tags.tags:
+                pose = T @ np.array(tag.T_object_tag)
+                if (view.rotation @ pose[:3, 2])[2] < -0.1:  # it looks at the eye
+                    corners = view.project(transform(pose, tag_corners(tag.edge_m)))
+                    axes.fill(corners[:, 0], corners[:, 1], fc=PAPER, ec=INK, lw=1.0, zorder=4.6)
+            for bead in profile.markers.values():
+                at = view.project(transform(T, np.array([bead.position_m])))[0]
+                size = 2.0 * bead.radius_m * view.scale_px_m * 0.72  # points of 100 dots an inch
+                axes.plot(at[0], at[1], "o", ms=size, mfc=(*colour, 0.6), mec=INK, mew=1.2, zorder=4.7)
+            entries.append(
+                Line2D([], [], color=colour, marker="s", ms=11, ls="", label=f"{profile.name}, {look.value}")
+            )
+        for near in self.contacts:
+            rows = np.flatnonzero(near.t_ns == t_ns)
+            if len(rows) and near.touching[rows[0]].any():
+                at = view.project(near.point_m[rows[0]][near.touching[rows[0]]])
+                axes.plot(at[:, 0], at[:, 1], "x", color=(0.95, 0.25, 0.2), ms=10, mew=3.0, zorder=9)
+                touch = Line2D(
+                    [], [], color=(0.95, 0.25, 0.2), marker="x", ms=9, mew=3, ls="", label="touched"
+                )
+                entries.append(touch)
+        return entries
+
+    def draw_strip(self, figure: Figure, t_ns: Int, row: int) -> None:
+        """What the hand said over the run, a lane for each kind that it said anything of."""
+        axes = figure.add_axes(STRIP_BOX)
+        style(axes, "What the hand said")
+        first, span = int(t_ns[0]), max(float(t_ns[-1] - t_ns[0]) * 1e-9, 1e-3)
+        lanes = [kind for kind in _LANES if any(one.kind == kind for one in self.gestures)]
+        for lane, kind in enumerate(reversed(lanes)):
+            for name, start_ns, stop_ns in spans(self.gestures, kind, int(t_ns[-1])):
+                start, length = (start_ns - first) * 1e-9, (stop_ns - start_ns) * 1e-9
+                axes.broken_barh(
+                    [(start, max(length, _TAP_S))], (lane - 0.38, 0.76), color=unit(GESTURE_RGB[kind])
+                )
+                if kind == "tap":
+                    at, side = start + 0.5 * max(length, _TAP_S), "center"
+                elif len(name) * _LETTER_SHARE * span < length:
+                    at, side = start + 0.004 * span, "left"
+                else:
+                    continue
+                axes.text(at, lane, name, size=8, color=PAPER, va="center", ha=side, clip_on=True)
+        axes.set_yticks(range(len(lanes)), [_LANES[kind] for kind in reversed(lanes)])
+        axes.set_ylim(-0.6, len(lanes) - 0.4)
+        axes.set_xlim(0.0, span)
+        axes.axvline((int(t_ns[row]) - first) * 1e-9, color=INK, lw=1.0, alpha=0.7)
+
+    def _placed(self, t_ns: int) -> list[tuple[ObjectProfile, Float, ObjectLook]]:
+        """Objects whose place is known at an instant: file, pose (4, 4), how well."""
+        profiles: Mapping[str, ObjectProfile] = {one.name: one for one in self.profiles}
+        found: list[tuple[ObjectProfile, Float, ObjectLook]] = []
+        for poses in self.objects:
+            row = int(_nearest(poses.t_ns, np.array([t_ns]))[0]) if len(poses) else -1
+            if (
+                row < 0
+                or abs(int(poses.t_ns[row]) - t_ns) > _NEAR_NS
+                or np.isnan(poses.position_m[row]).any()
+            ):
+                continue
+            tracked = ObjectLook.HIDDEN if poses.occluded[row] else ObjectLook.WHOLE
+            T = rigid(quaternion_to_matrix(poses.orientation_wxyz[row]), poses.position_m[row])
+            found.append((profiles[poses.object], T, tracked if poses.tracked[row] else ObjectLook.HELD))
+        return found
+
+
+def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str, int, int]]:
+    """Name, begin and end [ns] of every gesture of a kind, in the order of their beginnings; of a tap its key."""
+    found: dict[tuple[str, int], int] = {}
+    ended: set[tuple[str, int]] = set()
+    for one in gestures:
+        if one.kind == kind:
+            found[one.name, one.began_t_ns] = one.t_ns
+            if one.phase == "end":
+                ended.add((one.name, one.began_t_ns))
+    return [
+        (name, began, last if (name, began) in ended else end_ns)
+        for (name, began), last in sorted(found.items(), key=lambda item: item[0][1])
+    ]
+
+
+def _outline(part: Shape) -> Float:
+    """Points (N, 3) [m] whose hull is the part, in the object's frame."""
+    if isinstance(part, BoxShape):
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        points = 0.5 * signs * np.array(part.size_m)
+    elif isinstance(part, CylinderShape):
+        ring = part.radius_m * np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=1)
+        ends = [np.column_stack([ring, np.full(len(ring), z * part.length_m)]) for z in (-0.5, 0.5)]
+        points = np.concatenate(ends)
+    else:
+        circle = part.radius_m * np.stack([np.cos(_ROUND), np.sin(_ROUND), 0.0 * _ROUND], axis=1)
+        points = np.concatenate([np.roll(circle, shift, axis=1) for shift in range(3)])
+    return points if part.T_object_part is None else transform(np.array(part.T_object_part), points)
+
+
+def _nearest(rising_ns: Int, t_ns: Int) -> Int:
+    """Rows (T,) of rising times that are nearest to others (T,)."""
+    after = np.clip(np.searchsorted(rising_ns, t_ns), 0, len(rising_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    nearer = np.abs(rising_ns[before] - t_ns) <= np.abs(rising_ns[after] - t_ns)
+    return np.where(nearer, before, after)
