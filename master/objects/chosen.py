@@ -1,5 +1,6 @@
 """What is fitted: the sightings of a window as one list, with one place for each feature; and what starts look at."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,8 @@ from master.objects.features import Features
 from master.objects.fit import Fitted, Observations
 from master.objects.start import Sighted, reach
 from master.objects.window import Sighting, Window
+
+Doubt = Callable[[int, Float, Float], Float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -24,34 +27,37 @@ class Chosen:
 
     @classmethod
     def of(
-        cls, window: Window, features: Features, cameras: tuple[CameraModel, ...], T: Float | None
+        cls,
+        window: Window,
+        features: Features,
+        cameras: tuple[CameraModel, ...],
+        T: Float | None,
+        doubt: Doubt,
     ) -> "Chosen | None":
-        """All that is seen; of two places of a bead the nearer to where a pose (4, 4) has it; None: nothing."""
-        parts = [
-            (c, kind, k, sighting)
-            for c, both in enumerate(window.views)
-            for kind, line in enumerate(both)
-            for k, sighting in enumerate(line)
-        ]
+        """All that is seen; None: nothing.
+
+        Args:
+            window: The sightings.
+            features: Of the object.
+            cameras: Of the rig.
+            T: A pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken. None: none.
+            doubt: Camera, pose and areas (B,) [px^2] of its beads -> by how much their centroids may be off [px].
+        """
         rows: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
-        for c, kind, _, sighting in parts:
-            uv = _nearer(sighting, features, cameras[c], T)
-            there = np.isfinite(uv).all(axis=1) & np.isfinite(sighting.sigma_px)
-            n = int(there.sum())
-            tau = (sighting.t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
-            now = np.full(n, sighting is window.near(c, kind))
-            rows.append(
-                (
-                    np.full(n, c),
-                    sighting.point[there],
-                    tau,
-                    uv[there],
-                    sighting.sigma_px[there],
-                    np.full(n, sighting.t_sigma_s),
-                    now,
-                )
-            )
-        if not rows or not sum(len(row[0]) for row in rows):
+        for c, both in enumerate(window.views):
+            for kind, line in enumerate(both):
+                for sighting in line:
+                    uv, sigma = _nearer(sighting, features, cameras[c], T), sighting.sigma_px
+                    if T is not None and kind == 0:
+                        sigma = np.hypot(sigma, doubt(c, T, sighting.area_px2))
+                    there = np.isfinite(uv).all(axis=1) & np.isfinite(sigma)
+                    n = int(there.sum())
+                    tau = (sighting.t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
+                    late, now = np.full(n, sighting.t_sigma_s), np.full(n, sighting is window.near(c, kind))
+                    rows.append(
+                        (np.full(n, c), sighting.point[there], tau, uv[there], sigma[there], late, now)
+                    )
+        if not sum(len(row[0]) for row in rows):
             return None
         camera, point, tau, uv, sigma, t_sigma, now = (
             np.concatenate(column) for column in zip(*rows, strict=True)

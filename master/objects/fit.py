@@ -128,6 +128,7 @@ class Fitted:
         weight: (n,) of each observation, 0..1.
         misfit: (n,) chi square of each observation's feature in its camera, per number measured.
         residual_m: (n,) by how much each misses the object [m].
+        alone: What is seen tells the pose, without what was known before.
     """
 
     motion: Motion
@@ -136,6 +137,7 @@ class Fitted:
     weight: Float
     misfit: Float
     residual_m: Float
+    alone: bool = True
 
     @property
     def used(self) -> Bool:
@@ -190,14 +192,14 @@ class PoseFit:
     """Fits poses of one object in one rig. Holds no state between calls."""
 
     def __init__(
-        self, cameras: tuple[CameraModel, ...], points: Float, radius_m: Float, floor_px: float
+        self, cameras: tuple[CameraModel, ...], points: Float, radius_m: Float, floor_px: Float
     ) -> None:
         """Set up.
 
         Args:
             cameras: Of the rig.
             points: (P, 3) [m] of the object, `radius_m` (P,) of beads, 0: a corner.
-            floor_px: Standard deviation of what lens and calibration leave, per feature and camera.
+            floor_px: (P,) standard deviation of what light, lens and calibration leave, per point and camera.
         """
         self._see, self._points, self._radius = Cameras(cameras), points, radius_m
         self._floor_2 = floor_px * floor_px
@@ -215,7 +217,7 @@ class PoseFit:
             past: What else is known; None: nothing.
             feature: (n,) of what each observation is a part: what is weighed down together with it in its camera.
         """
-        sums = _Sums(seen, feature, self._floor_2, len(self._points))
+        sums = _Sums(seen, feature, self._floor_2[seen.point], len(self._points))
         basis = seen.tau_s[:, None] ** np.arange(ORDERS) / _FACTORIAL
         motion, problem = start, None
         for _ in range(_ROUNDS):
@@ -237,9 +239,8 @@ class PoseFit:
         self, seen: Observations, basis: Float, motion: Motion, sums: "_Sums", past: Past | None
     ) -> "_Problem | None":
         way = np.einsum("nk,kij->nij", basis, motion.rates)
-        arm = (
-            rotation_vector_to_matrix(way[:, 1]) @ (self._points[seen.point] @ motion.T[:3, :3].T)[..., None]
-        )[..., 0]
+        turn = rotation_vector_to_matrix(way[:, 1])
+        arm = (turn @ (self._points[seen.point] @ motion.T[:3, :3].T)[..., None])[..., 0]
         uv, by_point, depth = self._see.see(
             seen.camera, arm + motion.T[:3, 3] + way[:, 0], self._radius[seen.point]
         )
@@ -247,7 +248,12 @@ class PoseFit:
         if not np.isfinite(miss).all():
             return None
         by_pose = np.concatenate([by_point, -(by_point @ skew(arm))], axis=2)  # (n, 2, 6)
-        rows = (basis[:, None, :, None] * by_pose[:, :, None, :]).reshape(len(uv), 2, _N)
+        rows = basis[:, None, :, None] * by_pose[:, :, None, :]
+        # A small turn of R0 is turned with it; one of theta turns as the left Jacobian of the rotation vector has it.
+        about = skew(way[:, 1])
+        rows[:, :, 1:, 3:] = rows[:, :, 1:, 3:] @ (np.eye(3) + 0.5 * about + about @ about / 6.0)[:, None]
+        rows[:, :, 0, 3:] = by_pose[..., 3:] @ turn
+        rows = rows.reshape(len(uv), 2, _N)
         speed = (by_pose @ motion.rates[1].reshape(6, 1))[..., 0]
         lag_2 = np.vecdot(speed, speed) * seen.t_sigma_s**2 * 0.5
         misfit, weight, cost = sums.weigh(miss, lag_2)
@@ -305,7 +311,7 @@ class _Problem:
 class _Sums:
     """Adds observations up with errors that stay: which belong together, and their variances."""
 
-    def __init__(self, seen: Observations, feature: Int, floor_2: float, points: int) -> None:
+    def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
         variance = seen.sigma_px**2
         self._fresh = np.minimum(_FRESH * variance, _FRESH_PX**2)
         stays = variance - self._fresh + floor_2

@@ -15,6 +15,7 @@ from master.objects.features import Features
 from master.objects.window import Sighting, Window
 
 _PART = 0.72  # of what a bead shows when it is whole
+_NEARLY = 0.93  # of that, a bead may show and be whole
 _LEARN, _FORGET = 0.3, 0.002  # towards more, towards less, from frame to frame
 
 
@@ -55,16 +56,33 @@ class Hidden:
             expected[c] = should
             occluded |= bool((should & ~used[c]).any())
             if markers is not None and beads:
-                occluded |= self._partly(c, camera, T_rig_object, markers, should[:beads] & used[c, :beads])
+                occluded |= self._partly(c, T_rig_object, markers, should[:beads] & used[c, :beads])
         return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
 
-    def _partly(self, c: int, camera: CameraModel, T: Float, markers: Sighting, seen: Bool) -> bool:
-        """Whether a bead that is seen shows too little; learns what they show."""
-        rows = np.arange(self._features.beads)
+    def doubt_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
+        """By how much the centroids of beads (B,) in camera `c` may be off, as something hides a part of them [px].
+
+        Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.
+        """
+        share, radius_px = self._share(c, T_rig_object, area_px2)
+        missing = 1.0 - share / (_NEARLY * self._whole[c])
+        return np.nan_to_num(np.clip(missing, 0.0, 1.0) * radius_px)
+
+    def _share(self, c: int, T: Float, area_px2: Float) -> tuple[Float, Float]:
+        """Which share of their discs (B,) beads of these areas [px^2] show, and the radii of the discs (B,) [px]."""
+        rows = slice(0, self._features.beads)
+        camera = self._cameras[c]
         points = self._features.points[rows] @ T[:3, :3].T + T[:3, 3]
-        away = np.linalg.norm(points - camera.centre, axis=1)
-        disc = np.pi * (self._features.radius_m[rows] * camera.matrix[0, 0] / away) ** 2
-        share = np.where(seen, markers.area_px2 / disc, np.nan)
+        radius = (
+            self._features.radius_m[rows]
+            * camera.matrix[0, 0]
+            / np.linalg.norm(points - camera.centre, axis=1)
+        )
+        return area_px2 / (np.pi * radius * radius), radius
+
+    def _partly(self, c: int, T: Float, markers: Sighting, seen: Bool) -> bool:
+        """Whether a bead that is seen shows too little; learns what they show."""
+        share = np.where(seen, self._share(c, T, markers.area_px2)[0], np.nan)
         whole = self._whole[c]
         partly = bool((share < _PART * whole).any())
         known = np.isfinite(share)

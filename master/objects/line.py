@@ -37,7 +37,8 @@ from master.stereo.triangulate import Triangulator
 
 HELD_S = 0.5
 _DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
-_LEAST_FLOOR_PX = 0.03
+# What light does to a ball's centroid beyond what a slave says, and to a corner.
+_BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
@@ -89,7 +90,8 @@ class ObjectLine:
         self._features = Features.of(profile, rig.markers)
         late = {name: round(1e3 * us) for name, us in rig.stamp_offset_us.items()}
         self._windows = Windows(models, self._features, predict=rig.pairing == "predict", late_ns=late)
-        floor_px = max(CalibrationResidual.of(rig).rays_px, _LEAST_FLOOR_PX)
+        least_px = np.where(self._features.radius_m > 0.0, _BEAD_FLOOR_PX, _CORNER_FLOOR_PX)
+        floor_px = np.maximum(CalibrationResidual.of(rig).rays_px, least_px)
         self._fit = PoseFit(self._cameras, self._features.points, self._features.radius_m, floor_px)
         self._triangulator = Triangulator.of(self._cameras) if len(models) > 1 else None
         self._hidden = Hidden(self._features, self._cameras)
@@ -98,6 +100,7 @@ class ObjectLine:
         self._known: deque[_Known] = deque(maxlen=16)
         self._doubt = 0.0
         self._sure_ns = -(2**63)
+        self._lost_behind = False
         self._last_ns = -(2**63)
 
     def push(self, message: MarkerDetections | TagDetections) -> list[SolvedObject]:
@@ -122,7 +125,7 @@ class ObjectLine:
 
     def _solve(self, window: Window) -> ObjectPose:
         predicted = self._predicted(window.t_ns)
-        seen = Chosen.of(window, self._features, self._cameras, None if predicted is None else predicted.T)
+        seen = self._chosen(window, None if predicted is None else predicted.T)
         now = (
             seen is not None
             and float(np.abs(seen.seen.tau_s).min()) <= _FRESH_PERIODS * window.period_ns * 1e-9
@@ -134,13 +137,14 @@ class ObjectLine:
             return self._held(window, predicted)
         oldest = window.t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
         self._known.append(_Known(window.t_ns, fitted, oldest))
-        if not _poor(fitted, _POOR_M, _POOR_RAD):
+        if fitted.alone and not _poor(fitted, _POOR_M, _POOR_RAD):
             self._sure_ns = window.t_ns
         elif window.t_ns - self._sure_ns > HELD_S * 1e9:
             self._known.clear()
             return self._none(window.t_ns)
         tracked = not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
+        self._lost_behind = shown.occluded
         T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
         features = self._features.feature[seen.seen.point[fitted.used]]
         near = fitted.used & (np.abs(seen.seen.tau_s) <= _FRESH_PERIODS * window.period_ns * 1e-9)
@@ -171,7 +175,7 @@ class ObjectLine:
                 return self._of_two(window, seen, led, past)
         best: tuple[Fitted, Chosen] | None = None
         for T in self._starts(window):
-            again = Chosen.of(window, self._features, self._cameras, T)
+            again = self._chosen(window, T)
             if again is None or (fitted := self._fitted(again, Motion.still(T), None, window.t_ns)) is None:
                 continue
             good = self._holds(again, fitted) and self._begins(again, fitted)
@@ -184,15 +188,19 @@ class ObjectLine:
         self._doubt = 0.0
         return self._of_two(window, best[1], best[0], None)
 
+    def _chosen(self, window: Window, T: Float | None) -> Chosen | None:
+        """What is seen of the object, near a pose (4, 4) if there is one."""
+        return Chosen.of(window, self._features, self._cameras, T, self._hidden.doubt_px)
+
     def _fitted(self, seen: Chosen, start: Motion, past: Past | None, t_ns: int) -> Fitted | None:
         """The fit, with the past where the present does not tell enough; how it may have moved since is then in it."""
         alone = self._fit(seen.seen, start, feature=seen.feature)
         if alone is not None and not _poor(alone, _POOR_M, _POOR_RAD):
             return alone
-        if past is None or alone is None:
-            return alone if past is None else self._fit(seen.seen, start, past, feature=seen.feature)
-        both = self._fit(seen.seen, start, past, feature=seen.feature)
-        return None if both is None else _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
+        both = None if past is None else self._fit(seen.seen, start, past, feature=seen.feature)
+        if alone is None:
+            return None if both is None else replace(both, alone=False)
+        return alone if both is None else _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
 
     def _holds(self, seen: Chosen, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
@@ -294,6 +302,7 @@ class ObjectLine:
         shown = self._hidden.look(
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
         )
+        self._lost_behind = shown.occluded
         cov = known.fitted.cov[:6, :6].copy()
         grown = np.repeat([_PUSHED_M_S2, _PUSHED_RAD_S2], 3) * 0.5 * dt * dt
         speed = known.fitted.motion.rates[1].ravel() * (dt - _DIES_S * (1.0 - np.exp(-dt / _DIES_S)))
@@ -314,6 +323,7 @@ class ObjectLine:
         )
 
     def _none(self, t_ns: int) -> ObjectPose:
+        """No pose; what hid it when it was lost is taken to hide it still."""
         self._steady.forget()
         return ObjectPose(
             object=self.name,
@@ -326,7 +336,7 @@ class ObjectLine:
             tracked=False,
             seen=0,
             expected=0,
-            occluded=False,
+            occluded=self._lost_behind,
         )
 
 
@@ -348,7 +358,7 @@ def _unheeded(fitted: Fitted, alone: Fitted, since_s: float) -> Fitted:
     blind = axes[:, size > _POOR_M**2] / scale[:, None]
     cov = fitted.cov.copy()
     cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (blind @ blind.T)
-    return replace(fitted, cov=cov)
+    return replace(fitted, cov=cov, alone=False)
 
 
 def _turned(T: Float, other: Float) -> float:

@@ -13,6 +13,7 @@ from master.ik.part_filter import PartFilter
 
 _ARM_M = 0.1
 _ANEW_S = 0.5
+_FRESH = 0.15  # of the variance of a pose, new in each frame: most of its error stays
 
 
 class Steady:
@@ -37,7 +38,7 @@ class Steady:
             self._R, self._values = T[:3, :3], np.zeros(6)
         turn = _ARM_M * matrix_to_rotation_vector(T[:3, :3] @ self._R.T)
         signals = np.concatenate([T[:3, :3] @ self._middle + T[:3, 3], self._values[3:] + turn])
-        noise = np.concatenate([np.diagonal(cov)[:3], _ARM_M**2 * np.diagonal(cov)[3:]])
+        noise = _FRESH * np.concatenate([np.diagonal(cov)[:3], _ARM_M**2 * np.diagonal(cov)[3:]])
         values = self._filter.push(dt, signals, noise)
         self._R = rotation_vector_to_matrix((values - self._values)[3:] / _ARM_M) @ self._R
         self._values, self._t_ns = values, t_ns
