@@ -6,8 +6,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from deploy.demo import TOGETHER, DemoError, DemoSettings, run_demo, stop_on_signals
+from deploy.demo import DemoSettings, run_demo, stop_on_signals
 from deploy.replay import ReplayError, ReplaySettings, run_replay
+from deploy.sensors import DemoError, best_rigs
+from deploy.summary import summary_lines
 
 _EXAMPLES = {
     "demo": """examples:
@@ -16,6 +18,9 @@ _EXAMPLES = {
   phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
   phalanx demo --scene grasp                    both at once, while a hand closes round a bar: cameras lose its fingers
   phalanx demo --scene grasp --rig desk-back3   the same without the wrist device, to compare
+  phalanx demo --scene object                   a wand of painted beads travels before the cameras
+  phalanx demo --scene grasp --rig desk-cube    the bar has a cube of tags: where it is, and which fingers touch it
+  phalanx demo --scene gestures --seconds 80    pinches, dials, taps and pointing, against what the hand really said
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
@@ -24,28 +29,6 @@ _EXAMPLES = {
   phalanx replay GRASP --only markers --out out/grasp-markers    without what the wrist device tells, to compare
   phalanx replay CURL --hand HAND.json --level fk --out out/fk   its fingers from the laser alone, to compare
 """,
-}
-_LABELS = {
-    "poses_per_s": ("poses", "/s"),
-    "latency_p50_ms": ("latency, median", "ms"),
-    "latency_p99_ms": ("latency, 99 %", "ms"),
-    "lost": ("frames lost on the way", ""),
-    "skipped": ("frames a slave had no time for", ""),
-    "frames_without_pose": ("frames without a pose", ""),
-    "marker_mm": ("marker error, median", "mm"),
-    "laser_mm": ("laser point error, median", "mm"),
-    "laser_right": ("laser points on the right finger", "of 1"),
-    "tip_within_6px": ("fingertips found within 6 px", "of 1"),
-    "tip_false": ("fingertips that are none", "of 1"),
-    "pip_rms_deg": ("PIP error up to 85 deg, RMS", "deg"),
-    "joint_mm_visible": ("joint error, visible fingers", "mm"),
-    "joint_mm": ("joint error, all fingers", "mm"),
-    "pip_deg_visible": ("PIP error, visible fingers", "deg"),
-    "pip_deg": ("PIP error, all fingers", "deg"),
-    "joint_mm_hidden": ("joint error, hidden fingers", "mm"),
-    "pip_deg_hidden": ("PIP error, hidden fingers", "deg"),
-    "hand_over_step_mm": ("step when a sensor takes over", "mm"),
-    "forearm_tilt_deg": ("forearm against the vertical, RMS", "deg"),
 }
 
 
@@ -63,8 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    together = options.scene.partition("@")[0] in TOGETHER
-    rigs = options.rigs or (("desk-back3", "wrist-back3") if together else ("desk",))
+    rigs = options.rigs or best_rigs(options.scene)
     settings = DemoSettings(
         options.seconds,
         options.headless,
@@ -97,9 +79,8 @@ def _finish(summary: dict[str, object], file: Path | None) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps(summary, indent=1) + "\n")
     print()
-    for key, (label, unit) in _LABELS.items():
-        if key in summary:
-            print(f"  {label:30s} {summary[key]:>9} {unit}")
+    for line in summary_lines(summary):
+        print(f"  {line}")
 
 
 def _say(line: str) -> None:
@@ -121,8 +102,8 @@ def _parser() -> argparse.ArgumentParser:
     demo = commands.add_parser(
         "demo",
         help="everything on this machine, without hardware",
-        description="Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU, one master "
-        "for all of them and the viewer.",
+        description="Starts a slave with a synthetic camera for each camera of the rigs, one for each IMU and tracker, "
+        "one master for all of them and the viewer.",
         epilog=_EXAMPLES["demo"],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -148,7 +129,8 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         metavar="NAME",
         help="once for each that runs; default: desk, for scenes of both kinds desk-back3 (three markers on the back "
-        "tell how the palm lies) and wrist-back3 of the same hand; --rig desk --rig wrist has one",
+        "tell how the palm lies) and wrist-back3 of the same hand, for object desk-wand; desk-cube and desk-tracker "
+        "track objects, too; --rig desk --rig wrist has one hand",
     )
     rig.add_argument(
         "--wrist", dest="rigs", action="store_const", const=["wrist"], help="the wrist device: --rig wrist"
@@ -157,7 +139,8 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--scene",
         default="standard",
-        help="standard, lights (it changes), poses, hand-routine (of calibrate hand), or leap:FILE.npz; of a wrist "
+        help="standard, lights (it changes), poses, hand-routine (of calibrate hand), object (that is tracked, on its "
+        "way), gestures, or leap:FILE.npz; of a wrist "
         "device standard, curl, wearer, poses or spread; of both kinds of rig at once grasp, both-poses, both-curl, "
         "both-travel or both-moves; the last two kinds each with @dark, @indoor, @bright or @sun",
     )

@@ -1,5 +1,5 @@
-"""The demo: a slave for each camera and each IMU of its rigs, all synthetic, the master and the viewer, as processes
-of this machine.
+"""The demo: a slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer, as
+processes of this machine.
 
 Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The slaves' clocks
 have different zeros and rates, and each camera runs 5 ms after the one before.
@@ -21,26 +21,23 @@ from pathlib import Path
 from typing import cast
 
 from deploy.process import Process
+from deploy.sensors import DemoError, Sensor, SensorKind, rig_options, sensors_of
 
 _READY_S = 30.0
+_STALE = ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd", "object_*.npz", "contact_*.npz",
+          "gestures.jsonl")  # fmt: skip
 # Until the scene begins: two seconds of a core's time for each process to be ready, shared with whatever else runs, and
 # one in which cameras already look at the hand, which does not move yet, so that the light is known and a hand found.
 # Poses before the scene are not judged. An IMU begins with it: its filter settles while the hand still rests.
 _READY_CORE_S, _KNOWN_S, _LEAST_S, _MOST_S = 2.0, 1.0, 4.0, 20.0
 # What draws pictures gives way to what is measured: a real camera costs no processor its time.
 _GIVES_WAY = 4
+_DRIVERS: dict[SensorKind, Callable[[str], list[str]]] = {
+    "camera": lambda name: ["run", "--camera", "synthetic", "--name", name],
+    "imu": lambda name: ["imu", "--imu", "synthetic", "--name", name],
+    "tracker": lambda name: ["tracker", name, "--device", "synthetic"],
+}
 _LATE_MS, _APART_PPM, _ZERO_MS = 5.0, 50.0, 1234.5
-TOGETHER = (
-    "grasp",
-    "both-poses",
-    "both-curl",
-    "both-travel",
-    "both-moves",
-)  # seen by both kinds of rig alike
-
-
-class DemoError(Exception):
-    """The demo cannot run; the text says why and what to do."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +66,10 @@ class DemoSettings:
     web: bool = False
     master: str = "master"
 
+    def sensors(self) -> list[Sensor]:
+        """What is simulated. Raises DemoError: see `sensors_of`."""
+        return sensors_of(self.calibration, self.rigs, self.scene)
+
 
 @dataclass(slots=True)
 class _State:
@@ -92,7 +93,7 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
     """
-    epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(_sensors(settings)) + 1, os.getloadavg()[0]))
+    epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(settings.sensors()) + 1, os.getloadavg()[0]))
     restarts = play(settings, epoch_ns, stop, say)
     summary = _report(settings, epoch_ns, say)
     if restarts:
@@ -126,12 +127,13 @@ def play(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DemoError(f"--out {out}: cannot make the folder: {error.strerror}") from error
-    for stale in ("summary.json", "live.json", "poses.npz", "hand.png", "run.rrd"):
-        (out / stale).unlink(missing_ok=True)
+    for stale in _STALE:
+        for file in out.glob(stale):
+            file.unlink()
     state = _State()
     processes: list[Process] = []
     try:
-        drawn = {sensor.name for sensor in _sensors(settings) if not sensor.imu}
+        drawn = {sensor.name for sensor in settings.sensors() if sensor.kind == "camera"}
         for name, command, environment in _table(settings, epoch_ns):
             nice = _GIVES_WAY if name in drawn else 0
             processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state), nice))
@@ -161,16 +163,16 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
     bus = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     tree = ["--calibration", str(settings.calibration)]
-    place = [*_options(settings.rigs), *tree]
+    place = [*rig_options(settings.rigs), *tree]
     rows: list[tuple[str, list[str], dict[str, str]]] = []
     link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
     played = ["--seed", str(settings.seed), "--scene-epoch-ns", str(epoch_ns)]
-    for index, sensor in enumerate(_sensors(settings)):
+    for index, sensor in enumerate(settings.sensors()):
         clock = ["--clock-offset-ms", str(_ZERO_MS * (index + 1)), "--clock-ppm", str(_APART_PPM * index)]
         start = ["--start-offset-ms", str(_LATE_MS * index - 1e3 * _KNOWN_S)]
-        driver = ["imu", "--imu", "synthetic"] if sensor.imu else ["run", "--camera", "synthetic", *start]
-        who = ["--name", sensor.name, "--rig", sensor.rig, *tree, "--scene", sensor.scene]
-        command = [*driver, *who, *played, *clock, *link]
+        who = ["--rig", sensor.rig, *tree, "--scene", sensor.scene]
+        command = [*_DRIVERS[sensor.kind](sensor.name), *who, *played, *clock, *link]
+        command += start if sensor.kind == "camera" else []
         rows.append((sensor.name, [sys.executable, "-m", "slave", *command], key))
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
@@ -179,76 +181,6 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
         page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))] if settings.web else []
         rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus, *page], key))
     return rows
-
-
-@dataclass(frozen=True, slots=True)
-class _Sensor:
-    """A camera or an IMU of a rig, and the scene that it senses."""
-
-    name: str
-    rig: str
-    scene: str
-    imu: bool = False
-
-
-def _sensors(settings: DemoSettings) -> list[_Sensor]:
-    """The cameras of all rigs, then each IMU whose mounting and world are known.
-
-    Raises:
-        DemoError: A rig cannot be read, two have a sensor of the same name, or rigs of one hand would each see another.
-    """
-    rigs = {name: _rig(settings.calibration, name) for name in settings.rigs}
-    if len(rigs) < len(settings.rigs):
-        raise DemoError(f"--rig {' --rig '.join(settings.rigs)}: a rig stands twice")
-    moves, _, light = settings.scene.partition("@")
-    hands = [rig.hand for rig in rigs.values()]
-    if len(set(hands)) < len(hands) and moves not in TOGETHER:
-        raise DemoError(
-            f"--scene {settings.scene}: rigs {', '.join(rigs)} see one hand together only in {', '.join(TOGETHER)}"
-        )
-    worn = any(rig.kind == "wrist" for rig in rigs.values())
-    cameras: list[_Sensor] = []
-    imus: list[_Sensor] = []
-    for name, rig in rigs.items():
-        # The light behind the @ is that of a wrist device; cameras that watch markers have their own.
-        scene = moves if light and worn and rig.kind == "markers" else settings.scene
-        cameras += [_Sensor(camera, name, scene) for camera in rig.cameras]
-        imus += [_Sensor(imu, name, scene, imu=True) for imu in rig.imus]
-    names = [sensor.name for sensor in (*cameras, *imus)]
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise DemoError(
-            f"rigs {', '.join(rigs)}: {twice[0]!r} stands twice; every sensor has a name of its own"
-        )
-    return cameras + imus
-
-
-@dataclass(frozen=True, slots=True)
-class _Rig:
-    """A rig file, as far as it matters here."""
-
-    kind: str
-    hand: str
-    cameras: list[str]
-    imus: list[str]
-
-
-def _rig(calibration: Path, name: str) -> _Rig:
-    path = calibration / "rigs" / f"{name}.json"
-    try:
-        rig = json.loads(path.read_text())
-        imu = cast(dict[str, object], rig.get("imu") or {})
-        placed = imu.get("q_palm_imu") is not None and imu.get("q_rig_world") is not None
-        imus = [str(imu.get("name", "imu"))] if placed else []
-        return _Rig(str(rig.get("kind")), str(rig.get("hand")), cast(list[str], rig["cameras"]), imus)
-    except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
-        raise DemoError(
-            f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
-        ) from error
-
-
-def _options(rigs: tuple[str, ...]) -> list[str]:
-    """`--rig` for each."""
-    return [word for rig in rigs for word in ("--rig", rig)]
 
 
 def _free_port(kind: int) -> int:
@@ -337,7 +269,7 @@ def _report(settings: DemoSettings, epoch_ns: int, say: Callable[[str], None]) -
         raise DemoError(f"the master wrote no summary; its last line in {log}: {last}")
     say("comparing with the exact truth, drawing the hand ...")
     scene = ["--scene", settings.scene, "--seed", str(settings.seed)]
-    place = [*_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
+    place = [*rig_options(settings.rigs), "--calibration", str(settings.calibration), *scene]
     files = ["--poses", str(out / "poses.npz"), "--summary", str(out / "live.json"), "--out", str(out)]
     command = [sys.executable, "-m", "master", "report", *place, *files, "--scene-epoch-ns", str(epoch_ns)]
     # A session of its own: the first Ctrl-C must not reach the report; the second ends it through `run`.

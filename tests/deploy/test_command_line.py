@@ -10,8 +10,9 @@ from common.sim.scenes import NAMES
 from common.sim.together import TOGETHER
 from common.sim.wrist.scene import AMBIENTS, MOTIONS
 from deploy import __main__ as command_line
-from deploy import demo, replay
+from deploy import demo, replay, sensors
 from deploy.__main__ import main
+from deploy.summary import summary_lines
 from slave.arguments import parser
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -216,10 +217,37 @@ def test_the_demo_starts_a_slave_for_the_imu_of_a_rig_that_has_one(tmp_path: Pat
     assert len({(one.clock_offset_ms, one.clock_ppm) for one in slaves}) == 3  # a clock of its own
 
 
+def test_a_tracker_on_an_object_is_a_slave_of_its_own(tmp_path: Path) -> None:
+    table = rows("desk-tracker", ROOT / "calib_json", tmp_path, "object")
+    assert list(table) == ["left", "right", "tracker", "master"]
+    slave = parser().parse_args(table["tracker"][3:])
+    assert (slave.command, slave.device, slave.scene) == ("tracker", "synthetic", "object")
+
+
+def test_the_summary_says_what_was_told_of_objects_and_gestures() -> None:
+    lines = summary_lines(
+        {
+            "poses_per_s": 60.0,
+            "object_mm": 1.2,
+            "gestures_right": 11,
+            "gestures_made": 12,
+            "gestures_false": 1,
+            "gestures": {"pinch index": 3, "tap 5": 1},
+        }
+    )
+    assert [line.split() for line in lines[:2]] == [
+        ["poses", "60.0", "/s"],
+        ["object,", "error", "of", "its", "place,", "median", "1.2", "mm"],
+    ]
+    assert lines[2].endswith("11/12 (1 false)")
+    assert lines[3] == "gestures: pinch index 3x, tap 5 1x"
+    assert summary_lines({}) == []
+
+
 def test_a_rig_whose_imu_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "rigs").mkdir()
     (tmp_path / "rigs/odd.json").write_text(json.dumps({"cameras": ["left"], "imu": 5}))
-    with pytest.raises(demo.DemoError, match=r"odd\.json: cannot read the rig"):
+    with pytest.raises(sensors.DemoError, match=r"odd\.json: cannot read the rig"):
         rows("odd", tmp_path, tmp_path)
 
 
@@ -240,12 +268,13 @@ def test_of_both_kinds_each_sensor_has_its_rig_and_one_master_runs_all(tmp_path:
         (("desk", "wrist"), "standard", "desk, wrist see one hand together only in grasp, both-poses"),
         (("desk", "desk"), "grasp", "a rig stands twice"),
         (("desk", "desk4"), "grasp", "'left' stands twice"),
+        (("desk",), "object", "rig desk tracks no object; --rig desk-wand"),
     ],
 )
 def test_rigs_that_cannot_be_played_together_are_refused(
     rigs: tuple[str, ...], scene: str, says: str, tmp_path: Path
 ) -> None:
-    with pytest.raises(demo.DemoError, match=says):
+    with pytest.raises(sensors.DemoError, match=says):
         rows(rigs, ROOT / "calib_json", tmp_path, scene)
 
 
@@ -261,6 +290,8 @@ def test_two_hands_are_played_each_by_its_own_scene(tmp_path: Path) -> None:
         (["--scene", "grasp@dark"], ("desk-back3", "wrist-back3")),
         (["--scene", "grasp", "--rig", "desk"], ("desk",)),
         (["--wrist", "--scene", "grasp"], ("wrist",)),
+        (["--scene", "object"], ("desk-wand",)),
+        (["--scene", "object", "--rig", "desk-cube"], ("desk-cube",)),
     ],
 )
 def test_a_scene_of_both_kinds_is_played_before_both(
@@ -280,6 +311,6 @@ def test_a_scene_of_both_kinds_is_played_before_both(
 
 def test_the_demo_runs_its_cameras_as_the_standard_scene_says() -> None:
     # The launcher imports nothing of what it starts, so these stand twice.
-    assert demo.TOGETHER == TOGETHER
+    assert sensors.TOGETHER == TOGETHER
     assert demo._LATE_MS * 1e6 == LATE_NS
     assert demo._APART_PPM == APART_PPM
