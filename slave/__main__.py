@@ -18,6 +18,7 @@ import cv2
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
 from common.errors import CalibrationError, CameraError, LightsError, PhalanxError
+from common.object_profile import ObjectProfile
 from slave.arguments import CAMERAS, parser
 from slave.cameras import real
 from slave.cameras.source import FrameSource
@@ -59,7 +60,7 @@ def _run(options: argparse.Namespace) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
     rig, camera = _calibration(options)
-    files = CameraFiles(*_paths(options), camera, rig)
+    files = CameraFiles(*_paths(options), camera, rig, objects=tuple(_objects(options, rig).values()))
     if rig.kind == "wrist" and options.colours != "none":  # with none, fingers need not be known
         hand_path = options.calibration / "hands" / f"{rig.hand}.json"
         files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
@@ -151,6 +152,12 @@ def _calibration(options: argparse.Namespace) -> tuple[RigCalibration, CameraCal
             f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}"
         )
     return rig, load(camera_path, CameraCalibration)
+
+
+def _objects(options: argparse.Namespace, rig: RigCalibration) -> dict[str, ObjectProfile]:
+    """The objects of the rig, by name."""
+    folder: Path = options.calibration / "objects"
+    return {name: load(folder / f"{name}.json", ObjectProfile) for name in rig.objects}
 
 
 def _paths(options: argparse.Namespace) -> tuple[Path, Path]:
@@ -272,6 +279,7 @@ def _record(options: argparse.Namespace) -> int:
         rig=rig,
         note=options.note,
         clock=clock_of(clock, skewed),
+        objects=_objects(options, rig),
     )
     refuse_occupied(options.output)  # before a camera is opened
     scene = (options.calibration, rig, options.scene, options.seed)
@@ -366,7 +374,7 @@ def _join(options: argparse.Namespace) -> int:
 def _detect(options: argparse.Namespace) -> int:
     from common.frame_recording import MANIFEST, Manifest
     from slave.cameras.replay import is_grey
-    from slave.offline import detect_recording, save_detections
+    from slave.offline import detect_recording, save_detections, tag_collector
 
     def progress(done: int, total: int) -> None:
         if done % PROGRESS_EVERY == 0 or done == total:
@@ -378,8 +386,11 @@ def _detect(options: argparse.Namespace) -> int:
         raise CalibrationError(
             f"--hand: camera {options.camera!r} sees markers; only a wrist camera knows a hand"
         )
-    found = detect_recording(options.recording, options.camera, options.calibration, progress)
+    tags = tag_collector(options.recording, options.camera, options.calibration)
+    found = detect_recording(options.recording, options.camera, options.calibration, progress, tags)
     save_detections(options.output, found)
+    if tags is not None:
+        save_detections(options.output.parent / f"tags_{options.camera}.npz", tags.all())
     return 0
 
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from common.arrays import Image
-from common.messages import MarkerDetections, Message
+from common.messages import MarkerDetections, Message, TagDetections
 from slave.cameras.source import Frame, FrameSource
 from slave.markers.detector import Detections
 from slave.tally import Tally
@@ -32,6 +32,14 @@ class StrobedDetector(Protocol):
 
     def push(self, frame: Frame) -> WristFound | None:
         """What was found, where the frame completes a strobed triple."""
+        ...
+
+
+class Tags(Protocol):
+    """What finds the tags of objects; a `LiveTags`."""
+
+    def push(self, frame: Frame, session: int, spent_ns: int) -> TagDetections | None:
+        """Tags of a frame whose markers took `spent_ns`; None: not searched."""
         ...
 
 
@@ -76,10 +84,11 @@ def run(
     tally: Tally,
     stop: threading.Event,
     show: Callable[[Frame], None] = lambda _frame: None,
+    tags: Tags | None = None,
 ) -> None:
     """Detect and send until the source ends or `stop` is set. A frame without any marker is sent as well.
 
-    `show` is offered every frame once its message is sent; it must not wait.
+    Tags are sought once the markers of the frame are sent. `show` is offered every frame after that; it must not wait.
 
     Raises:
         CameraError: The camera is gone.
@@ -103,6 +112,8 @@ def run(
         )
         sender.send(message)
         tally.frame(frame.seq, detect_ns, found.uv)
+        if tags is not None and (seen := tags.push(frame, sender.session, detect_ns)) is not None:
+            sender.send(seen)
         show(frame)
 
 

@@ -94,7 +94,8 @@ HELP = {
         "detect in a recording",
         """\
   phalanx-slave detect recordings/wave --camera left --calibration calib_json -o detections_left.npz
-        offline: every frame of one camera, the same bytes on every run
+        offline: every frame of one camera, the same bytes on every run; of a rig whose objects have tags those, too:
+        tags_left.npz beside it
   phalanx-slave detect recordings/curl --camera wrist --calibration calib_json -o detections_wrist.npz
         of a wrist device: laser points and fingertips of every strobed triple; the hand is DIR/hands/RIG'S HAND.json
 """,

@@ -85,6 +85,7 @@ def _manifest(parts: Sequence[FrameRecording]) -> tuple[Manifest, dict[str, Fram
         clicks={
             name: part.manifest.clicks[name] for name, part in owners.items() if name in part.manifest.clicks
         },
+        objects={name: file for part in reversed(parts) for name, file in part.manifest.objects.items()},
         note="; ".join(dict.fromkeys(part.manifest.note for part in parts if part.manifest.note)),
     )
     return manifest, {name: owners[name] for name in names if name in owners}

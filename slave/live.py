@@ -22,6 +22,7 @@ from slave.markers.engine import Engine
 from slave.markers.following import detector_for
 from slave.preview import Previews
 from slave.report import Numbers, Reporter
+from slave.tags.live import LiveTags, finder_of
 from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
 from slave.uplink import Uplink
@@ -125,7 +126,8 @@ def _marker_line(
     workers: ThreadPoolExecutor,
 ) -> _Line:
     rig = files.rig
-    tally = Tally(rig.markers)
+    tags = LiveTags(files.camera, files.objects)
+    tally = Tally(rig.markers, tags.counts)
     if colours == "none":
         blind = BlindDetector(len(rig.markers))
         return _Line(lambda: run(source, blind, uplink, name, tally, stop, show), tally, None)
@@ -138,10 +140,39 @@ def _marker_line(
     elif colours == "follow":
         _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
     return _Line(
-        lambda: run(source, detector, uplink, name, tally, stop, seen),
+        lambda: run(source, detector, uplink, name, tally, stop, seen, tags),
         numbers,
-        marker_changes(detector, make),
+        _both(marker_changes(detector, make), _tag_changes(tags)),
     )
+
+
+def _tag_changes(tags: LiveTags) -> Prepare:
+    """How changed object files, or another lens, reach what finds tags."""
+
+    def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
+        if (new.objects, new.camera.intrinsics) == (old.objects, old.camera.intrinsics):
+            return None
+        finder = finder_of(new.camera, new.objects)
+        return lambda: tags.replace(finder)
+
+    return prepare
+
+
+def _both(first: Prepare, second: Prepare) -> Prepare:
+    """What two that use the same files make of a change."""
+
+    def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
+        switches = [made for one in (first, second) if (made := one(old, new)) is not None]
+        if not switches:
+            return None
+
+        def switch() -> None:
+            for made in switches:
+                made()
+
+        return switch
+
+    return prepare
 
 
 def _wrist_line(

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -20,6 +21,9 @@ from slave.markers.colours import ColourRow, calibrate
 from slave.markers.following import detector_for
 from slave.markers.workers import Inline
 from slave.wrist.offline import RecordedWristDetections
+
+if TYPE_CHECKING:
+    from slave.tags.offline import RecordedTags, TagCollector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,6 +78,7 @@ def detect_recording(
     camera: str,
     calibration: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
+    tags: "TagCollector | None" = None,
 ) -> RecordedDetections:
     """Detect the markers in every frame of one camera, with colours that follow the light where it has references.
 
@@ -82,6 +87,7 @@ def detect_recording(
         camera: Camera name.
         calibration: calib_json tree whose cameras/<camera>.json holds the marker colours.
         progress: Called with frames done and frames in all.
+        tags: Is given every frame, too.
 
     Raises:
         RecordingError: The recording is broken or has no such camera or no frame of it.
@@ -104,6 +110,8 @@ def detect_recording(
             detector = detector.fresh()
         image = read_png(folder / row.file, (model.height_px, model.width_px))
         found = detector.push(image, row.t_ns)
+        if tags is not None:
+            tags.push(image, row)
         uv[i], area[i], quality[i] = found.uv, found.area, found.quality
         sigma_px[i], rival_uv[i] = found.sigma_px, found.rival_uv
         progress(i + 1, len(rows))
@@ -194,8 +202,27 @@ def make_folder(folder: Path) -> None:
         raise RecordingError(f"{folder}: cannot make the folder: {error.strerror}") from error
 
 
-def save_detections(path: Path, found: RecordedDetections | RecordedWristDetections) -> None:
-    """Write detections_<camera>.npz; equal content gives equal bytes.
+def tag_collector(folder: Path, camera: str, calibration: Path | None) -> "TagCollector | None":
+    """What finds the tags of a recording's objects; None: none of them has any.
+
+    Raises:
+        RecordingError: The recording is broken or has no such camera.
+        CalibrationError: An object's file is broken or missing.
+    """
+    recording = open_recording(folder)
+    manifest = recording.manifest
+    recording.frames_of(camera)  # refuses an unknown name
+    rig = manifest.marker_rig()
+    if not rig.objects:
+        return None
+    from slave.tags.offline import TagCollector, tagged_objects
+
+    objects = tagged_objects(manifest.objects, rig, calibration)
+    return TagCollector(manifest.cameras[camera], objects, manifest.continuous) if objects else None
+
+
+def save_detections(path: Path, found: "RecordedDetections | RecordedWristDetections | RecordedTags") -> None:
+    """Write detections_<camera>.npz, or tags_<camera>.npz; equal content gives equal bytes.
 
     Raises:
         RecordingError: The file cannot be written.

@@ -20,6 +20,7 @@ from typing import TypeAlias
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse, save
 from common.camera_settings import WANTED, CameraSettings, figures
 from common.errors import CalibrationError, PhalanxError
+from common.object_profile import ObjectProfile
 from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
 
@@ -35,6 +36,7 @@ class CameraFiles:
         camera_path, rig_path: The camera file and the rig file.
         camera, rig: Their content.
         hand_path, hand: The same of the hand, of which only the slave of a wrist device needs to know; else None.
+        objects: Content of the files of the rig's objects, which lie beside it.
     """
 
     camera_path: Path
@@ -43,12 +45,13 @@ class CameraFiles:
     rig: RigCalibration
     hand_path: Path | None = None
     hand: HandProfile | None = None
+    objects: tuple[ObjectProfile, ...] = ()
 
     @property
     def paths(self) -> tuple[Path, ...]:
         """All of them."""
         hand = () if self.hand_path is None else (self.hand_path,)
-        return (self.camera_path, self.rig_path, *hand)
+        return (self.camera_path, self.rig_path, *hand, *object_paths(self.rig_path, self.rig))
 
     def read_again(self) -> "CameraFiles":
         """The same files, as they are now.
@@ -56,12 +59,19 @@ class CameraFiles:
         Raises:
             CalibrationError: One is broken or gone.
         """
+        rig = load(self.rig_path, RigCalibration)
         return replace(
             self,
             camera=load(self.camera_path, CameraCalibration),
-            rig=load(self.rig_path, RigCalibration),
+            rig=rig,
             hand=None if self.hand_path is None else load(self.hand_path, HandProfile),
+            objects=tuple(load(path, ObjectProfile) for path in object_paths(self.rig_path, rig)),
         )
+
+
+def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
+    """The files of a rig's objects: DIR/objects/<name>.json of DIR/rigs/<rig>.json."""
+    return tuple(rig_path.parent.parent / "objects" / f"{name}.json" for name in rig.objects)
 
 
 # Makes what senses with other files (those in use, those to come), some tenths of a second, and returns what puts it

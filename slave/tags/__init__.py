@@ -1,0 +1,1 @@
+"""Fiducial tags (AprilTag, ArUco) on tracked objects."""

@@ -1,0 +1,276 @@
+"""Frame in, tags out: those that were seen are looked for where they should be, the rest is searched bit by bit.
+
+A push machine; it holds where each tag was and how it moved, and which part of the image is next.
+
+    expected   where the tag must be by its motion, its sides are fitted and its code is read    corners, reading
+    near       where that fails, and about what was found (the next face of the box): quads
+    anywhere   a part of the image each time, the whole in turn; all of it in the first frame
+
+So a frame costs what the tags in it cost and a fixed part of a search, whatever the camera sees.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from common.arrays import Float, Ids, Image
+from common.calibration import CameraCalibration
+from common.camera_model import CameraModel
+from common.errors import CalibrationError
+from common.messages import MAX_TAGS
+from common.object_profile import ObjectProfile, TagFamily
+from common.tag_family import GRIDS
+from slave.tags.corners import Corners, refine
+from slave.tags.quads import quads
+from slave.tags.reading import Codes
+
+HOLD_NS = 500_000_000  # a tag not seen for longer is anywhere
+VELOCITY_NS = 50_000_000  # a velocity is trusted no longer than this
+NEAR = 0.9  # of a tag's size about it, where the next face of its box may be
+MARGIN = 40.0 / 640.0  # of the image's width, as of markers: how far it may have gone astray
+SAME = 0.35  # of a tag's size: a patch whose middle is nearer to a tag that was found is that tag
+PARTS = ((0.0, 0.0), (0.4, 0.4), (0.4, 0.0), (0.0, 0.4))  # left, top of the parts, shares of the image
+PART = (
+    0.6  # their size; what is larger than the overlap is found in the image at half its size, the fifth part
+)
+IDLE = 4  # while a tag is seen, every so many frames a part is searched
+DIGITS = 6  # of what is reported: what comes after them differs between processors
+Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundTags:
+    """Tags of one frame.
+
+    Attributes:
+        ids: (N,) rising.
+        uv: (N, 4, 2) corners [px], distorted image: of the print top left, top right, bottom right, bottom left.
+        sigma_px: (N,) their standard deviation per axis.
+    """
+
+    ids: Ids
+    uv: Float
+    sigma_px: Float
+
+
+@dataclass(frozen=True, slots=True)
+class _Track:
+    """Where a tag was: corners (4, 2) [px], their velocity (4, 2) [px/s], when, and how wide its edges were."""
+
+    uv: Float
+    speed: Float
+    t_ns: int
+
+    def expected(self, t_ns: int) -> Float:
+        return self.uv + self.speed * (min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9)
+
+    @property
+    def size(self) -> float:
+        return float(np.ptp(self.uv, axis=0).max())
+
+
+class TagFinder:
+    """Finds the tags of one camera's objects. Holds a track per tag, and which part is searched next."""
+
+    def __init__(self, camera: CameraCalibration, objects: Sequence[ObjectProfile]) -> None:
+        """Seek the tags of `objects`.
+
+        Args:
+            camera: Camera file; with intrinsics the sides are followed as the lens bends them.
+            objects: One or more of them with tags.
+
+        Raises:
+            CalibrationError: Two objects have a tag of the same number, or a family has no such tag.
+        """
+        self._camera, self._objects = camera, tuple(objects)
+        self._size = (camera.height_px, camera.width_px)
+        self._lens = None if camera.intrinsics is None else CameraModel.of(camera, np.eye(4))
+        self._codes = codes_of(objects)
+        self._tracks: dict[int, _Track] = {}
+        self._turn = -1  # which part is next; negative before the first frame
+        self._idle = 0
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Numbers of all tags that are sought, rising."""
+        return tuple(sorted(int(number) for codes in self._codes for number in codes.ids))
+
+    def fresh(self) -> "TagFinder":
+        """A finder of the same tags that has seen nothing yet."""
+        return TagFinder(self._camera, self._objects)
+
+    def push(self, image: Image, t_ns: int) -> FoundTags:
+        """Find the tags of one frame.
+
+        Args:
+            image: (H, W, 3) BGR of the camera's size, or (H, W) grey.
+            t_ns: Time of the frame [ns], rising; only differences matter.
+
+        Raises:
+            ValueError: The image is not of the camera's size, or not 8 bit.
+        """
+        if image.shape[:2] != self._size or image.dtype != np.uint8:
+            raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {self._size} uint8")
+        grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8) if image.ndim == 3 else image
+        tracks = {n: track for n, track in self._tracks.items() if 0 <= t_ns - track.t_ns <= HOLD_NS}
+        found: dict[int, tuple[Float, float]] = {}
+        for codes in self._codes:
+            self._expected(grey, codes, tracks, t_ns, found)
+        sought = self._near(tracks, found, t_ns) + self._part(bool(found))
+        for box in sought:
+            self._search(grey[box[1] : box[3], box[0] : box[2]], grey, box, 1, found)
+        if self._turn == len(PARTS) or self._turn < 0:
+            half = np.asarray(cv2.resize(grey, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+            self._search(half, grey, (0, 0, 0, 0), 2, found)
+        if self._turn < 0:
+            self._turn = 0
+        self._tracks = {n: _advanced(tracks.get(n), uv, t_ns) for n, (uv, _) in found.items()} | {
+            n: track for n, track in tracks.items() if n not in found
+        }
+        numbers = sorted(found)[:MAX_TAGS]
+        return FoundTags(
+            np.array(numbers, np.uint16),
+            np.array([found[n][0] for n in numbers]).reshape(-1, 4, 2).round(DIGITS),
+            np.array([found[n][1] for n in numbers]).round(DIGITS),
+        )
+
+    def _expected(
+        self,
+        grey: Image,
+        codes: Codes,
+        tracks: dict[int, _Track],
+        t_ns: int,
+        found: dict[int, tuple[Float, float]],
+    ) -> None:
+        """Fit and read the tracked tags of a family where they must be by now."""
+        rows = [row for row, number in enumerate(codes.ids) if int(number) in tracks]
+        if not rows:
+            return
+        begun = np.array([tracks[int(codes.ids[row])].expected(t_ns) for row in rows])
+        corners = refine(grey, begun, codes.cells, self._lens, codes.inner[rows])
+        read = codes.read(grey, corners)
+        for k, row in enumerate(rows):
+            right = read.which[k] == row and read.turn[k] == 0 and read.fit[k] >= codes.expected
+            if right and math.isfinite(corners.sigma_px[k]):
+                found[int(codes.ids[row])] = corners.uv[k], float(corners.sigma_px[k])
+
+    def _search(
+        self, part: Image, grey: Image, box: Box, scale: int, found: dict[int, tuple[Float, float]]
+    ) -> None:
+        """Seek tags in a part of the image that begins at left, top of `box` and is smaller by `scale`."""
+        begun = quads(part)
+        begun = (begun + 0.5) * scale - 0.5 + np.array(box[:2], np.float64)
+        begun = begun[[not _known(quad, found) for quad in begun]] if len(begun) else begun
+        for codes in self._codes if len(begun) else ():
+            rough = refine(grey, begun, codes.cells, self._lens)
+            good = np.isfinite(rough.sigma_px)
+            if not good.any():
+                continue
+            rough = Corners(rough.uv[good], rough.sigma_px[good], rough.contrast[good], rough.width_px[good])
+            read = codes.read(grey, rough)
+            sure = np.flatnonzero(read.fit >= codes.sure)
+            if not len(sure):
+                continue
+            printed = np.array([np.roll(rough.uv[k], -read.turn[k], axis=0) for k in sure])
+            final = refine(grey, printed, codes.cells, self._lens, codes.inner[read.which[sure]])
+            fits = read.fit[sure]
+            for k in np.argsort(-fits, kind="stable"):
+                number = int(codes.ids[read.which[sure[k]]])
+                if number not in found and math.isfinite(final.sigma_px[k]):
+                    found[number] = final.uv[k], float(final.sigma_px[k])
+
+    def _near(self, tracks: dict[int, _Track], found: dict[int, tuple[Float, float]], t_ns: int) -> list[Box]:
+        """Where lost tags may be, and those beside what was found; boxes that touch become one."""
+        boxes: list[Box] = []
+        for number, track in tracks.items():
+            astray = (
+                0.0
+                if number in found
+                else MARGIN * self._size[1] * (1.0 + (t_ns - track.t_ns) / VELOCITY_NS / 4)
+            )
+            uv = found[number][0] if number in found else track.expected(t_ns)
+            boxes.append(self._about(uv, NEAR * track.size + astray))
+        return _joined(boxes)
+
+    def _about(self, uv: Float, margin: float) -> Box:
+        height, width = self._size
+        low, high = np.floor(uv.min(axis=0) - margin), np.ceil(uv.max(axis=0) + margin)
+        left, top = np.clip(low, 0, [width, height]).astype(int).tolist()
+        right, bottom = np.clip(high, 0, [width, height]).astype(int).tolist()
+        return left, top, right, bottom
+
+    def _part(self, seen: bool) -> list[Box]:
+        """The part of the image that is searched in this frame, if any."""
+        height, width = self._size
+        if self._turn < 0:
+            return [(0, 0, width, height)]
+        self._idle = (self._idle + 1) % IDLE
+        if seen and self._idle:
+            self._turn = self._turn % len(PARTS)
+            return []
+        self._turn = (self._turn + 1) % (len(PARTS) + 1)
+        if self._turn == len(PARTS):
+            return []
+        x, y = PARTS[self._turn]
+        left, top = int(x * width), int(y * height)
+        return [(left, top, left + math.ceil(PART * width), top + math.ceil(PART * height))]
+
+
+def codes_of(objects: Sequence[ObjectProfile]) -> list[Codes]:
+    """What is sought for the tags of objects, by family.
+
+    Raises:
+        CalibrationError: Two objects have a tag of the same number, or a family has no such tag.
+    """
+    owner: dict[int, str] = {}
+    families: dict[TagFamily, list[int]] = {}
+    for profile in objects:
+        if profile.tags is None:
+            continue
+        family = profile.tags.family
+        for tag in profile.tags.tags:
+            if tag.id in owner:
+                raise CalibrationError(
+                    f"object {profile.name!r}: tags: {tag.id} is on object {owner[tag.id]!r}, too; a message tells them"
+                    " by their numbers alone"
+                )
+            if tag.id >= GRIDS[family].tags:
+                raise CalibrationError(
+                    f"object {profile.name!r}: tags: {tag.id}: {family} has 0 to {GRIDS[family].tags - 1}"
+                )
+            owner[tag.id] = profile.name
+            families.setdefault(family, []).append(tag.id)
+    return [Codes(family, numbers) for family, numbers in families.items()]
+
+
+def _known(quad: Float, found: dict[int, tuple[Float, float]]) -> bool:
+    """Whether a patch is a tag that was found."""
+    middle = quad.mean(axis=0)
+    return any(
+        np.abs(uv.mean(axis=0) - middle).max() < SAME * np.ptp(uv, axis=0).max() for uv, _ in found.values()
+    )
+
+
+def _advanced(track: _Track | None, uv: Float, t_ns: int) -> _Track:
+    if track is None or not 0 < t_ns - track.t_ns <= 2 * VELOCITY_NS:
+        return _Track(uv, np.zeros_like(uv), t_ns)
+    return _Track(uv, (uv - track.uv) / ((t_ns - track.t_ns) * 1e-9), t_ns)
+
+
+def _joined(boxes: list[Box]) -> list[Box]:
+    """Boxes that touch as one."""
+    whole: list[Box] = []
+    for box in boxes:
+        left, top, right, bottom = box
+        apart: list[Box] = []
+        for other in whole:
+            if left <= other[2] and other[0] <= right and top <= other[3] and other[1] <= bottom:
+                left, top = min(left, other[0]), min(top, other[1])
+                right, bottom = max(right, other[2]), max(bottom, other[3])
+            else:
+                apart.append(other)
+        whole = [*apart, (left, top, right, bottom)]
+    return whole
