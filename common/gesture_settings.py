@@ -17,7 +17,8 @@ from common.messages import Name
 # Bends are of the bones, 0 where they lie in the palm's plane in one line; `bend` is MCP and PIP together, of the
 # thumb MCP and IP. `thumb_across`, `thumb_below`, `thumb_ahead`: where its tip is from the wrist: to the thumb's side,
 # out of the palm, to the fingers, as share of the palm's length. Gaps are between the skins of two tips.
-# `index_ahead`: how much more than the mean of the other three the index is bent. Spreads are between neighbours.
+# `index_ahead`: how much more than the mean of the other three the index is bent; `fingers_bend`: the mean of the four.
+# Spreads are between neighbours.
 Quantity = Literal[
     "index_mcp_deg", "index_pip_deg", "index_bend_deg",
     "middle_mcp_deg", "middle_pip_deg", "middle_bend_deg",
@@ -25,7 +26,8 @@ Quantity = Literal[
     "little_mcp_deg", "little_pip_deg", "little_bend_deg",
     "thumb_bend_deg", "thumb_across", "thumb_below", "thumb_ahead",
     "thumb_index_gap_mm", "thumb_middle_gap_mm", "thumb_ring_gap_mm", "thumb_little_gap_mm",
-    "index_ahead_deg", "index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg",
+    "index_ahead_deg", "fingers_bend_deg",
+    "index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg",
 ]  # fmt: skip
 Finger = Literal["thumb", "index", "middle", "ring", "little"]
 Score = Annotated[float, Meta(ge=0.0, le=1.0)]
@@ -88,10 +90,11 @@ def study_poses() -> dict[Name, PoseShape]:
     return {
         "open_palm": PoseShape(
             ranges={
-                "index_bend_deg": _most(13.0, 7.0),
-                "middle_bend_deg": _most(13.0, 7.0),
-                "ring_bend_deg": _most(13.0, 7.0),
-                "little_bend_deg": _most(13.0, 7.0),
+                "index_bend_deg": _most(18.0, 9.0),
+                "middle_bend_deg": _most(18.0, 9.0),
+                "ring_bend_deg": _most(18.0, 9.0),
+                "little_bend_deg": _most(18.0, 9.0),
+                "fingers_bend_deg": _most(15.0, 3.0),
                 "thumb_across": _between(0.4, 3.0, 0.1),
             }
         ),
@@ -105,7 +108,6 @@ def study_poses() -> dict[Name, PoseShape]:
                 "little_bend_deg": _least(110.0, 12.0),
                 "thumb_across": _between(-2.0, 0.5, 0.1),
             },
-            needs=("index", "middle"),
         ),
         "pointing": PoseShape(
             ranges={
@@ -115,7 +117,6 @@ def study_poses() -> dict[Name, PoseShape]:
                 "ring_bend_deg": _least(115.0, 12.0),
                 "little_bend_deg": _least(110.0, 12.0),
             },
-            needs=("index",),
         ),
         "small_grasp": PoseShape(
             ranges={
@@ -142,9 +143,9 @@ def study_poses() -> dict[Name, PoseShape]:
                 "index_bend_deg": _between(65.0, 135.0, 10.0),
                 "index_ahead_deg": _least(25.0, 10.0),
                 "thumb_index_gap_mm": _most(42.0, 6.0),
-                "middle_bend_deg": _most(62.0, 10.0),
-                "ring_bend_deg": _most(62.0, 10.0),
-                "little_bend_deg": _most(62.0, 10.0),
+                "middle_bend_deg": _most(66.0, 12.0),
+                "ring_bend_deg": _most(66.0, 12.0),
+                "little_bend_deg": _most(66.0, 12.0),
             },
         ),
     }

@@ -17,6 +17,8 @@ from common.messages import HandPose
 KNOWN_SIGMA_M = 0.015  # a tip that may be farther off is anywhere between straight and half bent
 # Sum of a finger's bends [rad], MCP, PIP and DIP, where it is as curled as it goes; of the thumb MCP and IP.
 _CURLED_RAD = np.radians([90.0, 230.0, 230.0, 230.0, 230.0])
+# Of fingers that nothing is known of [rad]: a thumb at rest, fingers half bent.
+LIKELY_RAD = np.radians([[8.0, 15.0, 15.0, 15.0], *([[0.0, 55.0, 75.0, 50.0]] * 4)])
 _PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad is thickest
 
 
@@ -70,17 +72,29 @@ class HandFeatures:
 
 
 def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
-    """The features of a pose of `model`'s hand; None where the pose has no hand."""
-    joints = pose.position_m
-    if not (pose.valid[WRIST] and np.isfinite(joints).all() and np.isfinite(pose.orientation_wxyz).all()):
+    """The features of a pose of `model`'s hand; None where the pose has no hand.
+
+    A finger of which the pose has nothing is not known, its doubt is infinite, and it stands where fingers that hide
+    are likely to be.
+    """
+    joints, wxyz = pose.position_m, pose.orientation_wxyz
+    if not (pose.valid[WRIST] and np.isfinite(joints[WRIST]).all() and np.isfinite(wxyz[WRIST]).all()):
         return None
-    rotation = quaternion_to_matrix(pose.orientation_wxyz)
-    palm = rotation[WRIST] @ model.rest_rotation[WRIST].T
-    place = joints[WRIST] - palm @ model.rest_position_m[WRIST]
+    palm = quaternion_to_matrix(wxyz[WRIST]) @ model.rest_rotation[WRIST].T
+    T_rig_palm = rigid(palm, joints[WRIST] - palm @ model.rest_position_m[WRIST])
+    lacking: Bool = np.isnan(joints).any(axis=1) | np.isnan(wxyz).any(axis=1)
+    if lacking.any():
+        likely = model.forward(T_rig_palm, LIKELY_RAD)
+        joints = np.where(lacking[:, None], likely.position_m, joints)
+        rotation = quaternion_to_matrix(np.where(lacking[:, None], 0.5, wxyz))
+        rotation = np.where(lacking[:, None, None], likely.rotation, rotation)
+    else:
+        rotation = quaternion_to_matrix(wxyz)
     bend = _bends(joints[CHAINS], rotation[CHAINS], palm)
     total = bend.sum(axis=1)
     total[0] -= bend[0, 0]
     sigma, wrist = _sigma_m(pose)
+    sigma = np.where(lacking[CHAINS].any(axis=1), np.inf, sigma)
     known = pose.valid[TIPS] & (sigma <= KNOWN_SIGMA_M)
     last = CHAINS[:, 2]
     along = joints[last] + _PAD_SHARE * (joints[TIPS] - joints[last])
@@ -99,7 +113,7 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         pads_m=along - radius[:, None] * rotation[TIPS][..., 1],
         radius_m=pose.radius_m[TIPS],
         joints_m=joints,
-        T_rig_palm=rigid(palm, place),
+        T_rig_palm=T_rig_palm,
         dorsal=palm[:, 1],
         palmar=-palm[:, 1],
         forward=palm[:, 2],

@@ -164,7 +164,7 @@ class PoseRecogniser:
         begins = self._beginning(features, fit, speed)
         if begins is not None and begins != self._held:
             return self._begin(features, begins, float(fit.confidence[begins]))
-        return self._go_on(features.hand, features.t_ns, fit)
+        return self._go_on(features, fit)
 
     def lose(self, hand: str, t_ns: int) -> list[Gesture]:
         """What is to be said where the hand itself is not known at `t_ns`."""
@@ -174,7 +174,7 @@ class PoseRecogniser:
     def _beginning(self, features: HandFeatures, fit: Fit, speed: float) -> int | None:
         """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
         best, t_ns = fit.best(), features.t_ns
-        if best is None or fit.confidence[best] < self._hold.begin:
+        if best is None or fit.confidence[best] < self._hold.begin or not features.seen.any():
             self._coming = None
             return None
         if best != self._coming:
@@ -194,17 +194,17 @@ class PoseRecogniser:
         self._going_ns = None
         return [*out, self._said(features.hand, t_ns, "begin", confidence)]
 
-    def _go_on(self, hand: str, t_ns: int, fit: Fit) -> list[Gesture]:
-        held = self._held
+    def _go_on(self, features: HandFeatures, fit: Fit) -> list[Gesture]:
+        held, hand, t_ns = self._held, features.hand, features.t_ns
         if held is None:
             return []
-        confidence = float(fit.confidence[held])
-        # Of a hand of which too little is known it may well be held, unless what is known speaks against it.
-        if not fit.known[held] and fit.score[held] >= self._hold.end:
-            return self._unsure(hand, t_ns)
-        if confidence >= self._hold.end:
+        confidence, enough = float(fit.confidence[held]), bool(fit.known[held])
+        if enough and confidence >= self._hold.end:
             self._going_ns, self._seen_ns, self._confidence = None, t_ns, confidence
             return [self._said(hand, t_ns, "update", confidence)]
+        # Of a hand of which too little is known it may well be held, unless what is known speaks against it.
+        if not (enough and features.seen.any()) and fit.score[held] >= self._hold.end:
+            return self._unsure(hand, t_ns)
         if self._going_ns is None:
             self._going_ns = t_ns
         if t_ns - self._going_ns >= 1e9 * self._hold.end_s:

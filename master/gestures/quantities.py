@@ -23,7 +23,7 @@ HIDDEN_DEG, HIDDEN_SIGMA_DEG = (
 )  # MCP and PIP of a finger that hides; of their sum
 _COUNT = len(QUANTITIES)
 _BENDS = slice(0, 12)  # index ... little, each MCP, PIP, both
-_THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _SPREADS = 12, slice(13, 16), slice(16, 20), 20, slice(21, 24)
+_THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _SPREADS = 12, slice(13, 16), slice(16, 20), 20, slice(22, 25)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +59,7 @@ class Quantities:
         sigma[_GAPS] = 1e3 * np.hypot(doubt[1:], doubt[0])
         value[_AHEAD] = both[0] - both[1:].mean()
         sigma[_AHEAD] = np.hypot(turned[1], np.sqrt((turned[2:] ** 2).sum()) / 3.0)
+        value[_AHEAD + 1], sigma[_AHEAD + 1] = both.mean(), turned[1:].mean()  # neighbours are wrong alike
         value[_SPREADS], sigma[_SPREADS] = _spreads(chain, features), np.hypot(turned[1:-1], turned[2:])
         return cls(value, sigma)
 
