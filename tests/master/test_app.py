@@ -1,6 +1,7 @@
 """Tests of the live loop with a source, a clock and sinks of the test's own."""
 
 import threading
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -11,7 +12,7 @@ from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
-from master.app import RunFigures, health, run
+from master.app import Beside, RunFigures, health, run
 from master.live import cameras_line
 from master.rig import RigSetup, pipeline_of
 from master.stages import StageTimes
@@ -23,10 +24,10 @@ from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 class ScriptedSource:
     """Gives messages in turn, with pauses (None), then sets `stop`."""
 
-    def __init__(self, messages: list[MarkerDetections | ImuSample | None], stop: threading.Event) -> None:
+    def __init__(self, messages: Sequence[MarkerDetections | Beside | None], stop: threading.Event) -> None:
         self._messages, self._stop = iter(messages), stop
 
-    def get(self, timeout_s: float) -> MarkerDetections | ImuSample | None:
+    def get(self, timeout_s: float) -> MarkerDetections | Beside | None:
         assert timeout_s > 0
         try:
             return next(self._messages)
