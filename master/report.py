@@ -15,14 +15,12 @@ from common.sim.scenes import scene_by_name
 from common.sim.together import TOGETHER
 from common.sim.wrist.render import WristRenderer
 from common.sim.wrist.scene import WristScene
-from master.object_score import ObjectTruth, score_object, score_objects
 from master.outputs.files import load_poses
 from master.outputs.picture import best_row, draw_summary
 from master.outputs.picture_told import ToldPicture
 from master.outputs.picture_wrist import WristPicture
 from master.outputs.poses import Poses
 from master.outputs.rerun import write_rrd
-from master.outputs.told_files import load_object, object_path
 from master.outputs.truth import PosesTruth
 from master.rig import RigSetup
 from master.score import Truth, score, score_hidden
@@ -116,28 +114,12 @@ def report_scene(
     row = best_row(poses, shown)
     judged = _judge(poses, row, setup, played, epoch_ns, tell)
     full = summary | judged.scores | told.figures(played.shown, epoch_ns, int(poses.t_ns[-1]))
-    if played.shown is not None:
-        full |= score_objects(_object_scores(poses_file.parent, setup, played.shown, epoch_ns))
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
     picture, truth = out / "hand.png", judged.truth
     draw_summary(picture, poses, setup.rig, setup.hand, figures, truth, row, judged.wrist, shown)
     write_rrd(out / "run.rrd", poses, setup, truth=truth, images=judged.images, told=told.messages())
     return full
-
-
-def _object_scores(folder: Path, setup: RigSetup, scene: Scene, epoch_ns: int) -> dict[str, dict[str, float]]:
-    """Of each tracked object whose poses stand beside those of the hand."""
-    scores: dict[str, dict[str, float]] = {}
-    for one in setup.objects:
-        if not (path := object_path(folder, one.name)).exists():
-            continue
-        poses = load_object(path)
-        poses = poses.rows(int(np.searchsorted(poses.t_ns, epoch_ns)), len(poses))
-        true = [scene.truth((t_ns - epoch_ns) * 1e-9).objects[one.name] for t_ns in poses.t_ns.tolist()]
-        truth = ObjectTruth(poses.t_ns, np.array(true).reshape(-1, 4, 4))
-        scores[one.name] = score_object(poses, truth)
-    return scores
 
 
 def _judge(
