@@ -327,7 +327,8 @@ def _simulated(add: Callable[..., argparse.Action]) -> None:
         default="standard",
         metavar="NAME",
         help=f"standard | lights | poses | hand-routine | object | gestures | leap:FILE.npz | {BOTH} | board; before a "
-        f"wrist device standard | curl | wearer | poses | spread | {BOTH}, each with @dark | @indoor | @bright | @sun, or board",
+        f"wrist device standard | curl | wearer | poses | spread | {BOTH}, each with @dark | @indoor | @bright | @sun, "
+        "or board",
     )
     add("--seed", type=int, default=7)
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
