@@ -43,6 +43,7 @@ SECTIONS = {
     "wrist_inverse": "Random poses from laser and fingertip, exact and noisy, at level ik; baseline: the cost of fk",
     "wrist_calibration": "Laser plane by number of views, flat field, palm by board, who wears it; exact truth",
     "wrist_mounting": "How a wrist device sits, its clocks, from 10 s with markers: noisy truth, rendered; exact truth",
+    "tracker": "A Vive tracker registered to the cameras from 12 s, and its clock; goal 3 mm, 2 deg; exact truth",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "volume": "A finger tip in 27 places of the volume that the rig desk states; exact truth, no baseline",

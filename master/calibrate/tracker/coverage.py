@@ -12,6 +12,7 @@ LEAST_S, LEAST_TURN_RAD, LEAST_WAY_M = 8.0, np.radians(45.0), 0.10
 LEAST_PACE_RAD_S, LEAST_PACE_M_S = np.radians(20.0), 0.05
 _ENDS = (0.03, 0.97)  # quantiles: a stray pose is no motion
 _PACE_S = 0.2
+_BEGUN_S = 1.0  # before that there is no motion to speak of
 _ADVICE = {
     "seconds": "keep the object before the cameras, where the tracker sees a base station",
     "turn": "turn it about its {axes} axis as well, a quarter turn and back",
@@ -43,9 +44,9 @@ class Coverage:
     @property
     def missing(self) -> tuple[str, ...]:
         """What to do besides, for a person; nothing: it is enough."""
+        if self.shared_s < _BEGUN_S:
+            return (_ADVICE["seconds"],)
         wanting: list[str] = []
-        if self.shared_s < LEAST_S:
-            wanting.append(_ADVICE["seconds"])
         poor = [axis for axis, turn in zip("xyz", self.turn_rad, strict=True) if turn < LEAST_TURN_RAD]
         if poor:
             wanting.append(_ADVICE["turn"].format(axes=" and its ".join(poor)))
@@ -53,6 +54,8 @@ class Coverage:
             wanting.append(_ADVICE["way"])
         if self.pace_rad_s < LEAST_PACE_RAD_S and self.pace_m_s < LEAST_PACE_M_S:
             wanting.append(_ADVICE["pace"])
+        if self.shared_s < LEAST_S:
+            wanting.append(_ADVICE["seconds"])
         return tuple(wanting)
 
     @property
