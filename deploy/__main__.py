@@ -20,7 +20,8 @@ _EXAMPLES = {
   phalanx demo --scene grasp --rig desk-back3   the same without the wrist device, to compare
   phalanx demo --scene object                   a wand of painted beads travels before the cameras
   phalanx demo --scene grasp --rig desk-cube    the bar has a cube of tags: where it is, and which fingers touch it
-  phalanx demo --scene gestures --seconds 80    pinches, dials, taps and pointing, against what the hand really said
+  phalanx demo --scene gestures --seconds 80 --bus tcp/127.0.0.1:47802
+                                                pinches, dials, taps and pointing, against what the hand really said
 """,
     "replay": """examples:
   phalanx replay RECORDING --out out/replay     the same line on recorded frames, the same bytes on every run
@@ -56,6 +57,7 @@ def _demo(options: argparse.Namespace) -> int:
         options.seed,
         options.scene,
         options.web,
+        bus=options.bus,
     )
     summary = run_demo(settings, stop_on_signals(), _say)
     _finish(summary, options.json)
@@ -134,6 +136,11 @@ def _parser() -> argparse.ArgumentParser:
     )
     rig.add_argument(
         "--wrist", dest="rigs", action="store_const", const=["wrist"], help="the wrist device: --rig wrist"
+    )
+    demo.add_argument(
+        "--bus",
+        metavar="ENDPOINT",
+        help="where other programs can read along, as tcp/127.0.0.1:47802 (default: any free port)",
     )
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
     demo.add_argument(

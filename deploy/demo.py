@@ -54,6 +54,7 @@ class DemoSettings:
         scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
         master: Module that is run as the master.
+        bus: Endpoint of the master's bus; None: a port that is free.
     """
 
     seconds: float
@@ -65,6 +66,7 @@ class DemoSettings:
     scene: str = "standard"
     web: bool = False
     master: str = "master"
+    bus: str | None = None
 
     def sensors(self) -> list[Sensor]:
         """What is simulated. Raises DemoError: see `sensors_of`."""
@@ -161,7 +163,7 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     """The process table: name, command line, environment."""
     key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
     beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
-    bus = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    bus = settings.bus or f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     tree = ["--calibration", str(settings.calibration)]
     place = [*rig_options(settings.rigs), *tree]
     rows: list[tuple[str, list[str], dict[str, str]]] = []

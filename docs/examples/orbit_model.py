@@ -1,6 +1,6 @@
 """Pinch, and turn or zoom a 3D model on the screen.
 
-Run a master that tells gestures (`phalanx demo --scene gestures`, or a real one), and beside it
+Run a master (or `phalanx demo --scene gestures --bus tcp/127.0.0.1:47802`), and beside it
 
     python docs/examples/orbit_model.py                      a chair, in a window; or --web: as a page
     python docs/examples/orbit_model.py --model engine.glb --radius 0.3

@@ -1,6 +1,6 @@
 """An eyes-free volume dial: grip the air as if round a knob, and turn it.
 
-Run a master that tells gestures (`phalanx demo --scene gestures`, or a real one), and beside it
+Run a master (or `phalanx demo --scene gestures --bus tcp/127.0.0.1:47802`), and beside it
 
     python docs/examples/volume_dial.py --output wpctl
 

@@ -217,6 +217,14 @@ def test_the_demo_starts_a_slave_for_the_imu_of_a_rig_that_has_one(tmp_path: Pat
     assert len({(one.clock_offset_ms, one.clock_ppm) for one in slaves}) == 3  # a clock of its own
 
 
+def test_others_read_along_at_the_bus_that_the_user_names(tmp_path: Path) -> None:
+    settings = demo.DemoSettings(
+        1.0, True, tmp_path, ROOT / "calib_json", ("desk",), 7, bus="tcp/127.0.0.1:47999"
+    )
+    (master,) = (command for name, command, _ in demo._table(settings, 10**12) if name == "master")
+    assert master[master.index("--bus") + 1] == "tcp/127.0.0.1:47999"
+
+
 def test_a_tracker_on_an_object_is_a_slave_of_its_own(tmp_path: Path) -> None:
     table = rows("desk-tracker", ROOT / "calib_json", tmp_path, "object")
     assert list(table) == ["left", "right", "tracker", "master"]
