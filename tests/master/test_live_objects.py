@@ -1,0 +1,165 @@
+"""A live master of a rig with an object: tags, tracker, markers come by datagram, poses and contact go to the bus."""
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from shutil import copytree
+
+import msgspec
+import pytest
+
+from common.calibration import RigCalibration, load, save
+from common.clock import SystemClock
+from common.keys import new_key
+from common.messages import (
+    Command,
+    Contact,
+    Gesture,
+    HandPose,
+    ObjectPose,
+    ObjectSource,
+    TrackerPose,
+)
+from common.object_profile import ObjectProfile
+from common.zenoh_bus import ZenohBus
+from master.live import LiveSettings, cameras_line, run_live
+from master.outputs.told_files import contact_path, load_contact, load_object, object_path
+from master.rig import load_setups
+from master.tuning import RigFiles
+from slave.uplink import Uplink
+from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.object_run import (
+    START_NS,
+    T_OBJECT_TRACKER,
+    T_RIG_TRACKING,
+    ObjectRun,
+    matrix,
+    object_run,
+    tracker_pose,
+)
+
+FRAMES = 30
+
+
+@pytest.fixture
+def tree(root: Path, tmp_path: Path) -> Path:
+    """The shipped files, with a tracker on the cube."""
+    copytree(root / "calib_json", tmp_path / "calib")
+    rig_path, cube_path = tmp_path / "calib/rigs/desk-cube.json", tmp_path / "calib/objects/cube.json"
+    rig, cube = load(rig_path, RigCalibration), load(cube_path, ObjectProfile)
+    save(rig_path, msgspec.structs.replace(rig, T_rig_tracking=matrix(T_RIG_TRACKING)))
+    cube = msgspec.structs.replace(cube, tracker="puck", T_object_tracker=matrix(T_OBJECT_TRACKER))
+    save(cube_path, cube)
+    return tmp_path / "calib"
+
+
+class Master:
+    """A live master and all who send to it."""
+
+    def __init__(self, stack: ExitStack, tree: Path, out: Path) -> None:
+        key, beacon, endpoint = bytes.fromhex(new_key()), free_udp_port(), free_endpoint()
+        setups = load_setups(tree, ("desk-cube",))
+        settings = LiveSettings(
+            ("127.255.255.255", beacon),
+            ("127.0.0.1", 0),
+            endpoint,
+            5.0,
+            out / "poses.npz",
+            out / "live.json",
+            RigFiles(tree, ("desk-cube",)),
+        )
+        self.lines: list[str] = []
+        self.stop = threading.Event()
+        args = (setups, key, settings, self.stop, self.lines.append)
+        self.thread = threading.Thread(target=run_live, args=args)
+        self.thread.start()
+        stack.callback(self.end)
+        self.bus = ZenohBus(None, endpoint)
+        stack.callback(self.bus.close)
+        self.inboxes = {
+            name: self.bus.subscribe(name, depth=4 * FRAMES)
+            for name in ("hand", "object", "contact", "gesture")
+        }
+        names = ("left", "right", "puck")
+        self.ends = {name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in names}
+        for end in self.ends.values():
+            stack.callback(end.close)
+            assert end.wait_for_start(20.0)
+        self.bus.ask(Command("master", "report"), 5.0)  # who is answered is subscribed
+
+    def counts(self) -> dict[str, int]:
+        return self.bus.ask(Command("master", "report"), 5.0).counts
+
+    def end(self) -> None:
+        self.stop.set()
+        self.thread.join(20.0)
+
+
+@pytest.fixture
+def master(tree: Path, tmp_path: Path) -> Iterator[Master]:
+    with ExitStack() as stack:
+        yield Master(stack, tree, tmp_path)
+
+
+def play(shown: ObjectRun, master: Master) -> None:
+    """Send all of the run, at its pace and as if it were now."""
+    shift_ns = SystemClock().now_ns() - shown.messages[0].t_ns + 50_000_000
+    for one in shown.messages:
+        end = master.ends[one.source if isinstance(one, TrackerPose) else one.camera]
+        changes: dict[str, int] = {"session": end.session, "t_ns": one.t_ns + shift_ns}
+        if not isinstance(one, TrackerPose):
+            changes["ready_t_ns"] = one.ready_t_ns + shift_ns
+        end.send(msgspec.structs.replace(one, **changes))
+        master.stop.wait(0.008)
+
+
+def test_objects_and_contact_come_on_the_bus_and_into_files(
+    master: Master, root: Path, tree: Path, tmp_path: Path
+) -> None:
+    (setup,) = load_setups(tree, ("desk-cube",))
+    shown = object_run(root, "desk-cube", FRAMES, "grasp", 60, setup)
+    play(shown, master)
+    assert until(lambda: master.counts().get("left.tags_received", 0) == FRAMES // 3)
+    assert until(lambda: any(line.startswith("cameras: left, right; tracker: puck") for line in master.lines))
+    device = [tracker_pose("puck", shown.pose("cube", START_NS), k, k) for k in range(5)]
+    master.stop.wait(0.6)  # longer than cameras are preferred
+    for one in device:
+        now_ns = SystemClock().now_ns()
+        puck = master.ends["puck"]
+        puck.send(msgspec.structs.replace(one, session=puck.session, t_ns=now_ns))
+        master.stop.wait(0.01)
+    assert until(lambda: master.counts().get("puck.received", 0) == 5)
+    counts = master.counts()
+    for event in ("left.lost", "left.skipped", "right.lost", "right.skipped", "refused.impostor"):
+        assert event not in counts, "what never happened is not told"
+    assert counts["object.cube.tracked"] >= FRAMES // 2
+    master.end()
+    poses = [one for one in drained(master, "object") if isinstance(one, ObjectPose)]
+    assert {ObjectSource(one.source) for one in poses if one.tracked} == {
+        ObjectSource.TAGS,
+        ObjectSource.TRACKER,
+    }
+    assert all(one.latency_ns > 0 for one in poses)
+    hands = [one for one in drained(master, "hand") if isinstance(one, HandPose)]
+    contacts = [one for one in drained(master, "contact") if isinstance(one, Contact)]
+    assert len(hands) == len(contacts) > FRAMES // 2
+    assert {(one.hand, one.object) for one in contacts} == {("default-right", "cube")}
+    assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
+    assert len(load_object(object_path(tmp_path, "cube"))) == len(poses)
+    assert len(load_contact(contact_path(tmp_path, "default-right", "cube"))) == len(contacts)
+    told = msgspec.json.decode((tmp_path / "live.json").read_bytes())
+    assert told["counts"]["objects"] == sum(one.tracked for one in poses)
+    assert told["object_latency_p50_ms"] > 0.0
+
+
+def drained(master: Master, name: str) -> list[object]:
+    found: list[object] = []
+    while (message := master.inboxes[name].get(0.1)) is not None:
+        found.append(message)
+    return found
+
+
+def test_who_is_there_is_said_by_kind() -> None:
+    said = cameras_line(("left",), frozenset({"left", "palm", "puck"}), ("puck", "other"))
+    assert said == "cameras: left; IMU: palm; tracker: puck"
