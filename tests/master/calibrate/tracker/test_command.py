@@ -53,9 +53,10 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
     def command(*arguments: object) -> int:
         monkeypatch.setattr(sys, "argv", ["phalanx-master", "calibrate", "tracker", *map(str, arguments)])
         try:
-            return main()
+            main()
         except SystemExit as end:
             return int(end.code or 0)
+        return 0
 
     return command
 
