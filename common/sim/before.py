@@ -44,18 +44,16 @@ def sleeve_before(view: View, snapshot: Snapshot, marker: Shape, depth_m: float)
 
 
 def things_before(
-    snapshot: Snapshot, marker: Shape, uv: Float, depth_m: float, but: SeenPart | None = None
+    snapshot: Snapshot, box: tuple[Float, Float], uv: Float, depth_m: float, but: SeenPart | None = None
 ) -> list[Shape]:
-    """Outlines of things and of tracked objects that pass before a marker at a pixel (2,) and a depth.
+    """Outlines of things, and of parts of tracked objects, that pass before a marker at a pixel (2,) and a depth.
 
     Args:
         snapshot: The image.
-        marker: Its outline.
+        box: Low and high corner (2,) [px] of the marker, with room for motion.
         uv: Its middle [px].
         depth_m: How far away it is.
         but: What cannot hide it: its own bead, or what it is stuck on.
     """
     found = [thing.shape for thing in snapshot.things if float(thing.depth(uv)) < depth_m]
-    low, high = marker.corners.min(axis=0) - REACH_PX, marker.corners.max(axis=0) + REACH_PX
-    tracked = snapshot.tracked.before(uv, depth_m, low, high)
-    return found + [part.shape for part in tracked if part is not but]
+    return found + [part.shape for part in snapshot.tracked.before(uv, depth_m, *box) if part is not but]

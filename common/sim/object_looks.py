@@ -36,6 +36,7 @@ class Looks:
     focal_px: float
     project: Project
     thing: tuple[Colour, ...] = field(default_factory=lambda: light.shades(light.THING_LINEAR_RGB))
+    faces: tuple[Colour, ...] = field(default_factory=lambda: _faces())
 
     def seen(self, surface: ObjectSurface, points: Points) -> SeenObjects:
         """What a camera sees of the objects whose key points are there."""
@@ -51,7 +52,7 @@ class Looks:
         bands = self._bands(balls, uv[1], uv[2], points)
         for k, ball in enumerate(balls):
             fills = () if ball.marker is not None else tuple(zip(bands[k], self.thing, strict=True))
-            round_parts[id(ball)] = _whole(ball.middle, uv[1][k], fills, points)
+            round_parts[id(ball)] = _whole(ball.middle.start, uv[1][k], fills, points)
         parts = [
             self._block(part, points) if isinstance(part, Block) else round_parts[id(part)]
             for part in surface.parts
@@ -106,9 +107,13 @@ class Looks:
         layers = [raster.hull(rims_uv[:, k].reshape(-1, 2)) for k in range(rims_uv.shape[1])]
         front = 0 if float(axis @ ends[0]) > 0.0 else 1  # whose outward normal points to the camera
         cosine = float(axis @ self.to_light) * (1.0 if front else -1.0)
-        face = rims_uv[front, 0], light.face_shade(light.THING_LINEAR_RGB, cosine)
+        face = rims_uv[front, 0], self._face(cosine)
         fills = (*zip(layers, self.thing, strict=True), face)
         return SeenPart(layers[0], fills, points.uv[rod.ends], ends[:, 2], points.speed_uv[rod.ends])
+
+    def _face(self, cosine: float) -> Colour:
+        """Colour of a dark flat face whose normal has that cosine to the light."""
+        return self.faces[round(max(cosine, 0.0) * (len(self.faces) - 1))]
 
     def _block(self, block: Block, points: Points) -> SeenPart:
         corners, uv = points.at[block.corners], points.uv[block.corners]
@@ -116,11 +121,13 @@ class Looks:
         normal = unit(cross(rings[:, 1] - rings[:, 0], rings[:, 3] - rings[:, 0]))
         out = normal * np.sign(np.vecdot(normal, rings.mean(axis=1) - middle))[:, None]
         fills = tuple(
-            (uv[list(face)], light.face_shade(light.THING_LINEAR_RGB, float(side @ self.to_light)))
+            (uv[list(face)], self._face(float(side @ self.to_light)))
             for face, side, corner in zip(BLOCK_FACES, out, rings[:, 0], strict=True)
             if float(side @ corner) < 0.0
         )
-        return _whole(block.corners, raster.hull(uv), fills, points)
+        at, speed = uv.mean(axis=0), points.speed_uv[block.corners].mean(axis=0)
+        depth = np.full(2, middle[2])
+        return SeenPart(raster.hull(uv), fills, np.stack([at, at]), depth, np.stack([speed, speed]))
 
     def _sheet(self, sheet: Sheet, points: Points) -> SeenSheet:
         at, uv = points.at[sheet.corners], points.uv[sheet.corners]
@@ -146,8 +153,12 @@ class Looks:
         ]
 
 
-def _whole(place: slice, outline: Float, fills: tuple[tuple[Float, Colour], ...], points: Points) -> SeenPart:
-    """A part without ends: its middle stands for both."""
-    uv, speed = points.uv[place].mean(axis=0), points.speed_uv[place].mean(axis=0)
-    depth = np.full(2, points.at[place, 2].mean())
-    return SeenPart(outline, fills, np.stack([uv, uv]), depth, np.stack([speed, speed]))
+def _whole(point: int, outline: Float, fills: tuple[tuple[Float, Colour], ...], points: Points) -> SeenPart:
+    """A ball: it has no ends, its middle stands for both."""
+    place = [point, point]
+    return SeenPart(outline, fills, points.uv[place], points.at[place, 2], points.speed_uv[place])
+
+
+def _faces() -> tuple[Colour, ...]:
+    """Colours of dark faces by the cosine to the light, from 0 to 1."""
+    return tuple(light.face_shade(light.THING_LINEAR_RGB, k / 64.0) for k in range(65))

@@ -82,12 +82,21 @@ class ObjectPainter:
             for sheet in tracked.sheets
             if sheet.shows
         ]
+        boxes = np.array([(one.corners.min(axis=0), one.corners.max(axis=0)) for one, _ in hand])
+        boxes = boxes.reshape(-1, 2, 2)
+        away = np.array([depth for _, depth in hand])
         found: list[PaintedFeature] = []
         for feature, own in features:
             shape, depth = feature.shape, float(feature.at[2])
-            nearer = things_before(snapshot, shape, shape.corners.mean(axis=0), depth - TOUCHING_M, own)
-            nearer += [*self._hand_before(snapshot, feature, hand, palm), *cards]
-            found.append(PaintedFeature(feature, self._cover(shape, nearer)))
+            low, high = shape.corners.min(axis=0) - REACH_PX, shape.corners.max(axis=0) + REACH_PX
+            nearer = things_before(snapshot, (low, high), feature.uv, depth - TOUCHING_M, own)
+            nearer += self._skin_before(snapshot, feature, (low, high), palm)
+            markers = (away < depth) & raster.overlaps(boxes[:, 0], boxes[:, 1], low, high)
+            nearer += [*(hand[int(k)][0] for k in np.flatnonzero(markers)), *cards]
+            cover = raster.cover(
+                shape, None, nearer, raster.moments(shape, self._view.exposure_s), self._size
+            )
+            found.append(PaintedFeature(feature, cover))
         return found
 
     def look(self, item: PaintedFeature, box: Box) -> Float32:
@@ -122,27 +131,14 @@ class ObjectPainter:
             )
         return views
 
-    def _hand_before(
-        self,
-        snapshot: Snapshot,
-        feature: SeenBead | SeenSheet,
-        hand: Sequence[tuple[Shape, float]],
-        palm: Shape,
+    def _skin_before(
+        self, snapshot: Snapshot, feature: SeenBead | SeenSheet, box: tuple[Float, Float], palm: Shape
     ) -> list[Shape]:
-        """What of the hand may lie before a feature."""
-        view, shape, depth = self._view, feature.shape, float(feature.at[2])
-        low, high = shape.corners.min(axis=0) - REACH_PX, shape.corners.max(axis=0) + REACH_PX
-        middle = shape.corners.mean(axis=0)
-        skin = skin_before(view, snapshot, middle[None], feature.at[2:], low[None], high[None])[0]
-        before = [*phalanges(snapshot, skin), *sleeve_before(view, snapshot, shape, depth)]
-        before += [one for one, away in hand if away < depth]
-        return [*before, *([palm] if bool(view.behind_palm(snapshot, feature.at)) else [])]
-
-    def _cover(self, shape: Shape, nearer: Sequence[Shape]) -> Coverage:
-        low, high = shape.corners.min(axis=0) - REACH_PX, shape.corners.max(axis=0) + REACH_PX
-        near = [
-            one
-            for one in nearer
-            if bool(raster.overlaps(low, high, one.corners.min(axis=0), one.corners.max(axis=0)))
+        """What of skin and sleeve may lie before a feature, whose box `low`, `high` (2,) [px] is given."""
+        view, depth, uv = self._view, feature.at[2:], feature.uv[None]
+        skin = skin_before(view, snapshot, uv, depth, box[0][None], box[1][None])[0]
+        before = [
+            *phalanges(snapshot, skin),
+            *sleeve_before(view, snapshot, feature.shape, float(depth[0])),
         ]
-        return raster.cover(shape, None, near, raster.moments(shape, self._view.exposure_s), self._size)
+        return [*before, *([palm] if bool(view.behind_palm(snapshot, feature.at)) else [])]

@@ -63,6 +63,11 @@ class SeenBead:
     t_s: float
 
     @property
+    def uv(self) -> Float:
+        """Its middle (2,) [px]."""
+        return self.part.ends_uv[0]
+
+    @property
     def shape(self) -> Shape:
         """Its outline."""
         return self.part.shape
@@ -90,6 +95,11 @@ class SeenSheet:
     shows: bool
     lit: float
     t_s: float
+
+    @property
+    def uv(self) -> Float:
+        """Its middle (2,) [px]."""
+        return self.paper_uv.mean(axis=0)
 
     @property
     def shape(self) -> Shape:

@@ -107,7 +107,7 @@ class Painter:
             nearer += [
                 *([palm] if hidden[c] else []),
                 *sleeve_before(view, snapshot, caps[c], float(centre[c, 2])),
-                *things_before(snapshot, caps[c], snapshot.uv[cap.centre], float(centre[c, 2])),
+                *things_before(snapshot, (low[c], high[c]), snapshot.uv[cap.centre], float(centre[c, 2])),
                 *cards,
             ]
             cut = view.own_finger(snapshot, c)
@@ -121,7 +121,7 @@ class Painter:
             before = skin_before(view, snapshot, uv.mean(axis=0)[None], depth, *at)[0]
             nearer = [*phalanges(snapshot, before), *([] if view.shows_back(snapshot) else [palm]), *cards]
             nearer += sleeve_before(view, snapshot, shape, float(depth[0]))
-            nearer += things_before(snapshot, shape, uv.mean(axis=0), float(depth[0]))
+            nearer += things_before(snapshot, (at[0][0], at[1][0]), uv.mean(axis=0), float(depth[0]))
             cover = raster.cover(shape, None, nearer, raster.moments(shape, view.exposure_s), self._size)
             painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
             hand.append((shape, float(depth[0])))

@@ -160,6 +160,10 @@ class Renderer:
         if (low >= high).any():
             return
         under = image[low[1] : high[1], low[0] : high[0]]
+        if len(moments) == 1:
+            for outline, colour in part.fills:
+                raster.fill(under, raster.fixed(outline - low), colour)
+            return
         fills = [(outline - low, part.speed(outline), colour) for outline, colour in part.fills]
         total = np.zeros(under.shape, np.float32)
         for moment in moments:
