@@ -1,13 +1,11 @@
 """Pinch, and turn or zoom a 3D model on the screen.
 
 Run a master (or `phalanx demo --scene gestures --bus tcp/127.0.0.1:47802`), and beside it
-
     python docs/examples/orbit_model.py                      a chair, in a window; or --web: as a page
     python docs/examples/orbit_model.py --model engine.glb --radius 0.3
 
-A clutch of two steps. First thumb and finger meet and stay for a moment: the model is taken, nothing moves yet. Then
-what moves first decides: the hand (orbit) or the gap of the pinch (zoom; wider is larger), until the pinch ends.
-Letting go moves both, so what the last moment did is undone. Turns and zooms add up from pinch to pinch.
+A clutch of two steps: a pinch that stays for a moment takes the model; what then moves first decides, the hand (orbit)
+or the gap of the pinch (zoom), until the pinch ends. Letting go moves both: what the last moment did is undone.
 """
 
 import argparse
@@ -43,9 +41,10 @@ HELP = {"": "pinch to take the model", "taken": "taken: move the hand to orbit, 
 class Orbit:
     """Yaw, pitch [rad] and log of the zoom (3,) by pinches; holds what is shown, its goal, and the clutch."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, mirror: bool = False) -> None:
         self.shown, self.mode, self._goal = np.zeros(3), "", np.zeros(3)
         self._first_ns, self._t_ns, self._pinch = 0, 0, ("", 0)
+        self._gain = GAIN * ([-1, 1, 1] if mirror else [1, 1, 1])
         self._from: tuple[Float, Float] | None = None  # middle and gap (4,) [m], goal: where it began
         self._past: deque[tuple[int, Float]] = deque(maxlen=512)
 
@@ -74,7 +73,7 @@ class Orbit:
             self.mode, self._from = ("orbit" if far[0] > far[1] else "zoom"), (at, self._goal)
         elif self.mode != "taken":
             turned = moved[[0, 1, 3]] * ([1, 1, 0] if self.mode == "orbit" else [0, 0, 1])
-            self._goal = np.clip(goal + GAIN * turned, -MOST, MOST)
+            self._goal = np.clip(goal + self._gain * turned, -MOST, MOST)
         self._past.append((self._t_ns, self._goal))
 
     def glide(self, seconds: float) -> None:
@@ -127,6 +126,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--bus", default="tcp/127.0.0.1:47802", help="of the master (default: %(default)s)")
     parser.add_argument("--model", type=Path, metavar="FILE.glb", help="what to show (default: a chair)")
+    parser.add_argument("--mirror", action="store_true", help="the reference camera faces you")
     parser.add_argument("--radius", type=float, default=1.0, help="of the model (default: %(default)s)")
     parser.add_argument("--web", type=int, nargs="?", const=9091, metavar="PORT", help="a page, not a window")
     options = parser.parse_args()
@@ -138,7 +138,7 @@ def main() -> None:
             show = rr.RecordingStream("orbit_model")
             show.connect_grpc(viewer.url)
             show_model(show, model, options.radius)
-            run(ZenohBus(None, options.bus), Orbit(), show, viewer.alive)
+            run(ZenohBus(None, options.bus), Orbit(mirror=options.mirror), show, viewer.alive)
     except (PhalanxError, OSError) as error:
         sys.exit(f"orbit_model: {error}")
     except KeyboardInterrupt:

@@ -84,6 +84,17 @@ def test_a_hand_that_moves_turns_the_model_its_way_and_leaves_its_size(app: Modu
     assert (yaw, zoom) == (0.0, 0.0)
 
 
+def test_before_a_camera_that_faces_the_hand_it_turns_the_other_way_about(app: ModuleType) -> None:
+    ways = []
+    for mirror in (False, True):
+        orbit = app.Orbit(mirror=mirror)
+        for message in pinch(*path([0.1, 0.05, 0.0])):
+            orbit.push(message)
+        orbit.glide(10.0)
+        ways.append(orbit.shown)
+    np.testing.assert_allclose(ways[1], ways[0] * [-1.0, 1.0, 1.0])
+
+
 def test_a_gap_that_opens_makes_it_larger_and_turns_nothing(app: ModuleType) -> None:
     at, gap = still(150)
     gap[40:] = np.interp(np.arange(110), [0, 80], [0.002, 0.012])
