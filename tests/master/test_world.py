@@ -343,3 +343,24 @@ def test_a_hand_is_solved_as_without_objects(wand: ObjectRun) -> None:
     assert len(poses[0]) == len(poses[1]) > 3
     for one, other in zip(*poses, strict=True):
         np.testing.assert_array_equal(one.position_m, other.position_m)
+
+
+@pytest.mark.parametrize("which", ["wand", "cube"])
+def test_nonsense_that_is_sealed_rightly_ends_nothing(which: str, request: pytest.FixtureRequest) -> None:
+    shown: ObjectRun = request.getfixturevalue(which)
+    world, rng = world_of(with_tracker(shown.setup)), np.random.default_rng(7)
+    for k in range(60):
+        base = shown.messages[int(rng.integers(len(shown.messages)))]
+        t_ns = int(base.t_ns + rng.integers(-(10**9), 10**9))
+        count, far = int(rng.integers(0, 6)), 10.0 ** rng.integers(-3, 17)
+        ids = np.sort(rng.choice(8, count, replace=False)).astype(np.uint16)
+        uv, sigma = rng.normal(size=(count, 4, 2)) * far, 10.0 ** rng.uniform(-3.0, 3.0, count)
+        turn = rng.normal(size=4) * 10.0 ** rng.integers(-160, 160)
+        for message in (
+            TagDetections("left", 1, k, t_ns, t_ns, ids, uv, sigma),
+            TrackerPose("puck", 1, k, t_ns, rng.normal(size=3) * far, turn),
+            msgspec.structs.replace(base, t_ns=int(rng.integers(-(2**62), 2**62))),
+            base,
+        ):
+            for one in world.push(message):
+                assert isinstance(one, Contact | Gesture) or one.pose.t_ns is not None
