@@ -82,7 +82,7 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         return None
     palm = quaternion_to_matrix(wxyz[WRIST]) @ model.rest_rotation[WRIST].T
     T_rig_palm = rigid(palm, joints[WRIST] - palm @ model.rest_position_m[WRIST])
-    lacking: Bool = np.isnan(joints).any(axis=1) | np.isnan(wxyz).any(axis=1)
+    lacking: Bool = np.asarray(np.isnan(joints).any(axis=1) | np.isnan(wxyz).any(axis=1), np.bool_)
     if lacking.any():
         likely = model.forward(T_rig_palm, LIKELY_RAD)
         joints = np.where(lacking[:, None], likely.position_m, joints)

@@ -1,8 +1,8 @@
 """A pose from a few examples: ranges about what was shown, refused where it cannot be told from another.
 
 An example is a hold of some frames; of each quantity it has the median. Over the examples a quantity has a mean and a
-spread, which nobody repeats better than `FLOOR` another day; few examples widen it as Student's t does (the factor for
-68 % of a new one, n - 1 degrees of freedom). The range is the mean and that much either way, the border is as wide
+spread, which nobody repeats better than `FLOOR` another day; few examples widen it as Student's t does (the factor that
+holds 86 % of new ones, n - 1 degrees of freedom). The range is the mean and that much either way, the border is as wide
 again.
 
 Only what was known in every example is asked, and of what says the same twice only one. A pose is refused where an
@@ -130,7 +130,7 @@ def _shape(name: str, examples: Sequence[Example], weight: float) -> PoseShape:
         np.mean([np.where(known, example.quantities.sigma, 0.0) ** 2 for example in examples], axis=0)
     )
     n = len(examples)
-    wider = float(stdtrit(n - 1, 0.84)) * sqrt(1.0 + 1.0 / n)
+    wider = float(stdtrit(n - 1, 0.93)) * sqrt(1.0 + 1.0 / n)
     ranges: dict[Quantity, Span] = {}
     for quantity in _ASKED:
         column, unit = QUANTITIES.index(quantity), _unit(quantity)
