@@ -6,7 +6,7 @@
     23 - 32 s   turns once about its own axis and once about another, wholly
     32 - 35 s   rests
     35 - 45 s   wanders; a card passes before it (`CARDS`) that hides it from above
-    45 - 53 s   wanders; the open hand comes before it and hides some of it
+    45 - 53 s   comes to rest; the open hand comes before it, hides some of it and goes again
     53 - 60 s   wanders
 
 Else the hand is aside, its fingers slowly moving. Place, pace, axes and order of the turns are drawn from the seed.
@@ -38,7 +38,7 @@ ASIDE_M = np.array([0.165, 0.06, 0.07])  # the hand, where it hides nothing
 BEFORE_M = np.array([0.0, 0.055, -0.11])  # the hand where it hides some of it, against the object
 WANDER_M = np.array([0.07, 0.055, 0.06])
 WANDER_DEG = np.array([75.0, 75.0, 90.0])
-WANDERS_S = ((0.3, 12.0), (35.0, 59.7))
+WANDERS_S = ((0.3, 12.0), (35.0, 46.4), (51.6, 59.7))
 SHUTTLE_S, SHUTTLE_M_S, SHUTTLE_HZ = (15.0, 23.0), 0.6, (0.8, 1.1)
 SPINS_S = ((23.2, 27.4), (27.6, 31.8))
 COMES_S = (45.0, 46.6, 51.4, 53.0)
