@@ -24,15 +24,16 @@ from common.camera_model import CameraModel
 from common.srgb import to_linear
 
 LIGHT = to_linear(np.arange(256) / 255.0)  # of a byte
-ALONG, ACROSS = 24, 13  # samples of a side: places on it, and steps from black to white
+ALONG, ACROSS = 18, 9  # samples of a side: places on it, and steps from black to white
 ENDS_PX = 1.6  # of a side that are left out at either end: there the next side begins
 REACH_PX = 3.5  # to either side of the edge, at most
-CELL = 0.72  # of the border's width that is looked at
-PASSES, STEPS = 2, 4
+CELL = 0.55  # of the border's width that is looked at
+PASSES, STEPS = 2, 3
 WIDEST_PX, SHARPEST_PX = 4.0, 0.25  # an edge
-FLOOR_PX = 0.02  # what is left where there is no noise: pixels are squares, sampled by straight lines
+FLOOR_PX = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
 BILINEAR = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
-MISFIT = 0.15  # of the contrast: an edge that departs more from the law has something on it
+MISFIT = 0.15  # of the contrast: an edge that departs more from the law has something on it,
+ROUGH_MISFIT = 0.4  # or is that of a small tag whose code is not known yet
 LEAST_CONTRAST = 0.008  # in linear light, white is 1
 SLIMMEST = 0.1  # sine of the angle between two sides
 LEAST_REACH_PX = 1.2
@@ -113,7 +114,8 @@ def _fit(
         None if inner is None else inner.reshape(4 * n, cells),
     )
     density = ALONG * ACROSS / (length * (1.0 - 2.0 * margin) * 2.0 * reach)  # samples per square pixel
-    return _met(uv, outward, reach, density, _edges(sides))
+    misfit = ROUGH_MISFIT if inner is None else MISFIT
+    return _met(uv, outward, reach, density, misfit, _edges(sides))
 
 
 def _on_side(begin: Float, end: Float, place: Float, lens: CameraModel | None) -> Float:
@@ -228,7 +230,7 @@ def normal_law(z: Float) -> Float:
     return 0.5 * (1.0 + np.tanh(0.7978845608 * z * (1.0 + 0.044715 * z * z)))
 
 
-def _met(uv: Float, outward: Float, reach: Float, density: Float, line: _Lines) -> Corners:
+def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float, line: _Lines) -> Corners:
     """Where the lines of neighbouring sides meet, and how sure that is."""
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)
@@ -249,6 +251,6 @@ def _met(uv: Float, outward: Float, reach: Float, density: Float, line: _Lines) 
         & (contrast > LEAST_CONTRAST)
         & (width < 0.99 * WIDEST_PX)
     )
-    good &= line.misfit.reshape(n, 4) < (MISFIT * contrast) ** 2
+    good &= line.misfit.reshape(n, 4) < (misfit * contrast) ** 2
     sigma = np.sqrt(spread.mean(axis=1) / 2.0)
     return Corners(met, np.where(good.all(axis=1), sigma, np.nan), contrast.min(axis=1), width.mean(axis=1))

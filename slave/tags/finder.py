@@ -36,7 +36,7 @@ PARTS = ((0.0, 0.0), (0.4, 0.4), (0.4, 0.0), (0.0, 0.4))  # left, top of the par
 PART = (
     0.6  # their size; what is larger than the overlap is found in the image at half its size, the fifth part
 )
-IDLE = 4  # while a tag is seen, every so many frames a part is searched
+IDLE = 4  # while all that were seen are, every so many frames is searched beside them, and a part
 DIGITS = 6  # of what is reported: what comes after them differs between processors
 Box = tuple[int, int, int, int]  # left, top, right, bottom [px]
 
@@ -119,7 +119,9 @@ class TagFinder:
         found: dict[int, tuple[Float, float]] = {}
         for codes in self._codes:
             self._expected(grey, codes, tracks, t_ns, found)
-        sought = self._near(tracks, found, t_ns) + self._part(bool(found))
+        lost = any(number not in found for number in tracks)
+        part = self._part(bool(found))
+        sought = (self._near(tracks, found, t_ns) if lost or not self._idle else []) + part
         for box in sought:
             self._search(grey[box[1] : box[3], box[0] : box[2]], grey, box, 1, found)
         if self._turn == len(PARTS) or self._turn < 0:
