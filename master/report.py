@@ -113,7 +113,11 @@ def report_scene(
     shown = ToldPicture(setup.objects, told.objects, told.contacts, told.gestures)
     row = best_row(poses, shown)
     judged = _judge(poses, row, setup, played, epoch_ns, tell)
-    full = summary | judged.scores | told.figures(played.shown, epoch_ns, int(poses.t_ns[-1]))
+    full = (
+        summary
+        | judged.scores
+        | told.figures(played.shown, epoch_ns, int(poses.t_ns[0]), int(poses.t_ns[-1]))
+    )
     figures = {name: float(value) for name, value in full.items() if isinstance(value, int | float)}
     tell("drawing the hand", 0, 1)
     picture, truth = out / "hand.png", judged.truth

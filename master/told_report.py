@@ -102,8 +102,8 @@ class ToldRun:
             out += [contact_row(near, row) for row in range(len(near))]
         return out
 
-    def figures(self, scene: Scene | None, epoch_ns: int, until_ns: int) -> dict[str, object]:
-        """Figures of the summary.
+    def figures(self, scene: Scene | None, epoch_ns: int, from_ns: int, until_ns: int) -> dict[str, object]:
+        """Figures of the summary, of poses from a time to a time.
 
         Returns:
             Those of `score_objects`; held_s, how long an object was held; gestures, how often each was made
@@ -124,7 +124,7 @@ class ToldRun:
         if made:
             out["gestures"] = dict(made.most_common())
         if scene is not None and isinstance(scene.motion, Saying):
-            out |= judge_gestures(self.gestures, scene.motion, epoch_ns, until_ns)
+            out |= judge_gestures(self.gestures, scene.motion, epoch_ns, from_ns, until_ns)
         return out
 
 
@@ -139,7 +139,7 @@ def truth_of_object(scene: Scene, poses: ObjectPoses, epoch_ns: int) -> ObjectTr
 
 
 def judge_gestures(
-    told: Sequence[Gesture], motion: Saying, epoch_ns: int, until_ns: int
+    told: Sequence[Gesture], motion: Saying, epoch_ns: int, from_ns: int, until_ns: int
 ) -> dict[str, object]:
     """What the hand of a scene said against what was told of it; poses of the hand are not judged.
 
@@ -147,15 +147,16 @@ def judge_gestures(
         told: Gestures in the order of time.
         motion: The hand of the scene.
         epoch_ns: Scene time 0 on the clock of the messages.
-        until_ns: The end of the run.
+        from_ns: The first pose of the run.
+        until_ns: Its last one.
     """
     begun = [one for one in _beginnings(told) if one.kind != "pose"]
-    end_s = (until_ns - epoch_ns) * 1e-9
+    first_s, end_s = (from_ns - epoch_ns) * 1e-9, (until_ns - epoch_ns) * 1e-9
     made = [
         (one, turn * motion.period_s)
         for turn in range(int(end_s // motion.period_s) + 1)
         for one in motion.said
-        if one.stop_s + turn * motion.period_s <= end_s
+        if first_s <= one.start_s + turn * motion.period_s and one.stop_s + turn * motion.period_s <= end_s
     ]
     heard: set[int] = set()
     right = 0
@@ -164,8 +165,8 @@ def judge_gestures(
         own = [k for k, told_one in enumerate(begun) if k not in heard and _is(told_one, one, span, epoch_ns)]
         right += bool(own)
         heard.update(own)
-    # One that the run cut off was made all the same.
-    cut = [k for k, one in enumerate(begun) if k not in heard and _seconds_of(one, epoch_ns) > end_s - 3.0]
+    # One that begin or end of the run cut off was made all the same.
+    cut = [k for k, one in enumerate(begun) if k not in heard and _cut(one, motion, epoch_ns, first_s, end_s)]
     out: dict[str, object] = {
         "gestures_right": right,
         "gestures_made": len(made),
@@ -220,6 +221,20 @@ def _beginnings(told: Sequence[Gesture]) -> list[Gesture]:
 
 def _label(one: Gesture) -> str:
     return one.kind if one.name == one.kind else f"{one.kind} {one.name}"
+
+
+def _cut(told: Gesture, motion: Saying, epoch_ns: int, first_s: float, end_s: float) -> bool:
+    """Whether it is one that the hand had begun before the first pose, or not done at the last."""
+    turns = range(int(end_s // motion.period_s) + 1)
+    spans = (
+        (one, one.start_s + k * motion.period_s, one.stop_s + k * motion.period_s)
+        for one in motion.said
+        for k in turns
+    )
+    return any(
+        (start < first_s or stop > end_s) and _is(told, one, (start, stop + _LATE_S), epoch_ns)
+        for one, start, stop in spans
+    )
 
 
 def _is(told: Gesture, made: Said, span_s: tuple[float, float], epoch_ns: int) -> bool:

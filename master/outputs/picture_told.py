@@ -23,7 +23,8 @@ STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the f
 _NEAR_NS = 60_000_000  # an object is shown where it was this close to the instant
 _LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
 _TAP_S = 0.15
-_LETTER_SHARE = 0.0165  # of the strip's length that a letter takes
+_LETTER_SHARE = 0.0155  # of the strip's length that a letter takes
+_LETTERS_LEAST = 3  # of a name that is cut off
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
 
@@ -108,13 +109,12 @@ class ToldPicture:
                 axes.broken_barh(
                     [(start, max(length, _TAP_S))], (lane - 0.38, 0.76), color=unit(GESTURE_RGB[kind])
                 )
-                if kind == "tap":
-                    at, side = start + 0.5 * max(length, _TAP_S), "center"
-                elif len(name) * _LETTER_SHARE * span < length:
-                    at, side = start + 0.004 * span, "left"
-                else:
+                letters = len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span))
+                if letters < min(len(name), _LETTERS_LEAST):
                     continue
-                axes.text(at, lane, name, size=8, color=PAPER, va="center", ha=side, clip_on=True)
+                at = start + (0.5 * max(length, _TAP_S) if kind == "tap" else 0.004 * span)
+                side = "center" if kind == "tap" else "left"
+                axes.text(at, lane, name[:letters], size=8, color=PAPER, va="center", ha=side, clip_on=True)
         axes.set_yticks(range(len(lanes)), [_LANES[kind] for kind in reversed(lanes)])
         axes.set_ylim(-0.6, len(lanes) - 0.4)
         axes.set_xlim(0.0, span)

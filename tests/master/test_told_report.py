@@ -48,21 +48,38 @@ def test_what_was_made_and_told_is_right_and_what_was_not_made_is_false() -> Non
         told("dial", "dial", 3.5, angle_rad=0.0),
         told("tap", "5", 6.5, "end"),
     ]
-    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS + 10 * 10**9)
+    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (3, 3, 0)
     wrong = [told("pinch", "ring", 1.2), told("tap", "5", 2.0, "end"), told("pose", "open_palm", 2.0)]
-    made = judge_gestures(wrong, Script(), EPOCH_NS, EPOCH_NS + 10 * 10**9)
+    made = judge_gestures(wrong, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (0, 3, 2)
 
 
 def test_the_script_repeats_and_what_the_end_cuts_off_is_not_asked_for() -> None:
     heard = [told("pinch", "index", 11.2), told("dial", "dial", 13.4, angle_rad=0.0)]
-    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS + 14 * 10**9)
+    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 14 * 10**9)
     assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (1, 4, 0)
 
 
+def test_what_the_beginning_of_the_run_cuts_off_is_neither_asked_for_nor_false() -> None:
+    heard = [
+        told("pinch", "index", 1.6),
+        told("tap", "5", 6.4, "end"),
+        told("dial", "dial", 4.0, angle_rad=0.0),
+    ]
+    made = judge_gestures(heard, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)
+    assert (made["gestures_right"], made["gestures_made"], made["gestures_false"]) == (2, 2, 0)
+    other = [told("pinch", "ring", 1.6)]  # that one it did not make
+    assert (
+        judge_gestures(other, Script(), EPOCH_NS, EPOCH_NS + 1_500_000_000, EPOCH_NS + 10**10)[
+            "gestures_false"
+        ]
+        == 1
+    )
+
+
 def test_too_late_is_not_right() -> None:
-    made = judge_gestures([told("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS + 10**10)
+    made = judge_gestures([told("pinch", "index", 2.6)], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)
     assert (made["gestures_right"], made["gestures_false"]) == (0, 1)
 
 
@@ -71,7 +88,7 @@ def test_the_angle_is_judged_from_where_the_dial_began() -> None:
     turned = Gesture(
         "h", began.t_ns + 2 * 10**9, "dial", "dial", "update", began.t_ns, 0.9, angle_rad=1.0 + 0.05
     )
-    assert judge_gestures([began, turned, turned], Script(), EPOCH_NS, EPOCH_NS + 10**10)[
+    assert judge_gestures([began, turned, turned], Script(), EPOCH_NS, EPOCH_NS, EPOCH_NS + 10**10)[
         "dial_deg"
     ] == pytest.approx(np.degrees(0.05), abs=0.01)
 
@@ -93,8 +110,10 @@ def test_the_files_of_a_run_are_its_messages_again(tmp_path: Path) -> None:
     again = next(one for one in run.messages() if isinstance(one, Contact))
     np.testing.assert_array_equal(again.point_m, rows[0].point_m)
     assert run.contacts[0].held.sum() * STEP_NS * 1e-9 == pytest.approx(0.05)
-    assert run.figures(None, EPOCH_NS, START_NS + 8 * STEP_NS) == {"held_s": 0.1}  # 0.05, rounded up
+    assert run.figures(None, EPOCH_NS, START_NS, START_NS + 8 * STEP_NS) == {
+        "held_s": 0.1
+    }  # 0.05, rounded up
 
 
 def test_a_run_that_told_nothing_has_no_figures(tmp_path: Path) -> None:
-    assert ToldRun.load(tmp_path, WATCHED, 0).figures(None, 0, 10**9) == {}
+    assert ToldRun.load(tmp_path, WATCHED, 0).figures(None, 0, 0, 10**9) == {}
