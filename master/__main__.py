@@ -75,15 +75,19 @@ def run(
     ] = 5.0,
     poses: Annotated[
         Path | None,
-        typer.Option(help="Write every pose to this .npz; of a second hand beside it, with its name."),
+        typer.Option(
+            help="Write every pose to this .npz; of a second hand beside it, with its name, and in the same folder"
+            " object_NAME.npz, contact_HAND_NAME.npz and gestures.jsonl."
+        ),
     ] = None,
     summary: Annotated[Path | None, typer.Option(help="Write the figures of the run to this .json.")] = None,
 ) -> None:
-    """Track live until Ctrl-C; poses go to the bus (key phalanx/hand/<name>) and, if asked, to a file.
+    """Track live until Ctrl-C; hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
+    and, if asked, to files.
 
     Several rigs of one hand are one hand: cameras that watch its markers and the device on its wrist are solved
-    together. Rigs of two hands are two hands, each published under its own name. The files of rigs, cameras and hands
-    are followed: what changes there is used at once.
+    together. Rigs of two hands are two hands, each published under its own name. The files of rigs, cameras, hands,
+    objects and gestures are followed: what changes there is used at once.
 
     Examples:
 
@@ -92,6 +96,8 @@ def run(
       phalanx-master run --rig desk --rig wrist
 
       phalanx-master run --rig desk --rig wrist-left
+
+      phalanx-master run --rig desk-wand --poses out/poses.npz
 
       phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
     """
@@ -111,10 +117,13 @@ def run(
 @app.command(name="solve")
 def solve_command(
     recording: Annotated[Path, typer.Argument(help="Folder of a raw-frame recording.")],
-    detections: Annotated[Path, typer.Option(help="Folder with detections_<camera>.npz.")],
-    out: Annotated[Path, typer.Option(help="Folder for poses.npz and summary.json.")],
+    detections: Annotated[Path, typer.Option(help="Folder with detections_<camera>.npz, tags_<camera>.npz.")],
+    out: Annotated[
+        Path, typer.Option(help="Folder for poses.npz, summary.json, and what else there is: see below.")
+    ],
     calibration: Annotated[
-        Path | None, typer.Option(help="Folder whose hands/ holds the rig's hand.")
+        Path | None,
+        typer.Option(help="Folder with hands/, gestures/, and objects/ that the recording does not carry."),
     ] = None,
     hand: Hand = None,
     rig_names: Annotated[
@@ -137,7 +146,8 @@ def solve_command(
 ) -> None:
     """Solve recorded detections offline and deterministically: no clock, no network.
 
-    Cameras and wrist device of one hand make one poses.npz together. Of a second hand there is poses-HAND.npz.
+    Cameras and wrist device of one hand make one poses.npz together. Of a second hand there is poses-HAND.npz. Beside
+    them stand object_NAME.npz and contact_HAND_NAME.npz of tracked objects, and gestures.jsonl, a Gesture a line.
 
     Examples:
 
