@@ -14,7 +14,7 @@ _ENDS = (0.03, 0.97)  # quantiles: a stray pose is no motion
 _PACE_S = 0.2
 _BEGUN_S = 1.0  # before that there is no motion to speak of
 _ADVICE = {
-    "seconds": "keep the object before the cameras, where the tracker sees a base station",
+    "seconds": f"go on until cameras and tracker have seen it together for {LEAST_S:.0f} s",
     "turn": "turn it about its {axes} axis as well, a quarter turn and back",
     "way": "carry it a hand's width and more to all sides, nearer and farther",
     "pace": "move it faster, about once to and fro in two seconds: nothing else tells the lag of the clocks",

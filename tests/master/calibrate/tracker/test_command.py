@@ -176,7 +176,7 @@ def test_coverage_tells_which_axis_and_what_else_is_missing() -> None:
     [turn] = of(Motion(7, strays=0.0, turns=(1.0, 1.0, 0.1)))
     assert "about its z axis as well" in turn
     assert any("hand's width" in line for line in of(Motion(7, strays=0.0, way_m=0.02)))
-    assert any("before the cameras" in line for line in of(Motion(7, seconds=4.0)))
+    assert any("together for 8 s" in line for line in of(Motion(7, seconds=4.0)))
     assert any("faster" in line for line in of(Motion(7, strays=0.0, pace=0.02)))
 
 
