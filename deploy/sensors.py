@@ -18,6 +18,7 @@ TOGETHER = (
 _BEST = {
     **dict.fromkeys(TOGETHER, ("desk-back3", "wrist-back3")),
     "object": ("desk-wand",),
+    "gestures": ("desk4",),  # fingers that bend towards one pair are seen by the other
 }
 
 

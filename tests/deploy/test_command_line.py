@@ -299,6 +299,7 @@ def test_two_hands_are_played_each_by_its_own_scene(tmp_path: Path) -> None:
         (["--scene", "grasp", "--rig", "desk"], ("desk",)),
         (["--wrist", "--scene", "grasp"], ("wrist",)),
         (["--scene", "object"], ("desk-wand",)),
+        (["--scene", "gestures"], ("desk4",)),
         (["--scene", "object", "--rig", "desk-cube"], ("desk-cube",)),
     ],
 )
