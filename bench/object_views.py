@@ -84,7 +84,7 @@ def _seen(features: Features, model: CameraModel, where: Where, t_s: float) -> t
         points = (poses[:, :3, :3] @ features.points[..., None])[..., 0] + poses[:, :3, 3]
         uv = model.project(points)
         rows = np.nan_to_num(uv[:, 1], nan=0.0)
-    return uv, features.expected(where(t_s + 0.5 * model.height_px * model.row_time_ns * 1e-9), model)
+    return uv, features.expected(where(t_s + 0.5 * model.height_px * model.row_time_ns * 1e-9), model, 0.8)
 
 
 def _messages(

@@ -14,12 +14,15 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import transform
 from common.object_profile import ObjectProfile, tag_corners
+from common.tag_family import GRIDS
 from master.objects.surface import Surface
 
-_MARGIN_PX = 4.0  # from the image's border
-_TAG_COSINE, _TAG_EDGE_PX = 0.42, 16.0  # of a tag that is found nearly always
+_MARGIN_PX = 6.0  # from the image's border
+# Of a tag that is found nearly always, by what the finder of the slaves finds of rendered ones: how it is turned to the
+# camera, and how short its shortest edge may be by cells.
+_TAG_COSINE, _CELL_PX = 0.65, 3.4
 _BEAD_PX = 2.5  # radius of a bead that is found nearly always
-_BEAD_SEEN = 0.7  # share of a bead that must not be behind the object
+_BEAD_SEEN = 0.75  # share of a bead that must not be behind the object
 _DISC: Float = np.array(
     [[0.0, 0.0]]
     + [[r * np.cos(a), r * np.sin(a)] for r in (0.45, 0.85) for a in np.arange(6) * np.pi / 3 + r]
@@ -38,6 +41,7 @@ class Features:
         rows: (B,) which rows of `MarkerDetections` are the beads.
         tag_ids: (N,) numbers of the tags.
         normals: (F, 3) outward of tags; 0: a bead.
+        cells: Along an edge of a tag, its black border included; 0: there are none.
         surface: What hides features of the object itself.
     """
 
@@ -48,6 +52,7 @@ class Features:
     rows: Int
     tag_ids: tuple[int, ...]
     normals: Float
+    cells: int
     surface: Surface
 
     @classmethod
@@ -77,6 +82,7 @@ class Features:
             normals=np.array(
                 [[0.0] * 3] * len(beads) + [[row[2] for row in tag.T_object_tag[:3]] for tag in tags]
             ).reshape(-1, 3),
+            cells=0 if profile.tags is None else GRIDS[profile.tags.family].cells + 2,
             surface=Surface(profile.shape),
         )
 
@@ -94,17 +100,25 @@ class Features:
         """Rows (4,) of `points` of the tag in that place of `tag_ids`."""
         return self.beads + 4 * tag + np.arange(4)
 
-    def expected(self, T_rig_object: Float, camera: CameraModel) -> Bool:
-        """(F,) which a camera sees of the object at a pose (4, 4), with nothing before it."""
+    def expected(self, T_rig_object: Float, camera: CameraModel, ease: float = 1.0) -> Bool:
+        """(F,) which a camera sees of the object at a pose (4, 4), with nothing before it.
+
+        Args:
+            T_rig_object: The pose.
+            camera: The camera.
+            ease: By what all that is asked of a feature is multiplied; below 1 those are told that may be seen.
+        """
         eye = (camera.centre - T_rig_object[:3, 3]) @ T_rig_object[:3, :3]
         uv = camera.project(transform(T_rig_object, self.points))
-        last = np.array([camera.width_px, camera.height_px]) - 1.0 - _MARGIN_PX
-        inside = ((uv >= _MARGIN_PX) & (uv <= last)).all(axis=1)
-        shows = np.concatenate([self._beads_show(eye, float(camera.matrix[0, 0])), self._tags_show(eye, uv)])
+        last = np.array([camera.width_px, camera.height_px]) - 1.0 - ease * _MARGIN_PX
+        inside = ((uv >= ease * _MARGIN_PX) & (uv <= last)).all(axis=1)
+        shows = np.concatenate(
+            [self._beads_show(eye, float(camera.matrix[0, 0]), ease), self._tags_show(eye, uv, ease)]
+        )
         np.logical_and.at(shows, self.feature, inside)
         return shows
 
-    def _tags_show(self, eye: Float, uv: Float) -> Bool:
+    def _tags_show(self, eye: Float, uv: Float, ease: float) -> Bool:
         """(N,) tags that are turned to an eye (3,) [m], object frame, and large in its image (P, 2) [px]."""
         count = len(self.tag_ids)
         if not count:
@@ -112,15 +126,15 @@ class Features:
         corners, seen = self.points[self.beads :].reshape(count, 4, 3), uv[self.beads :].reshape(count, 4, 2)
         normal = self.normals[self.beads :]
         sight = eye - corners.mean(axis=1)
-        turned = np.vecdot(normal, sight) >= _TAG_COSINE * np.linalg.norm(sight, axis=1)
+        turned = np.vecdot(normal, sight) >= ease * _TAG_COSINE * np.linalg.norm(sight, axis=1)
         edges = np.linalg.norm(seen - np.roll(seen, 1, axis=1), axis=2).min(axis=1)
         # A little off the paper, which lies on the surface.
         lifted = (
             np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1) + 1e-4 * normal[:, None]
         )
-        return turned & (edges >= _TAG_EDGE_PX * _TAG_COSINE) & ~self.surface.hides(eye, lifted).any(axis=1)
+        return turned & (edges >= ease * _CELL_PX * self.cells) & ~self.surface.hides(eye, lifted).any(axis=1)
 
-    def _beads_show(self, eye: Float, focal_px: float) -> Bool:
+    def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
         """(B,) beads that are large enough for an eye (3,) [m], object frame, and not behind the object."""
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]
         sight = eye - points
@@ -132,4 +146,4 @@ class Features:
         off = _DISC[:, :1] * across[:, None] + _DISC[:, 1:] * np.cross(ahead, across)[:, None]
         off += np.sqrt(1.0 - (_DISC * _DISC).sum(axis=1))[:, None] * ahead[:, None]
         hidden = self.surface.hides(eye, points[:, None] + radius[:, None, None] * off)
-        return (radius * focal_px >= _BEAD_PX * away) & ((~hidden).mean(axis=1) >= _BEAD_SEEN)
+        return (radius * focal_px >= ease * _BEAD_PX * away) & ((~hidden).mean(axis=1) >= ease * _BEAD_SEEN)

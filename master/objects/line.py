@@ -40,6 +40,7 @@ _DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
+_UNTOLD_M, _UNTOLD_RAD = 0.02, np.radians(12.0)  # less sure than this it does not tell all of the pose
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
@@ -137,12 +138,12 @@ class ObjectLine:
             return self._held(window, predicted)
         oldest = window.t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
         self._known.append(_Known(window.t_ns, fitted, oldest))
-        if fitted.alone and not _poor(fitted, _POOR_M, _POOR_RAD):
+        if fitted.alone:
             self._sure_ns = window.t_ns
         elif window.t_ns - self._sure_ns > HELD_S * 1e9:
             self._known.clear()
             return self._none(window.t_ns)
-        tracked = not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
+        tracked = fitted.alone or not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
         T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
@@ -200,7 +201,9 @@ class ObjectLine:
         both = None if past is None else self._fit(seen.seen, start, past, feature=seen.feature)
         if alone is None:
             return None if both is None else replace(both, alone=False)
-        return alone if both is None else _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
+        if both is None or not _poor(alone, _UNTOLD_M, _UNTOLD_RAD):
+            return alone if both is None else both
+        return _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
 
     def _holds(self, seen: Chosen, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
@@ -296,7 +299,7 @@ class ObjectLine:
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:
         """The pose while nothing tells: led on, or none."""
         known = self._known[-1] if self._known else None
-        if predicted is None or known is None:
+        if predicted is None or known is None or window.t_ns - self._sure_ns > HELD_S * 1e9:
             return self._none(window.t_ns)
         dt = (window.t_ns - known.t_ns) * 1e-9
         shown = self._hidden.look(

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
-import cv2
 import numpy as np
 
 from common.arrays import Float, Int
@@ -61,23 +60,65 @@ def poses_of_tags(
 def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
     """How a tag seen at normalised points (4, 2) may lie: misfit of the corners and `T_camera_object` of each way.
 
+    The derivative J of the homography at the tag's middle, seen from a view turned to it, is a rotation's upper left
+    2x2 times a scale; its third row is known but for the sign (ibid., 4.1). OpenCV 5 has this wrong for tags near the
+    optical axis.
+
     Args:
         corners: (4, 3) [m] of the tag, object frame, as printed top left, top right, bottom right, bottom left.
         xy: Where they are seen, undistorted (x/z, y/z).
     """
     edge = 0.25 * float(np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).sum())
     flat = tag_corners(edge)
-    T_tag_object = invert(fit_rigid(corners, flat))
-    count, turns, shifts, misses = cv2.solvePnPGeneric(
-        flat, np.ascontiguousarray(xy), np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_IPPE_SQUARE
-    )
+    H = _homography(flat[:, :2], xy)
+    if H is None:
+        return []
+    v = H[:2, 2]
+    J = H[:2, :2] - v[:, None] * H[2, :2]
+    turn = _turn_to(np.array([v[0], v[1], 1.0]))
+    A = np.asarray(np.linalg.solve(turn[:2, :2] - v[:, None] * turn[2, :2], J), np.float64)
+    A /= float(np.linalg.norm(A, 2))
+    left = np.eye(2) - A.T @ A
+    b = np.sqrt(np.maximum(np.diagonal(left), 0.0)) * [1.0, 1.0 if left[0, 1] >= 0.0 else -1.0]
     out: list[tuple[float, Float]] = []
-    for k in range(int(count)):
-        turn, shift = np.asarray(turns[k], np.float64), np.asarray(shifts[k], np.float64).ravel()
-        T = rigid(np.asarray(cv2.Rodrigues(turn)[0], np.float64), shift) @ T_tag_object
-        if np.isfinite(T).all() and shift[2] > 0.0:
-            out.append((float(np.ravel(misses)[k]), T))
-    return out
+    for sign in (1.0, -1.0):
+        first = turn @ np.vstack([A, sign * b])
+        u, _, vt = np.linalg.svd(np.column_stack([first, np.cross(first[:, 0], first[:, 1])]))
+        R = u @ vt
+        T = rigid(R, _shift(flat @ R.T, xy)) @ invert(fit_rigid(corners, flat))
+        seen = corners @ T[:3, :3].T + T[:3, 3]
+        if (seen[:, 2] > 0.0).all():
+            out.append((float(np.linalg.norm(seen[:, :2] / seen[:, 2:] - xy)), T))
+    return sorted(out, key=lambda way: way[0])
+
+
+def _homography(plane: Float, xy: Float) -> Float | None:
+    """The map (3, 3), 1 in its corner, from a plane's points (4, 2) to their images (4, 2); None: three in one line."""
+    rows = np.zeros((8, 8))
+    rows[::2, :2], rows[::2, 2] = plane, 1.0
+    rows[1::2, 3:5], rows[1::2, 5] = plane, 1.0
+    rows[:, 6:] = -(xy[:, :, None] * plane[:, None]).reshape(8, 2)
+    try:
+        return np.append(np.linalg.solve(rows, xy.ravel()), 1.0).reshape(3, 3)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _turn_to(sight: Float) -> Float:
+    """The least rotation (3, 3) that takes the z axis to the direction of a vector (3,) before the camera."""
+    x, y, z = sight / np.linalg.norm(sight)
+    cross = np.array([[0.0, 0.0, x], [0.0, 0.0, y], [-x, -y, 0.0]])
+    return np.eye(3) + cross + cross @ cross / (1.0 + z)
+
+
+def _shift(turned: Float, xy: Float) -> Float:
+    """Where the origin (3,) of turned points (N, 3) is, which are seen at (N, 2): linear least squares."""
+    rows = np.zeros((2 * len(xy), 3))
+    rows[::2, 0] = rows[1::2, 1] = 1.0
+    rows[:, 2] = -xy.ravel()
+    return np.asarray(
+        np.linalg.lstsq(rows, (xy * turned[:, 2:] - turned[:, :2]).ravel(), rcond=None)[0], np.float64
+    )
 
 
 def poses_of_beads(sighted: Sequence[Sighted], features: Features, triangulator: Triangulator) -> list[Float]:
