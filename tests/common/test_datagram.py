@@ -137,3 +137,21 @@ def test_the_window_at_its_limits() -> None:
     assert window.take(2**64 - 1) is False  # a huge jump costs no memory
     assert window.take(2**64 - WINDOW) is True
     assert window.take(2**64 - 1 - WINDOW) is Refusal.REPLAYED
+
+
+@given(st.sets(st.integers(1, 60), min_size=2))
+def test_what_is_missing_between_two_that_came(came: set[int]) -> None:
+    window = ReplayWindow()
+    for counter in came:
+        window.take(counter)
+    first, *_, last = sorted(came)
+    assert window.missing_between(first, last) == last - first - len(came) + 1
+    assert window.missing_between(0, first) == first - 1
+
+
+def test_what_is_too_old_to_be_known_counts_as_missing() -> None:
+    window = ReplayWindow()
+    for counter in (1, 2, 3, 5000):
+        window.take(counter)
+    assert window.missing_between(3, 5000) == 4996
+    assert window.missing_between(1, 3) == 1

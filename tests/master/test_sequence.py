@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from master.sequence import REMEMBERED, TRIPLE, CameraCounts, Sequence
+from master.sequence import REMEMBERED, TRIPLE, CameraCounts, Counted, Losses, Sequence
 
 
 @given(st.lists(st.integers(0, 300), min_size=1, max_size=200, unique=True))
@@ -77,3 +77,49 @@ def test_what_is_missing_between_triples(numbers: tuple[int, ...], lost: int) ->
     for seq in numbers:
         sequence.take(7, seq)
     assert sequence.counts.lost == lost
+
+
+def test_as_many_are_lost_as_datagrams_can_have_carried_them() -> None:
+    losses = Losses()
+    losses.gap(1, 4, numbers=1, datagrams=2)
+    losses.gap(4, 6, numbers=3, datagrams=1)
+    losses.gap(6, 7, numbers=2, datagrams=0)  # never sent
+    assert losses.lost == 2
+
+
+def test_a_late_datagram_of_another_kind_was_no_lost_message() -> None:
+    losses = Losses()
+    losses.gap(1, 3, numbers=1, datagrams=1)
+    losses.late(2, numbers=0)  # a tag
+    assert losses.lost == 0
+    losses.gap(3, 6, numbers=1, datagrams=2)
+    losses.late(4, numbers=0)
+    assert losses.lost == 1
+    losses.late(5, numbers=1)  # it came after all
+    assert losses.lost == 0
+    losses.late(99, numbers=1)
+    losses.begin_session()
+    losses.late(2, numbers=1)
+    assert losses.lost == 0
+
+
+def test_losses_of_an_hour_cost_no_memory() -> None:
+    losses = Losses()
+    for k in range(10 * REMEMBERED):
+        losses.gap(2 * k, 2 * k + 2, numbers=1, datagrams=1)
+    assert losses.lost == 10 * REMEMBERED
+    assert len(losses._gaps) == REMEMBERED
+
+
+def test_numbers_that_rise_as_they_like_miss_nothing() -> None:
+    counted = Counted(Sequence(None))
+
+    def nobody(after: int, before: int) -> int:
+        raise AssertionError(f"nothing is missing between {after} and {before}")
+
+    assert [counted.take(7, seq, 2 * k + 1, nobody) for k, seq in enumerate((5, 90, 91, 20, 91))] == [
+        *(True, True, True),
+        *(False, False),
+    ]
+    assert counted.sequence.counts == CameraCounts(received=3, late=2)
+    assert counted.losses.lost == 0

@@ -147,6 +147,7 @@ def test_contact_is_made_for_every_hand_of_cameras_and_every_object(wand: Object
     other = msgspec.structs.replace(wand.setup.objects[0], name="twin")
     first = with_fields(wand.setup, objects=(*wand.setup.objects, other))
     world = world_of(first, second, worn)
+    assert set(world._now.contacts) == {"default-right", "another"}, "a wrist device has a frame of its own"
     contacts = [one for one in told(world, wand.messages) if isinstance(one, Contact)]
     assert Counter((one.hand, one.object) for one in contacts) == {
         (hand, name): FRAMES for hand in ("default-right", "another") for name in ("wand", "twin")
