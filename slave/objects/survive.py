@@ -2,8 +2,8 @@
 
 The library has no Linux wheel, so nothing of it is loaded: whoever wants it builds it (docs/tracker.md). The program
 writes its lines into a pseudo terminal, because into a pipe C's stdio would write blocks of 4 kB, half a second of
-poses at once; what it tells people goes to stderr, as ever. It is ended with its slave; a slave that was killed leaves
-it running, and it keeps the devices until somebody ends it.
+poses at once; what it tells people goes to stderr, as ever. It ends with its slave, also with one that was killed: the
+terminal is that of its session, and hangs up when nobody has the other end any more (setsid(2), termios(3)).
 """
 
 import gzip
@@ -11,6 +11,7 @@ import logging
 import os
 import pty
 import select
+import shutil
 import subprocess
 import threading
 import tty
@@ -37,6 +38,8 @@ READ_S = 0.05  # a read waits so long, and looks whether it is to stop
 END_S = 3.0  # it closes its USB devices in that time
 LOG_EVERY_NS = 10_000_000_000
 _CHUNK = 1 << 16
+# The leader of a new session gets the first terminal that it opens as its own; then it becomes the program.
+_IN_ITS_TERMINAL = 'terminal=$1; shift; exec "$0" "$@" <"$terminal"'
 _LOG = logging.getLogger(__name__)
 
 
@@ -227,11 +230,17 @@ def _started(program: str, options: Sequence[str]) -> tuple["subprocess.Popen[by
     Raises:
         TrackerError: It cannot be started.
     """
+    found = shutil.which(program)
+    if found is None:
+        raise TrackerError(f"--device survive: cannot start {program}: no such program: {INSTALL}")
     ours, theirs = pty.openpty()
     try:
         tty.setraw(theirs)
         process = subprocess.Popen(
-            [program, *options], stdin=subprocess.DEVNULL, stdout=theirs, start_new_session=True
+            ["/bin/sh", "-c", _IN_ITS_TERMINAL, found, os.ttyname(theirs), *options],
+            stdin=subprocess.DEVNULL,
+            stdout=theirs,
+            start_new_session=True,
         )
     except OSError as error:
         os.close(ours)

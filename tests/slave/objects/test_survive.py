@@ -1,6 +1,8 @@
 """survive-cli as a program: it speaks, falls silent, dies and comes back, is missing; and recorded files."""
 
 import gzip
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
 from slave.objects.reopening import ReopeningTracker
 from slave.objects.survive import OPTIONS, SurviveFile, SurviveTracker
+from tests.network_helpers import until
 from tests.slave.objects.recorded import HEAD, pose, program
 
 
@@ -79,6 +82,35 @@ def test_a_program_that_ends_is_an_error_and_is_started_again(tmp_path: Path) ->
     assert False in finite
     assert again.counts()["lost"] >= 1
     assert again.counts()["back"] >= 1
+
+
+def test_a_slave_that_is_killed_leaves_no_program_behind(tmp_path: Path) -> None:
+    command = program(tmp_path, f"echo $$ > {tmp_path}/number; exec sleep 300")
+    script = (
+        "import threading, time\n"
+        "from common.clock import SystemClock\n"
+        "from slave.objects.survive import SurviveTracker\n"
+        f"SurviveTracker('tracker', None, SystemClock(), threading.Event(), {command!r})\n"
+        "time.sleep(300)\n"
+    )
+    slave = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).resolve().parents[3])
+    told = tmp_path / "number"
+    try:
+        assert until(lambda: told.exists() and told.read_text().strip().isdecimal())
+        number = int(told.read_text())
+        assert alive(number)
+    finally:
+        slave.kill()
+        slave.wait()
+    assert until(lambda: not alive(number))
+
+
+def alive(number: int) -> bool:
+    """Whether a process runs; one that has ended and is not yet fetched does not."""
+    try:
+        return Path(f"/proc/{number}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_two_devices_and_no_choice_end_it_though_it_would_be_reopened(tmp_path: Path) -> None:
