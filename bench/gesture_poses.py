@@ -1,7 +1,7 @@
 """The six study poses, as the master tells them: simulated people, rendered frames, hands that others recorded.
 
 **People, held markers**: twelve people of the study, each with bones as a calibration measures them, go through the
-study's poses for a minute before cameras that see all tips, 1 mm of noise. **Rendered**: the same scene as rendered
+study's poses before cameras that see all tips, 1 mm of noise. **Rendered**: the same scene as rendered
 frames through detector and pipeline, where hands turn and hide their fingers. **Wrist**: trials of the study, rendered,
 detected by the slave as a process, solved. A frame is right if the pose held in truth is the one that is told, from the
 third frame after it was formed on; an episode is right if it is told by then. **handy_poses**: seven static hands, both
@@ -121,7 +121,7 @@ def rows() -> Iterator[Row]:
     yield _cost()
 
 
-def people(numbers: Sequence[int] | range, seconds: float = 30.0) -> Told:
+def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
     """People of the study before cameras that see all markers: own bones, a measured model, 1 mm of noise."""
     out = Told()
     wrist, usual = load(CALIBRATION / "rigs/wrist.json", RigCalibration), _hand("right")
