@@ -125,9 +125,7 @@ def test_a_synthetic_tracker_is_where_the_object_is_in_a_frame_of_its_own(tmp_pa
     assert np.radians(0.02) < worst[1] < np.radians(0.4)
     again = SimulatedTracker.of(tracker.scene, profile, 3).pose(1.5)
     np.testing.assert_array_equal(again, tracker.pose(1.5))
-    np.testing.assert_allclose(
-        SET_UP_TRACKING[:3, 1], [0.0, -1.0, 0.0], atol=1e-12
-    )
+    np.testing.assert_allclose(SET_UP_TRACKING[:3, 1], [0.0, -1.0, 0.0], atol=1e-12)
 
 
 def test_in_real_time_its_stamps_are_on_the_slaves_clock(tmp_path: Path) -> None:
