@@ -17,6 +17,7 @@ from bench.row import Row
 SECTIONS = {
     "markers": "Marker detection, 640x480, six markers, one thread; baseline: the published pipeline rebuilt",
     "marker_accuracy": "Centroids on generated frames with exact truth, kind by kind; baseline: the published pipeline",
+    "tags": "Fiducial tags on generated frames with exact corners; baseline: cv2.aruco and its ways to refine",
     "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
     "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",
     "filters": "1 euro filter, 18 signals; baseline: one object per signal",
@@ -44,6 +45,7 @@ SECTIONS = {
     "wrist_calibration": "Laser plane by number of views, flat field, palm by board, who wears it; exact truth",
     "wrist_mounting": "How a wrist device sits, its clocks, from 10 s with markers: noisy truth, rendered; exact truth",
     "tracker": "A Vive tracker registered to the cameras from 12 s, and its clock; goal 3 mm, 2 deg; exact truth",
+    "objects": "Objects of beads and of tags at half a metre, rendered, detected, partly hidden; goal 3 mm, 2 deg",
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "gesture_poses": "The six study poses: simulated people, rendered frames, handy_poses, leapjs; exact truth",

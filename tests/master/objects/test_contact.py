@@ -111,7 +111,7 @@ def test_sigma_is_that_of_hand_and_object_along_the_normal() -> None:
 
 
 def test_touch_has_hysteresis() -> None:
-    away = PALM @ rigid(np.eye(3), np.array([0.0, 0.0045, 0.0])) @ IN_PALM
+    away = PALM @ rigid(np.eye(3), np.array([0.0, 0.006, 0.0])) @ IN_PALM
     fresh = watch(away).push(hand(CLOSED))[0]
     watching = watch()
     watching.push(hand(CLOSED))
