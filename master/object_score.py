@@ -80,8 +80,8 @@ def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
     """Of one object.
 
     Returns:
-        mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true instants at which a
-        tracked pose is there), occluded (share of the tracked poses that say so), nees (median of the squared error by
+        mm, deg (medians over tracked poses), mm_p95, deg_p95, mm_max, tracked (share of the true instants at which it
+        was), occluded (share of the tracked poses that say so), nees (median of the squared error by
         its covariance, six numbers: about 5.3 where that is honest). What has nothing to average is left out.
     """
     mm, deg = errors(poses, truth)
@@ -102,15 +102,16 @@ def score_object(poses: ObjectPoses, truth: ObjectTruth) -> dict[str, float]:
 
 
 def tracked_share(poses: ObjectPoses, truth: ObjectTruth) -> float:
-    """Share of the true instants that have a tracked pose nearer than the next true instant."""
-    told = poses.t_ns[poses.tracked]
-    if len(truth.t_ns) == 0 or len(told) == 0:
+    """Share of the true instants at which the nearest pose is tracked, and not farther than poses usually are apart."""
+    if len(truth.t_ns) == 0 or len(poses) == 0:
         return 0.0
-    period = np.median(np.diff(truth.t_ns)) if len(truth.t_ns) > 1 else _NEAR_NS
-    after = np.clip(np.searchsorted(told, truth.t_ns), 0, len(told) - 1)
+    apart = [np.median(np.diff(t_ns)) for t_ns in (truth.t_ns, poses.t_ns) if len(t_ns) > 1]
+    after = np.clip(np.searchsorted(poses.t_ns, truth.t_ns), 0, len(poses) - 1)
     before = np.maximum(after - 1, 0)
-    off = np.minimum(np.abs(told[after] - truth.t_ns), np.abs(told[before] - truth.t_ns))
-    return float((off < period).mean())
+    nearer = np.abs(poses.t_ns[before] - truth.t_ns) <= np.abs(poses.t_ns[after] - truth.t_ns)
+    nearest = np.where(nearer, before, after)
+    near = np.abs(poses.t_ns[nearest] - truth.t_ns) < max(apart, default=_NEAR_NS)
+    return float((near & poses.tracked[nearest]).mean())
 
 
 def score_objects(scores: dict[str, dict[str, float]]) -> dict[str, object]:

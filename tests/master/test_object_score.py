@@ -86,6 +86,11 @@ def test_what_is_held_is_not_scored_and_is_missing() -> None:
     assert score_object(none, true) == {"poses": 0.0, "tracked": 0.0}
     half = poses(true.t_ns[:5], true.T_rig_object[:5])
     assert tracked_share(half, true) == pytest.approx(5 / 11)
+    rare = poses(true.t_ns[::5], true.T_rig_object[::5])
+    assert tracked_share(rare, true) == 1.0, "a slow master that always tracks it loses nothing"
+    both = poses(true.t_ns, true.T_rig_object)
+    both.tracked[5:] = False
+    assert tracked_share(both, true) == pytest.approx(5 / 11)
 
 
 def test_the_worst_object_is_that_of_the_summary() -> None:
