@@ -30,10 +30,9 @@ from common.zenoh_bus import ZenohBus
 from master.outputs.rerun_process import ViewerProcess
 
 TAKE_NS, UNDO_NS, SILENT_NS = 200_000_000, 200_000_000, 1_000_000_000
-MOVED_M, OPENED_M = 0.012, 0.003  # what tells which of the two it is
 GAIN = np.array([12.0, 12.0, math.log(2.0) / 0.007])  # 13 cm turn it a quarter, 7 mm of gap double it
 MOST = np.array([np.inf, math.radians(85.0), math.log(20.0)])
-SMOOTH_S, FRAME_S, ASK_S = 0.07, 1.0 / 60.0, 1.0
+SMOOTH_S, FRAME_S, ASK_S, MOVED_M, OPENED_M = 0.07, 1.0 / 60.0, 1.0, 0.012, 0.003  # the last two decide
 PAINT = [(230, 159, 0), *[(86, 180, 233)] * 5]
 HELP = {"": "pinch to take the model", "taken": "taken: move the hand to orbit, open the pinch to zoom"}
 
@@ -138,11 +137,12 @@ def main() -> None:
             show = rr.RecordingStream("orbit_model")
             show.connect_grpc(viewer.url)
             show_model(show, model, options.radius)
-            run(ZenohBus(None, options.bus), Orbit(mirror=options.mirror), show, viewer.alive)
+            try:
+                run(ZenohBus(None, options.bus), Orbit(mirror=options.mirror), show, viewer.alive)
+            except KeyboardInterrupt:
+                show.disconnect()
     except (PhalanxError, OSError) as error:
         sys.exit(f"orbit_model: {error}")
-    except KeyboardInterrupt:
-        return
 
 
 if __name__ == "__main__":
