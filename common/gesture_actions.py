@@ -55,12 +55,12 @@ class DialSettings(Part, frozen=True):
     radius_high_m: Positive = 0.042
     curl_least: NonNegative = 0.3
     across_m: NonNegative = 0.018
-    aslant_rad: Positive = math.radians(38.0)
+    aslant_rad: Positive = math.radians(55.0)
     fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
     round_m: Positive = 0.012
     opposed_rad: Positive = math.radians(75.0)
-    loose_m: Positive = 0.003
-    open_m: Positive = 0.009
+    loose_m: Positive = 0.0025
+    open_m: Positive = 0.006
     regrip_s: NonNegative = 0.8
     lost_s: NonNegative = 0.5
     sigma_most_m: Positive = 0.015

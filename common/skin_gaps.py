@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Float
 from common.hand_model import CHAINS
 
-_ROUNDS = 12  # what is left then is below 0.05 mm, at worst, where fingers are parallel
+_ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

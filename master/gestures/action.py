@@ -29,11 +29,12 @@ class ActionWatch:
         self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
         self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
 
-    def push(self, seen: HandFeatures, *, worn_only: bool = False) -> list[Gesture]:
+    def push(self, seen: HandFeatures, caps_m: Float, *, worn_only: bool = False) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
         Args:
             seen: The hand.
+            caps_m: (5, 3) of the fingertips [m], rig frame.
             worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
         """
         pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
@@ -46,7 +47,7 @@ class ActionWatch:
             told += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
         still, across_m = still_frame(seen, worn_only=worn_only), float(touch.gap_m.min())
-        told += dial.push(seen, still, across_m, may_begin=not others and not point.active)
+        told += dial.push(seen, caps_m, still, across_m, may_begin=not others and not point.active)
         return told + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:

@@ -1,10 +1,10 @@
 """A dial: a grip about something round, by how much it is turned, over as many grips as it takes.
 
-Palm and fingers both turn a knob. The turn of a grip is that of the palm in the room and of the tips in the palm,
-together the turn of the tips in the room, which a hand is measured by best; a tip that is not seen goes with the palm,
-and counts less. It is against the grip's beginning, not summed up from step to step, so that neither noise nor a moment
-of loss adds up. A hand that lets go opens first: while its tips go in or out nothing that they do counts, back to a
-tenth of a second before, but the palm does; then the dial stands, and goes on when it is gripped again.
+Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
+also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
+beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. A hand that lets go
+opens first: then the dial stands where it was a tenth of a second before, and goes on from there when it is gripped
+again.
 
 The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
 what is known of it is the mean of both (`_axis_of`).
@@ -19,11 +19,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix
+from common.geometry import quaternion_to_matrix
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
-from master.gestures.grip import Circle, Tips, grip_of, spread_m, turned_in_palm
+from master.gestures.grip import Circle, Tips, circle_through, grip_of, spread_m, turned_by, widened_m
 from master.gestures.lasting import Lasting
 
 _AXIS_RAD = np.radians(15.0)  # how well the circle of the tips tells the axis of the knob
@@ -38,22 +38,15 @@ class _Grip:
 
     Attributes:
         tips: As they were when it closed.
-        palm: (3, 3) of the palm in the room, then or a little earlier.
-        axis: (3,) of the circle of the tips, in the room.
+        axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
         farthest: (3,) rotation vector [rad] of its largest turn so far.
     """
 
     tips: Tips
-    palm: Float
     axis: Float
     base_rad: float
     farthest: Float
-
-    @classmethod
-    def of(cls, tips: Tips, palm: Float, circle: Circle, base_rad: float) -> "_Grip":
-        """A grip that has just closed; what the palm has turned since `palm` counts."""
-        return cls(tips, palm, palm @ circle.axis, base_rad, np.zeros(3))
 
 
 class DialWatch:
@@ -63,9 +56,10 @@ class DialWatch:
         self._settings = settings
         self._dial: Lasting | None = None
         self._grip: _Grip | None = None
-        self._maybe: tuple[int, Tips] | None = None  # since when a grip is held still, and as it was then
+        self._maybe: deque[tuple[int, Tips]] = deque()  # a grip since when it is as it is now
         self._angle = 0.0
-        self._fingers: deque[tuple[int, Float]] = deque()  # how tips were turned in the palm, of late
+        self._before: Tips | None = None  # those of the grip that was let go
+        self._late: deque[tuple[int, float]] = deque()  # the angle of late
         self._closed_ns = self._known_ns = 0  # when the dial was gripped, and tips were known, last
         self._last: Gesture | None = None
 
@@ -74,25 +68,30 @@ class DialWatch:
         """Whether a dial has begun, gripped or about to be gripped again."""
         return self._dial is not None
 
-    def push(self, seen: HandFeatures, turn: Float, across_m: float, *, may_begin: bool) -> list[Gesture]:
+    def push(
+        self, seen: HandFeatures, caps_m: Float, turn: Float, across_m: float, *, may_begin: bool
+    ) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
         Args:
             seen: The hand.
+            caps_m: (5, 3) of the fingertips [m], rig frame.
             turn: (3, 3) from the rig frame to one that stands still in the room.
             across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
         """
-        tips = _tips_of(seen, turn, across_m, self._settings.sigma_most_m)
+        tips = _tips_of(seen, caps_m, turn, across_m, self._settings.sigma_most_m)
         if self._dial is None:
             circle = self._held(seen.t_ns, tips, self._settings.hold_s) if may_begin else None
             if circle is None:
-                self._maybe = self._maybe if may_begin else None
+                if not may_begin:
+                    self._maybe.clear()
                 return []
             self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
-            self._angle, self._grip = 0.0, _Grip.of(tips, tips.palm, circle, 0.0)
-            self._fingers.clear()
-            self._maybe, self._closed_ns, self._known_ns = None, seen.t_ns, seen.t_ns
+            self._angle, self._grip = 0.0, _Grip(tips, circle.axis, 0.0, np.zeros(3))
+            self._late.clear()
+            self._maybe.clear()
+            self._closed_ns = self._known_ns = seen.t_ns
             return [self._tell(self._dial, "begin", seen, turn, tips)]
         self._follow(seen.t_ns, tips)
         own = self._settings
@@ -103,7 +102,7 @@ class DialWatch:
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""
-        self._maybe = None
+        self._maybe.clear()
         last = self._last
         if self._dial is None or last is None or (t_ns - self._known_ns) * 1e-9 <= self._settings.lost_s:
             return []
@@ -113,18 +112,30 @@ class DialWatch:
         return self._end(told)
 
     def _end(self, told: Gesture) -> list[Gesture]:
-        self._dial = self._grip = self._maybe = self._last = None
+        self._dial = self._grip = self._last = None
+        self._maybe.clear()
         return [told]
 
     def _held(self, t_ns: int, tips: Tips, hold_s: float) -> Circle | None:
-        """The grip, if it has been held for so long."""
-        circle = grip_of(tips, self._settings)
+        """The grip, if it has been as it is now for so long."""
+        circle = self._again(tips) if self._dial is not None else grip_of(tips, self._settings)
         if circle is None:
-            self._maybe = None
+            self._maybe.clear()
             return None
-        if self._maybe is None or not _most(spread_m(tips, self._maybe[1])) <= self._settings.still_m:
-            self._maybe = (t_ns, tips)
-        return circle if (t_ns - self._maybe[0]) * 1e-9 >= hold_s else None
+        while self._maybe and _most(spread_m(tips, self._maybe[0][1])) > self._settings.still_m:
+            self._maybe.popleft()
+        self._maybe.append((t_ns, tips))
+        while len(self._maybe) > 1 and (t_ns - self._maybe[1][0]) * 1e-9 >= hold_s:
+            self._maybe.popleft()
+        return circle if (t_ns - self._maybe[0][0]) * 1e-9 >= hold_s else None
+
+    def _again(self, tips: Tips) -> Circle | None:
+        """The grip of a hand that had let go: as wide again as that before, for the knob is the same."""
+        before = self._before
+        if before is None or not abs(widened_m(tips, before)) <= self._settings.still_m:
+            return None
+        known = np.flatnonzero(tips.known)
+        return circle_through(tips.place_m[known], tips.palmar)
 
     def _follow(self, t_ns: int, tips: Tips) -> None:
         """Turn the dial, let it go, or grip it again."""
@@ -133,35 +144,27 @@ class DialWatch:
             self._known_ns = t_ns
         if grip is None:
             circle = self._held(t_ns, tips, own.again_s)
-            if circle is None or self._maybe is None:
+            if circle is None:
                 return
-            self._grip = grip = _Grip.of(tips, self._maybe[1].palm, circle, self._angle)
-            self._fingers.clear()
-            self._maybe = None
-        wider = spread_m(tips, grip.tips)
-        by = 0.0 if np.isnan(wider).all() else abs(float(np.nanmean(wider)))
+            self._grip = grip = _Grip(tips, circle.axis, self._angle, np.zeros(3))
+            self._late.clear()
+            self._maybe.clear()
+        by = abs(widened_m(tips, grip.tips))
         if by > own.open_m:
-            self._grip, self._closed_ns = None, t_ns
+            self._grip, self._before, self._closed_ns = None, grip.tips, t_ns
             return
         self._closed_ns = t_ns
-        fingers = self._turned_fingers(t_ns, tips, grip, loose=by > own.loose_m)
-        turn = matrix_to_rotation_vector(tips.palm @ fingers @ grip.palm.T)
+        if not by <= own.loose_m:
+            self._angle = self._late[0][1] if self._late else self._angle
+            return
+        turn = turned_by(tips, grip.tips)
         if float(turn @ turn) > float(grip.farthest @ grip.farthest):
             self._grip = grip = replace(grip, farthest=turn)
         twist = _twist(turn, _axis_of(grip)) + grip.base_rad
         self._angle = twist + 2.0 * np.pi * round((self._angle - twist) / (2.0 * np.pi))
-
-    def _turned_fingers(self, t_ns: int, tips: Tips, grip: _Grip, *, loose: bool) -> Float:
-        """Rotation (3, 3) of the tips in the palm, of a grip that is closed; of a loose one as it was a while
-        before."""
-        if not loose:
-            self._fingers.append((t_ns, turned_in_palm(tips, grip.tips)))
-            while len(self._fingers) > 2 and (t_ns - self._fingers[1][0]) * 1e-9 > _LOOSENS_S:
-                self._fingers.popleft()
-            return self._fingers[-1][1]
-        while len(self._fingers) > 1:
-            self._fingers.pop()
-        return self._fingers[0][1] if self._fingers else _EYE
+        self._late.append((t_ns, self._angle))
+        while len(self._late) > 2 and (t_ns - self._late[1][0]) * 1e-9 > _LOOSENS_S:
+            self._late.popleft()
 
     def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, turn: Float, tips: Tips) -> Gesture:
         grip = self._grip
@@ -187,14 +190,13 @@ def still_frame(seen: HandFeatures, *, worn_only: bool) -> Float:
     return quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
 
 
-def _tips_of(seen: HandFeatures, turn: Float, across_m: float, sigma_most_m: float) -> Tips:
-    rotation = seen.T_rig_palm[:3, :3]
+def _tips_of(seen: HandFeatures, caps_m: Float, turn: Float, across_m: float, sigma_most_m: float) -> Tips:
     pads = seen.pads_m - seen.tips_m
     return Tips(
-        palm=turn @ rotation,
-        place_m=(seen.tips_m - seen.T_rig_palm[:3, 3]) @ rotation,
+        place_m=caps_m @ turn.T,
         sigma_m=seen.sigma_m,
-        inwards=pads @ rotation / np.linalg.norm(pads, axis=1, keepdims=True),
+        inwards=(pads / np.linalg.norm(pads, axis=1, keepdims=True)) @ turn.T,
+        palmar=turn @ seen.palmar,
         across_m=across_m,
         curl=float(seen.curl[1:].mean()),
         known=seen.sigma_m <= sigma_most_m,

@@ -1,4 +1,4 @@
-"""Is the hand about a knob? The circle through its tips, and how they are turned in the palm against how they were.
+"""Is the hand about a knob? The circle through its tips, and how they are turned against how they were.
 
 The thumb's tip and those of the fingers lie about one circle, in one plane, pads inwards, the thumb across from the
 fingers. Nothing here remembers anything.
@@ -9,30 +9,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import fit_rigid
+from common.geometry import fit_rigid, matrix_to_rotation_vector
 from common.gesture_actions import DialSettings
 
-_INWARDS = 0.1  # cosine between the pad's side and the way to the middle, at least
+_INWARDS = -0.3  # cosine between the pad's side and the way to the middle, at least
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tips:
-    """Tips of thumb ... little in the frame of the palm.
+    """Tips of thumb ... little in a frame that stands still in the room: the caps' middles.
 
     Attributes:
-        palm: (3, 3) that frame -> one that stands still in the room.
         place_m: (5, 3) [m].
         sigma_m: (5,) [m], how sure each is.
         inwards: (5, 3) unit vectors out of the pads.
+        palmar: (3,) unit vector out of the palm.
         across_m: Between the skins of the thumb and the finger next to it [m].
         curl: Of the four fingers together, 0..1.
         known: (5,) whether a tip is known at all.
     """
 
-    palm: Float
     place_m: Float
     sigma_m: Float
     inwards: Float
+    palmar: Float
     across_m: float
     curl: float
     known: Bool
@@ -53,8 +53,8 @@ def grip_of(tips: Tips, settings: DialSettings) -> Circle | None:
     if not tips.known[0] or len(fingers) < settings.fingers_least or tips.curl < settings.curl_least:
         return None
     chosen = np.concatenate([[0], fingers])
-    circle = circle_through(tips.place_m[chosen])
-    if -circle.axis[1] < np.cos(settings.aslant_rad) or tips.across_m < settings.across_m:
+    circle = circle_through(tips.place_m[chosen], tips.palmar)
+    if float(circle.axis @ tips.palmar) < np.cos(settings.aslant_rad) or tips.across_m < settings.across_m:
         return None
     off = tips.place_m[chosen] - circle.centre_m
     along = off @ circle.axis
@@ -70,12 +70,12 @@ def grip_of(tips: Tips, settings: DialSettings) -> Circle | None:
     return circle if settings.radius_low_m <= circle.radius_m <= settings.radius_high_m else None
 
 
-def circle_through(points_m: Float) -> Circle:
+def circle_through(points_m: Float, palmar: Float) -> Circle:
     """The circle of least algebraic error (Kasa, 1976) in the plane of least squares through points (N, 3), N >= 3,
     palm frame."""
     middle = points_m.mean(axis=0)
     _, _, ways = np.linalg.svd(points_m - middle)
-    axis: Float = ways[2] if ways[2, 1] < 0.0 else -ways[2]
+    axis: Float = ways[2] if float(ways[2] @ palmar) > 0.0 else -ways[2]
     flat = (points_m - middle) @ ways[:2].T
     rows = np.column_stack([2.0 * flat, np.ones(len(flat))])
     found: Float = np.asarray(
@@ -85,14 +85,23 @@ def circle_through(points_m: Float) -> Circle:
     return Circle(middle + found[:2] @ ways[:2], axis, radius)
 
 
-def turned_in_palm(now: Tips, then: Tips) -> Float:
-    """Rotation (3, 3) by which the tips have turned in the palm as one since `then`; surer ones count more.
-
-    A tip that is not seen goes with the palm, as the hand has it, so that without any the turn is the palm's alone.
-    """
+def turned_by(now: Tips, then: Tips) -> Float:
+    """Rotation vector (3,) [rad] by which the tips have turned as one since `then`; surer ones count more."""
     sigma = np.hypot(now.sigma_m, then.sigma_m)
     weight = 1.0 / np.square(np.where(np.isfinite(sigma), np.maximum(sigma, 1e-3), 0.1))
-    return fit_rigid(now.place_m, then.place_m, weight)[:3, :3]
+    return matrix_to_rotation_vector(fit_rigid(now.place_m, then.place_m, weight)[:3, :3])
+
+
+def widened_m(tips: Tips, then: Tips) -> float:
+    """By how much the grip is wider than `then` [m]: half of what the thumb's tip has gone from those of the fingers.
+
+    NaN: the thumb or the fingers are not known.
+    """
+    fingers = (tips.known & then.known)[1:]
+    if not (tips.known[0] and then.known[0]) or fingers.sum() < 2:
+        return float("nan")
+    ways = [one.place_m[0] - one.place_m[1:][fingers].mean(axis=0) for one in (tips, then)]
+    return 0.5 * float(np.linalg.norm(ways[0]) - np.linalg.norm(ways[1]))
 
 
 def spread_m(tips: Tips, then: Tips) -> Float:

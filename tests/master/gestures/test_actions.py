@@ -1,0 +1,193 @@
+"""Pinch, dial, taps and pointing of hands whose truth is known: told in time, with the right values, nothing else."""
+
+from collections.abc import Iterable, Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from common.arrays import Float
+from common.calibration import HandProfile, load
+from common.errors import CalibrationError
+from common.geometry import axis_rotation, matrix_to_quaternion, rigid
+from common.gesture_actions import DialSettings, PinchSettings, check_actions
+from common.gesture_settings import GestureSettings, default_gestures
+from common.hand_model import TIPS, HandModel
+from common.messages import Gesture, HandPose
+from common.sim.gesture_postures import knob_grip, pinch_posture
+from common.sim.motion import POSES, REST, angles_of, smooth_step
+from master.gestures.recogniser import GestureRecogniser
+
+ROOT = Path(__file__).parents[3]
+STILL = np.zeros((5, 4))
+FRAME_NS = 16_666_667
+
+
+@pytest.fixture(scope="module")
+def model() -> HandModel:
+    return HandModel.of(load(ROOT / "calib_json/hands/default-right.json", HandProfile))
+
+
+def _pose(
+    model: HandModel, k: int, T: Float, posture_deg: Float, sigma_m: Float | float = 1e-3, markers: int = 1
+) -> HandPose:
+    """A hand at frame `k` whose tips are known to `sigma_m` (5,)."""
+    angles = angles_of(model, np.asarray(posture_deg, dtype=np.float64), STILL)
+    joints = model.forward(T, angles)
+    cov = np.tile(1e-6 * np.eye(3), (26, 1, 1))
+    cov[TIPS] = np.square(np.broadcast_to(sigma_m, 5))[:, None, None] * np.eye(3)
+    every, nothing = np.ones(26, dtype=bool), np.full((markers, 3), np.nan)
+    return HandPose(
+        hand="right",
+        t_ns=k * FRAME_NS,
+        position_m=joints.position_m,
+        orientation_wxyz=matrix_to_quaternion(joints.rotation),
+        radius_m=model.radius_m,
+        valid=every,
+        tracked=every,
+        cov_m2=cov,
+        source=np.full(26, 2, dtype=np.uint8),
+        angles_rad=angles,
+        markers_m=nothing,
+        markers_raw_m=nothing,
+        markers_cov_m2=np.full((markers, 3, 3), np.nan),
+        inside_volume=every,
+    )
+
+
+def _actions(recogniser: GestureRecogniser, poses: Iterable[HandPose]) -> list[Gesture]:
+    return [one for pose in poses for one in recogniser.push(pose) if one.kind != "pose"]
+
+
+def _closing(model: HandModel, target: Float, there: int = 30) -> Iterator[HandPose]:
+    """From rest to a posture in 20 frames, held, and back."""
+    rest = np.array(REST, dtype=np.float64)
+    for k in range(60 + there):
+        share = smooth_step(k / 20) * smooth_step((40 + there - k) / 20)
+        yield _pose(model, k, np.eye(4), rest + share * (target - rest))
+
+
+@pytest.mark.parametrize(("finger", "name"), [(1, "index"), (2, "middle"), (3, "ring"), (4, "little")])
+def test_a_pinch_of_each_finger_begins_goes_on_and_ends(model: HandModel, finger: int, name: str) -> None:
+    told = _actions(
+        GestureRecogniser(default_gestures(), model), _closing(model, pinch_posture(model, finger, STILL))
+    )
+    assert [(one.kind, one.name, one.phase) for one in told if one.phase != "update"] == [
+        ("pinch", name, "begin"),
+        ("pinch", name, "end"),
+    ]
+    closed = told[len(told) // 2]
+    assert closed.distance_m == pytest.approx(
+        -0.0005, abs=2e-3
+    )  # as the posture was made; the little reaches less
+    assert closed.strength > 0.99
+    assert {one.began_t_ns for one in told} == {told[0].t_ns}
+    assert all(b.t_ns - a.t_ns == FRAME_NS for a, b in pairwise(told))
+
+
+@pytest.mark.parametrize("name", ["small_grasp", "open_palm", "counting_two"])
+def test_a_fist_and_open_hands_say_nothing(model: HandModel, name: str) -> None:
+    told = _actions(GestureRecogniser(default_gestures(), model), _closing(model, np.array(POSES[name])))
+    assert not told
+
+
+def test_fingers_that_are_not_known_say_nothing(model: HandModel) -> None:
+    pinched = pinch_posture(model, 1, STILL)
+    recogniser = GestureRecogniser(default_gestures(), model)
+    poses = (_pose(model, k, np.eye(4), pinched, np.array([0.03, 0.03, 1e-3, 1e-3, 1e-3])) for k in range(60))
+    assert not _actions(recogniser, poses)
+
+
+def test_a_pinch_outlasts_a_brief_loss_and_not_a_long_one(model: HandModel) -> None:
+    pinched, settings = pinch_posture(model, 1, STILL), default_gestures()
+    lost = np.array([1e-3, 0.05, 1e-3, 1e-3, 1e-3])
+    brief = round(0.8 * settings.pinch.lost_s / (FRAME_NS * 1e-9))
+    recogniser = GestureRecogniser(settings, model)
+
+    def run(first: int, count: int, sigma: Float | float) -> list[str]:
+        poses = (_pose(model, k, np.eye(4), pinched, sigma) for k in range(first, first + count))
+        return [one.phase for one in _actions(recogniser, poses)]
+
+    assert run(0, 10, 1e-3)[0] == "begin"
+    assert set(run(10, brief, lost)) == {"update"}
+    assert set(run(10 + brief, 5, 1e-3)) == {"update"}
+    assert "end" in run(15 + brief, 2 * brief, lost)
+
+
+def test_a_dial_is_turned_by_the_palm_over_two_grips(model: HandModel) -> None:
+    knob = knob_grip(model, 0.022, STILL)
+    opened = knob.posture_deg + np.array([[14.0, -14.0, -14.0], *[[0.0, -17.0, -16.0]] * 4])
+    palm = np.interp(np.arange(240), [30, 80, 98, 116, 150, 200], [0.0, 50.0, 50.0, -20.0, -20.0, 40.0])
+    loose = np.interp(np.arange(240), [85, 96, 118, 130], [0.0, 1.0, 1.0, 0.0])
+    turns = np.radians(palm)
+    posture = knob.posture_deg + loose[:, None, None] * (opened - knob.posture_deg)
+    poses = [_pose(model, k, _about(knob.centre_m, knob.axis, turns[k]), posture[k]) for k in range(240)]
+    told = _actions(GestureRecogniser(default_gestures(), model), poses)
+    assert [one.phase for one in told if one.phase != "update"] == ["begin"]
+    angle = {one.t_ns // FRAME_NS: np.degrees(one.angle_rad) for one in told}
+    assert angle[80] == pytest.approx(50.0, abs=0.1)
+    assert angle[117] == pytest.approx(50.0, abs=1.5)  # the open hand has turned back by 70
+    assert angle[235] == pytest.approx(50.0 + 60.0, abs=2.0)
+    assert float(told[-1].direction @ knob.axis) > 0.999
+
+
+def test_a_wrist_device_alone_turns_a_dial_by_its_imu(model: HandModel) -> None:
+    knob, recogniser = knob_grip(model, 0.022, STILL), GestureRecogniser(default_gestures(), model)
+    told: list[Gesture] = []
+    for k in range(60):
+        turn = np.radians(max(k - 20, 0))
+        world = axis_rotation(1, 0.7) @ _about(np.zeros(3), knob.axis, turn)[:3, :3]
+        pose = _pose(model, k, np.eye(4), knob.posture_deg, markers=0)
+        told += _actions(
+            recogniser, [msgspec.structs.replace(pose, palm_world_wxyz=matrix_to_quaternion(world))]
+        )
+    assert told[0].phase == "begin"
+    assert np.degrees(told[-1].angle_rad) == pytest.approx(39.0, abs=0.1)
+
+
+def test_a_ray_goes_from_the_tip_where_knuckle_and_tip_point(model: HandModel) -> None:
+    told = _actions(
+        GestureRecogniser(default_gestures(), model), _closing(model, np.array(POSES["pointing"]))
+    )
+    assert {one.kind for one in told} == {"point"}
+    assert [one.phase for one in told if one.phase != "update"] == ["begin", "end"]
+    middle = told[len(told) // 2]
+    joints = model.forward(
+        np.eye(4), angles_of(model, np.array(POSES["pointing"], dtype=np.float64), STILL)
+    ).position_m
+    np.testing.assert_allclose(middle.origin_m, joints[10], atol=1e-9)
+    way = joints[10] - joints[7]
+    np.testing.assert_allclose(middle.direction, way / np.linalg.norm(way), atol=1e-9)
+
+
+def test_no_hand_ends_what_had_begun(model: HandModel) -> None:
+    settings, pinched = default_gestures(), pinch_posture(model, 1, STILL)
+    recogniser = GestureRecogniser(settings, model)
+    _actions(recogniser, (_pose(model, k, np.eye(4), pinched) for k in range(5)))
+    gone = [
+        msgspec.structs.replace(
+            _pose(model, k, np.eye(4), pinched),
+            valid=np.zeros(26, dtype=bool),
+            tracked=np.zeros(26, dtype=bool),
+            position_m=np.full((26, 3), np.nan),
+        )
+        for k in range(5, 60)
+    ]
+    assert [one.phase for one in _actions(recogniser, gone)] == ["end"]
+
+
+def test_thresholds_that_contradict_each_other_are_refused() -> None:
+    base: GestureSettings = default_gestures()
+    with pytest.raises(CalibrationError, match=r"here: pinch.end_gap_m"):
+        check_actions(PinchSettings(end_gap_m=0.001), base.dial, base.tap, base.point, "here")
+    with pytest.raises(CalibrationError, match=r"here: dial.open_m"):
+        check_actions(base.pinch, DialSettings(open_m=0.001), base.tap, base.point, "here")
+
+
+def _about(centre_m: Float, axis: Float, angle_rad: float) -> Float:
+    """(4, 4) a turn about an axis through a point, by Rodrigues' formula written out."""
+    k = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
+    rotation = np.eye(3) + np.sin(angle_rad) * k + (1.0 - np.cos(angle_rad)) * (k @ k)
+    return rigid(rotation, centre_m - rotation @ centre_m)
