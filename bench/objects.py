@@ -1,4 +1,4 @@
-"""Where tracked objects are: rendered frames, the slaves' detectors, the master's line, and the exact truth of the scene.
+"""Where tracked objects are: rendered frames, detectors of the slaves, line of the master, exact truth of the scene.
 
 The scene is `object` (`common/sim/travel`): the object wanders and turns, goes to and fro, turns wholly, and is partly
 hidden by a card and by a hand. Seeds are others than served to tune it. What a feature shows is the renderer's own

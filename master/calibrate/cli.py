@@ -11,6 +11,7 @@ from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
 from master.calibrate.mounting.command import mounting
+from master.calibrate.object.cube_command import cube
 from master.calibrate.time.commands import time_command
 from master.calibrate.tracker.command import tracker
 from master.calibrate.wrist.curl_command import curl
@@ -35,6 +36,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "wearer": wearer,
     "mounting": mounting,
     "tracker": tracker,
+    "cube": cube,
 }
 
 

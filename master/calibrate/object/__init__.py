@@ -1,0 +1,1 @@
+"""Objects that are tracked: what is printed for them, and their files."""
