@@ -76,9 +76,11 @@ class Score:
             if course[-1].phase == "end":
                 self._late(f"{event.kind} end", _s(course[-1].t_ns) - event.end_s)
             self._values(course, truth, event.end_s)
+        # What is said at the very end is in no event, and is not false either.
         last_s = float(truth.t_s[-1]) - 1.0
+        cut_s = min((one.start_s for one in truth.motion.said if one.stop_s >= last_s), default=last_s)
         for one in free:
-            self.false[one.kind] += _s(one.t_ns) < last_s
+            self.false[one.kind] += _s(one.t_ns) < min(cut_s, last_s)
 
     def add_silent(self, told: Iterable[Gesture]) -> None:
         """Of a hand that says nothing."""

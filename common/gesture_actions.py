@@ -71,17 +71,19 @@ class TapSettings(Part, frozen=True):
 
     Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
     `touch_gap_m`, `leave_gap_m`: between the skins of thumb and finger at which it touches and leaves; it leaves
-    earlier where it has gone away by `rise_m` from where it was nearest. `approach_s`: within so long it comes from
-    beyond `leave_gap_m`; slower is no tap. `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between
-    two taps. `level_rad`: how differently the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of
-    0..1, how far at most. `quiet_rad`: how far the four may bend together from when the thumb comes until it goes:
-    more is a hand that closes. `nearer_m`: how much nearer the thumb is to the finger of this key than to another.
-    `sigma_most_m`: of the tips of thumb and finger, above which nothing is told.
+    earlier where it has gone away by `rise_m` from where it was nearest. `pressed_m`: deeper than flesh gives way is
+    no tap but a hand that closes. `approach_s`: within so long it comes from beyond `leave_gap_m`; slower is no tap.
+    `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between two taps. `level_rad`: how differently
+    the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of 0..1, how far at most. `quiet_rad`:
+    how far the four may bend together from when the thumb comes until it goes: more is a hand that closes.
+    `nearer_m`: how much nearer the thumb is to the finger of this key than to another. `sigma_most_m`: of the tips of
+    thumb and finger, above which nothing is told.
     """
 
     touch_gap_m: Positive = 0.005
     leave_gap_m: Positive = 0.0085
     rise_m: Positive = 0.005
+    pressed_m: Positive = 0.007
     approach_s: Positive = 0.4
     shortest_s: NonNegative = 0.03
     longest_s: Positive = 0.6

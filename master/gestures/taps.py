@@ -83,6 +83,7 @@ class TapWatch:
         own = self._settings
         lasted = (seen.t_ns - going.began_ns) * 1e-9
         closes = abs(_bend_rad(seen) - going.bend_rad) > own.quiet_rad
+        closes = closes or gap < -own.pressed_m
         if lasted > own.longest_s or closes or not is_pad(seen, own):
             self.drop()
             return []
