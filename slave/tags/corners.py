@@ -31,6 +31,10 @@ CELL = 0.55  # of the border's width that is looked at
 PASSES, STEPS = 2, 3
 WIDEST_PX, SHARPEST_PX = 4.0, 0.25  # an edge
 FLOOR_PX = 0.01  # what is left where there is no noise: pixels are squares, sampled by straight lines
+CLEAR_PX, BLURRED = (
+    0.8,
+    0.05,
+)  # an edge that is wider is off by so much of what it is wider: motion has its own law
 BILINEAR = 9.0 / 4.0  # variance of a pixel against that of what is read between pixels
 MISFIT = 0.15  # of the contrast: an edge that departs more from the law has something on it,
 ROUGH_MISFIT = 0.4  # or is that of a small tag whose code is not known yet
@@ -235,7 +239,9 @@ def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float,
     n = len(uv)
     offset = line.offset.reshape(n, 4, 2)
     noise = line.misfit.reshape(n, 4) * np.maximum(BILINEAR * density, 1.0)
-    variance = noise[..., None] * line.variance.reshape(n, 4, 2) + FLOOR_PX**2
+    contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
+    floor = FLOOR_PX**2 + (BLURRED * np.maximum(width - CLEAR_PX, 0.0)) ** 2
+    variance = noise[..., None] * line.variance.reshape(n, 4, 2) + floor[..., None]
     # Corner k ends side k - 1 and begins side k. Each line tells how far it moved across itself, there.
     normals = np.stack([np.roll(outward, 1, axis=1), outward], axis=-2)
     moved = np.stack([np.roll(offset[..., 1], 1, axis=1), offset[..., 0]], axis=-1)
@@ -244,7 +250,6 @@ def _met(uv: Float, outward: Float, reach: Float, density: Float, misfit: float,
     inverse = np.linalg.inv(np.where(meet[..., None, None], normals, np.eye(2)))
     met = uv + np.einsum("nkij,nkj->nki", inverse, moved)
     spread = np.einsum("nkij,nkj->nk", inverse**2, doubt)
-    contrast, width = line.contrast.reshape(n, 4), line.width.reshape(n, 4)
     good = (
         meet
         & (np.abs(offset).max(axis=-1) < reach)
