@@ -14,9 +14,9 @@ from common.camera_model import CameraModel
 from master.objects.features import Features
 from master.objects.window import Sighting, Window
 
-_PART = 0.72  # of what a bead shows when it is whole
+_PART = 0.63  # of what a bead shows when it is whole
 _NEARLY = 0.93  # of that, a bead may show and be whole
-_LEARN, _FORGET = 0.3, 0.002  # towards more, towards less, from frame to frame
+_LEARN, _FORGET = 0.06, 0.004  # towards more, towards less, from frame to frame
 
 
 @dataclass(frozen=True, slots=True)
