@@ -142,7 +142,7 @@ class ObjectLine:
             self._sure_ns = window.t_ns
         elif window.t_ns - self._sure_ns > HELD_S * 1e9:
             self._known.clear()
-            return self._none(window.t_ns)
+            return self._none(window)
         tracked = fitted.alone or not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
@@ -300,7 +300,7 @@ class ObjectLine:
         """The pose while nothing tells: led on, or none."""
         known = self._known[-1] if self._known else None
         if predicted is None or known is None or window.t_ns - self._sure_ns > HELD_S * 1e9:
-            return self._none(window.t_ns)
+            return self._none(window)
         dt = (window.t_ns - known.t_ns) * 1e-9
         shown = self._hidden.look(
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
@@ -325,12 +325,19 @@ class ObjectLine:
             occluded=shown.occluded,
         )
 
-    def _none(self, t_ns: int) -> ObjectPose:
+    def _glimpsed(self, window: Window) -> bool:
+        """Whether a camera sees some of the beads and not all, while there is no pose."""
+        count = self._features.beads
+        looks = [window.near(c, 0) for c in range(len(self._cameras))]
+        seen = [int(np.isfinite(look.uv[:, 0]).sum()) for look in looks if look is not None]
+        return any(0 < n < count for n in seen)
+
+    def _none(self, window: Window) -> ObjectPose:
         """No pose; what hid it when it was lost is taken to hide it still."""
         self._steady.forget()
         return ObjectPose(
             object=self.name,
-            t_ns=t_ns,
+            t_ns=window.t_ns,
             position_m=np.full(3, np.nan),
             orientation_wxyz=np.full(4, np.nan),
             cov=np.full((6, 6), np.nan),
@@ -339,7 +346,7 @@ class ObjectLine:
             tracked=False,
             seen=0,
             expected=0,
-            occluded=self._lost_behind,
+            occluded=self._lost_behind or self._glimpsed(window),
         )
 
 
