@@ -1,9 +1,9 @@
 """Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
 
 A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
-pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Samples of an IMU and
-poses of a tracker go before frames: there may be ten to a frame, and each tells less. So do tags, without which an
-object is held for a while.
+pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Frames, tags, samples
+of IMUs and poses of trackers have each their own room in it: none drives another out, and at overload all that is
+taken is of the same stretch of time.
 """
 
 import os
@@ -22,7 +22,13 @@ from common.udp import UdpSocket
 from master.link import MasterLink, Taken
 from master.sequence import CameraCounts
 
-QUEUE = 64
+QUEUE = 64  # frames, or triples, that may wait
+ROOM = {
+    "frame": QUEUE,
+    "tags": QUEUE,
+    "imu": 16 * QUEUE,
+    "tracker": 16 * QUEUE,
+}  # what comes while so many frames do
 
 
 class Ingest:
@@ -75,6 +81,7 @@ class Ingest:
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
         self._queue: deque[Taken] = deque()
+        self._waiting = dict.fromkeys(ROOM, 0)
         self._changed = threading.Condition()
         self._overflowed = 0
         self._closing = threading.Event()
@@ -158,7 +165,11 @@ class Ingest:
         """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
-            return self._queue.popleft() if self._queue else None
+            if not self._queue:
+                return None
+            message = self._queue.popleft()
+            self._waiting[_kind(message)] -= 1
+            return message
 
     def close(self) -> None:
         """End the thread and give the port back. Safe to call twice."""
@@ -181,20 +192,24 @@ class Ingest:
                 self._put(message)
 
     def _put(self, message: Taken) -> None:
+        kind = _kind(message)
         with self._changed:
             self._queue.append(message)
-            if len(self._queue) > QUEUE:
+            self._waiting[kind] += 1
+            if self._waiting[kind] > ROOM[kind]:
                 self._overflowed += 1
-                del self._queue[self._least()]
+                self._waiting[kind] -= 1
+                del self._queue[next(k for k, one in enumerate(self._queue) if _kind(one) == kind)]
             self._changed.notify()
 
-    def _least(self) -> int:
-        """Which waiting message is dropped."""
-        for kinds in ((ImuSample, TrackerPose), TagDetections):
-            found = next((k for k, waiting in enumerate(self._queue) if isinstance(waiting, kinds)), None)
-            if found is not None:
-                return found
-        return 0
+
+def _kind(message: Taken) -> str:
+    """Whose room in the queue a message takes, a key of `ROOM`."""
+    if isinstance(message, ImuSample):
+        return "imu"
+    if isinstance(message, TrackerPose):
+        return "tracker"
+    return "tags" if isinstance(message, TagDetections) else "frame"
 
 
 def _check_address(host: str) -> None:

@@ -36,7 +36,7 @@ class LiveTags:
         finder = self._finder
         if finder is None:
             return None
-        if not self._pace.grants(spent_ns):
+        if not self._pace.grants(frame.t_ns, spent_ns):
             self._skipped += 1
             return None
         began_ns = time.perf_counter_ns()
