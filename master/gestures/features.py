@@ -41,6 +41,7 @@ class HandFeatures:
         pads_m: (5, 3) middle of the pad's skin [m], rig frame.
         radius_m: (5,) of the round end [m].
         joints_m: (26, 3) [m], rig frame.
+        joints_cov_m2: (26, 3, 3) [m^2], rig frame; where nothing is known, a metre each way.
         T_rig_palm: (4, 4) palm -> rig frame.
         dorsal, palmar, forward: (3,) unit vectors, rig frame: out of the back of the hand, out of the palm, along the
             palm to the fingers.
@@ -62,6 +63,7 @@ class HandFeatures:
     pads_m: Float
     radius_m: Float
     joints_m: Float
+    joints_cov_m2: Float
     T_rig_palm: Float
     dorsal: Float
     palmar: Float
@@ -113,6 +115,7 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         pads_m=along - radius[:, None] * rotation[TIPS][..., 1],
         radius_m=pose.radius_m[TIPS],
         joints_m=joints,
+        joints_cov_m2=_cov_m2(pose, lacking),
         T_rig_palm=T_rig_palm,
         dorsal=palm[:, 1],
         palmar=-palm[:, 1],
@@ -121,6 +124,11 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         side_sign=model.side_sign,
         palm_world_wxyz=pose.palm_world_wxyz,
     )
+
+
+def _cov_m2(pose: HandPose, lacking: Bool) -> Float:
+    told = np.isfinite(pose.cov_m2).all(axis=(1, 2)) & ~lacking
+    return np.where(told[:, None, None], pose.cov_m2, np.eye(3))
 
 
 def _sigma_m(pose: HandPose) -> tuple[Float, float]:
