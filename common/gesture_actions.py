@@ -43,7 +43,8 @@ class DialSettings(Part, frozen=True):
     between the skins of the thumb and any finger at least, and `aslant_rad`: between the circle and the plane of the
     palm at most: others are a thumb over a row of fingers. `fingers_least`: how many of the four lie on it.
     `round_m`: how far from it they may be; `opposed_rad`: at least so far round it is the thumb from each of them.
-    `loose_m`: in a grip that is wider or narrower by this the fingers turn nothing; `open_m`: by this it is none.
+    `quick_m`: fingers that have gone apart by this within a tenth of a second turn nothing, for they let go;
+    `loose_m`: nor do they in a grip that is wider or narrower by this, and `open_m`: by this it is none.
     `regrip_s`: how long an open hand may take to grip again; the angle goes on where it was. `lost_s`: how long tips
     may be unknown; `sigma_most_m`: of a tip, above which it is.
     """
@@ -59,6 +60,7 @@ class DialSettings(Part, frozen=True):
     fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
     round_m: Positive = 0.012
     opposed_rad: Positive = math.radians(75.0)
+    quick_m: Positive = 0.0009
     loose_m: Positive = 0.0025
     open_m: Positive = 0.006
     regrip_s: NonNegative = 0.8

@@ -3,8 +3,11 @@
 Palm and fingers both turn a knob, and the caps of the tips, turned as one in the room, have the sum of both; they are
 also what is measured best. A tip that is not seen goes with the palm, and counts less. The angle is against the grip's
 beginning, not summed up from step to step, so that neither noise nor a moment of loss adds up. A hand that lets go
-opens first: then the dial stands where it was a tenth of a second before, and goes on from there when it is gripped
+opens first: from when it begins to (`course`) the dial stands where it was, and goes on from there when it is gripped
 again.
+
+Tips that stand still to each other are a grip where most instants of the hold have its shape: which way the palm lies
+decides some of that, and cameras that see no more than fingertips doubt it from instant to instant.
 
 The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
 what is known of it is the mean of both (`_axis_of`).
@@ -22,13 +25,14 @@ from common.arrays import Float
 from common.geometry import quaternion_to_matrix
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
+from master.gestures.course import Course
 from master.gestures.features import HandFeatures
 from master.gestures.grip import Circle, Tips, circle_through, grip_of, spread_m, turned_by, widened_m
 from master.gestures.lasting import Lasting
 
 _AXIS_RAD = np.radians(15.0)  # how well the circle of the tips tells the axis of the knob
 _SWAY_RAD = np.radians(4.0)  # about other axes, by which a hand sways while it turns a knob
-_LOOSENS_S = 0.12  # in which a hand that lets go has become loose
+_MOST = 0.6  # of the instants of a hold have the shape of a grip
 _EYE = np.eye(3)
 
 
@@ -40,12 +44,14 @@ class _Grip:
         tips: As they were when it closed.
         axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
+        course: How it has gone of late.
         farthest: (3,) rotation vector [rad] of its largest turn so far.
     """
 
     tips: Tips
     axis: Float
     base_rad: float
+    course: Course
     farthest: Float
 
 
@@ -56,10 +62,9 @@ class DialWatch:
         self._settings = settings
         self._dial: Lasting | None = None
         self._grip: _Grip | None = None
-        self._maybe: deque[tuple[int, Tips]] = deque()  # a grip since when it is as it is now
+        self._maybe: deque[tuple[int, Tips, bool]] = deque()  # since when tips are as they are now; a grip's?
         self._angle = 0.0
         self._before: Tips | None = None  # those of the grip that was let go
-        self._late: deque[tuple[int, float]] = deque()  # the angle of late
         self._closed_ns = self._known_ns = 0  # when the dial was gripped, and tips were known, last
         self._last: Gesture | None = None
 
@@ -88,9 +93,8 @@ class DialWatch:
                     self._maybe.clear()
                 return []
             self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
-            self._angle, self._grip = 0.0, _Grip(tips, circle.axis, 0.0, np.zeros(3))
-            self._late.clear()
-            self._maybe.clear()
+            self._angle = 0.0
+            self._take(tips, circle)
             self._closed_ns = self._known_ns = seen.t_ns
             return [self._tell(self._dial, "begin", seen, turn, tips)]
         self._follow(seen.t_ns, tips)
@@ -118,16 +122,27 @@ class DialWatch:
 
     def _held(self, t_ns: int, tips: Tips, hold_s: float) -> Circle | None:
         """The grip, if it has been as it is now for so long."""
-        circle = self._again(tips) if self._dial is not None else grip_of(tips, self._settings)
-        if circle is None:
-            self._maybe.clear()
-            return None
-        while self._maybe and _most(spread_m(tips, self._maybe[0][1])) > self._settings.still_m:
+        own = self._settings
+        circle = self._again(tips) if self._dial is not None else grip_of(tips, own)
+        while self._maybe and _most(spread_m(tips, self._maybe[0][1])) > own.still_m:
             self._maybe.popleft()
-        self._maybe.append((t_ns, tips))
+        if circle is None and not self._maybe:
+            return None
+        self._maybe.append((t_ns, tips, circle is not None))
         while len(self._maybe) > 1 and (t_ns - self._maybe[1][0]) * 1e-9 >= hold_s:
             self._maybe.popleft()
-        return circle if (t_ns - self._maybe[0][0]) * 1e-9 >= hold_s else None
+        if (t_ns - self._maybe[0][0]) * 1e-9 < hold_s:
+            return None
+        if sum(shape for _, _, shape in self._maybe) < _MOST * len(self._maybe):
+            return None
+        known = np.flatnonzero(tips.known)
+        return circle_through(tips.place_m[known], tips.palmar) if len(known) >= 3 else None
+
+    def _take(self, tips: Tips, circle: Circle) -> None:
+        """A grip closes."""
+        course = Course(self._settings.quick_m)
+        self._grip = _Grip(tips, circle.axis, self._angle, course, np.zeros(3))
+        self._maybe.clear()
 
     def _again(self, tips: Tips) -> Circle | None:
         """The grip of a hand that had let go: as wide again as that before, for the knob is the same."""
@@ -144,27 +159,29 @@ class DialWatch:
             self._known_ns = t_ns
         if grip is None:
             circle = self._held(t_ns, tips, own.again_s)
-            if circle is None:
-                return
-            self._grip = grip = _Grip(tips, circle.axis, self._angle, np.zeros(3))
-            self._late.clear()
-            self._maybe.clear()
-        by = abs(widened_m(tips, grip.tips))
-        if by > own.open_m:
+            if circle is not None:
+                self._take(tips, circle)
+                self._closed_ns = t_ns
+            return
+        wide = widened_m(tips, grip.tips)
+        loosened = grip.course.loosens
+        if grip.course.sound(t_ns, wide, own.loose_m):
+            self._turn(t_ns, tips, grip, wide)
+        elif (ahead := grip.course.ahead_rad(t_ns)) is not None:
+            self._angle = ahead
+        if loosened and abs(wide) > own.open_m:
             self._grip, self._before, self._closed_ns = None, grip.tips, t_ns
-            return
-        self._closed_ns = t_ns
-        if not by <= own.loose_m:
-            self._angle = self._late[0][1] if self._late else self._angle
-            return
+        else:
+            self._closed_ns = t_ns
+
+    def _turn(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
+        """The angle of tips that turn the knob."""
         turn = turned_by(tips, grip.tips)
         if float(turn @ turn) > float(grip.farthest @ grip.farthest):
             self._grip = grip = replace(grip, farthest=turn)
         twist = _twist(turn, _axis_of(grip)) + grip.base_rad
         self._angle = twist + 2.0 * np.pi * round((self._angle - twist) / (2.0 * np.pi))
-        self._late.append((t_ns, self._angle))
-        while len(self._late) > 2 and (t_ns - self._late[1][0]) * 1e-9 > _LOOSENS_S:
-            self._late.popleft()
+        grip.course.push(t_ns, wide_m, self._angle)
 
     def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, turn: Float, tips: Tips) -> Gesture:
         grip = self._grip
