@@ -40,8 +40,12 @@ _FILL = 0.90  # share of the box that the hand may take
 _SKIN = np.array([1.0, 0.79, 0.67])
 _YAW, _PITCH = np.deg2rad(-20.0), np.deg2rad(-12.0)
 _WRIST_YAW, _WRIST_PITCH = np.deg2rad(30.0), np.deg2rad(58.0)
-_LINE = 52  # letters of what was tracked that fit in one line beside the figures
-_HALF_LINE = 36  # and beside nine of them
+_LINE, _HALF_LINE = (
+    52,
+    36,
+)  # letters of what was tracked that fit in one line beside eight figures, and beside more
+_MOST_FIGURES = 10
+_FIGURE_STEP, _FIGURE_STEP_NARROW = 0.0845, 0.0735  # of the width, between eight figures and between more
 # Key figures of the summary, in the order of importance: key, what it says, format.
 _FIGURES = (
     ("poses_per_s", "poses / s", "{:.1f}"),
@@ -128,7 +132,11 @@ def _header(
     model: HandModel,
     summary: Mapping[str, float],
 ) -> None:
-    figure.text(0.018, 0.942, "Phalanx", color=INK, size=25, weight="bold", va="center")
+    figure.text(0.018, 0.948, "Phalanx", color=INK, size=25, weight="bold", va="center")
+    shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary][
+        :_MOST_FIGURES
+    ]
+    many = len(shown) > 8
     worn = [wrist.rig] if wrist is not None and wrist.in_rig else []
     count = len(rig.cameras) + len(worn)
     rigs, cameras = f"rig {' and '.join([rig.name, *worn])}", f"{count} camera{'s' if count > 1 else ''}"
@@ -136,13 +144,12 @@ def _header(
     watched = f"{rigs} · {cameras}"
     if len(watched) > _HALF_LINE:
         watched = f"{rigs}\n{cameras}"
-    what = watched + (" · " if len(watched + hand) <= _LINE else "\n") + hand
+    what = watched + (" · " if len(watched + hand) <= _LINE and not many else "\n") + hand
     figure.text(0.019, 0.925, what, color=INK, alpha=0.75, size=12, va="top")
-    shown = [(label, form.format(summary[key])) for key, label, form in _FIGURES if key in summary]
     for i, (label, value) in enumerate(reversed(shown)):
-        x = 0.945 - i * 0.0845
+        x = 0.945 - i * (_FIGURE_STEP_NARROW if many else _FIGURE_STEP)
         figure.text(x, 0.949, value, color=INK, size=21, weight="bold", ha="center", va="center")
-        figure.text(x, 0.905, label, color=INK, alpha=0.75, size=10, ha="center", va="center")
+        figure.text(x, 0.905, label, color=INK, alpha=0.75, size=9 if many else 10, ha="center", va="center")
 
 
 def _hand(

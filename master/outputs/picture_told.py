@@ -23,7 +23,7 @@ STRIP_BOX = (0.285, 0.055, 0.315, 0.135)  # left, bottom, width, height of the f
 _NEAR_NS = 60_000_000  # an object is shown where it was this close to the instant
 _LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
 _TAP_S = 0.15
-_LETTER_SHARE = 0.0155  # of the strip's length that a letter takes
+_LETTER_SHARE = 0.0135  # of the strip's length that a letter takes
 _LETTERS_LEAST = 3  # of a name that is cut off
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
@@ -107,14 +107,16 @@ class ToldPicture:
             for name, start_ns, stop_ns in spans(self.gestures, kind, int(t_ns[-1])):
                 start, length = (start_ns - first) * 1e-9, (stop_ns - start_ns) * 1e-9
                 axes.broken_barh(
-                    [(start, max(length, _TAP_S))], (lane - 0.38, 0.76), color=unit(GESTURE_RGB[kind])
+                    [(start, max(length, _TAP_S))],
+                    (lane - 0.38, 0.76),
+                    fc=unit(GESTURE_RGB[kind]),
+                    ec=PAPER,
+                    lw=0.8,
                 )
-                letters = len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span))
-                if letters < min(len(name), _LETTERS_LEAST):
-                    continue
+                words = _words(name, len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span)))
                 at = start + (0.5 * max(length, _TAP_S) if kind == "tap" else 0.004 * span)
                 side = "center" if kind == "tap" else "left"
-                axes.text(at, lane, name[:letters], size=8, color=PAPER, va="center", ha=side, clip_on=True)
+                axes.text(at, lane, words, size=8, color=PAPER, va="center", ha=side, clip_on=True)
         axes.set_yticks(range(len(lanes)), [_LANES[kind] for kind in reversed(lanes)])
         axes.set_ylim(-0.6, len(lanes) - 0.4)
         axes.set_xlim(0.0, span)
@@ -151,6 +153,14 @@ def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str
         (name, began, last if (name, began) in ended else end_ns)
         for (name, began), last in sorted(found.items(), key=lambda item: item[0][1])
     ]
+
+
+def _words(name: str, letters: int) -> str:
+    """A name in as many lines as it has words, each cut to so many letters; empty where that says nothing."""
+    words = name.split("_")
+    if letters < min(max(map(len, words)), _LETTERS_LEAST):
+        return ""
+    return "\n".join(word[:letters] for word in words)
 
 
 def _outline(part: Shape) -> Float:

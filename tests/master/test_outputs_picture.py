@@ -1,10 +1,13 @@
 import errno
+from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from msgspec.structs import replace
 
 from common.calibration import RigCalibration, Volume
@@ -13,6 +16,7 @@ from common.geometry import matrix_to_quaternion, rigid
 from common.hand_model import TIPS, WRIST, HandModel
 from common.hand_profiles import generated_profile
 from common.messages import HandPose, Source
+from master.outputs import picture
 from master.outputs.hand_render import View, render_hand
 from master.outputs.palette import SOURCE_RGB
 from master.outputs.picture import best_row, draw_summary, fit_view
@@ -215,3 +219,19 @@ def test_the_small_view_holds_every_camera_of_a_large_rig_and_its_volume(tmp_pat
     assert np.abs(with_box.astype(int) - without_box).max() > 20
     assert np.abs(without_box.astype(int) - pair).max() > 100
     np.testing.assert_array_equal(images[0][:570], images[1][:570])  # nothing of it beyond its panel
+
+
+@pytest.mark.parametrize("count", [4, 8, 9, 10, 14])
+def test_no_word_of_the_head_stands_on_another(count: int) -> None:
+    keys = [key for key, _, _ in picture._FIGURES]
+    assert len(keys) >= count
+    figure = Figure(figsize=(16, 9), dpi=100)
+    canvas = FigureCanvasAgg(figure)
+    picture._header(figure, RIG, None, MODEL, dict.fromkeys(keys[:count], 147.8))
+    boxes = [text.get_window_extent(canvas.get_renderer()) for text in figure.texts]
+    assert len(boxes) == 2 + 2 * min(count, 10)
+    assert not [
+        (figure.texts[a].get_text(), figure.texts[b].get_text())
+        for a, b in combinations(range(len(boxes)), 2)
+        if boxes[a].overlaps(boxes[b])
+    ]
