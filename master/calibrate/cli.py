@@ -11,6 +11,7 @@ from master.calibrate.depth.commands import depth
 from master.calibrate.depth.verify_command import verify_command
 from master.calibrate.hand.commands import hand_command
 from master.calibrate.mounting.command import mounting
+from master.calibrate.object.command import object_command
 from master.calibrate.object.cube_command import cube
 from master.calibrate.time.commands import time_command
 from master.calibrate.tracker.command import tracker
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "mounting": mounting,
     "tracker": tracker,
     "cube": cube,
+    "object": object_command,
 }
 
 

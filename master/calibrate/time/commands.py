@@ -41,7 +41,7 @@ def time_command(
       phalanx-master calibrate time RECORDING --detections DIR --rig desk --out calib_json
     """
     opened = open_recording(recording)
-    used, cameras = _geometry(opened, rig, calibration)
+    used, cameras = geometry_of(opened, rig, calibration)
     base = rig_in_tree(out, rig or used.name, used)
     times = measure(opened, used, cameras, detections)
     for line in report_lines(used, times):
@@ -58,7 +58,7 @@ def time_command(
         )
 
 
-def _geometry(
+def geometry_of(
     recording: FrameRecording, rig: str | None, calibration: Path
 ) -> tuple[RigCalibration, dict[str, CameraCalibration]]:
     """Rig and cameras: the recording's own, or those of a calibration tree.

@@ -1,0 +1,184 @@
+"""The places of beads on a rigid body, and its pose at every instant, from where they were: one least-squares problem.
+
+Minimised over beads q_b and poses R_t, p_t, with the covariances C of the points, which hold what the cameras' pixels
+told (a bundle adjustment, linear in the points: Triggs et al. 2000):
+
+    sum_tb  rho( e' C^-1 e ),   e = R_t q_b + p_t - x_tb
+
+Poses are eliminated (Schur complement), so that what is solved has 3 B unknowns however long the motion was. The frame
+of q is free: steps that only move the whole body are excluded (inner constraints, ibid. 9.2.2). rho is Geman and
+McClure's, so that a bead that was taken for something else, or was half hidden, costs itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from common.errors import FitError
+from common.geometry import fit_rigid, rotation_vector_to_matrix, skew, transform
+from master.calibrate.object.seen import Seen
+
+_MOST = 1500  # instants: more of the same motion adds time, not knowledge
+_ROUNDS = 40
+_SETTLED_M = 1e-7
+_SOFT_2 = 12.0  # chi square of three numbers at which a bead counts a quarter
+STRAY = 0.1  # weight below which a bead at an instant counts as a stray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bundle:
+    """A rigid body that explains what was seen.
+
+    Attributes:
+        seen: The instants that were used.
+        beads_m: (B, 3) in a frame of its own.
+        cov_m2: (3 B, 3 B) of the beads among each other, from the covariances of the points alone.
+        T: (T, 4, 4) body -> rig.
+        off_m: (T, B, 3) where the body has a bead, less where it was seen; NaN: not seen.
+        weight: (T, B) 0..1; 0: not seen.
+        spread: How large what is left is by what the covariances expect.
+    """
+
+    seen: Seen
+    beads_m: Float
+    cov_m2: Float
+    T: Float
+    off_m: Float
+    weight: Float
+    spread: float
+
+    @property
+    def stray(self) -> Bool:
+        """(T, B) which sightings the body does not explain."""
+        return self.seen.known & (self.weight < STRAY)
+
+
+def usable(seen: Seen) -> Bool:
+    """(T,) instants that say something of the body: three beads or more are known."""
+    return seen.known.sum(axis=1) >= 3
+
+
+def fit_bundle(seen: Seen, rows: Int | None = None) -> Bundle:
+    """Fit a body.
+
+    Args:
+        seen: The beads over time.
+        rows: Which instants; None: all that are usable, at most so many, spread.
+
+    Raises:
+        FitError: A bead is never seen together with two others whose places are known.
+    """
+    chosen = np.flatnonzero(usable(seen)) if rows is None else rows
+    if len(chosen) > _MOST:
+        chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, _MOST).astype(np.int64))]
+    own = Seen(seen.names, seen.t_s[chosen], seen.points_m[chosen], seen.cov_m2[chosen])
+    beads, T = first_body(own)
+    info = np.where(own.known[..., None, None], _inverse(own.cov_m2), 0.0)
+    points = np.nan_to_num(own.points_m)
+    scale_2, cov = 1.0, np.empty(0)
+    weight = own.known.astype(np.float64)
+    for _ in range(_ROUNDS):
+        off = _off(beads, T, points)
+        chi = np.einsum("tbi,tbij,tbj->tb", off, info, off)
+        scale_2 = _scale_2(chi, own.known)
+        weight = np.where(own.known, (1.0 + chi / (_SOFT_2 * scale_2)) ** -2.0, 0.0)
+        step, poses, cov = _solved(beads, T, off, weight[..., None, None] * info)
+        beads = beads + step
+        turn = rotation_vector_to_matrix(poses[:, :3])
+        T = T.copy()
+        T[:, :3, :3], T[:, :3, 3] = turn @ T[:, :3, :3], T[:, :3, 3] + poses[:, 3:]
+        if float(np.abs(step).max()) < _SETTLED_M:
+            break
+    off = _off(beads, T, points)
+    left = np.where(own.known[..., None], off, np.nan)
+    return Bundle(own, beads, scale_2 * cov, T, left, weight, float(np.sqrt(scale_2)))
+
+
+def first_body(seen: Seen) -> tuple[Float, Float]:
+    """Beads (B, 3) and poses (T, 4, 4) to begin with: from the instant that is known best, bead by bead by medians.
+
+    Raises:
+        FitError: A bead is never seen together with two others whose places are known.
+    """
+    known = seen.known
+    size = np.nan_to_num(np.einsum("tbii->tb", seen.cov_m2), nan=0.0).sum(axis=1)
+    most = known.sum(axis=1) == known.sum(axis=1).max(initial=0)
+    first: int = int(np.argmin(np.where(most, size, np.inf)))
+    beads = seen.points_m[first] - np.nanmean(seen.points_m[first], axis=0)
+    for _ in range(3 + len(seen.names)):
+        T = np.array([_pose(points, beads) for points in seen.points_m])
+        placed = np.asarray((seen.points_m - T[:, None, :3, 3]) @ T[:, :3, :3], np.float64)
+        beads = _medians(placed, beads)
+    if np.isnan(beads).any():
+        lost = [name for name, bead in zip(seen.names, beads, strict=True) if np.isnan(bead).any()]
+        raise FitError(f"{', '.join(lost)}: never seen by two cameras together with three others")
+    T = np.array([_pose(points, beads) for points in seen.points_m])
+    return beads, T
+
+
+def _medians(placed: Float, beads: Float) -> Float:
+    """Beads (B, 3) by medians of places (T, B, 3); those of no place as they were."""
+    out = beads.copy()
+    told = np.flatnonzero(np.isfinite(placed).all(axis=2).any(axis=0))
+    out[told] = np.nanmedian(placed[:, told], axis=0)
+    return out
+
+
+def _pose(points: Float, beads: Float) -> Float:
+    """The pose (4, 4) of a body (B, 3) by points (B, 3); NaN where fewer than three are known of both."""
+    both = np.isfinite(points[:, 0] + beads[:, 0])
+    return fit_rigid(points[both], beads[both]) if both.sum() >= 3 else np.full((4, 4), np.nan)
+
+
+def _off(beads: Float, T: Float, points: Float) -> Float:
+    return np.array([transform(pose, beads) for pose in T]) - points
+
+
+def _inverse(cov: Float) -> Float:
+    return np.linalg.inv(np.where(np.isfinite(cov), cov, np.eye(3)))
+
+
+def _scale_2(chi: Float, known: Bool) -> float:
+    """What the covariances are to be multiplied by, 1 at least, from chi squares (T, B) by their median.
+
+    Of the 3 n numbers of an instant 6 go into its pose, so the chi square of a bead is that of 3 - 6 / n numbers, whose
+    median follows by Wilson and Hilferty (1931).
+    """
+    own = chi[known]
+    free = 3.0 - 6.0 / float(known.sum(axis=1).mean())
+    median = free * (1.0 - 2.0 / (9.0 * free)) ** 3
+    return max(1.0, float(np.median(own)) / median)
+
+
+def _solved(beads: Float, T: Float, off: Float, info: Float) -> tuple[Float, Float, Float]:
+    """One Gauss-Newton step: of the beads (B, 3), of the poses (T, 6: turn, place), and the beads' covariance."""
+    count = len(beads)
+    R = T[:, :3, :3]
+    by_pose = np.empty((len(T), count, 3, 6))
+    by_pose[..., :3] = -skew(np.einsum("tij,bj->tbi", R, beads))
+    by_pose[..., 3:] = np.eye(3)
+    weighed = info @ by_pose
+    V = np.einsum("tbki,tbkj->tij", by_pose, weighed) + 1e-6 * np.eye(6)
+    X = np.einsum("tki,tbkj->tbij", R, weighed).reshape(len(T), 3 * count, 6)
+    U = np.einsum("tki,tbkl,tlj->bij", R, info, R)
+    pull = np.einsum("tbij,tbj->tbi", info, off)
+    of_beads = -np.einsum("tki,tbk->bi", R, pull).ravel()
+    of_poses = -np.einsum("tbki,tbk->ti", by_pose, pull)
+    V_inverse = np.asarray(np.linalg.inv(V), np.float64)
+    X_V = X @ V_inverse  # (T, 3 B, 6)
+    S = -np.einsum("tai,tbi->ab", X_V, X)
+    for b in range(count):
+        S[3 * b : 3 * b + 3, 3 * b : 3 * b + 3] += U[b]
+    free = _free(beads)
+    cov = free @ np.asarray(np.linalg.inv(free.T @ S @ free), np.float64) @ free.T
+    step = cov @ (of_beads - np.einsum("tai,ti->a", X_V, of_poses))
+    poses = np.einsum("tij,tj->ti", V_inverse, of_poses - np.einsum("tai,a->ti", X, step))
+    return step.reshape(count, 3), poses, cov
+
+
+def _free(beads: Float) -> Float:
+    """Basis (3 B, 3 B - 6) of the steps that change the body and not only its frame."""
+    middle = beads - beads.mean(axis=0)
+    moves = np.concatenate([np.tile(np.eye(3), (len(beads), 1)), skew(middle).reshape(-1, 3)], axis=1)
+    return np.linalg.svd(moves)[0][:, 6:]

@@ -1,0 +1,216 @@
+"""`phalanx-master calibrate object`: where the beads of a new object sit, from its being moved before the cameras."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from common.calibration import RigCalibration, load
+from common.camera_model import CameraModel
+from common.errors import CalibrationError, FitError
+from common.frame_recording import open_recording
+from common.object_profile import ObjectProfile
+from master.calibrate.object.measure import measure_object
+from master.calibrate.object.save import (
+    add_to_rig,
+    measured_profile,
+    report_json,
+    report_lines,
+    write_object,
+)
+from master.calibrate.object.seen import Seen, rows_of, seen_by
+from master.calibrate.time.commands import geometry_of
+from master.calibrate.tree_files import load_marker_rig
+from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, JsonFile, RecordingRig, ResultTree
+from master.recorded import recorded_detections
+from master.summary import write_summary
+
+Name = Annotated[str, typer.Argument(help="Name of the object; its file is objects/NAME.json.")]
+Markers = Annotated[
+    str | None,
+    typer.Option(
+        help="Its beads, with commas; default: those of its file, else all free_markers of the rig."
+    ),
+]
+RadiusMm = Annotated[
+    float | None,
+    typer.Option(min=0.5, max=50.0, help="Radius of the beads; default: as its file has it, else 8."),
+]
+Recording = Annotated[
+    Path | None, typer.Option(help="Folder of a raw-frame recording of the object that moves.")
+]
+Detections = Annotated[Path | None, typer.Option(help="Folder with detections_<camera>.npz of it.")]
+Live = Annotated[bool, typer.Option("--live", help="Do the motion now, before the running master.")]
+Like = Annotated[
+    Path | None,
+    typer.Option(help="Object file whose frame, shape, tags and tracker are kept; default: its own."),
+]
+AddToRig = Annotated[bool, typer.Option("--add-to-rig", help="Name it under objects of the rig in --out.")]
+Seconds = Annotated[float, typer.Option(min=5.0, help="How many seconds a live motion may take at most.")]
+Picture = Annotated[Path | None, typer.Option(help="Write a picture of beads and residuals to this .png.")]
+
+
+def object_command(
+    name: Name,
+    markers: Markers = None,
+    radius_mm: RadiusMm = None,
+    recording: Recording = None,
+    detections: Detections = None,
+    live: Live = False,
+    rig: RecordingRig = None,
+    calibration: Calibration = CALIB_JSON,
+    like: Like = None,
+    add_to_rig: AddToRig = False,
+    seconds: Seconds = 60.0,
+    out: ResultTree = None,
+    json_file: JsonFile = None,
+    picture: Picture = None,
+    bus: BusEnd = HERE_BUS,
+) -> None:
+    """Measure where the beads of a rigid object sit, from fifteen seconds of its being turned before the cameras.
+
+    The rig lists the beads in markers and in free_markers, the camera files have their colours; the object's file is
+    not needed. Its frame is that of --like, or of its own file where there is one; else: origin in the middle of the
+    beads, x from the first to the second, y to the side of the one farthest from that line. Nothing is written without
+    --out.
+
+    Examples:
+
+      phalanx-master calibrate object wand --live --rig desk-wand --markers wand1,wand2,wand3 --radius-mm 9 --out TREE
+
+      phalanx-master calibrate object wand --recording REC --detections DIR --picture wand.png --out TREE --add-to-rig
+    """
+    _check_together(live, recording, detections, rig, add_to_rig, out)
+    base, where = base_of(calibration, name, like)
+    told = None if markers is None else tuple(part.strip() for part in markers.split(",") if part.strip())
+    if live:
+        assert rig is not None
+        used = load_marker_rig(calibration, rig)
+        names = names_of(told, base, used)
+        from master.calibrate.object.live import observe_live
+
+        seen, data = observe_live(bus, used, names, seconds, typer.echo), "live"
+    else:
+        assert recording is not None
+        assert detections is not None
+        used, names, seen = recorded(recording, detections, rig, calibration, told, base)
+        data = recording.resolve().name
+    try:
+        found = measure_object(seen)
+        profile, misses = measured_profile(found, name, radii(names, radius_mm, base), data, base, where)
+    except FitError as error:
+        raise FitError(f"{data}: {error}") from error
+    for line in report_lines(found, profile, misses):
+        typer.echo(line)
+    if picture is not None:
+        from master.calibrate.object.picture import draw_object  # matplotlib takes a second to import
+
+        draw_object(picture, found, profile)
+        typer.echo(f"drew {picture}")
+    written = _write(out, profile, rig or used.name, used, add_to_rig)
+    if json_file is not None:
+        write_summary(json_file, report_json(found, profile, misses) | {"written": written})
+
+
+def base_of(calibration: Path, name: str, like: Path | None) -> tuple[ObjectProfile | None, str]:
+    """The file whose frame and other parts are kept, and its name; None: there is none.
+
+    Raises:
+        CalibrationError: It is missing or broken.
+    """
+    path = calibration / "objects" / f"{name}.json" if like is None else like
+    if like is None and not path.exists():
+        return None, ""
+    return load(path, ObjectProfile), path.name
+
+
+def names_of(
+    told: tuple[str, ...] | None, base: ObjectProfile | None, rig: RigCalibration
+) -> tuple[str, ...]:
+    """The beads: as told, of the file, or all that sit on no hand.
+
+    Raises:
+        CalibrationError: Fewer than three, one stands twice, or the rig does not have them.
+    """
+    names = told or (tuple(base.markers) if base is not None and base.markers else rig.free_markers)
+    if len(names) < 3 or len(set(names)) < len(names):
+        raise CalibrationError(
+            "--markers: three different beads or more tell how an object is turned, these are"
+            f" {', '.join(names) or 'none'}"
+        )
+    rows_of(rig, names)
+    return names
+
+
+def radii(names: tuple[str, ...], radius_mm: float | None, base: ObjectProfile | None) -> dict[str, float]:
+    """Radius of each bead [m]: as told, as the file has it, or the usual."""
+    there = {} if base is None else {name: bead.radius_m for name, bead in base.markers.items()}
+    return {name: there.get(name, 0.008) if radius_mm is None else 1e-3 * radius_mm for name in names}
+
+
+def recorded(
+    recording: Path,
+    detections: Path,
+    rig: str | None,
+    calibration: Path,
+    told: tuple[str, ...] | None,
+    base: ObjectProfile | None,
+) -> tuple[RigCalibration, tuple[str, ...], Seen]:
+    """Rig, beads, and what was seen of them in a recording.
+
+    Raises:
+        RecordingError: A file of it is missing or broken.
+        CalibrationError: Its frames are unrelated, the rig does not fit it, or has not these beads.
+    """
+    opened = open_recording(recording)
+    used, cameras = geometry_of(opened, rig, calibration)
+    if not opened.manifest.continuous:
+        raise CalibrationError(
+            f"{recording}: its frames are unrelated poses (continuous is false): an object that moves is needed"
+        )
+    if len(used.cameras) < 2:
+        raise CalibrationError(f"rig {used.name!r}: cameras: two or more are needed")
+    names = names_of(told, base, used)
+    models = {camera: CameraModel.of(cameras[camera], used.camera_pose(camera)) for camera in used.cameras}
+    messages = [
+        message
+        for camera in used.cameras
+        for message in recorded_detections(detections, camera, len(used.markers))
+    ]
+    messages.sort(key=lambda message: message.t_ns)
+    rates = {camera: cameras[camera].frame_rate_hz for camera in used.cameras}
+    return used, names, seen_by(used, models, rates, messages, names)
+
+
+def _check_together(
+    live: bool,
+    recording: Path | None,
+    detections: Path | None,
+    rig: str | None,
+    adds: bool,
+    out: Path | None,
+) -> None:
+    if live == (recording is not None) or live == (detections is not None):
+        raise CalibrationError("give --live, or --recording FOLDER and --detections DIR of the motion")
+    if live and rig is None:
+        raise CalibrationError("--live needs --rig: that of the running master")
+    if adds and out is None:
+        raise CalibrationError("--add-to-rig writes into the tree --out: give --out DIR")
+
+
+def _write(
+    out: Path | None, profile: ObjectProfile, rig_name: str, rig: RigCalibration, adds: bool
+) -> list[str]:
+    if out is None:
+        typer.echo("nothing written: give --out DIR")
+        return []
+    written = [str(write_object(out, profile))]
+    typer.echo(f"wrote {written[0]}: markers")
+    if adds:
+        written.append(str(add_to_rig(out, rig_name, rig, profile.name)))
+        typer.echo(f"wrote {written[1]}: objects")
+    elif profile.name not in rig.objects:
+        typer.echo(
+            f'to track it: "objects": ["{profile.name}"] in rigs/{rig_name}.json (or again with --add-to-rig)'
+        )
+    return written

@@ -1,0 +1,42 @@
+"""The guided motion with the master that runs: opens its bus."""
+
+from collections.abc import Callable, Sequence
+
+from common.calibration import RigCalibration
+from common.clock import SystemClock
+from common.messages import HandPose
+from common.zenoh_bus import ZenohBus
+from master.calibrate.object.seen import Seen
+from master.calibrate.object.session import lead
+
+_DEPTH = 512  # poses that may wait while a line is printed
+
+
+def observe_live(
+    bus: str, rig: RigCalibration, names: Sequence[str], longest_s: float, say: Callable[[str], None]
+) -> Seen:
+    """Lead the user through the motion.
+
+    Args:
+        bus: Endpoint of the running master's bus.
+        rig: That it runs.
+        names: Of the beads.
+        longest_s: How long the motion may take [s].
+        say: Told one line at a time.
+
+    Raises:
+        BusError: Nobody listens there.
+        CalibrationError: The master runs another rig.
+        FitError: No pose came.
+    """
+    link = ZenohBus(None, bus, beyond=True)
+    try:
+        poses = link.subscribe("hand", rig.hand, _DEPTH)
+
+        def receive(timeout_s: float) -> HandPose | None:
+            message = poses.get(timeout_s)
+            return message if isinstance(message, HandPose) else None
+
+        return lead(receive, rig, names, SystemClock(), say, longest_s)
+    finally:
+        link.close()

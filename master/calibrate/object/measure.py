@@ -1,0 +1,192 @@
+"""Where the beads of an object sit: what was seen of its motion, checked, fitted, and refused with the cause."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.errors import FitError
+from common.geometry import matrix_to_rotation_vector
+from master.calibrate.object.bundle import Bundle, fit_bundle, usable
+from master.calibrate.object.frame import own_frame
+from master.calibrate.object.seen import Seen
+
+MOTION = (
+    "hold the object before the cameras for fifteen seconds, hands behind it, all beads in sight of two cameras: turn"
+    " it slowly about all its axes, and carry it to all sides"
+)
+FEWEST, ENOUGH = 60, 240  # instants at which all beads are known
+FEWEST_LOOKS, ENOUGH_LOOKS = 4, 15
+_LOOK_RAD = np.radians(
+    10.0
+)  # turned by so much, a bead shows cameras another side: what misleads them is another
+_LOOK_M = 0.04  # and so does one that is elsewhere
+_WINDOW_S = 0.25
+# By which a distance between beads may change, from the tenth to the ninetieth percentile of quarters of a second.
+_RIGID_M = 2e-3
+_RIGID_SIGMAS = 0.5  # most of a sigma changes from frame to frame, or is a suspicion that does not come true
+_SURE, _IN_WINDOW, _WINDOWS = 4.0, 5, 8
+_STRAYS = 0.3
+_SIGMA_M = 1e-3  # standard deviation of a bead, at most
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """Beads of an object.
+
+    Attributes:
+        bundle: What was fitted.
+        T_own_body: (4, 4) of the frame that is told (`master.calibrate.object.frame`).
+        looks: How many ways of turning and places cameras saw it in.
+        sigma_m: (B,) how sure each place is among the others, largest axis.
+    """
+
+    bundle: Bundle
+    T_own_body: Float
+    looks: int
+    sigma_m: Float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of the beads."""
+        return self.bundle.seen.names
+
+    @property
+    def rms_m(self) -> Float:
+        """(B,) by how much each misses the body, root of the mean square; strays left out."""
+        kept = np.where((self.bundle.weight > 0) & ~self.bundle.stray, 1.0, np.nan)
+        return np.sqrt(np.nanmean(kept * (self.bundle.off_m**2).sum(axis=-1), axis=0))
+
+    @property
+    def strays(self) -> Float:
+        """(B,) share of sightings of each that the body does not explain."""
+        return self.bundle.stray.sum(axis=0) / np.maximum(self.bundle.seen.known.sum(axis=0), 1)
+
+
+def measure_object(seen: Seen) -> Measurement:
+    """Measure.
+
+    Raises:
+        FitError: Too little is seen, the beads lie in one line, are not rigid, or the motion does not tell them.
+    """
+    refuse_little(seen)
+    refuse_loose(seen)
+    bundle = fit_bundle(seen)
+    own = own_frame(bundle.beads_m, seen.names)
+    looks = looks_of(bundle.T)
+    # What misleads cameras about a bead is the same while it shows the same side: looks count, and not instants.
+    size = bundle.cov_m2.reshape(len(seen.names), 3, len(seen.names), 3)
+    variance = np.array([np.linalg.eigvalsh(size[b, :, b])[-1] for b in range(len(seen.names))])
+    sigma = np.sqrt(variance * max(1.0, len(bundle.T) / looks))
+    found = Measurement(bundle, own, looks, sigma)
+    strays = found.strays
+    worst = int(np.argmax(strays))
+    if strays[worst] > _STRAYS:
+        raise FitError(
+            f"{seen.names[worst]}: {100 * strays[worst]:.0f} % of what was seen of it is somewhere else than the other"
+            " beads say: is its colour taught, is nothing else of that colour in sight, are the cameras calibrated?"
+        )
+    if looks < FEWEST_LOOKS or float(sigma.max()) > _SIGMA_M:
+        raise FitError(
+            f"it was seen in {looks} ways of turning and places, the beads are known to"
+            f" {1e3 * float(sigma.max()):.1f} mm: {MOTION}"
+        )
+    return found
+
+
+def refuse_little(seen: Seen) -> None:
+    """Refuse what is too short, or too seldom seen whole.
+
+    Raises:
+        FitError: With the bead that is seen least.
+    """
+    together = int((seen.known.all(axis=1) if len(seen.names) == 3 else usable(seen)).sum())
+    if together >= FEWEST:
+        return
+    if not seen.known.any():
+        raise FitError(f"no bead is seen by two cameras at once: {MOTION}")
+    each = ", ".join(
+        f"{name} {100 * share:.0f} %" for name, share in zip(seen.names, seen.known.mean(axis=0), strict=True)
+    )
+    how = "all beads" if len(seen.names) == 3 else "three beads or more"
+    raise FitError(
+        f"{how} are seen by two cameras at {together} of {len(seen.t_s)} instants, at least {FEWEST} are needed"
+        f" ({each}): {MOTION}"
+    )
+
+
+def refuse_loose(seen: Seen) -> None:
+    """Refuse beads that do not keep their distances: for the most part of the time, not for a moment.
+
+    Raises:
+        FitError: Which bead moved, where the others say so.
+    """
+    change = changes(seen)
+    loose = {pair: by for pair, by in change.items() if by[0] > by[1]}
+    if not loose:
+        return
+    worst = max(loose, key=lambda pair: loose[pair][0] / loose[pair][1])
+    told = ", ".join(
+        f"{seen.names[a]} - {seen.names[b]} by {1e3 * by:.1f} mm" for (a, b), (by, _) in loose.items()
+    )
+    guilty = guilty_of(change, len(seen.names))
+    blame = (
+        f"{seen.names[worst[0]]} or {seen.names[worst[1]]} moved, or one of them is taken for something else"
+        if guilty is None
+        else f"{seen.names[guilty]} moved, or something else is taken for it"
+    )
+    raise FitError(
+        f"not rigid: distances between beads change ({told}); {blame}. Fasten it and do the motion again"
+    )
+
+
+def guilty_of(change: Mapping[tuple[int, int], tuple[float, float]], count: int) -> int | None:
+    """The bead without which the others keep their distances, if it is one; `change` as of `changes`."""
+    rest = [
+        max((by / most for pair, (by, most) in change.items() if bead not in pair), default=0.0)
+        for bead in range(count)
+    ]
+    best, next_best = np.argsort(rest)[:2].tolist()
+    return best if rest[best] < 1.0 and 2.0 * rest[best] < rest[next_best] else None
+
+
+def changes(seen: Seen) -> dict[tuple[int, int], tuple[float, float]]:
+    """Of each pair of beads by how much its distance changes, and what is allowed [m]; without those hardly seen."""
+    window: Int = (seen.t_s / _WINDOW_S).astype(np.int64)
+    out = dict[tuple[int, int], tuple[float, float]]()
+    for a, b in combinations(range(len(seen.names)), 2):
+        way = seen.points_m[:, a] - seen.points_m[:, b]
+        distance = np.linalg.norm(way, axis=1)
+        unit = way / distance[:, None]
+        variance = np.einsum("ti,tij,tj->t", unit, seen.cov_m2[:, a] + seen.cov_m2[:, b], unit)
+        known = np.isfinite(distance)
+        if not known.any():
+            continue
+        # What is half hidden is less sure, and elsewhere than it seems.
+        usual = float(np.percentile(variance[known], 25.0))
+        known &= variance <= _SURE * usual
+        medians = [
+            np.median(distance[known & (window == w)])
+            for w in np.unique(window[known])
+            if (known & (window == w)).sum() >= _IN_WINDOW
+        ]
+        if len(medians) < _WINDOWS:
+            continue
+        low, high = np.percentile(medians, (10.0, 90.0))
+        out[a, b] = float(high - low), _RIGID_M + _RIGID_SIGMAS * float(np.sqrt(usual))
+    return out
+
+
+def looks_of(T: Float) -> int:
+    """In how many ways poses (T, 4, 4) differ enough that cameras see something else: greedily, the first ones kept."""
+    kept = np.empty((0, 4, 4))
+    for pose in T:
+        turn = np.linalg.norm(
+            matrix_to_rotation_vector(kept[:, :3, :3].swapaxes(1, 2) @ pose[:3, :3]), axis=-1
+        )
+        way = np.linalg.norm(kept[:, :3, 3] - pose[:3, 3], axis=1)
+        if not ((turn < _LOOK_RAD) & (way < _LOOK_M)).any():
+            kept = np.concatenate([kept, pose[None]])
+    return len(kept)

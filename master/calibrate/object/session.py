@@ -1,0 +1,90 @@
+"""The motion with a person: every second what is seen is told, and what is still wanting, until it is enough."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from common.calibration import RigCalibration
+from common.clock import Clock
+from common.errors import FitError
+from common.messages import HandPose
+from master.calibrate.object.bundle import first_body, usable
+from master.calibrate.object.measure import ENOUGH, ENOUGH_LOOKS, MOTION, looks_of
+from master.calibrate.object.seen import Seen, seen_in
+
+TELL_NS = 1_000_000_000
+_WAIT_S = 0.05
+_SHOWN = 200  # instants from which ways of turning are counted while it goes on
+
+Receive = Callable[[float], HandPose | None]
+
+
+def lead(
+    receive: Receive,
+    rig: RigCalibration,
+    names: Sequence[str],
+    clock: Clock,
+    say: Callable[[str], None],
+    longest_s: float,
+) -> Seen:
+    """Lead a person through the motion until it is enough, or the time is over.
+
+    Args:
+        receive: The next pose of the running master, waiting at most so long [s].
+        rig: Of that master.
+        names: Of the beads.
+        clock: Of this machine.
+        say: Told one line at a time.
+        longest_s: How long the motion may take [s].
+
+    Raises:
+        CalibrationError: As `master.calibrate.object.seen.seen_in`.
+        FitError: No pose came.
+    """
+    poses = list[HandPose]()
+    say(MOTION)
+    begin_ns = told_ns = clock.now_ns()
+    while clock.now_ns() - begin_ns < longest_s * 1e9:
+        pose = receive(_WAIT_S)
+        if pose is not None:
+            poses.append(pose)
+        now_ns = clock.now_ns()
+        if now_ns - told_ns < TELL_NS:
+            continue
+        told_ns = now_ns
+        if not poses:
+            say("no pose comes: is `phalanx-master run` running, on this --bus?")
+            continue
+        line, enough = progress(seen_in(poses, rig, names))
+        say(line)
+        if enough:
+            break
+    if not poses:
+        raise FitError("no pose came: is `phalanx-master run` running, on this --bus?")
+    return seen_in(poses, rig, names)
+
+
+def progress(seen: Seen) -> tuple[str, bool]:
+    """What there is and what is wanting, for a person; whether it is enough."""
+    rows = np.flatnonzero(usable(seen))
+    whole = int(seen.known.all(axis=1).sum())
+    looks = 0
+    if len(rows):
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, _SHOWN).astype(np.int64))]
+        try:
+            some = Seen(seen.names, seen.t_s[rows], seen.points_m[rows], seen.cov_m2[rows])
+            looks = looks_of(first_body(some)[1])
+        except FitError:
+            looks = 0
+    share = min(whole / ENOUGH, looks / ENOUGH_LOOKS, 1.0)
+    recent = seen.known[-30:].mean(axis=0)
+    poor = [name for name, part in zip(seen.names, recent, strict=True) if part < 0.5]
+    if poor:
+        hint = f"not seen by two cameras: {', '.join(poor)}"
+    elif share >= 1.0:
+        hint = "done"
+    elif looks / ENOUGH_LOOKS < whole / ENOUGH:
+        hint = "turn it about another axis, and carry it elsewhere"
+    else:
+        hint = "go on like this"
+    return f"{100 * share:3.0f} %  {whole} instants, {looks} ways of turning and places. {hint}", share >= 1.0
