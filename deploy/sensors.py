@@ -13,6 +13,7 @@ TOGETHER = (
     "both-curl",
     "both-travel",
     "both-moves",
+    "gestures",
 )  # seen by both kinds of rig alike
 # Scene -> its rigs, where it is no other than `desk`.
 _BEST = {

@@ -232,7 +232,9 @@ def _solved(
             damping *= 8.0
     posture = start_deg.ravel().copy()
     posture[free] += best_x
-    return posture.reshape(5, 3), best
+    # `angles_of` holds a joint at its limit: a posture beyond it would be the same, but the way there has a kink.
+    low, high = np.degrees(model.limits_rad[:, :3, 0]), np.degrees(model.limits_rad[:, :3, 1])
+    return np.clip(posture.reshape(5, 3), low, high), best
 
 
 def _pad(thumb: tuple[float, float, float], bend: tuple[float, float]) -> Float:

@@ -3,8 +3,11 @@
 In 75 s two rounds of everything, in an order, at a pace, in places and with knobs that are drawn from the seed: each
 finger is pinched, a knob is turned to and fro, another is turned farther than a hand turns at once and gripped again,
 keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and says
-nothing. The palm faces the cameras, as that of somebody does who turns a knob on his screen: a knob hides the tips of
-a hand that is seen from behind.
+nothing.
+
+What the cameras see of it changes as it does in use: in each round every act is shown another way (`_SHOWN_DEG`). Knobs
+and keys are seen from the palm's side, for they hide the tips of a hand that is seen from behind; pinches also from the
+side of the thumb; who points has the back of his hand up, the finger towards the cameras or past them.
 
 Skin meets skin: postures are found on the hand itself (`gesture_postures`). A hand that touches or grips stands still
 but for what it does, else it wanders as hands do. While a knob is turned the palm goes round its axis.
@@ -32,7 +35,15 @@ from common.sim.motion import FIST, POSES, REST, WAVE_CREST, Drift, HandState, W
 
 KEY_NAMES = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star"))
 PERIOD_S = 75.0
-TILT_DEG, TURN_DEG = 15.0, 14.0
+TURN_DEG = 14.0
+# Act -> two ways to show it: fingers towards the cameras, and rolled about them, 0: the palm to the cameras.
+_SHOWN_DEG = {
+    "pinches": ((15.0, 0.0), (25.0, 100.0)),
+    "dial": ((15.0, 0.0), (35.0, 30.0)),
+    "dial_again": ((15.0, 0.0), (25.0, -20.0)),
+    "taps": ((15.0, 0.0), (30.0, 0.0)),
+    "point": ((50.0, 175.0), (25.0, 140.0)),
+}
 REACH_M = np.array([0.04, 0.025, 0.04])
 BEND_DEG = np.array([5.0, 3.0])
 _FREE = (REST, POSES["open_palm"], FIST, WAVE_CREST, POSES["counting_two"], REST)
@@ -108,12 +119,15 @@ class Gestures:
             Track(np.zeros(1)),
             Track(np.zeros(1)),
         )
+        self._ways = np.random.default_rng([seed, 41])  # of its own, so that what the fingers do stays as it is
+        self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
         self._knobs: list[tuple[float, Knob]] = []
         self._keys = reachable_keys(model, self._own)
         self.said: tuple[Said, ...] = ()
         self._now = 0.6
-        for _ in range(2):
-            self._round()
+        second = self._ways.integers(0, 2, len(_SHOWN_DEG))
+        for k in range(2):
+            self._round({act: ways[(k + s) % 2] for (act, ways), s in zip(_SHOWN_DEG.items(), second)})
         self._finish()
 
     @property
@@ -133,37 +147,49 @@ class Gestures:
         angles = angles_of(self._model, self._posture.at(t), wobble + steady * (self._own - wobble))
         place = self._place.at(t)
         loose = 1.0 - steady
-        pose = self._pose(place[:3] + loose * shift, place[3:] + loose * turn)
+        pose = self._pose(np.radians(self._shown.at(t)), place[:3] + loose * shift, place[3:] + loose * turn)
         knob = next((knob for start, knob in reversed(self._knobs) if t >= start), None)
         if knob is not None:
             pose = pose @ _about(knob, float(self._turned.at(t)[0]))
         return HandState(pose, angles, np.radians(BEND_DEG) * self._sway.at(t))
 
-    def _pose(self, shift_m: Float, turn_rad: Float) -> Float:
-        """`T_rig_palm` (4, 4): palm to the cameras, fingers up in the image."""
+    def _pose(self, shown_rad: Float, shift_m: Float, turn_rad: Float) -> Float:
+        """`T_rig_palm` (4, 4): shown like that (2,), fingers up in the image."""
         to_cameras = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-        tilt = axis_rotation(0, np.radians(TILT_DEG))
-        rotation = rotation_vector_to_matrix(turn_rad) @ tilt @ to_cameras
+        shown = axis_rotation(0, float(shown_rad[0])) @ to_cameras @ axis_rotation(2, float(shown_rad[1]))
+        rotation = rotation_vector_to_matrix(turn_rad) @ shown
         middle = np.array([0.0, 0.0, 0.5 * float(self._model.rest_position_m[:, 2].max())])
         return rigid(rotation, self._centre + shift_m - rotation @ middle)
 
-    def _round(self) -> None:
-        acts: list[Callable[[], None]] = [
-            self._pinches,
-            self._dial,
-            self._dial_again,
-            self._taps,
-            self._point,
-        ]
-        for k in self._order(0, len(acts)):
-            acts[k]()
+    def _round(self, ways: dict[str, tuple[float, float]]) -> None:
+        acts: dict[str, Callable[[], None]] = {
+            "pinches": self._pinches,
+            "dial": self._dial,
+            "dial_again": self._dial_again,
+            "taps": self._taps,
+            "point": self._point,
+        }
+        order = [tuple(acts)[k] for k in self._order(0, len(acts))]
+        for k, act in enumerate(order):
+            if k == 0:
+                self._show(ways[act], self._now - 0.6)
+            acts[act]()
+            start = self._now
             self._free()
+            if k + 1 < len(order):
+                self._show(ways[order[k + 1]], start)
+
+    def _show(self, way: tuple[float, float], start_s: float) -> None:
+        """Turn the hand to be shown that way, from then till now."""
+        shown = np.array(way) + self._ways.uniform(-6.0, 6.0, 2)
+        self._shown.to(shown, start_s, self._now)
 
     def _finish(self) -> None:
         """Back to how it began."""
         if self._now > PERIOD_S - 0.7:
             raise ValueError(f"the script lasts {self._now} s")
-        for track, value in ((self._posture, np.array(REST)), (self._place, np.zeros(6))):
+        first = np.array(_SHOWN_DEG["dial"][0])
+        for track, value in ((self._posture, np.array(REST)), (self._place, np.zeros(6)), (self._shown, first)):
             track.to(value, self._now, self._now + 0.6)
 
     def _go(self, posture: Float, seconds: float, rest_s: float, steady: float) -> None:

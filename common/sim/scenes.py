@@ -22,7 +22,7 @@ from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = (
-    f"standard | lights | poses | hand-routine | object | gestures | leap:FILE.npz | {' | '.join(TOGETHER)}"
+    f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
 )
 VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
@@ -38,7 +38,7 @@ def scene_by_name(
 ) -> Scene:
     """The scene called `standard`, the same under light that changes (`lights`), the six poses of the Digits study
     (`poses`), a hand that follows the guided routine of `calibrate hand` (`hand-routine`), one beside a tracked object
-    that travels (`object`), one that pinches, dials, taps and points (`gestures`), one that moves as before a wrist
+    that travels (`object`), one that moves as before a wrist
     device at the same time (`TOGETHER`), or one that follows a recorded motion. `objects` are the files of the
     objects that the rig names (`common.sim.tracked`).
 

@@ -34,7 +34,7 @@ from common.sim.motion import (
 )
 from common.sim.poses import StudyPoses
 
-TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves")
+TOGETHER = ("grasp", "both-poses", "both-curl", "both-travel", "both-moves", "gestures")
 USUAL_BEND_DEG = np.array([8.0, 5.0])
 CURL_S, STRAIGHT_DEG, CURL_PIP_DEG, MCP_PER_PIP = 10.0, 4.0, 101.0, 0.54  # Kamper's ratio, row D8
 _CURL_LAG_RAD = np.array([0.3, 0.0, 0.1, 0.2, 0.3])  # no finger follows another at once
@@ -50,7 +50,7 @@ MOVES_SHIFT_M = np.array([0.05, 0.03, 0.04])
 
 
 def together_motion(name: str, model: HandModel, centre_m: Float, seed: int) -> HandMotion | None:
-    """The motion of that name (`TOGETHER`, `gestures`) about a place (3,) [m], rig frame; None: there is no such.
+    """The motion of that name (`TOGETHER`) about a place (3,) [m], rig frame; None: there is no such.
 
     The place alone differs between rigs: with the same hand and seed the fingers, the turns of the palm, the bend of
     the wrist and the shifts are the same.
