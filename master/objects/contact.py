@@ -9,6 +9,9 @@ How sure a distance is follows from the covariances along the normal of the surf
 object's place, that of its turn by the lever from its origin, and flesh that gives way. A finger touches from a
 distance `NEAR_M` on that noise alone does not explain, and lets go beyond `FAR_M` (and as much): so it does not
 flicker.
+
+An object is *held* by the thumb or the palm and a finger against them; or, since a hand hides what it does with what it
+holds, where it moves with the palm (`master.objects.carried`).
 """
 
 from collections import deque
@@ -30,6 +33,7 @@ from common.hand_model import CHAINS, METACARPALS, HandModel
 from common.messages import Contact, HandPose, ObjectPose
 from common.object_profile import ObjectProfile
 from common.round_cones import Cones
+from master.objects.carried import Carried
 from master.objects.surface import Nearest, Surface
 
 NEAR_M, FAR_M = 2.5e-3, 5.0e-3
@@ -46,6 +50,8 @@ _BONES: Int = np.concatenate(
     ]
 )
 _SEGMENTS = 15
+_PALM = 0
+_FREE = 2.5  # standard deviations of a distance beyond which a finger surely does not touch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +71,7 @@ class ContactWatch:
         self._surfaces = {profile.name: Surface(profile.shape) for profile in objects if profile.shape}
         self._poses: dict[str, deque[ObjectPose]] = {name: deque(maxlen=_POSES) for name in self._surfaces}
         self._touching: dict[str, Bool] = {name: np.zeros(6, np.bool_) for name in self._surfaces}
+        self._carried = {name: Carried() for name in self._surfaces}
 
     def push_object(self, pose: ObjectPose) -> None:
         """Take a pose of an object; of one that is not watched, or not after the last, nothing is kept."""
@@ -86,6 +93,7 @@ class ContactWatch:
         placed = _at(self._poses[name], pose.t_ns)
         if placed is None:
             self._touching[name] = np.zeros(6, np.bool_)
+            self._carried[name].forget()
             return _unknown(pose, name)
         found, sigma = _gaps(pose, surface, placed)
         # Fingers (5, 3) and the palm's four bones as a sixth of its own.
@@ -97,6 +105,9 @@ class ContactWatch:
         touching = _touches(distance[bones], bone_sigma[bones], self._touching[name])
         self._touching[name] = touching
         last = 3 * np.arange(5) + 2
+        centre = np.where(pose.valid[_PALM], pose.position_m[_PALM], np.nan)
+        free = _away(distance[bones[:5]], bone_sigma[bones[:5]])
+        carried = self._carried[name].push(pose.t_ns, placed.T, centre, float(distance[palm]), free)
         return Contact(
             hand=pose.hand,
             object=name,
@@ -106,8 +117,14 @@ class ContactWatch:
             point_m=transform(placed.T, found.point_m[last]),
             touching=touching[:5],
             palm_distance_m=float(distance[palm]),
-            held=bool((touching[0] or touching[5]) and touching[1:5].any()),
+            held=carried or bool((touching[0] or touching[5]) and touching[1:5].any()),
         )
+
+
+def _away(distance: Float, sigma: Float) -> bool:
+    """Whether fingers (5,) surely hold nothing: the thumb, or all the others, do not touch. NaN: not known."""
+    free = np.nan_to_num(distance - _FREE * sigma, nan=-np.inf) > FAR_M
+    return bool(free[0] or free[1:].all())
 
 
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
