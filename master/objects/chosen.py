@@ -8,8 +8,9 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from master.objects.features import Features
-from master.objects.fit import Fitted, Observations
+from master.objects.fit import Fitted
 from master.objects.start import Sighted, reach
+from master.objects.sums import Observations
 from master.objects.window import Sighting, Window
 
 Doubt = Callable[[int, Float, Float], Float]

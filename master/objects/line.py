@@ -4,16 +4,14 @@
 fitted (`master.objects.fit`) from where it was led to from the last one; where there is none, or that fit finds most of
 what is seen in the wrong place, from what is seen alone (`master.objects.start`), the best of all starts.
 
-**Too little is seen** to tell all of it, as two beads of three: then what was known before counts as well, as it was at
-a time before all frames of this fit, so that nothing counts twice.
+**Too little is seen** to tell all of it, as two beads of three: then what was known before counts as well
+(`master.objects.course`), as it was at a time before all frames of this fit, so that nothing counts twice.
 
-**One tag** has two poses that nearly explain it. Both are fitted; the one that was believed stays unless the other is
-clearly better over several frames, and as far as the other is possible the covariance reaches over to it.
+**One tag** has two poses that nearly explain it (`master.objects.lone_tag`).
 
 **Nothing is seen**: the pose is led on with dying speed, and after `HELD_S` there is none.
 """
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -22,21 +20,22 @@ import numpy as np
 from common.arrays import Float, Int
 from common.calibration import RigCalibration
 from common.camera_model import CameraModel
-from common.geometry import matrix_to_quaternion, matrix_to_rotation_vector
+from common.geometry import matrix_to_quaternion
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
 from master.objects.chosen import Chosen, sighted_now
+from master.objects.course import Course, unheeded
 from master.objects.features import Features
-from master.objects.fit import Fitted, Motion, Past, PoseFit
+from master.objects.fit import Fitted, PoseFit
 from master.objects.hidden import Hidden
-from master.objects.start import poses_of_beads, poses_of_tags, two_poses
+from master.objects.lone_tag import LoneTag
+from master.objects.motion import Motion
+from master.objects.start import poses_of_beads, poses_of_tags
 from master.objects.steady import Steady
 from master.objects.window import Window, Windows
 from master.stereo.place import CalibrationResidual
 from master.stereo.triangulate import Triangulator
 
-HELD_S = 0.5
-_DIES_S = 0.12  # in which the speed of a thing that nobody sees dies
 # What light does to a ball's centroid beyond what a slave says, and to a corner.
 _BEAD_FLOOR_PX, _CORNER_FLOOR_PX = 0.08, 0.03
 _POOR_M, _POOR_RAD = 6e-3, np.radians(4.0)  # less sure than this: the past counts
@@ -44,13 +43,8 @@ _UNTOLD_M, _UNTOLD_RAD = 0.02, np.radians(12.0)  # less sure than this it does n
 _LOST_M, _LOST_RAD = 0.05, np.radians(30.0)  # less sure than this is no pose
 _MOST = 0.5  # share of what is seen that must be in its place
 _START_MISFIT = 25.0  # chi square per number of what a pose from nothing rests on
-_PUSHED_M_S2, _PUSHED_RAD_S2 = 5.0, 40.0  # what may happen to its speed meanwhile
-_UNSEEN_M_S2, _ARM_M = 1.5, 0.1  # how it moves unseen, a turn counting by what it does a decimetre away
 _TRACKED_M, _TRACKED_RAD = 15e-3, np.radians(10.0)  # less sure than this is led on rather than measured
 _FRESH_PERIODS = 2.25  # an observation older than this is not now
-_FLIP_RAD = np.radians(8.0)  # poses of a tag nearer than this are one
-_BETTER = 12.0  # chi square, summed over frames, by which the other pose of a tag must be better
-_FORGET = 0.8  # of that sum, from frame to frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +55,8 @@ class SolvedObject:
     ready_t_ns: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """A pose that was fitted."""
-
-    t_ns: int
-    fitted: Fitted
-    oldest_ns: int
-
-
 class ObjectLine:
-    """Push machine. Holds the sightings that wait, the last poses, the filter, and how sure a tag's pose is."""
+    """Push machine. Holds the sightings that wait, where the object went, the filter, and how sure a tag's pose is."""
 
     def __init__(
         self, profile: ObjectProfile, rig: RigCalibration, models: Mapping[str, CameraModel]
@@ -98,9 +83,8 @@ class ObjectLine:
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
         self._steady = Steady(middle, rig.filter.jitter_m)
-        self._known: deque[_Known] = deque(maxlen=16)
-        self._doubt = 0.0
-        self._sure_ns = -(2**63)
+        self._course = Course()
+        self._lone = LoneTag(self._features, self._cameras, self._fit)
         self._lost_behind = False
         self._last_ns = -(2**63)
 
@@ -125,7 +109,7 @@ class ObjectLine:
         return out
 
     def _solve(self, window: Window) -> ObjectPose:
-        predicted = self._predicted(window.t_ns)
+        predicted = self._course.predicted(window.t_ns)
         seen = self._chosen(window, None if predicted is None else predicted.T)
         now = (
             seen is not None
@@ -136,14 +120,9 @@ class ObjectLine:
             fitted = self._found(window, seen, predicted)
         if fitted is None or seen is None:
             return self._held(window, predicted)
-        oldest = window.t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
-        self._known.append(_Known(window.t_ns, fitted, oldest))
-        if fitted.alone:
-            self._sure_ns = window.t_ns
-        elif window.t_ns - self._sure_ns > HELD_S * 1e9:
-            self._known.clear()
+        if not self._course.push(window.t_ns, fitted):
             return self._none(window)
-        tracked = fitted.alone or not _poor(fitted, _TRACKED_M, _TRACKED_RAD)
+        tracked = fitted.alone or not fitted.poorer(_TRACKED_M, _TRACKED_RAD)
         shown = self._hidden.look(window, fitted.motion.T, seen.used(fitted))
         self._lost_behind = shown.occluded
         T = self._steady.push(window.t_ns, fitted.motion.T, fitted.cov[:6, :6])
@@ -170,14 +149,16 @@ class ObjectLine:
     def _found(self, window: Window, seen: Chosen, predicted: Motion | None) -> Fitted | None:
         """The pose at the instant; None: what is seen is not it, or does not tell."""
         if predicted is not None:
-            past = self._past(window.t_ns, seen)
-            led = self._fitted(seen, predicted, past, window.t_ns)
+            led = self._fitted(seen, predicted, window.t_ns, led=True)
             if led is not None and self._holds(seen, led):
-                return self._of_two(window, seen, led, past)
+                return self._lone.of_two(window, seen, led, begins=False)
         best: tuple[Fitted, Chosen] | None = None
         for T in self._starts(window):
             again = self._chosen(window, T)
-            if again is None or (fitted := self._fitted(again, Motion.still(T), None, window.t_ns)) is None:
+            if (
+                again is None
+                or (fitted := self._fitted(again, Motion.still(T), window.t_ns, led=False)) is None
+            ):
                 continue
             good = self._holds(again, fitted) and self._begins(again, fitted)
             if good and (best is None or fitted.cost < best[0].cost):
@@ -185,29 +166,36 @@ class ObjectLine:
         if best is None:
             return None
         # What was known of where it went is of another thing.
-        self._known.clear()
-        self._doubt = 0.0
-        return self._of_two(window, best[1], best[0], None)
+        self._course.clear()
+        self._lone.forget()
+        return self._lone.of_two(window, best[1], best[0], begins=True)
 
     def _chosen(self, window: Window, T: Float | None) -> Chosen | None:
         """What is seen of the object, near a pose (4, 4) if there is one."""
         return Chosen.of(window, self._features, self._cameras, T, self._hidden.doubt_px)
 
-    def _fitted(self, seen: Chosen, start: Motion, past: Past | None, t_ns: int) -> Fitted | None:
-        """The fit, with the past where the present does not tell enough; how it may have moved since is then in it."""
+    def _fitted(self, seen: Chosen, start: Motion, t_ns: int, *, led: bool) -> Fitted | None:
+        """The fit; of one that was led there with the past, where the present does not tell enough.
+
+        How it may have moved since is then in it.
+        """
         alone = self._fit(seen.seen, start, feature=seen.feature)
-        if alone is not None and not _poor(alone, _POOR_M, _POOR_RAD):
+        if alone is not None and not alone.poorer(_POOR_M, _POOR_RAD):
             return alone
-        both = None if past is None else self._fit(seen.seen, start, past, feature=seen.feature)
+        both = None
+        if led:
+            oldest_ns = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
+            past = self._course.past(t_ns, oldest_ns)
+            both = self._fit(seen.seen, start, past, feature=seen.feature)
         if alone is None:
             return None if both is None else replace(both, alone=False)
-        if both is None or not _poor(alone, _UNTOLD_M, _UNTOLD_RAD):
+        if both is None or not alone.poorer(_UNTOLD_M, _UNTOLD_RAD):
             return alone if both is None else both
-        return _unheeded(both, alone, (t_ns - self._sure_ns) * 1e-9)
+        return unheeded(both, alone, self._course.unsure_s(t_ns), _POOR_M)
 
     def _holds(self, seen: Chosen, fitted: Fitted) -> bool:
         """Whether a pose is determined, and most of what is seen now is in its place."""
-        if _poor(fitted, _LOST_M, _LOST_RAD):
+        if fitted.poorer(_LOST_M, _LOST_RAD):
             return False
         return float(fitted.weight.mean()) >= _MOST and len(np.unique(seen.feature[fitted.used])) >= 1
 
@@ -217,29 +205,6 @@ class ObjectLine:
         enough = len(features) >= 3 or bool((features >= self._features.beads).any())
         return enough and float(fitted.misfit[fitted.used].mean()) < _START_MISFIT
 
-    def _predicted(self, t_ns: int) -> Motion | None:
-        """Where the object is led to; None: it was not seen for long."""
-        if not self._known:
-            return None
-        last = self._known[-1]
-        dt = (t_ns - last.t_ns) * 1e-9
-        if dt > HELD_S:
-            self._known.clear()
-            return None
-        return last.fitted.motion.at(_DIES_S * float(1.0 - np.exp(-dt / _DIES_S)))
-
-    def _past(self, t_ns: int, seen: Chosen) -> Past | None:
-        """What is known from before all that is seen in this window."""
-        oldest = t_ns + round(float(seen.seen.tau_s.min()) * 1e9)
-        known = next((k for k in reversed(self._known) if k.t_ns <= oldest), self._known[0])
-        dt = max((t_ns - known.t_ns) * 1e-9, 1e-3)
-        step = np.eye(12)
-        step[:6, 6:] = dt * np.eye(6)
-        pushed = np.repeat([_PUSHED_M_S2, _PUSHED_RAD_S2], 3)
-        grown = step @ known.fitted.cov @ step.T
-        grown[range(12), range(12)] += np.concatenate([0.5 * dt * dt * pushed, dt * pushed]) ** 2
-        return Past(known.fitted.motion.at(dt), np.asarray(np.linalg.inv(grown), np.float64))
-
     def _starts(self, window: Window) -> list[Float]:
         """Poses (4, 4) that the nearest frames suggest."""
         sighted = sighted_now(window, self._features)
@@ -248,68 +213,15 @@ class ObjectLine:
             poses += poses_of_beads(sighted, self._features, self._triangulator)
         return poses
 
-    def _of_two(self, window: Window, seen: Chosen, fitted: Fitted, past: Past | None) -> Fitted:
-        """Of the two poses of the only tag that is seen the one to believe, its covariance grown by the other."""
-        features = np.unique(seen.feature[fitted.used])
-        if len(features) != 1 or features[0] < self._features.beads:
-            self._doubt *= _FORGET
-            return fitted
-        other = self._other(window, seen, fitted, int(features[0]))
-        if other is None:
-            self._doubt *= _FORGET
-            return fitted
-        better = 0.5 * (fitted.cost - other.cost)
-        self._doubt = _FORGET * self._doubt + 2.0 * better * (1.0 - _FORGET) * 2.0
-        if past is None and not self._known:
-            if better > 0.0:
-                fitted, other, better = other, fitted, -better
-        elif self._doubt > _BETTER:
-            fitted, other, better, self._doubt = other, fitted, -better, 0.0
-        share = 1.0 / (1.0 + np.exp(np.clip(-better, -50.0, 50.0)))
-        off = np.concatenate(
-            [
-                other.motion.T[:3, 3] - fitted.motion.T[:3, 3],
-                matrix_to_rotation_vector(other.motion.T[:3, :3] @ fitted.motion.T[:3, :3].T),
-            ]
-        )
-        cov = fitted.cov.copy()
-        cov[:6, :6] += share * np.outer(off, off)
-        return replace(fitted, cov=cov)
-
-    def _other(self, window: Window, seen: Chosen, fitted: Fitted, feature: int) -> Fitted | None:
-        """The fit of the only tag's other pose, where there is another."""
-        corners = self._features.corners_of(feature - self._features.beads)
-        own = self._features.points[corners]
-        best: Fitted | None = None
-        for sighted in sighted_now(window, self._features):
-            if sighted.feature != feature:
-                continue
-            camera = self._cameras[sighted.camera]
-            for _, T in two_poses(own, camera.undistort(sighted.uv[0])):
-                there = camera.T_rig_camera @ T
-                if _turned(there, fitted.motion.T) < _FLIP_RAD:
-                    continue
-                other = self._fit(seen.seen, Motion.still(there), feature=seen.feature)
-                if other is None or _turned(other.motion.T, fitted.motion.T) < _FLIP_RAD:
-                    continue
-                if best is None or other.cost < best.cost:
-                    best = other
-        return best
-
     def _held(self, window: Window, predicted: Motion | None) -> ObjectPose:
         """The pose while nothing tells: led on, or none."""
-        known = self._known[-1] if self._known else None
-        if predicted is None or known is None or window.t_ns - self._sure_ns > HELD_S * 1e9:
+        cov = self._course.held_cov(window.t_ns)
+        if predicted is None or cov is None:
             return self._none(window)
-        dt = (window.t_ns - known.t_ns) * 1e-9
         shown = self._hidden.look(
             window, predicted.T, np.zeros((len(self._cameras), self._features.count), np.bool_)
         )
         self._lost_behind = shown.occluded
-        cov = known.fitted.cov[:6, :6].copy()
-        grown = np.repeat([_PUSHED_M_S2, _PUSHED_RAD_S2], 3) * 0.5 * dt * dt
-        speed = known.fitted.motion.rates[1].ravel() * (dt - _DIES_S * (1.0 - np.exp(-dt / _DIES_S)))
-        cov[range(6), range(6)] += grown**2 + speed**2
         T = self._steady.held(window.t_ns, predicted.T)
         return ObjectPose(
             object=self.name,
@@ -348,29 +260,3 @@ class ObjectLine:
             expected=0,
             occluded=self._lost_behind or self._glimpsed(window),
         )
-
-
-def _poor(fitted: Fitted, most_m: float, most_rad: float) -> bool:
-    """Whether place or turn is less sure than this in some direction."""
-    place = np.linalg.eigvalsh(fitted.cov[:3, :3])[-1]
-    turn = np.linalg.eigvalsh(fitted.cov[3:6, 3:6])[-1]
-    return not (place < most_m**2 and turn < most_rad**2)
-
-
-def _unheeded(fitted: Fitted, alone: Fitted, since_s: float) -> Fitted:
-    """A fit with what may have happened in directions that what is seen alone does not tell, for so long [s].
-
-    A turn about the line through two beads shows in nothing but what it does to other turns, which is too little to
-    rest on: its doubt grows as that of a thing that nobody sees.
-    """
-    scale = np.array([1.0] * 3 + [_ARM_M] * 3)
-    size, axes = np.linalg.eigh(alone.cov[:6, :6] * np.outer(scale, scale))
-    blind = axes[:, size > _POOR_M**2] / scale[:, None]
-    cov = fitted.cov.copy()
-    cov[:6, :6] += (0.5 * _UNSEEN_M_S2 * min(since_s, HELD_S) ** 2) ** 2 * (blind @ blind.T)
-    return replace(fitted, cov=cov, alone=False)
-
-
-def _turned(T: Float, other: Float) -> float:
-    """Angle between two poses [rad]."""
-    return float(np.linalg.norm(matrix_to_rotation_vector(T[:3, :3] @ other[:3, :3].T)))

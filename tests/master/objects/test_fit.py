@@ -7,7 +7,9 @@ from bench.object_views import Where, wander
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
-from master.objects.fit import Motion, Observations, PoseFit
+from master.objects.fit import PoseFit
+from master.objects.motion import Motion
+from master.objects.sums import Observations
 
 POINTS = np.array([[0.0, 0.0, 0.115], [0.052, 0.0, -0.084], [-0.052, 0.0, -0.084], [0.0, 0.04, 0.0]])
 BEADS = np.full(4, 0.009)

@@ -23,7 +23,8 @@ from common.geometry import (
 )
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
-from master.objects.line import HELD_S, ObjectLine
+from master.objects.course import HELD_S
+from master.objects.line import ObjectLine
 from master.objects.start import two_poses
 
 CALIBRATION = Path(__file__).parents[3] / "calib_json"

@@ -1,0 +1,118 @@
+"""What was seen of an object as weighted sums: errors that stay from frame to frame are taken out of them exactly.
+
+An error of a feature in a camera is one that stays (light, shape, cover, lens) plus one that is new in each frame. The
+first is an unknown of its own, eliminated by its Schur complement, so that four sightings of one bead at rest are not
+taken for four measurements.
+
+A feature that misses the pose by more than noise and a bad calibration is weighed down as a whole, in its camera, by
+Geman and McClure's law (iteratively reweighted least squares); one thing taken for another so costs itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Float, Int
+from master.stereo.misfit import RIG_PX
+
+_FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.stereo.tracks`
+_SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observations:
+    """What was seen of one object around an instant, n points.
+
+    Attributes:
+        camera: (n,) which camera.
+        point: (n,) which row of `Features.points`.
+        tau_s: (n,) when, from the instant [s].
+        uv: (n, 2) [px], distorted image.
+        sigma_px: (n,) standard deviation per axis.
+        t_sigma_s: (n,) of the times, the same error for all of a camera.
+    """
+
+    camera: Int
+    point: Int
+    tau_s: Float
+    uv: Float
+    sigma_px: Float
+    t_sigma_s: Float
+
+    def some(self, chosen: Bool) -> "Observations":
+        """Those of a mask (n,)."""
+        return Observations(
+            self.camera[chosen],
+            self.point[chosen],
+            self.tau_s[chosen],
+            self.uv[chosen],
+            self.sigma_px[chosen],
+            self.t_sigma_s[chosen],
+        )
+
+
+class Sums:
+    """Adds observations up: which belong together, and their variances. Holds no state between calls."""
+
+    def __init__(self, seen: Observations, feature: Int, floor_2: Float, points: int) -> None:
+        """Set up for observations.
+
+        Args:
+            seen: The observations.
+            feature: (n,) of what each is a part.
+            floor_2: (n,) variance per axis [px^2] that light, lens and calibration leave.
+            points: How many points the object has.
+        """
+        variance = seen.sigma_px**2
+        fresh = np.minimum(_FRESH * variance, _FRESH_PX**2)
+        stays = variance - fresh + floor_2
+        _, first, group = np.unique(seen.camera * points + seen.point, return_index=True, return_inverse=True)
+        # What the surest sighting keeps is kept by all; others have more that is new.
+        self._stays = np.full(len(first), np.inf)
+        np.minimum.at(self._stays, group, stays)
+        kept = self._stays[group]
+        self._fresh = fresh + stays - kept
+        self._total = kept + self._fresh
+        self._of_group = np.zeros((len(first), len(group)))
+        self._of_group[group, np.arange(len(group))] = 1.0
+        self._group_size = self._of_group.sum(axis=1)
+        _, self._whole = np.unique(seen.camera * (int(feature.max()) + 1) + feature, return_inverse=True)
+        self._whole_size = np.bincount(self._whole)
+        # Of numbers that were measured a bead has two, a tag eight, however often it was.
+        self._numbers = 2.0 * np.bincount(self._whole[first])
+
+    def weigh(self, miss: Float, lag_2: Float) -> tuple[Float, Float, float]:
+        """Chi square per number measured of the feature of each observation (n,), its weight (n,), and the cost.
+
+        The weight forgives what a bad calibration leaves (`RIG_PX`), the cost only what this one is known to leave.
+
+        Args:
+            miss: (n, 2) by which the observations miss the pose [px].
+            lag_2: (n,) variance that the doubt of their times makes [px^2].
+        """
+        total = self._total + lag_2
+        squared = 0.5 * np.vecdot(miss, miss)
+        mean = np.bincount(self._whole, squared / total) / self._whole_size
+        forgiven = np.bincount(self._whole, squared / (total + RIG_PX**2)) / self._whole_size
+        weight = (1.0 + forgiven / _SOFT_2) ** -2.0
+        cost = float((self._numbers * mean / (1.0 + mean / _SOFT_2)).sum())
+        return mean[self._whole], weight[self._whole], cost
+
+    def normal(self, rows: Float, weight: Float, lag_2: Float) -> tuple[Float, Float]:
+        """Normal matrix (N, N) and gradient (N,), the errors that stay eliminated.
+
+        Args:
+            rows: (n, 2, N + 1) derivatives of what is seen by the unknowns; last, by what it is missed [px].
+            weight: (n,) of the observations.
+            lag_2: As of `weigh`.
+        """
+        size = rows.shape[2]
+        w = weight / (self._fresh + lag_2)
+        weighted = rows * w[:, None, None]
+        both = weighted.reshape(-1, size).T @ rows.reshape(-1, size)
+        light = self._of_group @ weight / self._group_size
+        down = self._of_group @ w + light / self._stays
+        sums = (self._of_group @ weighted.reshape(len(rows), -1)) / np.sqrt(down)[:, None]
+        sums = sums.reshape(-1, size)
+        both -= sums.T @ sums
+        return both[:-1, :-1], both[:-1, -1]
