@@ -166,9 +166,7 @@ class RigSetup:
         if rig.kind == "wrist":
             wrist = WristSetup.of(rig, ordered[rig.cameras[0]], hand)
             return cls(rig, ordered, models, hand, wrist, rig)
-        for name in rig.markers:
-            if name not in rig.free_markers:
-                hand.mount(name)
+        _check_mounts(rig, hand)
         watched = () if objects is None else objects_of(rig, objects)
         return cls(rig, ordered, models, hand, objects=watched)
 
@@ -203,6 +201,23 @@ class RigSetup:
         return with_fields(
             out, cameras=cameras | worn[0].cameras, wrist=worn[0].wrist, wrist_rig=worn[0].rig, rows=rows
         )
+
+
+def _check_mounts(rig: RigCalibration, hand: HandModel) -> None:
+    """Refuse a marker that is neither the hand's nor free.
+
+    Raises:
+        CalibrationError: With its name.
+    """
+    for name in rig.markers:
+        if name not in rig.free_markers:
+            try:
+                hand.mount(name)
+            except CalibrationError as error:
+                raise CalibrationError(
+                    f"rig {rig.name!r}: {error}; what sits on no hand, as a bead of an object does, stands under "
+                    "'free_markers' as well"
+                ) from error
 
 
 def _gestures(setups: Sequence[RigSetup]) -> GestureSettings:

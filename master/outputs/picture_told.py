@@ -24,6 +24,8 @@ _NEAR_NS = 60_000_000  # an object is shown where it was this close to the insta
 _LANES = {"pose": "pose", "pinch": "pinch", "dial": "dial", "tap": "keys", "point": "point"}
 _TAP_S = 0.15
 _LETTER_SHARE = 0.0135  # of the strip's length that a letter takes
+_EDGED_SHARE = 0.01  # of it: what is shorter would be all edge
+_LANES_OF_TWO_LINES = 3  # at most, else names have one line
 _LETTERS_LEAST = 3  # of a name that is cut off
 _ROUND = np.linspace(0.0, 2.0 * np.pi, 33)
 
@@ -106,17 +108,30 @@ class ToldPicture:
         for lane, kind in enumerate(reversed(lanes)):
             for name, start_ns, stop_ns in spans(self.gestures, kind, int(t_ns[-1])):
                 start, length = (start_ns - first) * 1e-9, (stop_ns - start_ns) * 1e-9
+                colour, edged = unit(GESTURE_RGB[kind]), length > _EDGED_SHARE * span
                 axes.broken_barh(
                     [(start, max(length, _TAP_S))],
                     (lane - 0.38, 0.76),
-                    fc=unit(GESTURE_RGB[kind]),
-                    ec=PAPER,
+                    fc=colour,
+                    ec=PAPER if edged else colour,
                     lw=0.8,
                 )
-                words = _words(name, len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span)))
-                at = start + (0.5 * max(length, _TAP_S) if kind == "tap" else 0.004 * span)
-                side = "center" if kind == "tap" else "left"
-                axes.text(at, lane, words, size=8, color=PAPER, va="center", ha=side, clip_on=True)
+                letters = len(name) if kind == "tap" else int(length / (_LETTER_SHARE * span))
+                words = _words(name if len(lanes) > _LANES_OF_TWO_LINES else name.replace("_", "\n"), letters)
+                key = kind == "tap"
+                thin = key and _TAP_S < _LETTER_SHARE * span
+                axes.text(
+                    start
+                    + (_TAP_S if thin else 0.5 * _TAP_S if key else 0.0)
+                    + (0.0 if key and not thin else 0.004 * span),
+                    lane,
+                    words,
+                    size=8,
+                    color=INK if thin else PAPER,
+                    va="center",
+                    ha="center" if key and not thin else "left",
+                    clip_on=True,
+                )
         axes.set_yticks(range(len(lanes)), [_LANES[kind] for kind in reversed(lanes)])
         axes.set_ylim(-0.6, len(lanes) - 0.4)
         axes.set_xlim(0.0, span)
@@ -156,11 +171,11 @@ def spans(gestures: Sequence[Gesture], kind: str, end_ns: int) -> list[tuple[str
 
 
 def _words(name: str, letters: int) -> str:
-    """A name in as many lines as it has words, each cut to so many letters; empty where that says nothing."""
-    words = name.split("_")
-    if letters < min(max(map(len, words)), _LETTERS_LEAST):
+    """A name, each of its lines cut to so many letters; empty where that says nothing."""
+    lines = name.split("\n")
+    if letters < min(max(map(len, lines)), _LETTERS_LEAST):
         return ""
-    return "\n".join(word[:letters] for word in words)
+    return "\n".join(line[:letters] for line in lines)
 
 
 def _outline(part: Shape) -> Float:
