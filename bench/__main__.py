@@ -49,6 +49,7 @@ SECTIONS = {
     "recording": "Raw frames to disk; baseline: PNG of level 1, and encoding and writing in the camera loop",
     "occlusion": "Finger tips that no two cameras see, in six poses: two pairs of cameras; baseline: one pair",
     "gesture_poses": "The six study poses: simulated people, rendered frames, handy_poses, leapjs; exact truth",
+    "gestures": "Pinch, dial, taps, pointing: late, wrong, false; two marker rigs, fused, silent hands; exact truth",
     "volume": "A finger tip in 27 places of the volume that the rig desk states; exact truth, no baseline",
     "replay": "Recorded frames with exact truth (PHALANX_DATASETS); exact truth, no baseline",
     "live": "Two slaves and the master over real UDP, standard scene; baseline: an idle relay of datagrams",

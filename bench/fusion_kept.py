@@ -11,8 +11,8 @@ from typing import Literal, cast
 
 import numpy as np
 
-from bench.fusion_scene import Both, Observed, Shown, Sight
-from bench.fusion_shown import shown
+from bench.fusion_scene import MARKER_RIG, WRIST_RIG, Both, Observed, Shown, Sight
+from bench.fusion_shown import shown_of
 from bench.fusion_watched import watched
 from common.messages import decode, encode
 from common.npz import read_npz, write_npz
@@ -33,19 +33,27 @@ _HANGS_ON = (
     "bench/fusion_watched.py",
     "calib_json/*/*.json",
 )
-_MAKE: dict[Mode, Callable[[str, float, int], Shown]] = {"rendered": watched, "quick": shown}
+_MAKE: dict[Mode, Callable[[Both, float], Shown]] = {"rendered": watched, "quick": shown_of}
 
 
-def observed(name: str, seconds: float, seed: int, mode: Mode = "rendered", folder: Path = _KEPT) -> Shown:
+def observed(
+    name: str,
+    seconds: float,
+    seed: int,
+    mode: Mode = "rendered",
+    folder: Path = _KEPT,
+    rigs: tuple[str, str] = (MARKER_RIG, WRIST_RIG),
+) -> Shown:
     """The scene's messages, kept ones where there are; rendered and detected, or made of truth (`fusion_shown`).
 
     Raises:
         PhalanxError: No such scene.
     """
-    path = folder / f"{name}-{seconds:g}s-{seed}-{mode}-{_digest()}.npz"
+    both = Both.of(name, seed, rigs=rigs)
+    path = folder / f"{name}-{'-'.join(rigs)}-{seconds:g}s-{seed}-{mode}-{_digest()}.npz"
     if path.exists():
-        return _read(path, Both.of(name, seed), seconds)
-    made = _MAKE[mode](name, seconds, seed)
+        return _read(path, both, seconds)
+    made = _MAKE[mode](both, seconds)
     folder.mkdir(parents=True, exist_ok=True)
     _write(path, made)
     return made

@@ -47,13 +47,19 @@ class Both:
     wrist: RigSetup
 
     @classmethod
-    def of(cls, name: str, seed: int, calibration: Path = CALIBRATION) -> "Both":
-        """The scene called `name` before the shipped rigs.
+    def of(
+        cls,
+        name: str,
+        seed: int,
+        calibration: Path = CALIBRATION,
+        rigs: tuple[str, str] = (MARKER_RIG, WRIST_RIG),
+    ) -> "Both":
+        """The scene called `name` before a marker rig and a wrist device of one hand.
 
         Raises:
             PhalanxError: There is no such scene for either kind of rig.
         """
-        markers, wrist = load_setup(calibration, MARKER_RIG), load_setup(calibration, WRIST_RIG)
+        markers, wrist = (load_setup(calibration, rig) for rig in rigs)
         scene = scene_by_name(name, markers.rig, markers.cameras, markers.hand.profile, seed)
         worn = WristScene(wrist.rig, wrist.cameras, wrist.hand, scene.motion, seed=seed)
         return cls(name, seed, scene, worn, markers, wrist)

@@ -17,13 +17,8 @@ from slave.wrist.detector import WristDetector
 from slave.wrist.view import WristView
 
 
-def watched(name: str, seconds: float, seed: int) -> Shown:
-    """What the slaves report of the scene called `name` within its first `seconds`; about a second for each.
-
-    Raises:
-        PhalanxError: No such scene.
-    """
-    both = Both.of(name, seed)
+def watched(both: Both, seconds: float) -> Shown:
+    """What the slaves report of a scene within its first `seconds`; some seconds for each."""
     messages = orientations(both, seconds)
     times, paint = dict[str, Float](), dict[str, Float]()
     for camera in both.markers.rig.cameras:

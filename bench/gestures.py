@@ -5,7 +5,11 @@ all of that and tells it the true hand, so that what is left is the recogniser's
 the truth's (`gesture_truth`) it is told, in frames of 60 Hz; one that nobody said is false. The recordings `leapjs` say
 nothing but where they are named for it; they are the truth, played by our hand.
 
-    python -m bench.gestures --rigs desk-back3 desk --seeds 1 2 --seconds 75
+The fused hand of two rigs stands as MARKER_RIG+WRIST_RIG; what its cameras see is kept in out/fusion, for to draw the
+wrist camera takes long.
+
+    python -m bench.gestures --rigs desk-back3 desk4 --seeds 1 2 --seconds 75
+    python -m bench.gestures --rigs desk-back3+wrist-back3 --seeds 7 --seconds 29
     python -m bench.gestures --exact --leap wave three-claps
 """
 
@@ -19,6 +23,8 @@ from typing import cast
 
 import numpy as np
 
+from bench.fusion_kept import observed
+from bench.fusion_solved import solve as solve_both
 from bench.gesture_truth import GestureTruth
 from bench.played import START_NS, solve, times_of, watch
 from bench.row import Row
@@ -34,6 +40,7 @@ from master.gestures.recogniser import GestureRecogniser
 from master.rig import RigSetup, load_setup
 
 RATE_HZ = 60.0
+FUSED = "desk-back3+wrist-back3"
 SILENT = ("wave", "HandSplay-110fps", "rollAndPitchWithEntry", "three-claps", "confidence-demo")
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
 _DATA = Path(os.environ.get("PHALANX_DATASETS", Path(__file__).parent.parent.parent / "shared/datasets"))
@@ -110,25 +117,30 @@ class Score:
 
 
 def rows() -> Iterator[Row]:
-    """The rig with three markers on the back, a minute and a quarter of one seed, and the silent recordings."""
-    yield from table("desk-back3", scored("desk-back3", (1,), 75.0, exact=False))
+    """Two marker rigs over a minute and a quarter of one seed, the first with the wrist device over less, and the
+    silent recordings."""
+    for rig in ("desk-back3", "desk4"):
+        yield from table(rig, scored(rig, (1,), 75.0, exact=False))
+    yield from table(FUSED, scored(FUSED, (7,), 29.0, exact=False))
     yield from table("silent, true hands", silent(SILENT, None, 60.0))
 
 
 def scored(rig: str, seeds: Sequence[int], seconds: float, *, exact: bool) -> Score:
-    """The scene of several seeds before a rig."""
+    """The scene of several seeds before a marker rig, or MARKER_RIG+WRIST_RIG."""
     settings, score = default_gestures(), Score()
     for seed in seeds:
-        setup = load_setup(_CALIBRATION, rig)
+        marked, _, worn = rig.partition("+")
+        setup = load_setup(_CALIBRATION, marked)
         scene = scene_by_name("gestures", setup.rig, setup.cameras, setup.hand.profile, seed)
         if not isinstance(scene.motion, Gestures):
             raise TypeError("the scene `gestures` moves another way")
         truth = GestureTruth.of(scene.motion, scene.model, settings, min(seconds, scene.period_s))
-        poses = (
-            true_poses(scene.motion, scene.model, seconds)
-            if exact
-            else seen_poses(setup, "gestures", seed, seconds)
-        )
+        if exact:
+            poses: Iterable[HandPose] = true_poses(scene.motion, scene.model, seconds)
+        elif worn:
+            poses = fused_poses((marked, worn), seed, seconds)
+        else:
+            poses = seen_poses(setup, "gestures", seed, seconds)
         score.add(told_of(poses, scene.model, settings), truth)
     return score
 
@@ -162,6 +174,12 @@ def seen_poses(setup: RigSetup, name: str, seed: int, seconds: float) -> list[Ha
         watch(scene, camera, times_of(scene, camera, seconds, RATE_HZ)) for camera in setup.rig.cameras
     ]
     return solve(setup, watched)[0]
+
+
+def fused_poses(rigs: tuple[str, str], seed: int, seconds: float) -> list[HandPose]:
+    """The poses of the scene that a marker rig and a wrist device see together, rendered and detected."""
+    shown = observed("gestures", seconds, seed, rigs=rigs)
+    return solve_both(shown.both.fused, shown.messages)
 
 
 def true_poses(motion: HandMotion, model: HandModel, seconds: float) -> Iterator[HandPose]:

@@ -147,8 +147,8 @@ def _parser() -> argparse.ArgumentParser:
         "--scene",
         default="standard",
         help="standard, lights (it changes), poses, hand-routine (of calibrate hand), object (that is tracked, on its "
-        "way), gestures, or leap:FILE.npz; of a wrist "
-        "device standard, curl, wearer, poses or spread; of both kinds of rig at once grasp, both-poses, both-curl, "
+        "way), or leap:FILE.npz; of a wrist device "
+        "standard, curl, wearer, poses or spread; of both kinds of rig at once grasp, gestures, both-poses, both-curl, "
         "both-travel or both-moves; the last two kinds each with @dark, @indoor, @bright or @sun",
     )
     replay = commands.add_parser(

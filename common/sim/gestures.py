@@ -119,7 +119,9 @@ class Gestures:
             Track(np.zeros(1)),
             Track(np.zeros(1)),
         )
-        self._ways = np.random.default_rng([seed, 41])  # of its own, so that what the fingers do stays as it is
+        self._ways = np.random.default_rng(
+            [seed, 41]
+        )  # of its own, so that what the fingers do stays as it is
         self._shown = Track(np.array(_SHOWN_DEG["dial"][0]))
         self._knobs: list[tuple[float, Knob]] = []
         self._keys = reachable_keys(model, self._own)
@@ -127,7 +129,9 @@ class Gestures:
         self._now = 0.6
         second = self._ways.integers(0, 2, len(_SHOWN_DEG))
         for k in range(2):
-            self._round({act: ways[(k + s) % 2] for (act, ways), s in zip(_SHOWN_DEG.items(), second)})
+            self._round(
+                {act: ways[(k + s) % 2] for (act, ways), s in zip(_SHOWN_DEG.items(), second, strict=True)}
+            )
         self._finish()
 
     @property
@@ -189,7 +193,11 @@ class Gestures:
         if self._now > PERIOD_S - 0.7:
             raise ValueError(f"the script lasts {self._now} s")
         first = np.array(_SHOWN_DEG["dial"][0])
-        for track, value in ((self._posture, np.array(REST)), (self._place, np.zeros(6)), (self._shown, first)):
+        for track, value in (
+            (self._posture, np.array(REST)),
+            (self._place, np.zeros(6)),
+            (self._shown, first),
+        ):
             track.to(value, self._now, self._now + 0.6)
 
     def _go(self, posture: Float, seconds: float, rest_s: float, steady: float) -> None:

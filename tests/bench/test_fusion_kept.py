@@ -7,7 +7,7 @@ import pytest
 
 from bench import fusion_kept
 from bench.fusion_kept import observed
-from bench.fusion_scene import Shown, Sight
+from bench.fusion_scene import Both, Shown, Sight
 from bench.fusion_shown import shown
 from bench.played import START_NS
 from common.messages import ImuSample, MarkerDetections, WristDetections, encode
@@ -62,8 +62,8 @@ def test_lines_and_tips_are_reported_only_where_they_are_in_sight(made: Shown) -
 def test_what_was_kept_is_what_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: Shown) -> None:
     calls: list[str] = []
 
-    def once(name: str, seconds: float, seed: int) -> Shown:
-        calls.append(name)
+    def once(both: Both, seconds: float) -> Shown:
+        calls.append(both.name)
         return made
 
     monkeypatch.setitem(fusion_kept._MAKE, "quick", once)
