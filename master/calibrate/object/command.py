@@ -145,7 +145,9 @@ def names_of(
 def radii(names: tuple[str, ...], radius_mm: float | None, base: ObjectProfile | None) -> dict[str, float]:
     """Radius of each bead [m]: as told, as the file has it, or the usual."""
     there = {} if base is None else {name: bead.radius_m for name, bead in base.markers.items()}
-    return {name: there.get(name, 0.008) if radius_mm is None else 1e-3 * radius_mm for name in names}
+    return {
+        name: there.get(name, 0.008) if radius_mm is None else round(1e-3 * radius_mm, 7) for name in names
+    }
 
 
 def recorded(

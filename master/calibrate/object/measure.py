@@ -23,6 +23,7 @@ _LOOK_RAD = np.radians(
     10.0
 )  # turned by so much, a bead shows cameras another side: what misleads them is another
 _LOOK_M = 0.04  # and so does one that is elsewhere
+_LOOKS = 24  # what is off in the same way all the time averages out over no more
 _WINDOW_S = 0.25
 # By which a distance between beads may change, from the tenth to the ninetieth percentile of quarters of a second.
 _RIGID_M = 2e-3
@@ -79,7 +80,7 @@ def measure_object(seen: Seen) -> Measurement:
     # What misleads cameras about a bead is the same while it shows the same side: looks count, and not instants.
     size = bundle.cov_m2.reshape(len(seen.names), 3, len(seen.names), 3)
     variance = np.array([np.linalg.eigvalsh(size[b, :, b])[-1] for b in range(len(seen.names))])
-    sigma = np.sqrt(variance * max(1.0, len(bundle.T) / looks))
+    sigma = np.sqrt(variance * max(1.0, len(bundle.T) / min(looks, _LOOKS)))
     found = Measurement(bundle, own, looks, sigma)
     strays = found.strays
     worst = int(np.argmax(strays))
