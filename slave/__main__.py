@@ -140,7 +140,9 @@ def _tracker(options: argparse.Namespace) -> int:
         except PhalanxError:
             source.close()
             raise
-        run_live(options.name, source, uplink, clock, stop, say)
+        run_live(
+            options.name, source, uplink, clock, stop, say, recorded=options.device.startswith("survive:")
+        )
     return 0
 
 

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from common.clock import Clock
 from common.zenoh_bus import ZenohBus
-from slave.app import Barrier, Sender
+from slave.app import POLL_S, Barrier, Sender
 from slave.objects.source import TrackerSource
 from slave.objects.tally import PoseTally
 from slave.report import Reporter
@@ -17,18 +17,20 @@ from slave.uplink import Uplink
 LOOK_S = 0.5e-3  # between two poses it is looked whether the master has started
 
 
-def wait_for_start(source: TrackerSource, barrier: Barrier, stop: threading.Event) -> bool:
+def wait_for_start(
+    source: TrackerSource, barrier: Barrier, stop: threading.Event, recorded: bool = False
+) -> bool:
     """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
 
-    Poses are read meanwhile, and forgotten, so that none grows old in a buffer.
+    Poses are read meanwhile, and forgotten, so that none grows old in a buffer; those of a recording wait.
 
     Raises:
         TrackerError: The tracking system is gone.
     """
     while not stop.is_set():
-        if barrier.wait_for_start(LOOK_S):
+        if barrier.wait_for_start(POLL_S if recorded else LOOK_S):
             return True
-        if source.read() is None:
+        if not recorded and source.read() is None:
             return False
     return False
 
@@ -51,6 +53,7 @@ def run_live(
     clock: Clock,
     stop: threading.Event,
     say: Callable[[str], None],
+    recorded: bool = False,
 ) -> None:
     """Wait for the master, then send until `stop` is set or the source ends; closes source and uplink.
 
@@ -61,6 +64,7 @@ def run_live(
         clock: The slave's clock.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
+        recorded: The source is a recording, of which nothing is to be missed.
 
     Raises:
         TrackerError: The tracking system is gone.
@@ -71,7 +75,7 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
-        if wait_for_start(source, uplink, stop):
+        if wait_for_start(source, uplink, stop, recorded):
             run(source, uplink, tally, stop)
     finally:
         reporter.close()

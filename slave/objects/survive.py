@@ -153,7 +153,7 @@ class SurviveFile:
             name: Of the device in our messages.
             wanted: Its serial number, or what libsurvive calls it; None: there is one only.
             path: What `survive-cli --record FILE` wrote, or its --record-stdout.
-            clock: The slave's clock, on which the recording begins now.
+            clock: The slave's clock, on which the recording begins when it is read first.
             stop: Ends the stream, also while a pose is waited for.
 
         Raises:

@@ -93,6 +93,12 @@ def test_poses_before_the_start_are_forgotten() -> None:
     assert not wait_for_start(Source([]), Wire(waits=3), threading.Event())
 
 
+def test_a_recording_begins_with_the_start_and_misses_nothing() -> None:
+    source = Source([pose(k) for k in range(9)])
+    assert wait_for_start(source, Wire(waits=30), threading.Event(), recorded=True)
+    assert len(source.poses) == 9
+
+
 def tree(folder: Path) -> Path:
     """A calibration tree whose cube has a tracker that is not registered yet."""
     (folder / "objects").mkdir()
