@@ -67,11 +67,18 @@ class Gaps:
 def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
     """The gaps of cones against cones, broadcast against each other."""
     apart = b.start_m - a.start_m
-    shape = apart.shape[:-1]
-    s, t = np.full(shape, 0.5), np.full(shape, 0.5)
+    uu, vv = np.vecdot(a.along_m, a.along_m), np.vecdot(b.along_m, b.along_m)
+    uv, au, bv = (
+        np.vecdot(one, two) for one, two in ((a.along_m, b.along_m), (apart, a.along_m), (apart, b.along_m))
+    )
+    square = np.vecdot(apart, apart)
+    on_a = _Foot.of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, _lean(a.growth_m, uu))
+    on_b = _Foot.of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, _lean(b.growth_m, vv))
+    t = np.full(apart.shape[:-1], 0.5)
+    s = t
     for _ in range(_ROUNDS):
-        s = _nearest(apart + t[..., None] * b.along_m, a.along_m, a.growth_m)
-        t = _nearest(s[..., None] * a.along_m - apart, b.along_m, b.growth_m)
+        s = on_a.nearest(t)
+        t = on_b.nearest(s)
     from_a = a.start_m + s[..., None] * a.along_m
     between = b.start_m + t[..., None] * b.along_m - from_a
     length = np.sqrt(np.vecdot(between, between))
@@ -82,11 +89,39 @@ def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
     return Gaps(gap, s, t, middle, way)
 
 
-def _nearest(point_m: Float, along_m: Float, growth_m: Float) -> Float:
-    """Where (...) along a cone from 0 its skin is nearest to points (..., 3) outside: the foot, and a little on to
-    where it is thicker."""
-    square = np.vecdot(along_m, along_m)
-    foot = np.vecdot(point_m, along_m) / square
-    off = point_m - foot[..., None] * along_m
-    lean = growth_m / np.sqrt(np.maximum(square - growth_m**2, 1e-12))
-    return np.clip(foot + lean * np.sqrt(np.vecdot(off, off) / square), 0.0, 1.0)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Foot:
+    """Where along a cone its skin is nearest to a point that goes along the other's bone, both by their shares 0..1.
+
+    The foot of the point is linear in its share, and the square of its distance from the bone, in units of the bone's
+    length, is a quadratic: so a round needs no vectors.
+
+    Attributes:
+        foot, foot_by: (...) the foot of the other's start, and by how much it goes on.
+        off_2, off_by, off_by_2: (...) coefficients of that square.
+        lean: (...) by how much the nearest place is beyond the foot, to where the cone is thicker, per distance.
+    """
+
+    foot: Float
+    foot_by: Float
+    off_2: Float
+    off_by: Float
+    off_by_2: Float
+    lean: Float
+
+    @classmethod
+    def of(cls, foot: Float, foot_by: Float, c0: Float, c1: Float, c2: Float, lean: Float) -> "_Foot":
+        """By the feet, and the square of the distance from this cone's start, c0 + c1 x + c2 x^2 of a share x."""
+        off = c0 - foot * foot, c1 - 2.0 * foot * foot_by, c2 - foot_by * foot_by
+        return cls(foot, foot_by, *off, lean)
+
+    def nearest(self, share: Float) -> Float:
+        """Where (...) along the cone, for shares (...) of the other."""
+        off_2 = self.off_2 + share * (self.off_by + share * self.off_by_2)
+        beyond = self.lean * np.sqrt(np.maximum(off_2, 0.0))
+        return np.minimum(np.maximum(self.foot + share * self.foot_by + beyond, 0.0), 1.0)
+
+
+def _lean(growth_m: Float, square: Float) -> Float:
+    """Of cones by their growth and the squares of their lengths: the tangent of half their angle, outwards."""
+    return growth_m / np.sqrt(np.maximum(square - growth_m * growth_m, 1e-12))

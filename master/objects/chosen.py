@@ -42,26 +42,32 @@ class Chosen:
             features: Of the object.
             cameras: Of the rig.
             T: A pose (4, 4) near which the object is; of two places of a bead the nearer to it is taken. None: none.
-            doubt: Camera, pose and areas (B,) [px^2] of its beads -> by how much their centroids may be off [px].
+            doubt: Camera, pose and areas (..., B) [px^2] of its beads -> by how much their centroids may be off [px].
         """
-        rows: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
+        columns: list[tuple[Int, Int, Float, Float, Float, Float, Bool]] = []
         for c, both in enumerate(window.views):
             for kind, line in enumerate(both):
-                for sighting in line:
-                    uv, sigma = _nearer(sighting, features, cameras[c], T), sighting.sigma_px
-                    if T is not None and kind == 0:
-                        sigma = np.hypot(sigma, doubt(c, T, sighting.area_px2))
-                    there = np.isfinite(uv).all(axis=1) & np.isfinite(sigma)
-                    n = int(there.sum())
-                    tau = (sighting.t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
-                    late, now = np.full(n, sighting.t_sigma_s), np.full(n, sighting is window.near(c, kind))
-                    rows.append(
-                        (np.full(n, c), sighting.point[there], tau, uv[there], sigma[there], late, now)
-                    )
-        if not sum(len(row[0]) for row in rows):
+                told = [sighting for sighting in line if len(sighting.point)]
+                if not told:
+                    continue
+                point = np.concatenate([one.point for one in told])
+                uv, sigma = _nearer(told, point, features, cameras[c], T)
+                if T is not None and kind == 0:
+                    area = np.concatenate([one.area_px2 for one in told]).reshape(len(told), -1)
+                    sigma = np.hypot(sigma, doubt(c, T, area).ravel())
+                there: Int = np.flatnonzero(np.isfinite(uv[:, 0] + uv[:, 1] + sigma))
+                t_ns = np.concatenate([one.t_ns for one in told])
+                size = [len(one.point) for one in told]
+                late = np.repeat([one.t_sigma_s for one in told], size)
+                near = window.near(c, kind)
+                now = np.repeat([one is near for one in told], size)
+                tau = (t_ns[there] - (window.t_ns - window.origin_ns)) * 1e-9
+                at = np.full(len(there), c)
+                columns.append((at, point[there], tau, uv[there], sigma[there], late[there], now[there]))
+        if not sum(len(column[0]) for column in columns):
             return None
         camera, point, tau, uv, sigma, t_sigma, now = (
-            np.concatenate(column) for column in zip(*rows, strict=True)
+            np.concatenate(column) for column in zip(*columns, strict=True)
         )
         seen = Observations(camera, point, tau, uv, sigma, t_sigma)
         return cls(seen, features.feature[point], now, features.count, len(cameras))
@@ -74,13 +80,17 @@ class Chosen:
         return out
 
 
-def _nearer(sighting: Sighting, features: Features, camera: CameraModel, T: Float | None) -> Float:
-    """Places (K, 2) of a sighting, rivals taken where a pose has the point nearer to them."""
-    if T is None or np.isnan(sighting.rival_uv).all():
-        return sighting.uv
-    there = camera.project(features.points[sighting.point] @ T[:3, :3].T + T[:3, 3])
-    first, second = (np.linalg.norm(uv - there, axis=1) for uv in (sighting.uv, sighting.rival_uv))
-    return np.where((second < first)[:, None], sighting.rival_uv, sighting.uv)
+def _nearer(
+    line: list[Sighting], point: Int, features: Features, camera: CameraModel, T: Float | None
+) -> tuple[Float, Float]:
+    """Places (K, 2) of the points (K,) of sightings, rivals taken where a pose has the point nearer to them; sigmas."""
+    uv, sigma = np.concatenate([one.uv for one in line]), np.concatenate([one.sigma_px for one in line])
+    rival = np.concatenate([one.rival_uv for one in line])
+    if T is None or np.isnan(rival).all():
+        return uv, sigma
+    there = camera.project(features.points[point] @ T[:3, :3].T + T[:3, 3])
+    first, second = (np.linalg.norm(one - there, axis=1) for one in (uv, rival))
+    return np.where((second < first)[:, None], rival, uv), sigma
 
 
 def sighted_now(window: Window, features: Features) -> list[Sighted]:

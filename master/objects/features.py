@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import transform
+from common.geometry import cross, transform
 from common.object_profile import ObjectProfile, tag_corners
 from common.tag_family import GRIDS
 from master.objects.surface import Surface
@@ -27,6 +27,8 @@ _DISC: Float = np.array(
     [[0.0, 0.0]]
     + [[r * np.cos(a), r * np.sin(a)] for r in (0.45, 0.85) for a in np.arange(6) * np.pi / 3 + r]
 )
+
+_BULGE: Float = np.sqrt(1.0 - (_DISC * _DISC).sum(axis=1))[:, None]  # of a ball's near half over its disc
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +94,11 @@ class Features:
         return len(self.names)
 
     @property
+    def _first(self) -> Int:
+        """(F,) the first point of each feature."""
+        return np.concatenate([np.arange(self.beads), np.arange(self.beads, len(self.points), 4)])
+
+    @property
     def beads(self) -> int:
         """How many of them are beads: the first."""
         return len(self.rows)
@@ -115,7 +122,8 @@ class Features:
         shows = np.concatenate(
             [self._beads_show(eye, float(camera.matrix[0, 0]), ease), self._tags_show(eye, uv, ease)]
         )
-        np.logical_and.at(shows, self.feature, inside)
+        if len(self.points):
+            shows &= np.logical_and.reduceat(inside, self._first)
         return shows
 
     def _tags_show(self, eye: Float, uv: Float, ease: float) -> Bool:
@@ -136,14 +144,16 @@ class Features:
 
     def _beads_show(self, eye: Float, focal_px: float, ease: float) -> Bool:
         """(B,) beads that are large enough for an eye (3,) [m], object frame, and not behind the object."""
+        if not self.beads:
+            return np.zeros(0, np.bool_)
         points, radius = self.points[: self.beads], self.radius_m[: self.beads]
         sight = eye - points
         away = np.linalg.norm(sight, axis=1)
         ahead = sight / away[:, None]
-        across = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead), axis=1)])
+        across = cross(ahead, np.eye(3)[np.argmin(np.abs(ahead), axis=1)])
         across /= np.linalg.norm(across, axis=1, keepdims=True)
         # The near half of the ball, so that the rod that it is on is not before it.
-        off = _DISC[:, :1] * across[:, None] + _DISC[:, 1:] * np.cross(ahead, across)[:, None]
-        off += np.sqrt(1.0 - (_DISC * _DISC).sum(axis=1))[:, None] * ahead[:, None]
+        off = _DISC[:, :1] * across[:, None] + _DISC[:, 1:] * cross(ahead, across)[:, None]
+        off += _BULGE * ahead[:, None]
         hidden = self.surface.hides(eye, points[:, None] + radius[:, None, None] * off)
         return (radius * focal_px >= ease * _BEAD_PX * away) & ((~hidden).mean(axis=1) >= ease * _BEAD_SEEN)

@@ -60,24 +60,20 @@ class Hidden:
         return Seen(int(used.any(axis=0).sum()), int((expected | used).any(axis=0).sum()), occluded)
 
     def doubt_px(self, c: int, T_rig_object: Float, area_px2: Float) -> Float:
-        """By how much the centroids of beads (B,) in camera `c` may be off, as something hides a part of them [px].
+        """By how much the centroids of beads (..., B) in camera `c` may be off, as something hides a part of them [px].
 
         Whatever part of a disc is cut off, its centroid moves by at most about that part of the radius.
         """
         share, radius_px = self._share(c, T_rig_object, area_px2)
         missing = 1.0 - share / (_NEARLY * self._whole[c])
-        return np.nan_to_num(np.clip(missing, 0.0, 1.0) * radius_px)
+        return np.where(missing > 0.0, np.minimum(missing, 1.0) * radius_px, 0.0)  # NaN: not known, 0
 
     def _share(self, c: int, T: Float, area_px2: Float) -> tuple[Float, Float]:
-        """Which share of their discs (B,) beads of these areas [px^2] show, and the radii of the discs (B,) [px]."""
+        """What share of their discs (..., B) beads of these areas [px^2] show, and the radii (B,) of the discs [px]."""
         rows = slice(0, self._features.beads)
         camera = self._cameras[c]
-        points = self._features.points[rows] @ T[:3, :3].T + T[:3, 3]
-        radius = (
-            self._features.radius_m[rows]
-            * camera.matrix[0, 0]
-            / np.linalg.norm(points - camera.centre, axis=1)
-        )
+        sight = self._features.points[rows] @ T[:3, :3].T + (T[:3, 3] - camera.centre)
+        radius = self._features.radius_m[rows] * camera.matrix[0, 0] / np.sqrt(np.vecdot(sight, sight))
         return area_px2 / (np.pi * radius * radius), radius
 
     def _partly(self, c: int, T: Float, markers: Sighting, seen: Bool) -> bool:
