@@ -26,7 +26,7 @@ def watched(both: Both, seconds: float) -> Shown:
         times[camera] = times_of(both.scene, camera, seconds, rate)
         found, paint[camera] = _markers(both, camera, times[camera])
         messages += found
-    triples, line_t, line, tip = _triples(both, seconds)
+    triples, line_t, line, tip = triples_of(both, seconds)
     return Shown(both, seconds, in_order(messages + triples), Sight(times, paint, line_t, line, tip))
 
 
@@ -45,7 +45,7 @@ def _markers(both: Both, camera: str, times_s: Float) -> tuple[list[Observed], F
     return out, np.array(paint)
 
 
-def _triples(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
+def triples_of(both: Both, seconds: float) -> tuple[list[Observed], Float, Float, Bool]:
     """The wrist device's triples; when its laser frames were, what of line [m] and tips (K, 5) was in sight."""
     name = both.wrist.rig.cameras[0]
     own = both.wrist.cameras[name]

@@ -1,45 +1,39 @@
 """The six study poses, as the master tells them: simulated people, rendered frames, hands that others recorded.
 
 **People, held markers**: twelve people of the study, each with bones as a calibration measures them, go through the
-study's poses before cameras that see all tips, 1 mm of noise. **Rendered**: the same scene as rendered
-frames through detector and pipeline, where hands turn and hide their fingers. **Wrist**: trials of the study, rendered,
-detected by the slave as a process, solved. A frame is right if the pose held in truth is the one that is told, from the
-third frame after it was formed on; an episode is right if it is told by then. **handy_poses**: seven static hands, both
-sides, markers with 1 mm of noise. flat is an open palm, point is pointing (whatever the thumb does), fist is the end of
-a small grasp; horns and shaka are none. vulcan and relax are told but not judged: one is an open palm where its
+study's poses before cameras that see all tips, 1 mm of noise. **Rigs**: people before each rig through rendered frames,
+where hands turn and hide their fingers (`gesture_rigs`). **Wrist**: trials of the study, rendered, detected by the
+slave as a process, solved. A frame is right if the pose held in truth is the one that is told, from the third frame
+after it was formed on; an episode is right if it is told by then. **handy_poses**: seven static hands, both sides,
+markers with 1 mm of noise. flat is an open palm, point is pointing (whatever the thumb does), fist the end of a small
+grasp; horns and shaka are none. vulcan and relax are told but not judged: one is an open palm where its
 fingers are straight (left) and none where they are bent (right), the other a straight hand (left) and a bent one.
 **leapjs**: an event is wrong if the recorded joints contradict it by a rule of their own: which fingers are stretched
 (bends below 50 degrees together) and which are bent (above 85), and where thumb and index are.
 """
 
 import tempfile
-from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from bench.gesture_recorded import leap_rows, static_rows
-from bench.gesture_told import pose_of, told_of
-from bench.played import solve, times_of, times_of_poses, watch
+from bench.gesture_rigs import rows as rigs
+from bench.gesture_told import Told, pose_of, told_of
 from bench.row import Row, median_us
 from common.calibration import CameraCalibration, FilterCalibration, HandProfile, RigCalibration, load
 from common.geometry import matrix_to_quaternion
 from common.gesture_settings import default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
-from common.sim.motion import POSES
 from common.sim.poses import StudyPoses
-from common.sim.scene import Scene, view_centre
-from common.sim.scenes import scene_by_name
 from master.gestures.features import features_of
 from master.gestures.poses import PoseRecogniser
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.outputs.files import load_poses
-from master.rig import RigSetup, load_setup
 from master.study.one import TRIALS, Task, run_participant
 from master.study.participant import participant
 from master.study.session import TRIAL_S, Held
@@ -49,72 +43,14 @@ from master.study.trials import read_trials
 CALIBRATION = Path(__file__).parent.parent / "calib_json"
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 SIGMA_M = 1e-3
-FORMED = 2  # frames in which a formed pose may not be told yet
 _PERIOD_NS = 16_666_667
 _SEED, _PEOPLE, _WORN = 31, 12, 3
-_NONE = "none"
-
-
-@dataclass(slots=True)
-class Told:
-    """What was told of held poses: (true, told) -> frames; episodes, those told in time, and events while none fits."""
-
-    frames: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
-    episodes: int = 0
-    in_time: int = 0
-    passing: int = 0
-
-    def add(self, truth: Sequence[str | None], told: Sequence[str | None]) -> None:
-        """Of one hand, frame by frame."""
-        begin = 0
-        for k in range(1, len(truth) + 1):
-            if k < len(truth) and truth[k] == truth[begin]:
-                continue
-            name = truth[begin]
-            if name is not None and k - begin > FORMED:
-                self.episodes += 1
-                self.in_time += told[begin + FORMED] == name
-                self.frames.update((name, told[j] or _NONE) for j in range(begin + FORMED, k))
-            begin = k
-        self.passing += _passing(truth, told)
-
-    @property
-    def right(self) -> float:
-        """Percent of the frames."""
-        return (
-            100.0 * sum(n for (a, b), n in self.frames.items() if a == b) / max(sum(self.frames.values()), 1)
-        )
-
-    @property
-    def wrong(self) -> float:
-        """Percent of the frames in which another pose is told, rather than none."""
-        other = sum(n for (a, b), n in self.frames.items() if b not in (a, _NONE))
-        return 100.0 * other / max(sum(self.frames.values()), 1)
-
-    def rows(self, what: str, goal: str = "goal 98") -> Iterator[Row]:
-        """For the table, with the confusions of every pose that is not always right."""
-        note = f"{goal}; another pose {self.wrong:.2f}; of {sum(self.frames.values())} frames"
-        yield Row(f"{what}: frames right", self.right, "%", note)
-        share = 100.0 * self.in_time / max(self.episodes, 1)
-        yield Row(
-            "  episodes told within 2 frames",
-            share,
-            "%",
-            f"{goal}; of {self.episodes}; passing {self.passing}",
-        )
-        for name in POSES:
-            of = {told: n for (true, told), n in self.frames.items() if true == name}
-            if set(of) - {name}:
-                yield Row(f"  {name}", 100.0 * of.get(name, 0) / sum(of.values()), "%", str(of))
 
 
 def rows() -> Iterator[Row]:
     """All parts; a row that says so where the data are absent."""
     yield from people(range(1, _PEOPLE + 1)).rows("12 people, all markers seen")
-    for side, seed in (("right", 31), ("left", 32)):
-        yield from rendered(side, seed, 20.0).rows(
-            f"rendered, {side} hand turned by 35 deg", "no goal: fingers hide"
-        )
+    yield from rigs()
     yield from worn(range(1, _WORN + 1)).rows(f"wrist device, {_WORN} people")
     yield from static_rows()
     yield from leap_rows()
@@ -149,13 +85,6 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
     return out
 
 
-def rendered(side: str, seed: int, seconds: float) -> Told:
-    """The scene `poses` before the rig desk, rendered and detected."""
-    setup = load_setup(CALIBRATION, "desk", CALIBRATION / "hands" / f"default-{side}.json")
-    scene = scene_by_name("poses", setup.rig, setup.cameras, setup.hand.profile, seed)
-    return _watched(scene, setup, StudyPoses(setup.hand, view_centre(setup.rig), seed), seconds)
-
-
 def worn(numbers: Sequence[int] | range) -> Told:
     """Trials of the study: rendered, detected by the slave, calibrated and solved as everybody's."""
     rig = load(CALIBRATION / "rigs/wrist.json", RigCalibration)
@@ -188,32 +117,8 @@ def worn(numbers: Sequence[int] | range) -> Told:
     return out
 
 
-def _watched(scene: Scene, setup: RigSetup, motion: StudyPoses, seconds: float) -> Told:
-    watched = [
-        watch(scene, name, times_of(scene, name, seconds, setup.cameras[name].frame_rate_hz))
-        for name in setup.rig.cameras
-    ]
-    poses, _ = solve(setup, watched)
-    out = Told()
-    out.add([motion.held(t) for t in times_of_poses(poses).tolist()], told_of(poses, setup.hand))
-    return out
-
-
 def _held_at(trials: Sequence[Held], t_ns: int) -> str | None:
     return next((trial.pose for trial in trials if trial.from_ns <= t_ns <= trial.to_ns), None)
-
-
-def _passing(truth: Sequence[str | None], told: Sequence[str | None]) -> int:
-    """Poses that are told between two held ones, and are neither of them."""
-    held = [k for k, name in enumerate(truth) if name is not None]
-    count = 0
-    for k in range(1, len(told)):
-        if told[k] is None or told[k] == told[k - 1] or not held or not held[0] < k < held[-1]:
-            continue
-        before = next(truth[j] for j in range(k, -1, -1) if truth[j] is not None)
-        after = next(truth[j] for j in range(k, len(truth)) if truth[j] is not None)
-        count += told[k] not in (before, after)
-    return count
 
 
 def _cost() -> Row:

@@ -1,17 +1,83 @@
 """Hands of given joints as poses, and what is told of them: what the benches of gestures share."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from bench.row import Row
 from common.arrays import Float
 from common.gesture_settings import default_gestures
 from common.hand_model import HandModel
 from common.messages import JOINT_COUNT, HandPose, Source
+from common.sim.motion import POSES
 from master.gestures.features import features_of
 from master.gestures.poses import PoseRecogniser
 
+FORMED = 2  # frames in which a formed pose may not be told yet
+_NONE = "none"
 _SIGMA_M = 2e-3  # claimed of every joint
+
+
+@dataclass(slots=True)
+class Told:
+    """What was told of held poses: (true, told) -> frames; episodes, those told in time, and events while none fits."""
+
+    frames: Counter[tuple[str, str]] = field(default_factory=Counter[tuple[str, str]])
+    episodes: int = 0
+    in_time: int = 0
+    passing: int = 0
+
+    def add(self, truth: Sequence[str | None], told: Sequence[str | None]) -> None:
+        """Of one hand, frame by frame."""
+        begin = 0
+        for k in range(1, len(truth) + 1):
+            if k < len(truth) and truth[k] == truth[begin]:
+                continue
+            name = truth[begin]
+            if name is not None and k - begin > FORMED:
+                self.episodes += 1
+                self.in_time += told[begin + FORMED] == name
+                self.frames.update((name, told[j] or _NONE) for j in range(begin + FORMED, k))
+            begin = k
+        self.passing += _passing(truth, told)
+
+    def join(self, other: "Told") -> None:
+        """What was told of others as well."""
+        self.frames.update(other.frames)
+        self.episodes += other.episodes
+        self.in_time += other.in_time
+        self.passing += other.passing
+
+    @property
+    def right(self) -> float:
+        """Percent of the frames."""
+        return (
+            100.0 * sum(n for (a, b), n in self.frames.items() if a == b) / max(sum(self.frames.values()), 1)
+        )
+
+    @property
+    def wrong(self) -> float:
+        """Percent of the frames in which another pose is told, rather than none."""
+        other = sum(n for (a, b), n in self.frames.items() if b not in (a, _NONE))
+        return 100.0 * other / max(sum(self.frames.values()), 1)
+
+    def rows(self, what: str, goal: str = "goal 98") -> Iterator[Row]:
+        """For the table, with the confusions of every pose that is not always right."""
+        note = f"{goal}; another pose {self.wrong:.2f}; of {sum(self.frames.values())} frames"
+        yield Row(f"{what}: frames right", self.right, "%", note)
+        share = 100.0 * self.in_time / max(self.episodes, 1)
+        yield Row(
+            "  episodes told within 2 frames",
+            share,
+            "%",
+            f"{goal}; of {self.episodes}; passing {self.passing}",
+        )
+        for name in POSES:
+            of = {told: n for (true, told), n in self.frames.items() if true == name}
+            if set(of) - {name}:
+                yield Row(f"  {name}", 100.0 * of.get(name, 0) / sum(of.values()), "%", str(of))
 
 
 def pose_of(model: HandModel, t_ns: int, place_m: Float, turned_wxyz: Float, angles_rad: Float) -> HandPose:
@@ -47,3 +113,16 @@ def told_of(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
             recogniser.push(features)
         out.append(recogniser.held)
     return out
+
+
+def _passing(truth: Sequence[str | None], told: Sequence[str | None]) -> int:
+    """Poses that are told between two held ones, and are neither of them."""
+    held = [k for k, name in enumerate(truth) if name is not None]
+    count = 0
+    for k in range(1, len(told)):
+        if told[k] is None or told[k] == told[k - 1] or not held or not held[0] < k < held[-1]:
+            continue
+        before = next(truth[j] for j in range(k, -1, -1) if truth[j] is not None)
+        after = next(truth[j] for j in range(k, len(truth)) if truth[j] is not None)
+        count += told[k] not in (before, after)
+    return count

@@ -58,7 +58,8 @@ class HoldSettings(Part, frozen=True):
     It begins at a confidence of `begin` that has lasted `begin_s` (`doubt_s` where fewer than three of the four fingers
     are known), while the fingers turn by no more than `still_deg_s`
     (a hand on its way through a pose does not hold it), or, at any speed, that has lasted `slow_s`. It ends below `end`
-    that has lasted `end_s`, when another begins, or `lost_s` after the hand, or too much of it, was last known.
+    that has lasted `end_s`, when another begins, `lost_s` after the hand was last known, or, where nothing that is seen
+    speaks against it but too much of the hand hides, `hidden_s` after it was last confident.
     `known_share`: of the weight of a pose's quantities, how much must be known.
     """
 
@@ -70,6 +71,7 @@ class HoldSettings(Part, frozen=True):
     still_deg_s: Positive = 60.0
     slow_s: NonNegative = 0.25
     lost_s: NonNegative = 0.5
+    hidden_s: NonNegative = 3.0
     known_share: Score = 0.5
 
 

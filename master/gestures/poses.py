@@ -169,7 +169,7 @@ class PoseRecogniser:
     def lose(self, hand: str, t_ns: int) -> list[Gesture]:
         """What is to be said where the hand itself is not known at `t_ns`."""
         self._coming = None
-        return [] if self._held is None else self._unsure(hand, t_ns)
+        return [] if self._held is None else self._unsure(hand, t_ns, self._hold.lost_s)
 
     def _beginning(self, features: HandFeatures, fit: Fit, speed: float) -> int | None:
         """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
@@ -202,18 +202,19 @@ class PoseRecogniser:
         if enough and confidence >= self._hold.end:
             self._going_ns, self._seen_ns, self._confidence = None, t_ns, confidence
             return [self._said(hand, t_ns, "update", confidence)]
-        # Of a hand of which too little is known it may well be held, unless what is known speaks against it.
-        if not (enough and features.seen.any()) and fit.score[held] >= self._hold.end:
-            return self._unsure(hand, t_ns)
+        # Fingers that hide speak neither for nor against it, and other poses begin where they are told.
+        if fit.score[held] >= self._hold.end:
+            self._going_ns = None
+            return self._unsure(hand, t_ns, self._hold.hidden_s)
         if self._going_ns is None:
             self._going_ns = t_ns
         if t_ns - self._going_ns >= 1e9 * self._hold.end_s:
             return self._end(hand, t_ns)
         return [self._said(hand, t_ns, "update", confidence)]
 
-    def _unsure(self, hand: str, t_ns: int) -> list[Gesture]:
+    def _unsure(self, hand: str, t_ns: int, longest_s: float) -> list[Gesture]:
         """The held pose goes on for a while, ever less sure."""
-        left = 1.0 - 1e-9 * (t_ns - self._seen_ns) / max(self._hold.lost_s, 1e-9)
+        left = 1.0 - 1e-9 * (t_ns - self._seen_ns) / max(longest_s, 1e-9)
         if left <= 0.0:
             return self._end(hand, t_ns)
         return [self._said(hand, t_ns, "update", min(left, 1.0) * self._confidence)]

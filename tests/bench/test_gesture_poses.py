@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from bench.gesture_poses import Told
 from bench.gesture_recorded import agrees
+from bench.gesture_told import Told
 from common.geometry import axis_rotation
 from common.sim.motion import POSES
 from tests.hand_helpers import LEFT, RIGHT
