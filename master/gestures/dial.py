@@ -169,10 +169,10 @@ class DialWatch:
             self._turn(t_ns, tips, grip, wide)
         elif (ahead := grip.course.ahead_rad(t_ns)) is not None:
             self._angle = ahead
-        if loosened and abs(wide) > own.open_m:
-            self._grip, self._before, self._closed_ns = None, grip.tips, t_ns
-        else:
+        if not abs(wide) > own.open_m:
             self._closed_ns = t_ns
+        elif loosened:
+            self._grip, self._before = None, grip.tips
 
     def _turn(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
         """The angle of tips that turn the knob."""
