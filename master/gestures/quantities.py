@@ -70,9 +70,10 @@ def _hidden(bend: Float, sigma: Float, seen: Bool) -> tuple[Float, Float]:
     A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies behind the
     hand or before the palm. That an unseen finger hides is joined with what is believed of it, as one more witness.
     """
-    weight = np.where(seen, 0.0, sigma**2 / (sigma**2 + HIDDEN_SIGMA_DEG**2))
-    weight = np.where(np.isfinite(weight), weight, 1.0)
-    joined = np.sqrt(1.0 - weight) * np.where(np.isfinite(sigma), sigma, 0.0)
+    known = np.isfinite(sigma)
+    own = np.where(known, sigma, 0.0)
+    weight = np.where(seen, 0.0, np.where(known, own * own / (own * own + HIDDEN_SIGMA_DEG**2), 1.0))
+    joined = np.sqrt(1.0 - weight) * own
     return bend + weight[:, None] * (HIDDEN_DEG - bend), np.where(weight >= 1.0, HIDDEN_SIGMA_DEG, joined)
 
 
