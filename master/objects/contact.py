@@ -122,9 +122,8 @@ class ContactWatch:
 
 
 def _away(distance: Float, sigma: Float) -> bool:
-    """Whether fingers (5,) surely hold nothing: the thumb, or all the others, do not touch. NaN: not known."""
-    free = np.nan_to_num(distance - _FREE * sigma, nan=-np.inf) > FAR_M
-    return bool(free[0] or free[1:].all())
+    """Whether fingers (5,) surely hold nothing: none but the thumb touches, which alone holds nothing. NaN: not known."""
+    return bool((np.nan_to_num(distance - _FREE * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
 def _touches(distance: Float, sigma: Float, before: Bool) -> Bool:
