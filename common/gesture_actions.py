@@ -18,9 +18,9 @@ class PinchSettings(Part, frozen=True):
 
     `begin_gap_m`, `end_gap_m`: skin to skin at which it begins and ends. `closed_gap_m`, `open_gap_m`: where the
     strength is 1 and 0. `clear_m`: how much nearer than the finger next to it the finger is to the thumb; less is a
-    fist or a bunch. `apart_rad`: how far the pads may be turned from facing each other. `fist_curl`: of 0..1, the
-    other fingers together are curled less. `sigma_most_m`: of a tip, above which a finger is not known; `lost_s`: how
-    long a pinch of such a finger lasts.
+    fist or a bunch. `away_m`: as far beyond, nothing else is asked. `apart_rad`: how far the pads may be turned from
+    facing each other, doubt included. `fist_curl`: of 0..1, the other fingers together are curled less.
+    `sigma_most_m`: of the gap, above which it is not known; `lost_s`: how long a pinch lasts without it.
     """
 
     begin_gap_m: Positive = 0.009
@@ -28,9 +28,10 @@ class PinchSettings(Part, frozen=True):
     closed_gap_m: NonNegative = 0.001
     open_gap_m: Positive = 0.040
     clear_m: NonNegative = 0.006
+    away_m: Positive = 0.025
     apart_rad: Positive = math.radians(105.0)
     fist_curl: Positive = 0.75
-    sigma_most_m: Positive = 0.012
+    sigma_most_m: Positive = 0.005
     lost_s: NonNegative = 0.35
 
 
@@ -73,18 +74,20 @@ class TapSettings(Part, frozen=True):
 
     Index to ring finger, from the tip: 1 2 3, 4 5 6, 7 8 9; little finger: star, 0, hash (docs/gestures.md).
     `touch_gap_m`, `leave_gap_m`: between the skins of thumb and finger at which it touches and leaves; it leaves
-    earlier where it has gone away by `rise_m` from where it was nearest. `pressed_m`: deeper than flesh gives way is
+    earlier where it has gone away by `rise_m` from where it was nearest. `down_gap_m`: as near as this it comes at
+    least, or has only passed. `pressed_m`: deeper than flesh gives way is
     no tap but a hand that closes. `approach_s`: within so long it comes from beyond `leave_gap_m`; slower is no tap.
     `shortest_s`, `longest_s`: how long a touch is a tap. `apart_s`: between two taps. `level_rad`: how differently
     the fingers of a pad are bent at most, MCP and PIP together; `curl_most`: of 0..1, how far at most. `quiet_rad`:
     how far the four may bend together from when the thumb comes until it goes: more is a hand that closes.
-    `nearer_m`: how much nearer the thumb is to the finger of this key than to another. `sigma_most_m`: of the tips of
-    thumb and finger, above which nothing is told.
+    `nearer_m`: how much nearer the thumb is to the finger of this key than to another, over the whole touch; less is
+    told as none. `sigma_most_m`, `place_sigma_m`: of the gap, and of the finger's PIP, above which nothing is told.
     """
 
     touch_gap_m: Positive = 0.005
     leave_gap_m: Positive = 0.0085
     rise_m: Positive = 0.005
+    down_gap_m: Positive = 0.003
     pressed_m: Positive = 0.007
     approach_s: Positive = 0.4
     shortest_s: NonNegative = 0.03
@@ -93,8 +96,9 @@ class TapSettings(Part, frozen=True):
     level_rad: Positive = math.radians(50.0)
     curl_most: Positive = 0.8
     quiet_rad: Positive = math.radians(25.0)
-    nearer_m: NonNegative = 0.0015
-    sigma_most_m: Positive = 0.012
+    nearer_m: NonNegative = 0.0002
+    sigma_most_m: Positive = 0.006
+    place_sigma_m: Positive = 0.008
 
 
 class PointSettings(Part, frozen=True):
@@ -102,7 +106,8 @@ class PointSettings(Part, frozen=True):
 
     `stretched_rad`, `bent_rad`: sums of the flexions of PIP and DIP, of the index at most and of each of the others at
     least. `slack_rad`: by how much both are wider for one that has begun. `hold_s`: how long until it begins, and how
-    long the shape may be lost. `sigma_most_m`: of a finger's tip, above which it is not known.
+    long the shape may be lost. `sigma_most_m`: of a finger's tip, above which it is not known; `ray_sigma_rad`: of the
+    ray, above which it is told to nobody (half as much again for one that has begun).
     """
 
     stretched_rad: Positive = math.radians(45.0)
@@ -110,6 +115,7 @@ class PointSettings(Part, frozen=True):
     slack_rad: NonNegative = math.radians(20.0)
     hold_s: NonNegative = 0.12
     sigma_most_m: Positive = 0.015
+    ray_sigma_rad: Positive = math.radians(6.0)
 
 
 def check_actions(
@@ -122,6 +128,7 @@ def check_actions(
     """
     rising = (
         ("pinch.end_gap_m", pinch.begin_gap_m, pinch.end_gap_m, "begin_gap_m"),
+        ("pinch.away_m", pinch.clear_m, pinch.away_m, "clear_m"),
         ("pinch.open_gap_m", pinch.closed_gap_m, pinch.open_gap_m, "closed_gap_m"),
         ("dial.radius_high_m", dial.radius_low_m, dial.radius_high_m, "radius_low_m"),
         ("dial.open_m", dial.loose_m, dial.open_m, "loose_m"),

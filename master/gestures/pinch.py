@@ -1,9 +1,13 @@
 """Pinches: thumb and one finger pad to pad, how far apart their skins are and how firmly they close.
 
-A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the gap to
-it is the least of the four, the pads face each other (the thumb over a fist lies on the backs of the fingers) and not
-all others are curled in. A finger that is not known neither begins nor ends a pinch: one that has begun goes on, its
-confidence falling, until `lost_s` are over.
+A pinch begins when the gap falls below one threshold and ends above another, wider one. It is one finger's: the others
+are well away from the thumb, or they are at least farther, and then the pads face each other as far as that is known
+(the thumb over a fist lies on the backs of the fingers) and not all others are curled in. Where the others are away
+no bend is asked for: the tips tell it, which are measured however the palm lies.
+
+What decides is how sure the gap is, along the way from skin to skin; a thumb whose depth is doubtful may still be known
+to meet a finger beside it. A gap that is not known neither begins nor ends a pinch: one that has begun goes on at the
+gap that was known last, its confidence falling, until `lost_s` are over.
 """
 
 import numpy as np
@@ -15,16 +19,14 @@ from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting, below
 from master.gestures.touch import ThumbTouch
 
-_ALIKE = 0.7  # of the doubt of two tips: part of it is the palm's, and moves both
-
 
 class PinchWatch:
-    """Push machine. Holds the pinch that has begun, and when its fingers were known last."""
+    """Push machine. Holds the pinch that has begun, and when its gap was known last, and how wide it was."""
 
     def __init__(self, settings: PinchSettings) -> None:
         self._settings = settings
         self._pinch: Lasting | None = None
-        self._finger, self._known_ns = 0, 0
+        self._finger, self._known_ns, self._gap_m = 0, 0, 0.0
         self._last: Gesture | None = None
 
     @property
@@ -39,11 +41,12 @@ class PinchWatch:
             if finger is None:
                 return []
             self._finger, self._known_ns = finger, seen.t_ns
+            self._gap_m = float(touch.gap_m[finger])
             self._pinch = Lasting(seen.hand, "pinch", FINGERS[finger + 1], seen.t_ns)
             return [self._tell(self._pinch, "begin", seen, touch)]
-        if self._known(seen, self._finger):
-            self._known_ns = seen.t_ns
-            if touch.gap_m[self._finger] > self._settings.end_gap_m:
+        if self._known(touch, self._finger):
+            self._known_ns, self._gap_m = seen.t_ns, float(touch.gap_m[self._finger])
+            if self._gap_m > self._settings.end_gap_m:
                 return self._end(self._tell(self._pinch, "end", seen, touch))
         elif (seen.t_ns - self._known_ns) * 1e-9 > self._settings.lost_s:
             return self._end(self._tell(self._pinch, "end", seen, touch))
@@ -65,21 +68,23 @@ class PinchWatch:
     def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
         own = self._settings
         finger = int(np.argmin(touch.gap_m))
-        if touch.gap_m[finger] > own.begin_gap_m or not self._known(seen, finger):
+        if touch.gap_m[finger] > own.begin_gap_m or not self._known(touch, finger):
             return None
         others = np.delete(np.arange(4), finger)
-        if touch.gap_m[others].min() - touch.gap_m[finger] < own.clear_m:
-            return None
-        if touch.pads_face[finger] < np.cos(own.apart_rad):
+        clear_m = float(touch.gap_m[others].min() - touch.gap_m[finger])
+        if clear_m >= own.away_m:
+            return finger
+        turned_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
+        if clear_m < own.clear_m or turned_rad > own.apart_rad:
             return None
         return finger if float(seen.curl[1:][others].min()) < own.fist_curl else None
 
-    def _known(self, seen: HandFeatures, finger: int) -> bool:
-        return bool(max(seen.sigma_m[0], seen.sigma_m[finger + 1]) <= self._settings.sigma_most_m)
+    def _known(self, touch: ThumbTouch, finger: int) -> bool:
+        return bool(touch.sigma_m[finger] <= self._settings.sigma_most_m)
 
     def _tell(self, pinch: Lasting, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
-        own, gap = self._settings, float(touch.gap_m[self._finger])
-        sigma = _ALIKE * float(np.hypot(seen.sigma_m[0], seen.sigma_m[self._finger + 1]))
+        own, gap = self._settings, self._gap_m
+        sigma = float(touch.sigma_m[self._finger])
         strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
         self._last = pinch.told(
             phase,

@@ -5,6 +5,11 @@ tip by its own marker and the knuckle by the palm, and they are as far apart as 
 millimetre turns the line knuckle - tip by a third of what it turns the last bone, whose direction is habit more than
 measurement (the DIP follows the PIP). It begins at the tip because there is no hand beyond it.
 
+How sure the ray is follows from what is known of both ends across it. One that may be off by more than a few degrees
+is withheld: before one pair of cameras, a palm that faces them is known by its fingertips alone, and knuckles stand
+anywhere within some centimetres. It must be sure twice in a row when the pointing begins; one that is not for a
+moment later stays as it was last.
+
 Nothing is smoothed here: the markers are already, by the 1 EUR filter with a cut-off that rises with speed, and a
 hand at rest is held still by the hand's own filter. A second filter would only add its lag.
 """
@@ -18,16 +23,19 @@ from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting
 
+_LASTING = 1.5  # the doubt of a ray that is told already may be larger by this
 _KNUCKLE, _TIP = CHAINS[1, 0], CHAINS[1, 3]
 
 
 class PointWatch:
-    """Push machine. Holds the pointing that has begun, and since when its shape is there or was lost."""
+    """Push machine. Holds the pointing that has begun, since when its shape is there or was lost, and if the ray was
+    sure."""
 
     def __init__(self, settings: PointSettings) -> None:
         self._settings = settings
         self._point: Lasting | None = None
         self._since_ns: int | None = None  # of the shape before it begins; of its loss after
+        self._sure = False  # whether the ray was
         self._last: Gesture | None = None
 
     @property
@@ -38,18 +46,19 @@ class PointWatch:
     def push(self, seen: HandFeatures, *, may_begin: bool) -> list[Gesture]:
         """What is to be told at the instant of the features; it begins only where it may."""
         own, point = self._settings, self._point
-        shape = self._shape(seen)
+        shape, before = self._shape(seen), self._sure
+        self._sure = _ray_sigma_rad(seen) <= own.ray_sigma_rad * (1.0 if point is None else _LASTING)
         if point is None:
             if not (shape and may_begin):
                 self._since_ns = None
                 return []
             if self._since_ns is None:
                 self._since_ns = seen.t_ns
-            if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s:
+            if (seen.t_ns - self._since_ns) * 1e-9 < own.hold_s or not (self._sure and before):
                 return []
             self._point, self._since_ns = Lasting(seen.hand, "point", "point", self._since_ns), None
             return [self._tell(self._point, "begin", seen)]
-        if shape:
+        if shape and self._sure:
             self._since_ns = None
         elif self._over(seen.t_ns):
             return self._end(self._tell(point, "end", seen))
@@ -92,6 +101,8 @@ class PointWatch:
     def _tell(self, point: Lasting, phase: Phase, seen: HandFeatures) -> Gesture:
         tip = seen.joints_m[_TIP]
         way = tip - seen.joints_m[_KNUCKLE]
+        if not self._sure and self._last is not None:
+            way = self._last.direction
         bend = _bends(seen)
         middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
         clear = np.clip((bend[2:] - middle) / middle, 0.0, 1.0).mean() * (0.5 + 0.5 * self._known(seen)[1])
@@ -104,3 +115,12 @@ class PointWatch:
 def _bends(seen: HandFeatures) -> Float:
     """How far each finger is bent beyond its knuckle (5,) [rad]."""
     return seen.bend_rad[:, 1:].sum(axis=1)
+
+
+def _ray_sigma_rad(seen: HandFeatures) -> float:
+    """Standard deviation [rad] of the ray, about the axis where it is worst."""
+    way = seen.joints_m[_TIP] - seen.joints_m[_KNUCKLE]
+    length = float(np.linalg.norm(way))
+    across = np.eye(3) - np.outer(way, way) / length**2
+    cov = across @ (seen.joints_cov_m2[_TIP] + seen.joints_cov_m2[_KNUCKLE]) @ across
+    return float(np.sqrt(max(np.linalg.eigvalsh(cov)[2], 0.0))) / length

@@ -3,9 +3,13 @@
 The four fingers side by side are a keypad, held so that the index finger lies on top and the tips at the left: the rows
 are the fingers, the columns their segments, from the tip (docs/gestures.md). A touch is the thumb's that comes from
 well away and goes away again; it is told when it goes, so that a hand that closes, pinches or rests its thumb tells
-no key. The key is where the thumb was when it was nearest: the finger by the gap between skins, the segment by the
-planes that halve the bends of the finger, which the thumb's tip passes half a segment, a centimetre, from the middle
-of any key.
+no key. The finger is that of the least gap between skins, the segment is told by the planes that halve the bends of
+the finger, which the thumb's tip passes half a segment, a centimetre, from the middle of any key.
+
+Both are judged over the whole touch, from when the thumb is down until it has gone, each instant by how sure the
+thumb's tip is in it: a finger that it touches hides part of its cap, so that it is known worst while it is down, and
+best as it leaves. Fingers that are too alike in their gaps tell nothing, nor do gaps that are not known, nor a finger
+whose tip is seen while its bones may be anywhere, as those of a palm that one pair of cameras looks into.
 """
 
 from dataclasses import dataclass
@@ -24,20 +28,57 @@ KEYS = (("3", "2", "1"), ("6", "5", "4"), ("9", "8", "7"), ("hash", "0", "star")
 """Name of the key on each segment, from the knuckle on, of index ... little."""
 
 _PALMAR = -0.3  # cosine: a thumb that lies on the back of a segment touches no key
-_ALIKE = 0.7  # of the doubt of two tips: part of it is the palm's, and moves both
+_DOWN_M = 0.001  # a thumb whose gap is larger than the least by less is down
 _NEVER_NS = -(2**61)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Instant:
+    """The thumb at an instant of a touch.
+
+    Attributes:
+        gap_m: (4,) to index ... little.
+        sigma_m: Of the least of them.
+        place_sigma_m: Of the PIP of that finger, along its worst axis.
+        beyond_m: (4, 2) how far beyond the bends of PIP and DIP of each.
+        weight: 1 over the variance of the thumb's tip.
+        middle_m: (4, 3, 3) between the thumb's tip and the middle of each segment, rig frame.
+    """
+
+    gap_m: Float
+    sigma_m: float
+    place_sigma_m: float
+    beyond_m: Float
+    weight: float
+    middle_m: Float
+
+    @classmethod
+    def of(cls, seen: HandFeatures, touch: ThumbTouch) -> "_Instant":
+        """That of a hand."""
+        gap = touch.key_gap_m.min(axis=1)
+        chain = seen.joints_m[CHAINS[1:]]
+        bone = np.diff(chain, axis=1)
+        bone = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+        tip, finger = seen.tips_m[0], int(gap.argmin())
+        return cls(
+            gap_m=gap,
+            sigma_m=_sigma_m(touch, finger),
+            place_sigma_m=_worst_m(seen.joints_cov_m2[CHAINS[finger + 1, 1]]),
+            beyond_m=np.vecdot(tip - chain[:, 1:3], bone[:, :-1] + bone[:, 1:]) * 0.5,
+            weight=1.0 / max(float(seen.sigma_m[0]), 1e-4) ** 2,
+            middle_m=0.5 * (0.5 * (chain[:, :-1] + chain[:, 1:]) + tip),
+        )
 
 
 @dataclass(slots=True)
 class _Touch:
-    """A touch that goes on: what it was like when the thumb was nearest, and how the fingers were bent before."""
+    """A touch that goes on: since when, how the fingers were bent before, its least gap, and all its instants, of which
+    there are no more than `longest_s` has."""
 
     began_ns: int
-    gap_m: float
-    key: str
-    middle_m: Float
-    confidence: float
     bend_rad: float
+    least_m: float
+    instants: list[_Instant]
 
 
 class TapWatch:
@@ -56,78 +97,73 @@ class TapWatch:
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
         """What is to be told at the instant of the features; a touch begins only where it may."""
-        own = self._settings
-        gaps = touch.key_gap_m.min(axis=1)
-        finger = int(np.argmin(gaps))
-        gap = float(gaps[finger])
-        known = max(seen.sigma_m[0], seen.sigma_m[finger + 1]) <= own.sigma_most_m
+        own, now = self._settings, _Instant.of(seen, touch)
+        known = now.sigma_m <= own.sigma_most_m and now.place_sigma_m <= own.place_sigma_m
         if self._touch is not None:
-            return self._go_on(self._touch, seen, touch, finger, gap, known=bool(known))
+            return self._go_on(self._touch, seen, now, known=known)
         if not known:
             return []
+        finger = int(now.gap_m.argmin())
+        gap = float(now.gap_m[finger])
         if gap >= own.leave_gap_m:
             self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
-        if gap > own.touch_gap_m or not may_begin or not self._begins(seen, touch, finger, gaps):
-            return []
-        self._touch = self._as_it_is(seen.t_ns, seen, touch, finger, self._clear_rad)
+        if gap <= own.touch_gap_m and may_begin and self._begins(seen, touch, finger):
+            self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
         return []
 
     def drop(self) -> None:
         """Forget the touch: the hand is gone, or does something else."""
         self._touch, self._clear_ns = None, _NEVER_NS
 
-    def _go_on(
-        self, going: _Touch, seen: HandFeatures, touch: ThumbTouch, finger: int, gap: float, *, known: bool
-    ) -> list[Gesture]:
+    def _go_on(self, going: _Touch, seen: HandFeatures, now: _Instant, *, known: bool) -> list[Gesture]:
         """A touch goes on, ends as a tap, or was none."""
-        own = self._settings
+        own, gap = self._settings, float(now.gap_m.min())
         lasted = (seen.t_ns - going.began_ns) * 1e-9
         closes = abs(_bend_rad(seen) - going.bend_rad) > own.quiet_rad
-        closes = closes or gap < -own.pressed_m
-        if lasted > own.longest_s or closes or not is_pad(seen, own):
+        if lasted > own.longest_s or closes or (known and gap < -own.pressed_m) or not is_pad(seen, own):
             self.drop()
             return []
         if not known:
             return []
-        if gap < going.gap_m:
-            self._touch = self._as_it_is(going.began_ns, seen, touch, finger, going.bend_rad)
-            return []
-        if gap < min(own.leave_gap_m, max(going.gap_m + own.rise_m, own.touch_gap_m)):
+        going.instants.append(now)
+        going.least_m = min(going.least_m, gap)
+        if gap < min(own.leave_gap_m, max(going.least_m + own.rise_m, own.touch_gap_m)):
             return []
         self._touch, self._clear_ns, self._clear_rad = None, seen.t_ns, _bend_rad(seen)
-        if lasted < own.shortest_s:
+        if lasted < own.shortest_s or going.least_m > own.down_gap_m:
             return []
-        self._tapped_ns = seen.t_ns
-        tap = Lasting(seen.hand, "tap", going.key, going.began_ns)
-        return [tap.told("end", seen.t_ns, going.confidence, distance_m=going.gap_m, origin_m=going.middle_m)]
+        return self._tapped(going, seen)
 
-    def _begins(self, seen: HandFeatures, touch: ThumbTouch, finger: int, gaps: Float) -> bool:
+    def _begins(self, seen: HandFeatures, touch: ThumbTouch, finger: int) -> bool:
         own = self._settings
         if (seen.t_ns - self._tapped_ns) * 1e-9 < own.apart_s:
             return False
         if (seen.t_ns - self._clear_ns) * 1e-9 > own.approach_s:
             return False
-        if np.delete(gaps, finger).min() - gaps[finger] < own.nearer_m:
-            return False
         segment = int(np.argmin(touch.key_gap_m[finger]))
         return bool(touch.key_palmar[finger, segment] > _PALMAR and is_pad(seen, own))
 
-    def _as_it_is(
-        self, began_ns: int, seen: HandFeatures, touch: ThumbTouch, finger: int, bend_rad: float
-    ) -> _Touch:
-        segment = segment_of(seen, finger + 1)
-        gap = float(touch.key_gap_m[finger].min())
-        sigma = _ALIKE * float(np.hypot(seen.sigma_m[0], seen.sigma_m[finger + 1]))
-        chain = seen.joints_m[CHAINS[finger + 1]]
-        middle = 0.5 * (0.5 * (chain[segment] + chain[segment + 1]) + seen.tips_m[0])
-        return _Touch(
-            began_ns,
-            gap,
-            KEYS[finger][segment],
-            middle,
-            below(gap, self._settings.leave_gap_m, sigma),
-            bend_rad,
-        )
+    def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
+        """The tap of a touch that is over; nothing where two fingers may have been touched."""
+        least = [float(one.gap_m.min()) for one in gone.instants]
+        down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
+        course, nearest = gone.instants[down:], gone.instants[int(np.argmin(least))]
+        weight = np.array([one.weight for one in course])
+        weight = weight / weight.sum()
+        gap = weight @ np.array([one.gap_m for one in course])
+        finger = int(gap.argmin())
+        nearer_m = float(np.delete(gap, finger).min() - gap[finger])
+        if nearer_m < self._settings.nearer_m:
+            return []
+        beyond = np.tensordot(weight, np.array([one.beyond_m for one in course]), axes=1)[finger]
+        segment = 2 if beyond[1] > 0.0 else int(beyond[0] > 0.0)
+        sigma = nearest.sigma_m
+        sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
+        sure *= below(0.0, float(np.abs(beyond).min()), sigma)
+        self._tapped_ns = seen.t_ns
+        tap = Lasting(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
+        middle = nearest.middle_m[finger, segment]
+        return [tap.told("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
 
 
 def is_pad(seen: HandFeatures, settings: TapSettings) -> bool:
@@ -141,10 +177,10 @@ def _bend_rad(seen: HandFeatures) -> float:
     return float(seen.bend_rad[1:, :2].sum(axis=1).mean())
 
 
-def segment_of(seen: HandFeatures, finger: int) -> int:
-    """Which segment 0 ... 2, from the knuckle, of finger 1 ... 4 the thumb's tip is at."""
-    chain = seen.joints_m[CHAINS[finger]]
-    bone = np.diff(chain, axis=0)
-    bone = bone / np.linalg.norm(bone, axis=1, keepdims=True)
-    beyond = np.vecdot(seen.tips_m[0] - chain[1:3], bone[:-1] + bone[1:]) > 0.0
-    return 2 if beyond[1] else int(beyond[0])
+def _sigma_m(touch: ThumbTouch, finger: int) -> float:
+    """Of the gap (0 ... 3) to the finger, that of the segment that is nearest."""
+    return float(touch.key_sigma_m[finger, int(touch.key_gap_m[finger].argmin())])
+
+
+def _worst_m(cov_m2: Float) -> float:
+    return float(np.sqrt(max(np.linalg.eigvalsh(cov_m2)[2], 0.0)))
