@@ -122,7 +122,7 @@ class ContactWatch:
 
 
 def _away(distance: Float, sigma: Float) -> bool:
-    """Whether fingers (5,) surely hold nothing: none but the thumb touches, which alone holds nothing. NaN: not known."""
+    """Whether fingers (5,) surely hold nothing: all but the thumb, which alone holds nothing, are away. NaN: unknown."""
     return bool((np.nan_to_num(distance - _FREE * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
