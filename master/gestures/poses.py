@@ -174,7 +174,9 @@ class PoseRecogniser:
     def _beginning(self, features: HandFeatures, fit: Fit, speed: float) -> int | None:
         """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
         best, t_ns = fit.best(), features.t_ns
-        if best is None or fit.confidence[best] < self._hold.begin or not features.seen.any():
+        # Of both kinds of sensors none may see a tip just now and fingers be known all the same.
+        there = (features.seen | features.known).any()
+        if best is None or fit.confidence[best] < self._hold.begin or not there:
             self._coming = None
             return None
         if best != self._coming:

@@ -115,6 +115,13 @@ def test_hidden_fingers_do_not_stop_a_pose_but_an_unknown_hand_begins_none() -> 
     assert confidence == sorted(confidence, reverse=True)
 
 
+def test_a_pose_of_known_fingers_begins_where_no_sensor_sees_a_tip_just_now() -> None:
+    nothing = np.zeros(5, np.bool_)
+    for doubt, said in ((0.005, [POINT]), (0.2, [])):
+        begun = play([posture(POINT)] * 30, sigma_m=np.full(5, doubt), tracked=nothing)[1]
+        assert [one.name for one in begun if one.phase == "begin"] == said
+
+
 def test_pointing_is_told_with_the_three_bent_fingers_hidden() -> None:
     # What cameras see from behind a pointing hand: thumb and index.
     doubt = np.array([1e-3, 1e-3, 0.05, 0.05, 0.05])
