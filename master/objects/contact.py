@@ -122,7 +122,7 @@ class ContactWatch:
 
 
 def _away(distance: Float, sigma: Float) -> bool:
-    """Whether fingers (5,) surely hold nothing: all but the thumb, which alone holds nothing, are away. NaN: unknown."""
+    """Whether fingers (5,) surely hold nothing: all are away but the thumb, which alone holds nothing. NaN: open."""
     return bool((np.nan_to_num(distance - _FREE * sigma, nan=-np.inf)[1:] > FAR_M).all())
 
 
