@@ -85,7 +85,7 @@ class Program:
         self._get, self._set, self._play = PROGRAMS[name]
         for program in (self._get[0], self._play[0]):
             if shutil.which(program) is None:
-                raise PhalanxError(f"--output {name}: {program} is not installed; try {', '.join(PROGRAMS)}, print")
+                raise PhalanxError(f"{program} is not installed; --output has {', '.join(PROGRAMS)}, print")
         self.read()
 
     def read(self) -> int:
