@@ -5,9 +5,9 @@ finger is pinched, a knob is turned to and fro, another is turned farther than a
 keys are tapped, the index finger points. Between them the hand waves, opens, makes a fist and travels, and says
 nothing.
 
-What the cameras see of it changes as it does in use: in each round every act is shown another way (`_SHOWN_DEG`). Knobs
-and keys are seen from the palm's side, for they hide the tips of a hand that is seen from behind; pinches also from the
-side of the thumb; who points has the back of his hand up, the finger towards the cameras or past them.
+What the cameras see of it changes as it does in use: in each round every act is shown another way (`_SHOWN_DEG`).
+Knobs, keys and pinches are seen more or less from the palm's side, for they hide tips of a hand that is seen from
+behind; who points has the back of his hand up, the finger towards the cameras or past them.
 
 Skin meets skin: postures are found on the hand itself (`gesture_postures`). A hand that touches or grips stands still
 but for what it does, else it wanders as hands do. While a knob is turned the palm goes round its axis.
@@ -38,7 +38,7 @@ PERIOD_S = 75.0
 TURN_DEG = 14.0
 # Act -> two ways to show it: fingers towards the cameras, and rolled about them, 0: the palm to the cameras.
 _SHOWN_DEG = {
-    "pinches": ((15.0, 0.0), (25.0, 100.0)),
+    "pinches": ((15.0, 0.0), (35.0, -30.0)),
     "dial": ((15.0, 0.0), (35.0, 30.0)),
     "dial_again": ((15.0, 0.0), (25.0, -20.0)),
     "taps": ((15.0, 0.0), (30.0, 0.0)),
