@@ -31,11 +31,12 @@ def observe_live(
     """
     link = ZenohBus(None, bus, beyond=True)
     try:
-        poses = link.subscribe("hand", rig.hand, _DEPTH)
+        poses = link.subscribe("hand", depth=_DEPTH)
 
         def receive(timeout_s: float) -> HandPose | None:
             message = poses.get(timeout_s)
-            return message if isinstance(message, HandPose) else None
+            # A wrist device alone tells of hands without markers.
+            return message if isinstance(message, HandPose) and len(message.markers_raw_m) else None
 
         return lead(receive, rig, names, SystemClock(), say, longest_s)
     finally:
