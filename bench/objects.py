@@ -62,25 +62,20 @@ def _rows_of(title: str, found: list[Outcome]) -> Iterable[Row]:
         np.concatenate([getattr(one, key) for one in found]) for key in ("mm", "deg", "sigmas_2")
     )
     frames = sum(one.frames for one in found)
-    yield Row(
-        f"{title}: place, 95 % of frames",
-        float(np.percentile(mm, 95)),
-        "mm",
-        f"median {np.median(mm):.2f}; goal 3",
-    )
-    yield Row(
-        f"{title}: turn, 95 % of frames",
-        float(np.percentile(deg, 95)),
-        "deg",
-        f"median {np.median(deg):.2f}; goal 2",
-    )
+    for what, values, unit, goal in (("place", mm, "mm", 3), ("turn", deg, "deg", 2)):
+        if len(values):  # a stretch in which it is never tracked has no error
+            most, middle = np.percentile(values, [95, 50])
+            note = f"median {middle:.2f}; goal {goal}"
+            yield Row(f"{title}: {what}, 95 % of frames", float(most), unit, note)
     yield Row(
         f"{title}: tracked and within both",
         100.0 * float(((mm <= 3.0) & (deg <= 2.0)).sum()) / frames,
         "%",
         f"of {frames} frames",
     )
-    yield Row(f"{title}: error by foretold sigma", float(np.sqrt(np.median(sigmas))), "", "median; goal 1")
+    if len(sigmas):
+        middle = float(np.sqrt(np.median(sigmas)))
+        yield Row(f"{title}: error by foretold sigma", middle, "", "median; goal 1")
     for what, pairs in (
         ("hidden and flagged", [one.flagged for one in found]),
         ("not hidden and flagged", [one.clear for one in found]),
