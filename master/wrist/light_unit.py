@@ -34,7 +34,8 @@ class LightUnit:
 
         Args:
             relative: (5,) distances by light; NaN: none.
-            depth_m: (5, P) of the tips along the optical axis in each pose.
+            depth_m: (5, P) of the tips along the optical axis in each pose; a tip that is not before the camera is lit
+                in none of them.
             likely: (5, P) probabilities of the poses without light, summing to 1; NaN: of this finger nothing is known.
             weight: How much this triple is news: 1 for a pose that is not related to the last.
         """
@@ -42,11 +43,12 @@ class LightUnit:
         out = np.zeros(depth_m.shape)
         if not len(told):
             return out
-        ratio = np.log(relative[told, None] / depth_m[told])
+        before = depth_m[told] > 0.0
+        ratio = np.log(relative[told, None] / np.where(before, depth_m[told], 1.0))
         place = np.clip((ratio + _WIDEST) / _STEP, 0.0, len(self._log) - 1.0).round().astype(np.int64)
         # What each finger says of the factor: its poses' probabilities by the factor they need, blurred by the noise.
         said = np.stack(
-            [np.bincount(at, p, len(self._log)) for at, p in zip(place, likely[told], strict=True)]
+            [np.bincount(at, p, len(self._log)) for at, p in zip(place, likely[told] * before, strict=True)]
         )
         blurred = np.stack([np.convolve(one, _BLUR, "same") for one in said])
         news = _SHARED * np.log((1.0 - _FALSE) * blurred + _FALSE * _FLAT)
@@ -55,7 +57,7 @@ class LightUnit:
             # A finger is not a witness of itself.
             others = np.exp(now - news[k] - (now - news[k]).max())
             factor = np.convolve(others / others.sum(), _BLUR, "same")
-            out[f] = np.log((1.0 - _FALSE) * factor[place[k]] + _FALSE * _FLAT)
+            out[f] = np.log((1.0 - _FALSE) * np.where(before[k], factor[place[k]], 0.0) + _FALSE * _FLAT)
         self._belief = _KEPT**weight * (self._belief + weight * news.sum(axis=0))
         self._belief -= self._belief.max()
         return out
