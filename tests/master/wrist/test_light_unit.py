@@ -1,4 +1,4 @@
-"""The unit of LED light: learnt from sure fingers it decides between two poses; a tip behind the camera tells nothing."""
+"""The unit of LED light: learnt from sure fingers, it decides between poses; a tip behind the camera tells nothing."""
 
 import numpy as np
 
