@@ -21,9 +21,7 @@ from common.sim.travel import CARDS, ObjectTravel
 from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
-NAMES = (
-    f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
-)
+NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
 VIEWS = f"{NAMES} | board"
 _LEAP = "leap:"
 
