@@ -10,9 +10,9 @@ UNIT = 7.0
 
 def two_poses(near_m: float, far_m: float) -> tuple[Float, Float, Float]:
     """A hand whose index may be near or far, and whose other fingers are sure; the light is that of the near one."""
-    depth = np.tile([[0.10, 0.20]], (5, 1)) + 0.01 * np.arange(5)[:, None]
+    depth: Float = np.full((5, 2), (0.10, 0.20)) + 0.01 * np.arange(5.0)[:, None]
     depth[1] = near_m, far_m
-    likely = np.tile([[1.0, 0.0]], (5, 1))
+    likely: Float = np.full((5, 2), (1.0, 0.0))
     likely[1] = 0.5, 0.5
     return UNIT * depth[:, 0], depth, likely
 
