@@ -113,7 +113,7 @@ HELP = {
 }
 CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
 BEACON_PORT = 47800
-BOTH = "grasp | both-poses | both-curl | both-travel | both-moves"  # the same motion for both kinds of rig
+BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
 
 
 def parser() -> argparse.ArgumentParser:
@@ -326,7 +326,7 @@ def _simulated(add: Callable[..., argparse.Action]) -> None:
         "--scene",
         default="standard",
         metavar="NAME",
-        help=f"standard | lights | poses | hand-routine | object | gestures | leap:FILE.npz | {BOTH} | board; before a "
+        help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | board; before a "
         f"wrist device standard | curl | wearer | poses | spread | {BOTH}, each with @dark | @indoor | @bright | @sun, "
         "or board",
     )

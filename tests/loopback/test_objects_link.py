@@ -12,7 +12,7 @@ from common.clock import SkewedClock, SystemClock
 from common.datagram import Kind, Refusal, Sealer
 from common.messages import MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
 from common.session import RigKeys
-from master.ingest import QUEUE, Ingest
+from master.ingest import ROOM, Ingest
 from master.link import MasterLink
 from slave.link import SlaveLink
 from slave.uplink import Uplink
@@ -294,14 +294,18 @@ def test_both_come_over_real_sockets_and_are_counted(stack: ExitStack) -> None:
     assert ingest.lost == ingest.skipped == ingest.counts["left.tags_late"] == 0
 
 
-def test_a_slow_master_drops_poses_of_trackers_then_tags_and_frames_last(stack: ExitStack) -> None:
+def test_at_overload_each_kind_of_message_keeps_its_newest(stack: ExitStack) -> None:
     ingest = Ingest(
         ("left",), KEY, SystemClock(), ("127.255.255.255", 9), ("127.0.0.1", 0), "", trackers=("puck",)
     )
     stack.callback(ingest.close)
-    for seq in range(QUEUE):
+    count = ROOM["tracker"] + 5
+    for seq in range(count):
         for message in (detections("left", 1, seq), tags("left", 1, seq), tracker("puck", 1, seq)):
             ingest._put(message)
-    taken = [ingest.get(0.0) for _ in range(QUEUE)]
-    assert [one.seq for one in taken if isinstance(one, MarkerDetections)] == list(range(QUEUE))
-    assert ingest.counts["queue.dropped"] == 2 * QUEUE
+    taken = [ingest.get(0.0) for _ in range(sum(ROOM[kind] for kind in ("frame", "tags", "tracker")))]
+    for kind, room in ((MarkerDetections, "frame"), (TagDetections, "tags"), (TrackerPose, "tracker")):
+        newest = list(range(count - ROOM[room], count))
+        assert [one.seq for one in taken if isinstance(one, kind)] == newest, kind
+    assert ingest.get(0.0) is None
+    assert ingest.counts["queue.dropped"] == 3 * count - len(taken)
