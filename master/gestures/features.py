@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import quaternion_to_matrix, rigid
+from common.geometry import cross, quaternion_to_matrix, rigid
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, WRIST, HandModel
 from common.messages import HandPose
 
@@ -150,5 +150,5 @@ def _bends(chain: Float, rotation: Float, palm: Float) -> Float:
     out[0, 0] = np.arctan2(-first[0, 1], np.hypot(first[0, 0], first[0, 2]))
     before, after, hinge = bone[:, :-1], bone[:, 1:], rotation[:, 1:3, :, 0]
     # A flexion by a turns by -a about the joint's +x.
-    out[:, 1:] = np.arctan2(-np.vecdot(np.cross(before, after), hinge), np.vecdot(before, after))
+    out[:, 1:] = np.arctan2(-np.vecdot(cross(before, after), hinge), np.vecdot(before, after))
     return out

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float
+from common.geometry import cross
 from common.hand_model import CHAINS
 from common.skin_gaps import Gaps, RoundCones, gaps_between
 from master.gestures.features import HandFeatures
@@ -95,7 +96,7 @@ def _palmar(features: HandFeatures) -> Float:
     out = np.empty((5, 3, 3))
     pad = features.pads_m - (chain[:, 2] + _PAD_SHARE * (chain[:, 3] - chain[:, 2]))
     out[:, 2] = pad / np.linalg.norm(pad, axis=1, keepdims=True)
-    hinge = np.cross(bone[:, 2], out[:, 2])  # across the finger, the same for all its segments but for twist
-    across = np.cross(hinge[:, None], bone[:, :2])
+    hinge = cross(bone[:, 2], out[:, 2])  # across the finger, the same for all its segments but for twist
+    across = cross(hinge[:, None], bone[:, :2])
     out[:, :2] = across / np.linalg.norm(across, axis=-1, keepdims=True)
     return out

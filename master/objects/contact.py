@@ -22,6 +22,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import (
+    cross,
     invert,
     matrix_to_rotation_vector,
     quaternion_to_matrix,
@@ -151,7 +152,7 @@ def _gaps(pose: HandPose, surface: Surface, placed: _Placed) -> tuple[Nearest, F
     # Neighbouring joints err alike, so variances mix by shares and not by their squares.
     cov = (1.0 - along) * pose.cov_m2[start] + along * pose.cov_m2[stop]
     hand = np.einsum("ni,nij,nj->n", normal, cov, normal)
-    pull = np.concatenate([normal, np.cross(lever, normal)], axis=1)
+    pull = np.concatenate([normal, cross(lever, normal)], axis=1)
     own = np.einsum("ni,ij,nj->n", pull, placed.cov, pull)
     sigma = np.sqrt(hand + own + FLESH_M**2)
     nan = np.where(usable, 0.0, np.nan)
