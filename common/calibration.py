@@ -29,6 +29,7 @@ from common.errors import CalibrationError
 from common.gesture_settings import GestureSettings, check_gestures
 from common.messages import MAX_MARKERS, Name
 from common.object_profile import ObjectProfile, check_object, check_pose
+from common.output_settings import OutputSettings, check_outputs
 from common.replacing import replacing
 from common.strobe_calibration import StrobeCalibration, check_strobe
 from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, check_flat_field, check_wrist
@@ -36,6 +37,7 @@ from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, c
 Hsv = tuple[
     Annotated[int, Meta(ge=0, le=179)], Annotated[int, Meta(ge=0, le=255)], Annotated[int, Meta(ge=0, le=255)]
 ]
+RoiMargin = Annotated[float, Meta(ge=0.01, le=0.5)]
 LinearLight = Annotated[float, Meta(gt=0.0, le=1.0)]
 Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
 
@@ -66,7 +68,11 @@ class HsvRange(Part, frozen=True):
 
 
 class CameraCalibration(Part, frozen=True):
-    """cameras/<name>.json: mode, exposure, optics and marker colours of one camera."""
+    """cameras/<name>.json: mode, exposure, optics and marker colours of one camera.
+
+    `roi_margin`: how far from where it is expected a marker is still taken for itself, as a share of the image width
+    beside its own size.
+    """
 
     version: Literal[1]
     name: Name
@@ -80,6 +86,7 @@ class CameraCalibration(Part, frozen=True):
     focus_m: Positive | None = None  # of a lens with a motor; the intrinsics are those of this distance
     intrinsics: Intrinsics | None = None
     markers: dict[Name, HsvRange] | None = None
+    roi_margin: RoiMargin = 0.0625
     provenance: dict[str, Provenance] = {}
 
 
@@ -326,6 +333,8 @@ def check(value: Struct, where: str) -> None:
         check_object(value, where)
     elif isinstance(value, GestureSettings):
         check_gestures(value, where)
+    elif isinstance(value, OutputSettings):
+        check_outputs(value, where)
     elif isinstance(value, CameraCalibration):
         for name, colour in (value.markers or {}).items():
             for i, letter in ((1, "S"), (2, "V")):

@@ -1,5 +1,6 @@
 """What the types of calibration files are made of: their base, and numbers with their bounds."""
 
+from datetime import UTC, datetime
 from typing import Annotated
 
 from msgspec import Meta, Struct
@@ -28,3 +29,8 @@ class Provenance(Part, frozen=True):
     data: tuple[str, ...]
     residual: dict[str, Number]
     note: str = ""
+
+
+def date_now() -> str:
+    """This moment, as `Provenance.date` has it."""
+    return datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

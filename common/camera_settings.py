@@ -1,37 +1,84 @@
-"""Settings that a camera can change while it runs: what the command "set" says, and by which names a slave answers.
+"""Settings that a camera can change while it runs: what the commands "set" and "pick" say, and what a slave answers.
 
 A slave answers every command about its camera with a `Health` whose gauges say what the camera has now, read back, by
-the names of `figures`, and, with the prefix `WANTED`, what the camera file in use says.
+the names of `figures`, and, with the prefix `WANTED`, what the camera file in use says; beside them the colour ranges
+in use, by `range_figures`.
 """
 
-import msgspec
-from msgspec import Struct
+from collections.abc import Iterable
+from typing import Annotated
 
-from common.calibration import CameraCalibration, Positive
+import msgspec
+from msgspec import Meta, Struct
+
+from common.calibration import CameraCalibration, HsvRange, Positive, RoiMargin, check
+from common.errors import CalibrationError
+from common.messages import Name
 
 WANTED = "wanted."
+ROI_LEAST, ROI_MOST = 0.01, 0.5  # of `roi_margin`
+Pixel = Annotated[float, Meta(ge=-0.5, le=16384.0)]
+_OF_CAMERA = ("exposure_us", "analogue_gain", "colour_gains", "frame_rate_hz", "row_time_us")
 
 
 class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
-    """The body of the command "set": keys and units of the camera file; what is absent stays as it is."""
+    """The body of the command "set": keys and units of the camera file; what is absent stays as it is.
+
+    Of `markers` those that are named are replaced; null forgets a colour. A range without `reference_bgr_linear` keeps
+    the one that the marker has.
+    """
 
     exposure_us: Positive | None = None
     analogue_gain: Positive | None = None
     colour_gains: tuple[Positive, Positive] | None = None
-
-    @classmethod
-    def of(cls, camera: CameraCalibration) -> "CameraSettings":
-        """Those of a camera file."""
-        return cls(
-            exposure_us=camera.exposure_us,
-            analogue_gain=camera.analogue_gain,
-            colour_gains=camera.colour_gains,
-        )
+    frame_rate_hz: Positive | None = None
+    roi_margin: RoiMargin | None = None
+    markers: dict[Name, HsvRange | None] | None = None
 
     def over(self, camera: CameraCalibration) -> CameraCalibration:
-        """The camera file with these settings in place of its own."""
+        """The camera file with these settings in place of its own.
+
+        Raises:
+            CalibrationError: A range contradicts itself.
+        """
         given = {name: value for name, value in msgspec.structs.asdict(self).items() if value is not None}
-        return msgspec.structs.replace(camera, **given)
+        if self.markers is not None:
+            given["markers"] = self._ranges(camera.markers or {}) or None
+        new = msgspec.structs.replace(camera, **given)
+        check(new, "set")
+        return new
+
+    def _ranges(self, ranges: dict[str, HsvRange]) -> dict[str, HsvRange]:
+        merged = dict(ranges)
+        for name, colour in (self.markers or {}).items():
+            if colour is None:
+                merged.pop(name, None)
+                continue
+            before = ranges.get(name)
+            if colour.reference_bgr_linear is None and before is not None:
+                colour = msgspec.structs.replace(colour, reference_bgr_linear=before.reference_bgr_linear)
+            merged[name] = colour
+        return merged
+
+
+class ColourPick(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """The body of the command "pick": the marker, and a pixel on its paint.
+
+    Attributes:
+        marker: A marker of the rig.
+        uv: Pixel [px] of the whole frame.
+        t_ns: Time of the preview that was clicked on [ns], as it says; the frame is kept for a second. Without it, or
+            later, the newest frame is taken, in which a moving hand is elsewhere.
+    """
+
+    marker: Name
+    uv: tuple[Pixel, Pixel]
+    t_ns: int | None = None
+
+
+def same_exposed(a: CameraCalibration, b: CameraCalibration) -> bool:
+    """Whether two camera files ask the same of the camera itself."""
+    return all(getattr(a, key) == getattr(b, key) for key in _OF_CAMERA)
 
 
 def figures(camera: CameraCalibration) -> dict[str, float]:
@@ -44,3 +91,24 @@ def figures(camera: CameraCalibration) -> dict[str, float]:
         "blue_gain": blue,
         "frame_rate_hz": camera.frame_rate_hz,
     }
+
+
+def range_figures(camera: CameraCalibration, markers: Iterable[str]) -> dict[str, float]:
+    """`roi_margin`, and `marker.NAME.h_low` ... `.v_high` of those of the markers that have a colour."""
+    found = {"roi_margin": camera.roi_margin}
+    for name in markers:
+        if (colour := (camera.markers or {}).get(name)) is not None:
+            for end, values in (("low", colour.hsv_low), ("high", colour.hsv_high)):
+                found |= {f"marker.{name}.{h}_{end}": float(v) for h, v in zip("hsv", values, strict=True)}
+    return found
+
+
+def refuse_strange(markers: Iterable[str], known: Iterable[str], where: str) -> None:
+    """Refuse markers that the rig has not.
+
+    Raises:
+        CalibrationError: With `where`, their names and those that there are.
+    """
+    there = tuple(known)
+    if strange := [name for name in markers if name not in there]:
+        raise CalibrationError(f"{where}: the rig has no {', '.join(strange)}; it has {', '.join(there)}")

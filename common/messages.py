@@ -20,7 +20,7 @@ from msgspec import Meta, Struct, field
 from common.arrays import Bool, Code, Float, Ids
 from common.errors import MessageError
 
-WIRE_VERSION = 8
+WIRE_VERSION = 9
 MAX_MARKERS = 48
 MAX_TAGS = 16  # in one frame: their corners fit one Ethernet packet
 JOINT_COUNT = 26
@@ -28,6 +28,7 @@ FINGER_COUNT = 5
 MAX_PREVIEW_BYTES = 256 * 1024
 MAX_STILL_BYTES = 900 * 1024
 MAX_BODY_CHARACTERS = 64 * 1024
+MAX_CHECKS = 64
 
 # The look-ahead: in Python `$` also matches before a final line feed, and names become keys and file names.
 Name = Annotated[str, Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.-]+(?!\n)$")]
@@ -66,6 +67,24 @@ class ObjectSource(IntEnum):
 
 GestureKind = Literal["pose", "pinch", "dial", "tap", "point"]
 Phase = Literal["begin", "update", "end"]
+CheckCode = Literal[
+    "camera_absent",
+    "auto_mode",
+    "exposure_drift",
+    "colour_collision",
+    "marker_unseen",
+    "background_in_range",
+    "calibration_absent",
+    "calibration_stale",
+    "camera_moved",
+    "clock_unsynchronised",
+    "packet_loss",
+    "rate_low",
+    "too_hot",
+    "disk_full",
+    "strobe_slipped",
+    "imu_silent",
+]
 
 
 class Message(Struct, frozen=True, eq=False, forbid_unknown_fields=True, tag_field="type"):
@@ -497,6 +516,38 @@ class Health(Message, frozen=True, eq=False, tag=True):
     gauges: Annotated[dict[Name, Finite], Meta(max_length=512)]
 
 
+class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):
+    """One thing that is not as it should be.
+
+    Attributes:
+        code: Which kind; programs go by it.
+        subject: Whose: a camera, an IMU, a camera and its marker (`left.index`), a process.
+        sentence: What is wrong, for a person.
+        fix: What to do.
+    """
+
+    code: CheckCode
+    subject: Name
+    sentence: Annotated[str, Meta(min_length=1, max_length=500)]
+    fix: Annotated[str, Meta(min_length=1, max_length=500)]
+
+
+class Checklist(Message, frozen=True, eq=False, tag=True):
+    """All that is not as it should be at one instant; empty: all is well.
+
+    Attributes:
+        source: Process name: "master".
+        session: Random id of the process.
+        t_ns: Moment of the report [ns], clock of the source.
+        items: Each code and subject once, in the order of `CheckCode`, then of subjects.
+    """
+
+    source: Name
+    session: Count
+    t_ns: TimeNs
+    items: Annotated[tuple[CheckItem, ...], Meta(max_length=MAX_CHECKS)]
+
+
 class Command(Message, frozen=True, eq=False, tag=True):
     """An order to one process, answered by a `Health` of that process.
 
@@ -562,6 +613,7 @@ AnyMessage: TypeAlias = (
     | Contact
     | Gesture
     | Health
+    | Checklist
     | Command
     | Preview
     | Still
@@ -587,6 +639,7 @@ _DECODER = msgspec.msgpack.Decoder(
     | Contact
     | Gesture
     | Health
+    | Checklist
     | Command
     | Preview
     | Still,

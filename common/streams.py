@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from common.messages import (
+    Checklist,
     Command,
     Contact,
     Gesture,
@@ -57,6 +58,9 @@ STREAMS = {
     "contact": Stream(Contact, Path.ZENOH, "phalanx/contact/{name}", True),
     "gesture": Stream(Gesture, Path.ZENOH, "phalanx/gesture/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
+    "checklist": Stream(Checklist, Path.ZENOH, "phalanx/checklist/{name}", True),
+    # What came as datagrams, in the order and with the times in which the master solves it, while somebody records.
+    "taken": Stream(Message, Path.ZENOH, "phalanx/taken/{name}", False),
     "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
     "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False),
     "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", False),

@@ -1,4 +1,4 @@
-"""docs/schema holds the JSON schema of every file a user may write, exported from the types: `make schema`."""
+"""docs/schema holds the JSON schema of every file a user may write, and of the bus, from the types: `make schema`."""
 
 from pathlib import Path
 
@@ -8,43 +8,66 @@ import pytest
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, schema
 from common.frame_recording import Manifest
 from common.gesture_settings import GestureSettings
+from common.message_schema import bus_schema
+from common.messages import HandPose, Message
 from common.object_profile import ObjectProfile
+from common.output_settings import OutputSettings
 
+MESSAGES = "messages.json"
 FOLDER = Path(__file__).resolve().parents[1] / "docs" / "schema"
 KINDS: dict[str, type[msgspec.Struct]] = {
     "camera.json": CameraCalibration,
     "gestures.json": GestureSettings,
     "hand.json": HandProfile,
     "object.json": ObjectProfile,
+    "outputs.json": OutputSettings,
     "recording.json": Manifest,
     "rig.json": RigCalibration,
 }
 
 
-def text_of(kind: type[msgspec.Struct]) -> str:
+ALL = (*KINDS, MESSAGES)
+
+
+def text_of(name: str) -> str:
     """What the file must say, to the last byte."""
-    return schema(kind).decode() + "\n"
+    return (bus_schema() if name == MESSAGES else schema(KINDS[name])).decode() + "\n"
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ALL)
 def test_the_schema_equals_the_type(name: str) -> None:
     path = FOLDER / name
     assert path.is_file(), f"{path} is missing: run `make schema`"
-    assert path.read_text() == text_of(KINDS[name]), f"{path} is out of date: run `make schema`"
+    assert path.read_text() == text_of(name), f"{path} is out of date: run `make schema`"
 
 
 def test_no_schema_is_left_over() -> None:
-    assert {path.name for path in FOLDER.iterdir()} == set(KINDS)
+    assert {path.name for path in FOLDER.iterdir()} == set(ALL)
 
 
-@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("name", ALL)
 def test_the_schema_refuses_unknown_keys_too(name: str) -> None:
-    definitions = msgspec.json.decode(text_of(KINDS[name]), type=dict[str, object])["$defs"]
+    definitions = msgspec.json.decode(text_of(name), type=dict[str, object])["$defs"]
     for kind, definition in msgspec.convert(definitions, dict[str, dict[str, object]]).items():
         assert definition.get("additionalProperties") is False, kind
 
 
+def test_the_schema_of_the_bus_says_of_every_field_how_it_travels() -> None:
+    definitions = msgspec.json.decode(bus_schema(), type=dict[str, object])["$defs"]
+    parts = msgspec.convert(definitions, dict[str, dict[str, object]])
+    assert {kind.__name__ for kind in Message.__subclasses__()} <= set(parts)
+    fields = msgspec.convert(parts["HandPose"]["properties"], dict[str, dict[str, object]])
+    assert set(fields) == {"type", *(field.encode_name for field in msgspec.structs.fields(HandPose))}
+    assert all(fields.values())
+    assert [fields[name].get("x-dtype") for name in ("position_m", "source", "valid", "t_ns")] == [
+        "<f8",
+        "u1",
+        "?",
+        None,
+    ]
+
+
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
-    for file, kind in KINDS.items():
-        (FOLDER / file).write_text(text_of(kind))
+    for file in ALL:
+        (FOLDER / file).write_text(text_of(file))

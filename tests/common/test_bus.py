@@ -123,7 +123,9 @@ def test_the_living_are_listed_until_they_leave(pair: Pair) -> None:
 
 
 def test_what_does_not_belong_on_the_bus_is_refused(pair: Pair) -> None:
-    with pytest.raises(ValueError, match="streams on it: command, contact, device, gesture, hand, health"):
+    with pytest.raises(
+        ValueError, match="streams on it: checklist, command, contact, device, gesture, hand, health"
+    ):
         pair.master.subscribe("markers")
     with pytest.raises(ValueError, match="streams on it"):
         pair.master.publish("nonsense", "left", health("left"))

@@ -1,0 +1,87 @@
+"""How the computer is that a process runs on: temperature, throttling, room on its disk. Linux; what is not there is
+not told.
+
+A Raspberry Pi says by its firmware that it throttles, its clock is capped, or its supply is too weak. Other computers
+say by the trip points of their thermal zones how warm is too warm.
+
+Everything is read below a root, / unless the variable `PHALANX_SYSTEM_ROOT` says otherwise: there a rehearsal or a test
+lays its own files, with the room of the disk in `disk_free_mb`.
+"""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+
+ROOT = "PHALANX_SYSTEM_ROOT"
+HOT_C = 80.0  # from here on a Raspberry Pi lowers its clock (its documentation, "Frequency management")
+BELOW_TRIP_C = 5.0
+LEAST_TRIP_C = 50.0  # a lower one switches a fan, or is a dummy of the firmware
+_ZONES = "sys/class/thermal"
+_THROTTLED = "sys/devices/platform/soc/soc:firmware/get_throttled"
+_TRIPS = ("passive", "hot", "critical")
+_NOW = 0xF  # bits of what holds now; those above are of what has been since the start
+
+
+class Machine:
+    """Reads the gauges of the computer. Holds where they are."""
+
+    def __init__(self, folder: Path, environment: Mapping[str, str] = os.environ) -> None:
+        """Of this computer, and the disk that `folder` is on."""
+        self._root = Path(environment.get(ROOT, "/"))
+        self._folder = folder
+        self._rehearsed = ROOT in environment
+
+    def gauges(self) -> dict[str, float]:
+        """temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb."""
+        found: dict[str, float] = {}
+        zones = [
+            zone for path in sorted((self._root / _ZONES).glob("thermal_zone*")) if (zone := _zone(path))
+        ]
+        if zones:
+            now, limit = max(zones, key=lambda zone: zone[0] - zone[1])
+            found |= {"temperature_c": round(now, 1), "temperature_limit_c": limit}
+        if (flags := _text(self._root / _THROTTLED)) is not None:
+            with contextlib.suppress(ValueError):  # of another firmware: nothing is known
+                found["throttled"] = float(int(flags, 16) & _NOW)
+        if (free := self.disk_free_mb()) is not None:
+            found["disk_free_mb"] = round(free, 1)
+        return found
+
+    def disk_free_mb(self) -> float | None:
+        """Room on the disk [MB]; None: not known."""
+        if self._rehearsed and (text := _text(self._root / "disk_free_mb")) is not None:
+            with contextlib.suppress(ValueError):  # it is being written
+                return float(text)
+        try:
+            return shutil.disk_usage(self._folder).free * 1e-6
+        except OSError:
+            return None
+
+
+def _zone(path: Path) -> tuple[float, float] | None:
+    """Temperature of a thermal zone and the one that it should stay below [degrees C]; None where it has no limit."""
+    kind, milli = _text(path / "type"), _text(path / "temp")
+    if kind is None or milli is None:
+        return None
+    try:
+        now = int(milli) * 1e-3
+        trips = [
+            int(text) * 1e-3
+            for trip in path.glob("trip_point_*_type")
+            if _text(trip) in _TRIPS and (text := _text(trip.with_name(trip.name[:-4] + "temp"))) is not None
+        ]
+    except ValueError:
+        return None
+    if kind == "cpu-thermal":  # of a Raspberry Pi; its only trip point is far above what its firmware allows
+        return now, HOT_C
+    trips = [trip for trip in trips if trip >= LEAST_TRIP_C]
+    return (now, min(trips) - BELOW_TRIP_C) if trips else None
+
+
+def _text(path: Path) -> str | None:
+    try:
+        return path.read_text().strip()
+    except (OSError, UnicodeDecodeError):
+        return None

@@ -1,0 +1,59 @@
+"""What the command "raw" asks of a camera's slave: the body that a recorder writes and a slave reads."""
+
+import re
+from typing import Annotated
+
+import msgspec
+from msgspec import Meta, Struct
+
+from common.calibration import parse
+from common.errors import CalibrationError
+from common.messages import Name
+
+_LONGEST = 64  # of a `Name`
+_PLAIN = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_.-]*")
+
+
+class RawWish(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, omit_defaults=True):
+    """The body.
+
+    Attributes:
+        name: Of the recording, a new folder in the slave's own folder for raw frames.
+        lease_s: It ends by itself unless it is asked for again within so many s; 0: it goes on until "raw_stop".
+    """
+
+    name: Name
+    lease_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
+
+    @classmethod
+    def of(cls, body: str) -> "RawWish":
+        """Read a body.
+
+        Raises:
+            CalibrationError: It is none, or the name is not that of a folder; the text names the key.
+        """
+        wish = parse(body.encode(), cls, "raw")
+        refuse_strange(wish.name, "raw: name")
+        return wish
+
+    def body(self) -> str:
+        """The body that says this."""
+        return msgspec.json.encode(self).decode()
+
+
+def raw_name(stem: str, camera: str, number: int = 1) -> str:
+    """The raw frames of a camera beside a recording of messages STEM.mcap: STEM-CAMERA, then STEM-CAMERA-2."""
+    return f"{stem}-{camera}" if number == 1 else f"{stem}-{camera}-{number}"
+
+
+def refuse_strange(name: str, where: str) -> None:
+    """A name is that of one folder: nothing leads out of it, and none is hidden.
+
+    Raises:
+        CalibrationError: It is another; the text begins with `where`.
+    """
+    if not _PLAIN.fullmatch(name) or len(name) > _LONGEST:
+        raise CalibrationError(
+            f"{where}: {name!r}: must be letters, digits, _ . -, not begin with a dot, and have at most {_LONGEST} "
+            "characters"
+        )
