@@ -17,7 +17,7 @@ import cv2
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import Clock, SkewedClock, SystemClock
-from common.errors import CalibrationError, CameraError, LightsError, PhalanxError
+from common.errors import CalibrationError, CameraError, LightsError, PhalanxError, RecordingError
 from common.object_profile import ObjectProfile
 from slave.arguments import CAMERAS, parser
 from slave.cameras import real
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from slave.imu.recording import ImuRecorder
     from slave.imu.source import ImuSource
     from slave.objects.source import TrackerSource
+    from slave.raw import RawSettings
 
 PROGRESS_EVERY = 500  # frames
 
@@ -67,6 +68,7 @@ def _run(options: argparse.Namespace) -> int:
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
     key = rig_key(os.environ, options.key_file)
+    raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if rig.kind == "wrist" else marker_engine).engine_named(options.engine)
     source = _lit_source(options, rig, camera, clock, true_clock, stop)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
@@ -74,8 +76,28 @@ def _run(options: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
-    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say)
+    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say, raw)
     return 0
+
+
+def _raw_settings(options: argparse.Namespace, true_clock: Clock) -> "RawSettings | None":
+    """Where raw frames go, if they are kept; the folder is there from here on."""
+    from slave.raw import RawSettings
+
+    folder: Path | None = options.raw_folder
+    if folder is None:
+        return None
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RecordingError(f"--raw-folder {folder}: cannot make it: {error.strerror}") from error
+    return RawSettings(folder, round(options.raw_reserve_mb * 1e6), _skewed(options, true_clock))
+
+
+def _skewed(options: argparse.Namespace, true_clock: Clock) -> str:
+    """How the slave's clock differs from the machine's, for whoever compares two recordings; empty: not at all."""
+    skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
+    return skewed + (f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else "")
 
 
 def _imu(options: argparse.Namespace) -> int:
@@ -101,7 +123,7 @@ def _imu(options: argparse.Namespace) -> int:
     with _stop_by_signal() as stop:
         if options.imu == "synthetic":
             epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
-            imu = imu_of(options.imu, options.calibration, rig, options.scene, options.seed)
+            imu = imu_of(options.imu, *_world(options, rig), options.scene, options.seed)
             source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
         else:
             source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop)
@@ -131,7 +153,7 @@ def _tracker(options: argparse.Namespace) -> int:
             from slave.simulated import tracker_of
 
             epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
-            tracker = tracker_of(options.calibration, rig, options.scene, options.seed, profile)
+            tracker = tracker_of(*_world(options, rig), options.scene, options.seed, profile)
             source: TrackerSource = SyntheticTracker(options.name, tracker, epoch_ns, clock, stop)
         else:
             source = open_real(options.name, options.device, options.serial, options.program, clock, stop)
@@ -154,6 +176,13 @@ def _calibration(options: argparse.Namespace) -> tuple[RigCalibration, CameraCal
             f"rig {rig.name!r} has no camera {options.name!r}; it has {', '.join(rig.cameras)}"
         )
     return rig, load(camera_path, CameraCalibration)
+
+
+def _world(options: argparse.Namespace, rig: RigCalibration) -> tuple[Path, RigCalibration]:
+    """Folder and rig of the files that say how the simulated world is."""
+    from slave.simulated import world_of
+
+    return world_of(options.calibration, rig, options.truth, options.truth_rig)
 
 
 def _objects(options: argparse.Namespace, rig: RigCalibration) -> dict[str, ObjectProfile]:
@@ -220,14 +249,19 @@ def _source(
         from slave.cameras.synthetic import SyntheticCamera
         from slave.simulated import FrameClock, scene_of
 
-        scene = scene_of(options.calibration, rig, options.scene, options.seed)
+        scene = scene_of(*_world(options, rig), options.scene, options.seed)
         epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
         late_ns = round(options.start_offset_ms * 1e6)
         waits = isinstance(true_clock, FrameClock)
         sleep = true_clock.sleep if isinstance(true_clock, FrameClock) else time.sleep
-        return SyntheticCamera(
-            scene, camera.name, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
+        drawn = SyntheticCamera(
+            scene, camera, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
         )
+        if getattr(options, "faults", None) is None:
+            return drawn
+        from slave.cameras.faulty import FaultyCamera
+
+        return FaultyCamera(drawn, camera, options.faults)
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 
@@ -271,9 +305,7 @@ def _record(options: argparse.Namespace) -> int:
             raise CameraError(f"--every-frame: only a synthetic camera can wait, not {options.camera}")
         true_clock = FrameClock(options.scene_epoch_ns)
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
-    skewed = " as frames are drawn" if options.every_frame else ""
-    skewed += f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
-    skewed += f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else ""
+    skewed = (" as frames are drawn" if options.every_frame else "") + _skewed(options, true_clock)
     manifest = Manifest(
         version=1,
         kind=rig.kind,
@@ -284,8 +316,9 @@ def _record(options: argparse.Namespace) -> int:
         objects=_objects(options, rig),
     )
     refuse_occupied(options.output)  # before a camera is opened
-    scene = (options.calibration, rig, options.scene, options.seed)
-    imu = imu_of(str(options.camera), *scene) if options.imu == "synthetic" else None
+    imu = None
+    if options.imu == "synthetic":
+        imu = imu_of(str(options.camera), *_world(options, rig), options.scene, options.seed)
     display = ProgressDisplay(options.name, sys.stderr)
     with _imu_beside(options, rig, clock) as beside:
         source = _lit_source(options, rig, camera, clock, true_clock)

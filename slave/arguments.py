@@ -24,6 +24,8 @@ HELP = {
         waits for the master's start, then sends one sealed datagram per frame
   phalanx-slave run --name left --rig desk --camera synthetic --bind 127.0.0.1 --key-file rig.key
         without hardware: renders the standard scene in real time
+  phalanx-slave run --name left --rig desk --camera synthetic --calibration new --truth calib_json --key-file rig.key
+        a simulated camera that knows neither lens nor place nor colours yet, to practise setting it up
   phalanx-slave run --name wrist --rig wrist --camera synthetic --bind 127.0.0.1 --key-file rig.key
         the camera of a wrist device, docs/wrist.md
   phalanx-slave run --name wrist --rig wrist --camera synthetic --scene grasp --scene-epoch-ns N --key-file rig.key
@@ -32,6 +34,8 @@ HELP = {
         before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
         with a USB camera; docs/cameras.md says which settings are fixed and checked
+  phalanx-slave run --name left --rig desk --camera picamera2 --raw-folder recordings --key-file rig.key
+        keeps raw frames while it tracks whenever `phalanx-master record FILE --raw` asks; docs/recording.md
 """,
     ),
     "imu": (
@@ -151,6 +155,12 @@ def _run(run: argparse.ArgumentParser) -> None:
     _camera(run)
     _link(run)
     run.add_argument(
+        "--faults",
+        type=Path,
+        metavar="FILE",
+        help="of a synthetic camera: what is wrong with it, JSON, read again whenever it changes (docs/checklist.md)",
+    )
+    run.add_argument(
         "--colours",
         choices=("follow", "fixed", "none"),
         default="follow",
@@ -163,6 +173,20 @@ def _run(run: argparse.ArgumentParser) -> None:
         default="numpy",
         help="what detects markers, or fingers before a wrist device: numba is several times faster, needs the extra "
         "`fast` (default: %(default)s)",
+    )
+    run.add_argument(
+        "--raw-folder",
+        type=Path,
+        metavar="DIR",
+        help="keep raw frames there, lossless, while it tracks, when `phalanx-master record FILE --raw` asks for them: "
+        "a new folder each time (docs/recording.md)",
+    )
+    run.add_argument(
+        "--raw-reserve-mb",
+        type=_megabytes,
+        default=200.0,
+        metavar="MB",
+        help="stay free on its disk (default: %(default)g)",
     )
 
 
@@ -331,6 +355,14 @@ def _simulated(add: Callable[..., argparse.Action]) -> None:
         "or board",
     )
     add("--seed", type=int, default=7)
+    add(
+        "--truth",
+        type=Path,
+        metavar="DIR",
+        help="calib_json tree that says how the simulated world is: lenses, places, paints, hand; this slave goes on "
+        "believing --calibration, where they may be unknown (default: it believes the truth)",
+    )
+    add("--truth-rig", metavar="NAME", help="the rig in it, a file in DIR/rigs (default: of the same name)")
     add("--scene-epoch-ns", type=int, metavar="N", help="CLOCK_MONOTONIC at scene time 0; default: now")
     add("--clock-offset-ms", type=_number, default=0.0, metavar="X", help="this machine's clock is ahead")
     add("--clock-ppm", type=_number, default=0.0, metavar="Y", help="and gains on the true one")

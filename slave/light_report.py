@@ -11,12 +11,18 @@ from slave.cameras.source import Frame
 from slave.markers.colour_watch import ColourWarning
 
 LOG_EVERY_NS = 10_000_000_000  # the same subject is logged no more often
+NAME = 64  # characters of a name in `Health`
 ALL = "light"  # the subject of what concerns every marker
 _LOG = logging.getLogger(__name__)
 
 
 class Following(Protocol):
-    """What is reported on: a `FollowingDetector`."""
+    """What is reported on: a `ChangingDetector`."""
+
+    @property
+    def follows(self) -> bool:
+        """Whether the light is followed at present."""
+        ...
 
     @property
     def warnings(self) -> list[ColourWarning]:
@@ -96,7 +102,17 @@ class LightReport:
         return {**self._others.counts(), **warned, **own}
 
     def gauges(self) -> dict[str, float]:
-        """Those of the others, and the light against calibration: red and blue relative to green, and green."""
+        """Those of the others, and, while the light is followed, what it is against calibration.
+
+        That is red and blue relative to green, and green. Of markers that look alike
+        twins.<one>..<other>, the hues between them.
+        """
+        if not self._detector.follows:
+            return dict(self._others.gauges())
         blue, green, red = np.exp(self._detector.log_gains).tolist()
         light = {"light_red": red / green, "light_blue": blue / green, "light_exposure": green}
-        return {**self._others.gauges(), **light}
+        return {**self._others.gauges(), **light, **_twins(self._detector.warnings)}
+
+
+def _twins(warnings: list[ColourWarning]) -> dict[str, float]:
+    return {f"twins.{one.marker}..{one.twin}"[:NAME]: one.hues for one in warnings if one.twin is not None}

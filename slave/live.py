@@ -3,7 +3,7 @@
 import gc
 import logging
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal
@@ -13,14 +13,19 @@ from common.clock import Clock
 from common.hand_model import FINGERS
 from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
-from slave.cameras.source import Frame, FrameSource
+from slave.cameras.source import FrameSource
 from slave.light_report import LightReport
+from slave.markers.beside import told_frames, told_places
 from slave.markers.blind import BlindDetector
 from slave.markers.changing import Changeable, ChangingDetector, marker_changes
 from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
-from slave.markers.following import detector_for
+from slave.markers.following import can_follow, detector_for
+from slave.markers.known import KnownDetector
+from slave.overlay import MarkerOverlay, WristOverlay
+from slave.picker import LivePicker
 from slave.preview import Previews
+from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
 from slave.tags.live import LiveTags, finder_of
 from slave.tally import Tally
@@ -36,6 +41,10 @@ NO_REFERENCE = (
     "{}: markers: no reference_bgr_linear, so the colours do not follow the light; calibrate again with "
     "`phalanx-slave colours`, or say --colours fixed"
 )
+NO_COLOUR = (
+    "{}: markers: no colour for {} yet, which cannot be seen: pick them in the console, or calibrate them with "
+    "`phalanx-slave colours`"
+)
 _LOG = logging.getLogger(__name__)
 
 
@@ -49,6 +58,7 @@ def run_live(
     engine: Engine | WristEngine,
     stop: threading.Event,
     say: Callable[[str], None],
+    raw_frames: RawSettings | None = None,
 ) -> None:
     """Wait for the master, then detect and send until `stop` is set or the source ends; closes source and uplink.
 
@@ -62,18 +72,22 @@ def run_live(
         engine: What scans and measures for markers, or what does the inner loops before a wrist device.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
+        raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
 
     Raises:
-        CalibrationError: A marker has no colour, or something of a wrist device is not calibrated.
+        CalibrationError: Something of a wrist device is not calibrated.
         CameraError: The camera is gone.
     """
-    previews = Previews(name, clock)
     workers = ThreadPoolExecutor(1, thread_name_prefix=f"{name} colours")
+    raw = RawFrames(name, raw_frames, lambda: tuning.files, clock, lambda: uplink.started)
+    read = raw.reading(source)
     if isinstance(engine, WristEngine):
-        line = _wrist_line(name, files, source, uplink, colours, engine, stop, previews.offer)
+        line = _wrist_line(name, files, read, uplink, clock, colours, engine, stop)
     else:
-        line = _marker_line(name, files, source, uplink, colours, engine, stop, previews.offer, workers)
-    tuning = CameraTuning(files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0)
+        line = _marker_line(name, files, read, uplink, clock, colours, engine, stop, workers)
+    tuning = CameraTuning(
+        files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.picker
+    )
     reporter = Reporter(
         name,
         uplink,
@@ -81,8 +95,9 @@ def run_live(
         clock,
         lambda endpoint: ZenohBus(None, endpoint),
         stop.set,
-        shown=previews,
+        shown=line.previews,
         camera=tuning,
+        raw=raw,
     )
     try:
         gc.collect()
@@ -92,9 +107,10 @@ def run_live(
             line.run()
     finally:
         reporter.close()
-        previews.close()
+        line.previews.close()
         uplink.close()
         source.close()
+        raw.close()
         workers.shutdown(cancel_futures=True)
     say(f"{line.numbers.counts()['frames']} frames, sent {uplink.counts['sent']}")
 
@@ -106,12 +122,16 @@ class _Line:
     Attributes:
         run: The loop; returns at the end.
         numbers: What it counts.
+        previews: Who shows them.
         prepare: How changed files reach it; None: it uses none of them.
+        picker: Who makes a colour of a click; None: it uses none.
     """
 
     run: Callable[[], None]
     numbers: Numbers
+    previews: Previews
     prepare: Prepare | None
+    picker: LivePicker | None = None
 
 
 def _marker_line(
@@ -119,30 +139,36 @@ def _marker_line(
     files: CameraFiles,
     source: FrameSource,
     uplink: Uplink,
+    clock: Clock,
     colours: Colours,
     engine: Engine,
     stop: threading.Event,
-    show: Callable[[Frame], None],
     workers: ThreadPoolExecutor,
 ) -> _Line:
     rig = files.rig
     tags = LiveTags(files.camera, files.objects)
-    tally = Tally(rig.markers, tags.counts)
     if colours == "none":
-        blind = BlindDetector(len(rig.markers))
-        return _Line(lambda: run(source, blind, uplink, name, tally, stop, show), tally, None)
-    make = _maker(colours, engine, workers)
+        blind, tally = BlindDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
+        plain = Previews(name, clock)
+        return _Line(lambda: run(source, blind, uplink, name, tally, stop, plain.offer), tally, plain, None)
+    make = _maker(files, colours, engine, workers)
     detector = ChangingDetector(make(files.camera, rig))
-    numbers, seen = tally, show
-    if detector.follows:
-        numbers = LightReport(name, detector, tally, rig.markers, show)
+    tally = Tally(
+        rig.markers,
+        lambda: tags.counts() | _uncalibrated(detector.missing) | told_frames(detector.plain),
+        lambda: told_places(detector.plain),
+    )
+    previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))
+    numbers, seen = tally, previews.offer
+    if colours == "follow":
+        numbers = LightReport(name, detector, tally, rig.markers, previews.offer)
         seen = numbers.offer
-    elif colours == "follow":
-        _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
     return _Line(
         lambda: run(source, detector, uplink, name, tally, stop, seen, tags),
         numbers,
+        previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
+        LivePicker(detector, previews.shown, rig.markers),
     )
 
 
@@ -180,31 +206,48 @@ def _wrist_line(
     files: CameraFiles,
     source: FrameSource,
     uplink: Uplink,
+    clock: Clock,
     colours: Colours,
     engine: WristEngine,
     stop: threading.Event,
-    show: Callable[[Frame], None],
 ) -> _Line:
     if colours == "none":
-        tally = Tally(())
-        return _Line(lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, show), tally, None)
+        tally, plain = Tally(()), Previews(name, clock)
+        return _Line(
+            lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, plain.offer),
+            tally,
+            plain,
+            None,
+        )
     detector = WristDetector(view_of(files), files.camera.frame_rate_hz, engine=engine)
     names = tuple(f"{what}.{finger}" for what in ("laser", "tip") for finger in FINGERS)
     tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
+    previews = Previews(name, clock, WristOverlay(detector))
     return _Line(
-        lambda: run_wrist(source, detector, uplink, name, tally, stop, show),
+        lambda: run_wrist(source, detector, uplink, name, tally, stop, previews.offer),
         tally,
+        previews,
         wrist_changes(detector),
     )
 
 
+def _uncalibrated(missing: Sequence[str]) -> dict[str, int]:
+    """What `Health` says of markers without a colour."""
+    return {"uncalibrated": int(bool(missing))} | {f"uncalibrated.{name}": 1 for name in missing}
+
+
 def _maker(
-    colours: Colours, engine: Engine, workers: ThreadPoolExecutor
+    files: CameraFiles, colours: Colours, engine: Engine, workers: ThreadPoolExecutor
 ) -> Callable[[CameraCalibration, RigCalibration], Changeable]:
-    """What makes a detector for given files, now and whenever they change."""
+    """What makes a detector for given content of the files, now and whenever it changes."""
 
     def make(camera: CameraCalibration, rig: RigCalibration) -> Changeable:
+        if missing := [name for name in rig.markers if name not in (camera.markers or {})]:
+            _LOG.warning("%s", NO_COLOUR.format(files.camera_path, ", ".join(missing)))
+            return KnownDetector(camera, rig.markers, engine, rig.free_markers)
         if colours == "follow":
+            if not can_follow(camera, rig.markers):
+                _LOG.warning("%s", NO_REFERENCE.format(files.camera_path))
             return detector_for(camera, rig.markers, workers, engine=engine, free=rig.free_markers)
         return MarkerDetector(camera, rig.markers, engine=engine, free=rig.free_markers)
 

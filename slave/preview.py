@@ -4,6 +4,9 @@ The loop only offers its frames: one comparison when nobody looks, otherwise a r
 a second. A thread of its own shrinks, encodes and publishes; while it is busy the newest frame replaces the
 waiting one, so a slow bus costs pictures and never a measurement. A *still*, one whole frame on request, goes the
 same way: cameras are calibrated from stills.
+
+Who looks may wish to see which pixels are in the range of a marker, and what was found: that is drawn on the same
+thread. Of several who look, each sees what all have wished for in the last three seconds.
 """
 
 import logging
@@ -16,12 +19,16 @@ import numpy as np
 from common.arrays import Image
 from common.bus import Bus
 from common.clock import Clock
-from common.errors import BusError
+from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
+from common.preview_wish import PreviewWish
 from slave.cameras.source import Frame
+from slave.overlay import Overlay
 
 PERIOD_NS = 100_000_000
 LOOK_NS = 3_000_000_000
+SHOWN = 10  # frames that are kept for a click on one of them: the last second
+FOUND = ""  # stands beside the names of markers for the wish to see what was found
 QUALITY = 80
 STILL_QUALITIES = (95, 90, 80, 60, 30)  # the first whose file fits into a message
 WAIT_S = 0.5
@@ -57,17 +64,21 @@ class Gate:
 class Previews:
     """Publishes one camera on stream "preview" while somebody looks, and on "still" when one is asked for.
 
-    Holds the gate, the newest frames that wait, the bus while there is one, and how many pictures went out.
+    Holds the gate, what is wished to be drawn, the newest frames that wait, those shown last, the bus while there is
+    one, and how many pictures went out.
     """
 
-    def __init__(self, camera: str, clock: Clock) -> None:
+    def __init__(self, camera: str, clock: Clock, overlay: Overlay | None = None) -> None:
         """Start the thread; nothing is published before `use` and `ask`.
 
         Args:
             camera: Name of the camera.
             clock: Clock of the frames' times.
+            overlay: Draws what is wished for; None: nothing is sought, so there is nothing to draw.
         """
-        self._camera = camera
+        self._camera, self._overlay = camera, overlay
+        self._wishes: dict[str, int] = {}  # what -> until when [ns]
+        self._shown: deque[Frame] = deque(maxlen=SHOWN)
         self._clock = clock
         self._gate = Gate()
         self._waiting: deque[Frame] = deque(maxlen=1)
@@ -81,9 +92,27 @@ class Previews:
         self._thread = threading.Thread(target=self._work, name=f"{camera} preview", daemon=True)
         self._thread.start()
 
-    def ask(self) -> None:
-        """Somebody looks: show the camera for the next 3 s. Never waits."""
-        self._gate.ask(self._clock.now_ns())
+    def ask(self, body: str = "") -> None:
+        """Somebody looks: show the camera for the next 3 s, with what the body, a `PreviewWish`, asks for. Never waits.
+
+        Raises:
+            CalibrationError: The body is none, or names a marker that is not sought.
+        """
+        wish = PreviewWish.of(body)
+        known = () if self._overlay is None else self._overlay.markers
+        if strange := [name for name in wish.mask if name not in known]:
+            raise CalibrationError(
+                f"preview: mask: camera {self._camera!r} does not look for {', '.join(strange)}; it looks for "
+                f"{', '.join(known) or 'no markers'}"
+            )
+        now_ns = self._clock.now_ns()
+        until = dict.fromkeys((*wish.mask, *((FOUND,) if wish.found else ())), now_ns + LOOK_NS)
+        self._wishes = {what: end for what, end in self._wishes.items() if end >= now_ns} | until
+        self._gate.ask(now_ns)
+
+    def shown(self, t_ns: int) -> Frame | None:
+        """The frame of that time [ns], if it was shown within the last second. From any thread."""
+        return next((frame for frame in tuple(self._shown) if frame.t_ns == t_ns), None)
 
     def ask_still(self) -> None:
         """Publish the next frame whole. Never waits."""
@@ -112,13 +141,23 @@ class Previews:
 
     def _work(self) -> None:
         while not self._closing.is_set():
-            self._wake.wait(WAIT_S)
+            if not self._wake.wait(WAIT_S):
+                self._shown.clear()  # nobody looks any more
             self._wake.clear()
             if self._still and not self._closing.is_set():
                 self._send_whole(self._still.popleft())
             if self._waiting and not self._closing.is_set():
                 frame = self._waiting.popleft()
-                self._publish("preview", Preview(self._camera, frame.t_ns, small_jpeg(frame.image)))
+                self._shown.append(frame)
+                self._publish("preview", Preview(self._camera, frame.t_ns, self._picture(frame)))
+
+    def _picture(self, frame: Frame) -> bytes:
+        """The JPEG file of a frame, with what is wished for."""
+        wishes = [what for what, end in self._wishes.items() if end >= frame.t_ns]
+        if self._overlay is None or not wishes:
+            return small_jpeg(frame.image)
+        mask = [what for what in wishes if what != FOUND]
+        return _within(self._overlay.draw(_half(frame.image), frame, mask, FOUND in wishes))
 
     def _send_whole(self, frame: Frame) -> None:
         data = whole_jpeg(frame.image)
@@ -155,10 +194,19 @@ def whole_jpeg(image: Image) -> bytes | None:
 
 def small_jpeg(image: Image) -> bytes:
     """JPEG file of `image` (H, W, 3) BGR or (H, W) grey at half its width and height, smaller still if it must be."""
+    return _within(_half(image))
+
+
+def _half(image: Image) -> Image:
+    height, width = image.shape[:2]
+    half = (max(width // 2, 1), max(height // 2, 1))
+    return np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _within(image: Image) -> bytes:
+    """JPEG file of `image`, shrunk until it fits into a message."""
     while True:
-        height, width = image.shape[:2]
-        half = (max(width // 2, 1), max(height // 2, 1))
-        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), np.uint8)
         data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()
         if len(data) <= MAX_PREVIEW_BYTES:
             return data
+        image = _half(image)

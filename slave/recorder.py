@@ -61,6 +61,8 @@ class Recorder:
         reserve_bytes: int = RESERVE_BYTES,
         queue_bytes: int = QUEUE_BYTES,
         free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
+        encoders: int = ENCODERS,
+        reserve_option: str = "--reserve-mb",
     ) -> None:
         """Make the recording and start the threads.
 
@@ -73,6 +75,8 @@ class Recorder:
             reserve_bytes: Stays free on the disk.
             queue_bytes: Memory for frames that wait; two fit in any case.
             free_bytes: What is free on the disk of a folder.
+            encoders: So many threads at most encode, and one a core.
+            reserve_option: What a user says to have another reserve.
 
         Raises:
             RecordingError: The folder holds something, or cannot be written.
@@ -80,10 +84,11 @@ class Recorder:
         self._writer = RecordingWriter(folder, manifest)
         self._folder, self._camera, self._length = folder, manifest.cameras[camera], length
         self._name, self._show, self._reserve, self._free = camera, show, reserve_bytes, free_bytes
+        self._reserve_option = reserve_option
         frame_bytes = self._camera.width_px * self._camera.height_px * (1 if is_grey(manifest, camera) else 3)
         self._capacity = max(queue_bytes // frame_bytes, 2)
         self._waiting: queue.Queue[_Waiting | None] = queue.Queue(self._capacity)
-        self._encoders = ThreadPoolExecutor(min(ENCODERS, os.cpu_count() or 1), f"{camera} png")
+        self._encoders = ThreadPoolExecutor(min(encoders, os.cpu_count() or 1), f"{camera} png")
         self._taken = self._refused = self._lost = 0  # by the camera's thread
         self._first_ns = self._last_ns = 0
         self._last_seq: int | None = None
@@ -192,13 +197,13 @@ class Recorder:
             fit = max(free - self._reserve, 0) // len(png)
             raise RecordingError(
                 f"{self._folder}: {expected} frames of {megabytes(len(png))} need {megabytes(expected * len(png))}, "
-                f"{megabytes(free)} are free and {megabytes(self._reserve)} stay free (--reserve-mb): make room, or "
-                f"record at most {fit} frames ({fit / self._camera.frame_rate_hz:.1f} s)"
+                f"{megabytes(free)} are free and {megabytes(self._reserve)} stay free ({self._reserve_option}): "
+                f"make room, or record at most {fit} frames ({fit / self._camera.frame_rate_hz:.1f} s)"
             )
         if free - len(png) < self._reserve:
             raise RecordingError(
                 f"{self._folder}: ended after {self._frames} frames: {megabytes(free)} are free on the disk and "
-                f"{megabytes(self._reserve)} stay free (--reserve-mb)"
+                f"{megabytes(self._reserve)} stay free ({self._reserve_option})"
             )
         self._writer.add(self._name, frame.seq, frame.t_ns, frame.illumination, png)
         self._frames += 1

@@ -1,4 +1,4 @@
-"""Tell the master how the slave is: `Health` once a second and on command, on a thread of its own.
+"""Tell the master how the slave is: `Health` twice a second and on command, on a thread of its own.
 
 The camera loop never waits for the bus: this thread opens it when the uplink has learned where the master's
 bus is, opens it anew when another master takes over, and lives on without it when there is none.
@@ -7,16 +7,20 @@ bus is, opens it anew when another master takes over, and lives on without it wh
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Protocol
 
 from common.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
+from common.machine import Machine
 from common.messages import Command, Health
 
-PERIOD_S = 1.0
-LOG_EVERY = 10  # reports
-ALONE_AT = 3  # the report after which a slave without a master says what it hears
+PERIOD_S = (
+    0.5  # two reports make a judgement in the checklist of the master, which is to be out within two seconds
+)
+LOG_EVERY = 20  # reports
+ALONE_AT = 6  # the report after which a slave without a master says what it hears
 _LOG = logging.getLogger(__name__)
 
 
@@ -54,8 +58,8 @@ class Numbers(Protocol):
 class Shown(Protocol):
     """What shows the camera's picture; a `Previews`."""
 
-    def ask(self) -> None:
-        """Somebody looks."""
+    def ask(self, body: str = "") -> None:
+        """Somebody looks, and wishes for what the body says. Raises `PhalanxError` where that is wrong."""
         ...
 
     def ask_still(self) -> None:
@@ -68,28 +72,28 @@ class Shown(Protocol):
 
 
 class Tuned(Protocol):
-    """The camera whose settings can be changed; a `CameraTuning`."""
+    """What has commands of its own: the camera whose settings can be changed, a `CameraTuning`; `RawFrames`."""
 
     def commands(self) -> Mapping[str, Callable[[str], Mapping[str, float]]]:
         """Verb -> what to do with its body; the gauges of the answer. Each may raise `PhalanxError`."""
         ...
 
     def look(self) -> None:
-        """Once a period: apply files that were changed."""
+        """Once a period: apply files that were changed, end what is over."""
         ...
 
     def counts(self) -> Mapping[str, int]:
-        """Event of the camera -> how often."""
+        """Event of it -> how often."""
         ...
 
     def figures(self) -> Mapping[str, float]:
-        """What the camera has now."""
+        """What it has now."""
         ...
 
 
 class Reporter:
     """Publishes `Health` and answers "report", "stop" and, where there is a picture, "preview" and "still";
-    where the camera can be changed, also its commands. Once a period it lets the camera's files be looked at.
+    where the camera can be changed, or raw frames kept, also their commands. Once a period it lets them look.
 
     Holds the bus while a master is there, and the gauges of the last period.
     """
@@ -105,6 +109,7 @@ class Reporter:
         period_s: float = PERIOD_S,
         shown: Shown | None = None,
         camera: Tuned | None = None,
+        raw: Tuned | None = None,
     ) -> None:
         """Start the thread.
 
@@ -118,6 +123,7 @@ class Reporter:
             period_s: Time between reports [s].
             shown: Shows the camera's picture on the command "preview".
             camera: Changes the settings of the camera.
+            raw: Keeps raw frames.
         """
         self._name = name
         self._link = link
@@ -127,8 +133,9 @@ class Reporter:
         self._stop = stop
         self._period_s = period_s
         self._shown = shown
-        self._camera = camera
-        self._commands = {} if camera is None else dict(camera.commands())
+        self._parts = tuple(part for part in (camera, raw) if part is not None)
+        self._commands = {verb: act for part in self._parts for verb, act in part.commands().items()}
+        self._machine = Machine(Path.cwd())
         self._gauges: dict[str, float] = {}
         self._bus: Bus | None = None
         self._endpoint: str | None = None
@@ -139,8 +146,8 @@ class Reporter:
     def health(self, now: Mapping[str, float] | None = None) -> Health:
         """The report of this moment, with the gauges of the last period, or `now` in their place."""
         counts = {**self._numbers.counts(), **self._link.counts}
-        if self._camera is not None:
-            counts |= self._camera.counts()
+        for part in self._parts:
+            counts |= part.counts()
         gauges = self._gauges | dict(now or {})
         return Health(self._name, self._link.session, self._clock.now_ns(), counts, gauges)
 
@@ -148,15 +155,15 @@ class Reporter:
         """Obey a command.
 
         "report" says how it is, "preview" shows the picture for 3 s, "still" sends the next frame whole, "stop" ends
-        the slave; the others are those of the camera.
+        the slave; the others are those of the camera and of raw frames.
 
         Raises:
             PhalanxError: It could not be done.
             ValueError: Another verb; the asker reads which ones there are.
         """
         plain: dict[str, Callable[[], None]] = {"report": lambda: None, "stop": self._stop}
-        if self._shown is not None:
-            plain |= {"preview": self._shown.ask, "still": self._shown.ask_still}
+        if (shown := self._shown) is not None:
+            plain |= {"preview": lambda: shown.ask(command.body), "still": shown.ask_still}
         if command.verb in plain:
             plain[command.verb]()
             return self.health()
@@ -175,8 +182,8 @@ class Reporter:
         while not self._closing.wait(self._period_s):
             if count % LOG_EVERY == ALONE_AT and self._link.zenoh_endpoint is None:
                 _LOG.warning("%s", _why_alone(self._link.counts))
-            if self._camera is not None:
-                self._camera.look()
+            for part in self._parts:
+                part.look()
             self._gauges = dict(self._numbers.gauges()) | self._figures()
             try:
                 self._follow(self._link.zenoh_endpoint)
@@ -192,7 +199,8 @@ class Reporter:
         self._leave()
 
     def _figures(self) -> dict[str, float]:
-        return {} if self._camera is None else dict(self._camera.figures())
+        own = {name: value for part in self._parts for name, value in part.figures().items()}
+        return own | self._machine.gauges()
 
     def _follow(self, endpoint: str | None) -> None:
         if endpoint is None or endpoint == self._endpoint:

@@ -7,7 +7,7 @@ from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
 from common.clock import SkewedClock
-from common.errors import CameraError, TrackerError
+from common.errors import CalibrationError, CameraError, TrackerError
 from common.frame_recording import open_recording
 from common.imu_recording import write_imu
 from common.object_profile import ObjectProfile
@@ -33,6 +33,38 @@ class FrameClock:
     def sleep(self, seconds: float) -> None:
         """Let so many seconds be over."""
         self._now_ns += round(seconds * 1e9)
+
+
+def world_of(
+    believed: Path, rig: RigCalibration, truth: Path | None, name: str | None
+) -> tuple[Path, RigCalibration]:
+    """Folder and rig that say how the simulated world is: those that the slave believes, unless it is told otherwise.
+
+    Args:
+        believed: The calib_json tree of the slave.
+        rig: Its rig, of which places and lenses may be unknown.
+        truth: Another tree, which knows them; None: the slave believes the truth.
+        name: The rig there; None: the one of the same name.
+
+    Raises:
+        CalibrationError: That rig is of another kind, lacks cameras, or one of its files is missing or broken.
+    """
+    if truth is None:
+        if name is not None:
+            raise CalibrationError(f"--truth-rig {name}: needs --truth DIR, the tree that it is in")
+        return believed, rig
+    path = truth / "rigs" / f"{rig.name if name is None else name}.json"
+    true = load(path, RigCalibration)
+    if true.kind != rig.kind:
+        raise CalibrationError(
+            f"{path}: kind: the true rig is one of {true.kind}, rig {rig.name!r} of {rig.kind}"
+        )
+    if strange := [camera for camera in rig.cameras if camera not in true.cameras]:
+        raise CalibrationError(
+            f"{path}: cameras: the true rig has no {', '.join(strange)}, only {', '.join(true.cameras)}: name the "
+            f"cameras of rig {rig.name!r} so, or take another one (--truth-rig)"
+        )
+    return truth, true
 
 
 def scene_of(calibration: Path, rig: RigCalibration, name: str, seed: int) -> Scene | BoardScene | WristScene:

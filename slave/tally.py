@@ -18,10 +18,16 @@ class Tally:
     """
 
     def __init__(
-        self, names: tuple[str, ...], others: Callable[[], Mapping[str, int]] = dict[str, int]
+        self,
+        names: tuple[str, ...],
+        others: Callable[[], Mapping[str, int]] = dict[str, int],
+        more: Callable[[], Mapping[str, float]] = dict[str, float],
     ) -> None:
-        """Count for the markers `names`, or whatever else is sought; `others` counts more, told with the own counts."""
-        self._others = others
+        """Count for the markers `names`, or whatever else is sought; `others` counts more, told with the own counts.
+
+        `more` are gauges told with the own ones.
+        """
+        self._others, self._more = others, more
         self._lock = threading.Lock()
         self._frames = self._sought = 0
         self._dropped = 0
@@ -70,11 +76,16 @@ class Tally:
         return {**counts, **self._others()}
 
     def gauges(self) -> dict[str, float]:
-        """rate_hz since the last call, running mean and worst (since the last call) of the detection time [us]."""
+        """rate_hz since the last call, running mean and worst (since the last call) of detection [us].
+
+        And those that are told beside them.
+        """
+        more = self._more()
         now_ns = time.monotonic_ns()
         with self._lock:
             since_ns, frames = self._rate_from
             rate_hz = (self._frames - frames) * 1e9 / max(now_ns - since_ns, 1)
             self._rate_from = (now_ns, self._frames)
             worst_us, self._worst_us = self._worst_us, 0.0
-            return {"rate_hz": rate_hz, "detect_us": self._detect_us, "detect_worst_us": worst_us}
+            own = {"rate_hz": rate_hz, "detect_us": self._detect_us, "detect_worst_us": worst_us}
+        return {**own, **more}

@@ -1,8 +1,9 @@
 """Change how the camera of a running slave is set: on command, or because its files were changed. No restart.
 
-    settings    say what the camera has
-    set         other exposure or gains (body: `common.camera_settings.CameraSettings`)
-    load        another content of the camera file (body: the file): exposure, gains and the colours of the markers
+    settings    say what the camera has, and which colours are in use
+    set         other exposure, gains, rate, margin, colours (body: `common.camera_settings.CameraSettings`)
+    pick        the colour of a marker, from a pixel on its paint (body: `common.camera_settings.ColourPick`)
+    load        another content of the camera file (body: the file): exposure, gains, rate, colours of the markers
     save        write the content in use to the slave's own camera file
 
 Everything is checked before anything is changed. What the camera did not take is given back, and the answer is an
@@ -12,20 +13,35 @@ the frames that it reads, and the new colours take over between two frames.
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
+
+from msgspec import structs
 
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, load, parse, save
-from common.camera_settings import WANTED, CameraSettings, figures
+from common.calibration_parts import Provenance, date_now
+from common.camera_settings import (
+    WANTED,
+    CameraSettings,
+    ColourPick,
+    figures,
+    range_figures,
+    refuse_strange,
+    same_exposed,
+)
 from common.errors import CalibrationError, PhalanxError
 from common.object_profile import ObjectProfile
 from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
+from slave.colours_in_use import in_use
 
 _LOG = logging.getLogger(__name__)
-NEEDS_RESTART = ("name", "width_px", "height_px", "frame_rate_hz", "focus_m")
+NEEDS_RESTART = ("name", "width_px", "height_px", "focus_m")
+# What "set" sets, and the colours.
+SETTINGS = ("exposure_us", "analogue_gain", "colour_gains", "frame_rate_hz", "roi_margin")
+MARKERS = "markers"
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +95,20 @@ def object_paths(rig_path: Path, rig: RigCalibration) -> tuple[Path, ...]:
 Prepare: TypeAlias = Callable[[CameraFiles, CameraFiles], Callable[[], None] | None]
 
 
+class Picker(Protocol):
+    """What makes a colour of a click; a `slave.picker.LivePicker`."""
+
+    def pick(
+        self, wish: ColourPick, camera: CameraCalibration
+    ) -> tuple[CameraCalibration, Mapping[str, float]]:
+        """The camera file with the colour, and gauges that say how good it is.
+
+        Raises:
+            PhalanxError: There is none, or no frame.
+        """
+        ...
+
+
 class CameraTuning:
     """Answers commands about the camera, and follows its files.
 
@@ -92,6 +122,7 @@ class CameraTuning:
         source: object,
         prepare: Prepare | None,
         running: Callable[[], bool],
+        picker: Picker | None = None,
     ) -> None:
         """Tune a camera.
 
@@ -100,20 +131,32 @@ class CameraTuning:
             source: The camera; a `Tunable`, or nothing can be changed but what senses.
             prepare: Makes what senses for other files; None: nobody senses.
             running: Whether frames are read: before, no change can be verified.
+            picker: Makes a colour of a click; None: no markers are sought.
         """
         self._used = self._on_disk = files
         self._source = source if isinstance(source, Tunable) else None
-        self._prepare, self._running = prepare, running
+        self._prepare, self._running, self._picker = prepare, running, picker
         self._turn = threading.Lock()
         self._watched = WatchedFiles()
         self._applied = self._refused = 0
+
+    @property
+    def files(self) -> CameraFiles:
+        """The files in use, with what was set and not saved."""
+        return self._used
 
     def commands(self) -> dict[str, Callable[[str], Mapping[str, float]]]:
         """Verb -> what to do with its body; the gauges of the answer.
 
         Each raises `PhalanxError` where the body is wrong, or the camera did not take it.
         """
-        return {"settings": self._settings, "set": self._set, "load": self._load, "save": self._save}
+        return {
+            "settings": self._settings,
+            "set": self._set,
+            "load": self._load,
+            "save": self._save,
+            "pick": self._pick,
+        }
 
     def counts(self) -> dict[str, int]:
         """`reload.applied`, `reload.refused`: changed files; and the events of the camera."""
@@ -121,8 +164,11 @@ class CameraTuning:
         return own if self._source is None else own | self._source.counts()
 
     def figures(self) -> dict[str, float]:
-        """What the camera has and does now."""
-        return {} if self._source is None else self._source.figures()
+        """What the camera has and does now, and what the content in use says of settings, size and colours."""
+        used = self._used
+        said = {WANTED + name: value for name, value in figures(used.camera).items()}
+        said |= in_use(used.camera, used.rig.markers)
+        return said if self._source is None else self._source.figures() | said
 
     def look(self) -> None:
         """Apply the files if they were changed; where that fails, say so once and go on as before."""
@@ -131,9 +177,8 @@ class CameraTuning:
                 return
             try:
                 was, self._on_disk = self._on_disk, self._used.read_again()
-                # Only what the file has changed: what a command has changed meanwhile stays.
-                kept = self._on_disk.camera == was.camera
-                if self._apply(replace(self._on_disk, camera=self._used.camera) if kept else self._on_disk):
+                camera = _merged(was.camera, self._on_disk.camera, self._used.camera)
+                if self._apply(replace(self._on_disk, camera=camera)):
                     self._applied += 1
                     _LOG.info("%s: changed, in use now", ", ".join(map(str, self._used.paths)))
             except PhalanxError as error:
@@ -143,14 +188,30 @@ class CameraTuning:
     def _settings(self, body: str) -> dict[str, float]:
         if body:
             raise CalibrationError("settings: takes no body")
-        wanted = {WANTED + name: value for name, value in figures(self._used.camera).items()}
-        return self.figures() | wanted
+        used = self._used
+        return self.figures() | range_figures(used.camera, used.rig.markers)
 
     def _set(self, body: str) -> dict[str, float]:
         with self._turn:
             wanted = parse(body.encode(), CameraSettings, "set")
-            self._apply(replace(self._used, camera=wanted.over(self._used.camera)))
+            camera = wanted.over(self._used.camera)
+            if wanted.markers is not None:
+                refuse_strange(wanted.markers, self._used.rig.markers, "set: markers")
+                camera = _told(camera, "set", wanted.markers)
+            self._apply(replace(self._used, camera=camera), forget=True)
         return self._settings("")
+
+    def _pick(self, body: str) -> dict[str, float]:
+        with self._turn:
+            wish = parse(body.encode(), ColourPick, "pick")
+            if self._picker is None:
+                raise CalibrationError(
+                    "pick: this slave seeks no markers: the camera of a wrist device, or started with --colours none"
+                )
+            refuse_strange((wish.marker,), self._used.rig.markers, "pick: marker")
+            camera, told = self._picker.pick(wish, self._used.camera)
+            self._apply(replace(self._used, camera=_told(camera, "pick", (wish.marker,))))
+        return self._settings("") | dict(told)
 
     def _load(self, body: str) -> dict[str, float]:
         with self._turn:
@@ -161,13 +222,19 @@ class CameraTuning:
         if body:
             raise CalibrationError("save: takes no body; what is in use is saved")
         with self._turn:
-            save(self._used.camera_path, self._used.camera)
-            self._on_disk = replace(self._on_disk, camera=self._used.camera)
-            _LOG.info("%s: saved as in use", self._used.camera_path)
+            path = self._used.camera_path
+            camera = self._used.camera
+            if path.exists():  # what somebody else has written there stays: a lens is calibrated elsewhere
+                camera = _merged(self._on_disk.camera, load(path, CameraCalibration), camera)
+                self._apply(replace(self._used, camera=camera))
+            _make_folder(path.parent)
+            save(path, camera)
+            self._on_disk = replace(self._on_disk, camera=camera)
+            _LOG.info("%s: saved as in use", path)
         return self._settings("")
 
-    def _apply(self, new: CameraFiles) -> bool:
-        """Have these files in use, wholly or not at all; False if they are.
+    def _apply(self, new: CameraFiles, *, forget: bool = False) -> bool:
+        """Have these files in use, wholly or not at all; False if they are. Only to `forget` may they lack colours.
 
         Raises:
             CalibrationError: They need a restart, or lack colours.
@@ -175,12 +242,13 @@ class CameraTuning:
         """
         old = self._used
         _refuse_restart(old, new)
+        if self._prepare is not None and not forget:
+            _refuse_lost(old, new)
         switch = None if self._prepare is None else self._prepare(old, new)
         if switch is None and new.camera == old.camera:
             self._used = new
             return False
-        exposed = CameraSettings.of(new.camera), new.camera.row_time_us
-        if exposed != (CameraSettings.of(old.camera), old.camera.row_time_us):
+        if not same_exposed(old.camera, new.camera):
             if self._source is None:
                 raise CalibrationError(f"camera {new.camera.name!r}: its driver can change no settings")
             self._source.tune(new.camera)
@@ -190,6 +258,50 @@ class CameraTuning:
         return True
 
 
+def _merged(was: CameraCalibration, now: CameraCalibration, used: CameraCalibration) -> CameraCalibration:
+    """A camera file that has changed from `was` to `now`, but what of it was left as it was is as in use.
+
+    That holds of its settings together, and of its colours: a lens that was calibrated meanwhile takes nothing back.
+    """
+    kept: dict[str, object] = {}
+    if all(getattr(was, key) == getattr(now, key) for key in SETTINGS):
+        kept |= {key: getattr(used, key) for key in SETTINGS}
+    if was.markers == now.markers:
+        kept[MARKERS] = used.markers
+        own = {MARKERS: used.provenance[MARKERS]} if MARKERS in used.provenance else {}
+        kept["provenance"] = now.provenance | own
+    return structs.replace(now, **kept)
+
+
+def _told(camera: CameraCalibration, verb: str, markers: Iterable[str]) -> CameraCalibration:
+    """The file, which says when and how its colours came about."""
+    note = "picked in the running slave" if verb == "pick" else "ranges set by hand in the running slave"
+    tool, before = f"phalanx-slave {verb}", camera.provenance.get(MARKERS)
+    others = before.data if before is not None and before.tool == tool else ()
+    names = tuple(dict.fromkeys((*others, *markers)))
+    origin = Provenance(date=date_now(), tool=tool, data=names, residual={}, note=note)
+    return structs.replace(camera, provenance=camera.provenance | {MARKERS: origin})
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibrationError(f"{folder}: cannot make the folder: {error.strerror}") from error
+
+
+def _refuse_lost(old: CameraFiles, new: CameraFiles) -> None:
+    was, now = (files.camera.markers or {} for files in (old, new))
+    if lost := [name for name in new.rig.markers if name in was and name not in now]:
+        raise CalibrationError(
+            f"camera {new.camera.name!r}: markers: no HSV range for {', '.join(lost)}, which {_has(lost)} one in use"
+        )
+
+
+def _has(names: list[str]) -> str:
+    return "has" if len(names) == 1 else "have"
+
+
 def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
     for key in NEEDS_RESTART:
         before, after = getattr(old.camera, key), getattr(new.camera, key)
@@ -197,6 +309,11 @@ def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
             raise CalibrationError(
                 f"camera {old.camera.name!r}: {key}: {before} cannot become {after} while it runs: restart the slave"
             )
+    if old.rig.kind == "wrist" and old.camera.frame_rate_hz != new.camera.frame_rate_hz:
+        raise CalibrationError(
+            f"camera {old.camera.name!r}: frame_rate_hz: {old.camera.frame_rate_hz} cannot become "
+            f"{new.camera.frame_rate_hz} while laser and LEDs flash in its time: restart the slave"
+        )
     if old.rig.kind != new.rig.kind:
         raise CalibrationError(
             f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all "

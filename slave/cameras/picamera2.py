@@ -6,8 +6,9 @@ those of the camera file. Image and metadata always come from the same captured 
 happens. When a frame was taken, and its number, are in `picamera2_frames`; whether cameras run in step, in
 `picamera2_sync`, which streams there are in `picamera2_streams`.
 
-Exposure and gains can be changed while frames are read: another thread writes the controls and watches the metadata
-of the frames that the loop reads, until three in a row show them.
+Exposure, gains and rate can be changed while frames are read: another thread writes the controls and watches the
+metadata of the frames that the loop reads, until three in a row show them. The mode stays, so a rate may not be above
+what that can do; and cameras that run in step keep their rate, which is that of all of them.
 """
 
 import contextlib
@@ -29,6 +30,7 @@ from slave.cameras.picamera2_library import open_library
 from slave.cameras.picamera2_modes import choose_mode, choose_raw_mode, read_modes, view_text
 from slave.cameras.picamera2_settings import (
     LIVE_CONTROLS,
+    RATE_CONTROL,
     Picamera2Options,
     check_ranges,
     controls,
@@ -155,11 +157,17 @@ class Picamera2Camera:
             raise CameraError(f"{self._where}: could not be closed: {failure[0]}") from failure[0]
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change exposure and gains while another thread reads frames; see `Tunable`.
+        """Change exposure, gains and rate while another thread reads frames; see `Tunable`.
 
         Raises:
-            CameraError: Out of range, not taken, or no frames are read.
+            CameraError: Out of range, not taken, no frames are read, or another rate where it runs in step with others.
         """
+        if self._sync is not None and camera.frame_rate_hz != self._calibration.frame_rate_hz:
+            raise CameraError(
+                f"{self._where}: frame_rate_hz: {self._calibration.frame_rate_hz:g} cannot become "
+                f"{camera.frame_rate_hz:g} while it runs in step with others (--sync): save it, and restart the slaves "
+                "of all of them"
+            )
         change(self._apply, self._calibration, camera)
         self._calibration = camera
 
@@ -178,7 +186,8 @@ class Picamera2Camera:
         available = self._library.camera_controls
         try:
             asked = controls(camera, self._options, self._enums, available)
-            live = {name: asked[name] for name in LIVE_CONTROLS if name in asked}
+            names = LIVE_CONTROLS if self._sync is not None else (*LIVE_CONTROLS, RATE_CONTROL)
+            live = {name: asked[name] for name in names if name in asked}
             check_ranges(live, available)
         except CameraError as error:
             raise CameraError(f"{self._where}: {error}") from error

@@ -19,7 +19,8 @@ from slave.cameras.picamera2_library import Enums
 from slave.cameras.settings import Setting, as_values
 
 Sync = Literal["off", "server", "client"]
-LIVE_CONTROLS = ("ExposureTime", "AnalogueGain", "ColourGains")  # that may change while frames come
+LIVE_CONTROLS = ("ExposureTime", "AnalogueGain", "ColourGains")  # that may change while frames come,
+RATE_CONTROL = "FrameDurationLimits"  # and this one where cameras run free
 
 GLOBAL_SHUTTER_ROW_US = (
     30.0  # where the camera file says 0: no official sensor needs longer for a row at video rates

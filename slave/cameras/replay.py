@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.camera_settings import CameraSettings, figures
+from common.camera_settings import figures, same_exposed
 from common.clock import Clock
 from common.errors import CameraError, RecordingError
 from common.frame_recording import FrameRow, Manifest, open_recording
@@ -76,7 +76,7 @@ class ReplayCamera:
         Raises:
             CameraError: The settings are not those of the recording.
         """
-        if CameraSettings.of(camera) == CameraSettings.of(self._calibration):
+        if same_exposed(camera, self._calibration):
             return
         raise CameraError(
             f"{self._folder}: its pictures are taken, with exposure_us {self._calibration.exposure_us:g}: a "

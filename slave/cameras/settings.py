@@ -18,7 +18,7 @@ class Tunable(Protocol):
     """A camera that tells what it has, and whose settings may be changed by another thread while it is read."""
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Take exposure and gains of `camera`; size and rate are those it was opened with.
+        """Take exposure, gains and rate of `camera`; its size is that it was opened with.
 
         Raises:
             CameraError: Refused, or not taken. The text names setting, wanted and got; the old settings are back, or

@@ -1,20 +1,21 @@
 """A camera that looks at the simulated scene, in real time: the first-class stand-in for hardware.
 
 Frame k is exposed when the camera's own oscillator, which is the slave's (perhaps skewed) clock, says
-`epoch + start offset + k periods`. It is handed over when a real sensor would have read out its last row. The
-picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame rate loses
-frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
+`epoch + start offset + k periods`, until the rate is changed. It is handed over when a real sensor would have read out
+its last row. The picture is drawn before that moment, so the hand-over is on time; a process too slow for its frame
+rate loses frames, seen as gaps in `seq` and in `skipped`, and never works off a backlog.
 
 The camera of a wrist device takes what its lights had on while it exposed (`slave.lights.simulated`). Without lights
 it is a camera that switches them itself, frame k by what k modulo 3 says. Either way a slow process loses whole cycles,
 for of a strobe whose single frames are lost no triple would ever be whole.
 
-The lamp of the simulated room is such that the settings of the camera file at the start expose it well. Exposure and
-gains that are changed later make the picture brighter or darker against that, and the exposure smears more or less.
+The lamp of the simulated room is such that the settings in the camera file of the scene expose it well. Other exposure
+and gains, at the start or later, make the picture brighter or darker against that, and the exposure smears as long.
 """
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import cv2
@@ -24,7 +25,7 @@ from common.arrays import Float, Image
 from common.calibration import CameraCalibration
 from common.camera_settings import figures
 from common.clock import Clock
-from common.errors import CameraError
+from common.errors import CalibrationError, CameraError
 from common.frame_recording import Illumination
 from common.sim.board import BoardScene
 from common.sim.scene import Scene
@@ -56,13 +57,25 @@ class LitBy(Protocol):
         ...
 
 
+@dataclass(frozen=True, slots=True)
+class _Pace:
+    """When frames are exposed: frame `seq` at `t_ns` [ns], the others at this rate before and after."""
+
+    seq: int
+    t_ns: int
+    rate_hz: float
+
+    def exposed_ns(self, seq: int) -> int:
+        return self.t_ns + round((seq - self.seq) * 1e9 / self.rate_hz)
+
+
 class SyntheticCamera:
     """A `FrameSource` that renders. Holds its settings, the number of the next frame and how many were skipped."""
 
     def __init__(
         self,
         scene: Scene | BoardScene | WristScene,
-        camera_name: str,
+        camera: str | CameraCalibration,
         epoch_ns: int,
         clock: Clock,
         start_offset_ns: int,
@@ -76,7 +89,8 @@ class SyntheticCamera:
 
         Args:
             scene: What it looks at.
-            camera_name: A camera of the scene's rig.
+            camera: A camera of the scene's rig: its name, or a file of it that says how it is set. The files of the
+                scene say what lens it has, and how it would be set well.
             epoch_ns: Scene time 0, on the true clock [ns].
             clock: The slave's clock; stamps are on it, and its rate is that of the camera.
             start_offset_ns: How much later than the epoch frame 0 is taken [ns].
@@ -86,22 +100,27 @@ class SyntheticCamera:
             live: The scene does not wait for who draws it, so that is done as fast as looks right.
 
         Raises:
-            CalibrationError: The scene has no such camera, or a marker without paint.
+            CalibrationError: The scene has no such camera, or one of another size, or a marker without paint.
+            CameraError: The exposure does not fit into a frame.
         """
-        self._renderer = renderer_of(scene, camera_name, live=live)
-        camera = scene.cameras[camera_name]
-        self._lit_for, self._camera = camera, camera
+        name = camera if isinstance(camera, str) else camera.name
+        self._renderer = renderer_of(scene, name, live=live)
+        true = scene.cameras[name]
+        camera = true if isinstance(camera, str) else camera
+        _refuse_other_size(camera, true)
+        self._lit_for, self._camera = true, true
         self._clock, self._true, self._sleep = clock, true_clock, sleep
         self._epoch_ns, self._lights = epoch_ns, lights
-        self._first_ns = self._own(epoch_ns + start_offset_ns)
-        self._rate_hz = camera.frame_rate_hz
-        self._rows_ns = camera.height_px * camera.row_time_us * 1e3
+        self._pace = _Pace(0, self._own(epoch_ns + start_offset_ns), camera.frame_rate_hz)
+        self._rows_ns = true.height_px * true.row_time_us * 1e3
         self._grey = scene.rig.kind == "wrist"
         self._cycle = len(STROBE) if isinstance(scene, WristScene) else 1
         self._next = 0
         self._started = False
         self._closed = False
         self.skipped = 0
+        if camera != true:
+            self.tune(camera)
 
     def read(self) -> Frame | None:
         """Draw the next frame, wait until it is due, hand it over; None once closed."""
@@ -121,16 +140,24 @@ class SyntheticCamera:
         self._closed = True
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Take other exposure and gains from the next frame on.
+        """Take other exposure, gains and rate from the next frame on.
 
         Raises:
-            CameraError: The exposure does not fit into a frame.
+            CameraError: The exposure does not fit into a frame, or the rows cannot be read out so often.
         """
-        if camera.exposure_us >= 1e6 / self._rate_hz:
+        rate_hz = camera.frame_rate_hz
+        if camera.exposure_us >= 1e6 / rate_hz:
             raise CameraError(
-                f"exposure_us: wanted {camera.exposure_us:g}, a frame at {self._rate_hz:g} Hz has "
-                f"{1e6 / self._rate_hz:g}; the settings before are still in use"
+                f"exposure_us: wanted {camera.exposure_us:g}, a frame at {rate_hz:g} Hz has "
+                f"{1e6 / rate_hz:g}; the settings before are still in use"
             )
+        if self._rows_ns > 1e9 / rate_hz:
+            raise CameraError(
+                f"frame_rate_hz: wanted {rate_hz:g}, the rows of a frame are read out in {self._rows_ns * 1e-3:.0f} "
+                f"us, so at most {1e9 / self._rows_ns:.4g}; the settings before are still in use"
+            )
+        if rate_hz != self._pace.rate_hz:  # the frame that is next comes when it would have come anyway
+            self._pace = _Pace(seq := self._next, self._exposed_ns(seq), rate_hz)
         gains_bgr = _sensitivity(camera) / _sensitivity(self._lit_for)
         self._camera, self._renderer = camera, self._renderer.exposed(camera.exposure_us, gains_bgr)
 
@@ -182,7 +209,7 @@ class SyntheticCamera:
         A cycle of a strobe that has begun is brought to its end, late or not.
         """
         late_ns = self._clock.now_ns() - self._readout_ns - self._exposed_ns(self._next)
-        period_ns = 1e9 / self._rate_hz
+        period_ns = 1e9 / self._pace.rate_hz
         begun = self._started and self._next % self._cycle != 0
         if begun or late_ns <= (0.5 * period_ns if self._started else 0.0):
             self._started = True
@@ -196,13 +223,22 @@ class SyntheticCamera:
 
     def _exposed_ns(self, seq: int) -> int:
         """Middle of the exposure of row 0 of frame `seq`, own clock [ns]."""
-        return self._first_ns + round(seq * 1e9 / self._rate_hz)
+        return self._pace.exposed_ns(seq)
 
     def _own(self, t_ns: int) -> int:
         return self._clock.from_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
 
     def _true_ns(self, t_ns: int) -> int:
         return self._clock.to_true(t_ns) if isinstance(self._clock, _Skewed) else t_ns
+
+
+def _refuse_other_size(camera: CameraCalibration, true: CameraCalibration) -> None:
+    size, true_size = ((one.width_px, one.height_px) for one in (camera, true))
+    if size != true_size:
+        raise CalibrationError(
+            f"camera {camera.name!r}: width_px, height_px: {size[0]} x {size[1]}, the simulated camera has "
+            f"{true_size[0]} x {true_size[1]}: write that into the camera file"
+        )
 
 
 def _sensitivity(camera: CameraCalibration) -> Float:

@@ -21,19 +21,23 @@ Its settings, which another thread may change while frames are read, are in `v4l
 import ctypes as c
 import errno
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 
+from msgspec import structs
+
 from common.arrays import Image
 from common.calibration import CameraCalibration
+from common.camera_settings import same_exposed
 from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras import v4l2_abi as abi
 from slave.cameras.grey import Pixels
 from slave.cameras.passing import Passing
+from slave.cameras.settings import change
 from slave.cameras.source import Frame
 from slave.cameras.stamps import ForeignClock, clock_of, system_clock
 from slave.cameras.v4l2_formats import Layout, Offer, choose_offer, read_offers, set_format
@@ -98,7 +102,7 @@ class V4l2Camera:
         self._streaming = False
         self._settings: V4l2Settings | None = None
         self._rate_hz = 0.0
-        self._numbers = Passing[int]()
+        self._times = Passing[tuple[int, int]]()  # number and time of frames
         self.broken = 0
         self._device: abi.Device | None = self._open(open_device)
         try:
@@ -125,7 +129,7 @@ class V4l2Camera:
             except CameraError as error:
                 raise CameraError(f"{self._where}: {error}") from error
             self._count(int(buffer.sequence))
-            self._numbers.put(self._seq)
+            self._times.put((self._seq, t_ns))
             if image is None:
                 self.broken += 1
                 continue
@@ -156,18 +160,48 @@ class V4l2Camera:
         device.close()
 
     def tune(self, camera: CameraCalibration) -> None:
-        """Change the exposure while another thread reads frames; see `Tunable`.
+        """Change exposure and rate while another thread reads frames; see `Tunable`.
 
         Raises:
-            CameraError: See `V4l2Settings.tune`.
+            CameraError: See `V4l2Settings.tune`; or its driver changes no rate while frames come, as UVC's.
         """
-        settings = self._settings
-        assert settings is not None  # the constructor opened it
+        period_us = 1e6 / camera.frame_rate_hz
+        if camera.exposure_us >= period_us:
+            raise CameraError(
+                f"{self._where}: exposure_us {camera.exposure_us:g} does not fit into a frame of {period_us:.0f} us"
+            )
+        old = self._calibration
         try:
-            settings.tune(self._calibration, camera, self._numbers)
+            for step in _steps(old, camera):
+                self._step(step)
         except CameraError as error:
+            self._step_back(old, error)
             raise CameraError(f"{self._where}: {error}") from error
+
+    def _step(self, camera: CameraCalibration) -> None:
+        """Change the rate alone, or the exposure alone."""
+        settings, before = self._settings, self._calibration
+        assert settings is not None  # the constructor opened it
+        if camera.frame_rate_hz != before.frame_rate_hz:
+            change(self._retime, before, camera)
+        else:
+            settings.tune(before, camera, self._times)
         self._calibration = camera  # its exposure is in the time of every frame from now on
+
+    def _step_back(self, old: CameraCalibration, failed: CameraError) -> None:
+        """Have `old` again where the first of two steps was taken.
+
+        Raises:
+            CameraError: It does not come back.
+        """
+        if self._calibration is old:
+            return
+        try:
+            self._step(old)
+        except CameraError as error:
+            raise CameraError(
+                f"{self._where}: {failed}; and the settings before did not come back: {error}"
+            ) from error
 
     def figures(self) -> dict[str, float]:
         """Settings as the camera has them now, and the rate measured at the start; nothing where it is gone."""
@@ -196,7 +230,7 @@ class V4l2Camera:
         size = (camera.width_px, camera.height_px)
         offer = choose_offer(read_offers(device, size), size, camera.frame_rate_hz, options.pixels)
         self._layout = set_format(device, offer, options.pixels)
-        self._set_rate(device, size)
+        self._set_rate(device, camera)
         self._settings = settings = V4l2Settings(
             device, camera, options.controls, options.allow_missing, options.pixels
         )
@@ -219,12 +253,29 @@ class V4l2Camera:
             )
         return name
 
-    def _set_rate(self, device: abi.Device, size: tuple[int, int]) -> None:
-        rate_hz = self._calibration.frame_rate_hz
+    def _retime(self, camera: CameraCalibration) -> None:
+        """Have frames come at the rate of `camera` while the loop reads them, and see that they do."""
+        settings = self._settings
+        assert settings is not None  # the constructor opened it
+        settings.ask(lambda device: self._set_rate(device, camera))
+        times = list(self._times.following(SETTLE_FRAMES, TIMEOUT_S))
+        self._rate_hz = got_hz = _rate_of(times[len(times) // 3 :])  # the first ones are of the rate before
+        if abs(got_hz - camera.frame_rate_hz) > RATE_SHARE * camera.frame_rate_hz:
+            raise CameraError(
+                f"frame_rate_hz: wanted {camera.frame_rate_hz:g}, frames come at {got_hz:.4g} Hz"
+            )
+
+    def _set_rate(self, device: abi.Device, camera: CameraCalibration) -> None:
+        size, rate_hz = (camera.width_px, camera.height_px), camera.frame_rate_hz
         parameters = abi.StreamParameters(type=abi.CAPTURE, numerator=1000, denominator=round(rate_hz * 1000))
         try:
             device.ioctl(abi.S_PARM, parameters)
         except OSError as error:
+            if error.errno == errno.EBUSY:
+                raise CameraError(
+                    f"frame_rate_hz: its driver sets no other rate ({rate_hz:g}) while frames come: write it into the "
+                    "camera file, and restart the slave"
+                ) from error
             if error.errno not in (errno.EINVAL, errno.ENOTTY):
                 raise
             return  # a fixed rate: it is measured below
@@ -254,8 +305,7 @@ class V4l2Camera:
         for _ in range(SETTLE_FRAMES):
             _, buffer = self._next(device)
             times.append((int(buffer.sequence), self._row_zero_ns(buffer)))
-        periods = [(b[1] - a[1]) / max(b[0] - a[0], 1) for a, b in pairwise(times) if b[1] > a[1]]
-        self._rate_hz = got_hz = 1e9 / median(periods) if periods else 0.0
+        self._rate_hz = got_hz = _rate_of(times)
         rate_hz = self._calibration.frame_rate_hz
         if abs(got_hz - rate_hz) > RATE_SHARE * rate_hz:
             raise CameraError(
@@ -311,6 +361,21 @@ class V4l2Camera:
         if buffer.flags & abi.STAMP_SOURCE == abi.STAMP_START_OF_EXPOSURE:
             return t_ns + half_ns
         return t_ns - round(self._calibration.height_px * self._calibration.row_time_us * 1e3) - half_ns
+
+
+def _steps(old: CameraCalibration, new: CameraCalibration) -> list[CameraCalibration]:
+    """From `old` to `new`: rate and exposure one after the other, so that the exposure always fits into a frame."""
+    retimed = structs.replace(old, frame_rate_hz=new.frame_rate_hz)
+    exposed = structs.replace(new, frame_rate_hz=old.frame_rate_hz)
+    if same_exposed(retimed, new) or same_exposed(exposed, new):
+        return [new]
+    return [exposed if new.exposure_us < old.exposure_us else retimed, new]
+
+
+def _rate_of(times: Sequence[tuple[int, int]]) -> float:
+    """Rate [Hz] of frames by their numbers and times [ns]; 0: there are too few."""
+    periods = [(b[1] - a[1]) / max(b[0] - a[0], 1) for a, b in pairwise(times) if b[1] > a[1]]
+    return 1e9 / median(periods) if periods else 0.0
 
 
 def _usb_clock_is_used() -> bool:

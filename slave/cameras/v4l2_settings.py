@@ -82,7 +82,7 @@ class V4l2Settings:
             settle()
         demand("it", self._wanted, read_back(self._device, self._controls, self._wanted), FIX)
 
-    def tune(self, old: CameraCalibration, new: CameraCalibration, frames: Passing[int]) -> None:
+    def tune(self, old: CameraCalibration, new: CameraCalibration, frames: Passing[tuple[int, int]]) -> None:
         """Change the exposure of the running camera; see `Tunable.tune`.
 
         Args:
@@ -107,7 +107,7 @@ class V4l2Settings:
         """Exposure and codes as the camera has them now; nothing where it is gone."""
         shown = [setting for setting in self._wanted if setting.name not in AUTOMATICS]
         try:
-            got = self._ask(lambda device: read_back(device, self._controls, shown))
+            got = self.ask(lambda device: read_back(device, self._controls, shown))
         except CameraError:  # the loop will say so
             return {}
         found = {f"control.{name}"[:64]: float(value) for name, value in got.items() if name != EXPOSURE}
@@ -120,7 +120,7 @@ class V4l2Settings:
         with self._asking:
             self._device = None
 
-    def _apply(self, camera: CameraCalibration, frames: Passing[int]) -> None:
+    def _apply(self, camera: CameraCalibration, frames: Passing[tuple[int, int]]) -> None:
         period_us = 1e6 / camera.frame_rate_hz
         if camera.exposure_us >= period_us:
             raise CameraError(
@@ -129,13 +129,18 @@ class V4l2Settings:
         controls = self._controls
         wanted = plan(camera, controls, self._given, self._missing, self._pixels)
         exposure = [setting for setting in wanted if setting.name == EXPOSURE]
-        self._ask(lambda device: write(device, controls, exposure))
+        self.ask(lambda device: write(device, controls, exposure))
         for _ in frames.following(SETTLE_FRAMES, TIMEOUT_S):
             pass
-        demand("it", wanted, self._ask(lambda device: read_back(device, controls, wanted)), FIX)
+        demand("it", wanted, self.ask(lambda device: read_back(device, controls, wanted)), FIX)
         self._wanted = wanted
 
-    def _ask(self, question: Callable[[Device], T]) -> T:
+    def ask(self, question: Callable[[Device], T]) -> T:
+        """What the open device answers, from any thread.
+
+        Raises:
+            CameraError: It is closed or gone, or what the question raises.
+        """
         with self._asking:
             if self._device is None:
                 raise CameraError("it was closed meanwhile")

@@ -18,21 +18,25 @@ from slave.cameras.passing import Passing
 from slave.markers.colour_watch import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.following import FollowingDetector
+from slave.markers.known import KnownDetector
 from slave.tuning import CameraFiles, Prepare
 
 LOOKS = 60  # a first light takes some tens of frames to be proven, or is not there to be proven
 TIMEOUT_S = 0.5
-Changeable: TypeAlias = MarkerDetector | FollowingDetector
+RECENT = 8  # frames whose detections are kept for whoever shows one of them
+Changeable: TypeAlias = MarkerDetector | FollowingDetector | KnownDetector
 
 
 class ChangingDetector:
-    """Holds the detector in use, the one that takes over with the next frame, and that frame's predecessor."""
+    """Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and what was
+    found of late."""
 
     def __init__(self, detector: Changeable) -> None:
         """Begin with `detector`."""
         self._detector = detector
         self._next: deque[Changeable] = deque(maxlen=1)  # one thread fills it, another empties it
         self._frames = Passing[tuple[Image, int]]()
+        self._found: deque[tuple[int, Float]] = deque(maxlen=RECENT)
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame; arguments and errors as of `MarkerDetector.push`."""
@@ -41,22 +45,16 @@ class ChangingDetector:
             _hand_over(self._detector, coming)
             self._detector = coming
         self._frames.put((image, t_ns))
-        return self._detector.push(image, t_ns)
+        found = self._detector.push(image, t_ns)
+        self._found.append((t_ns, found.uv))
+        return found
 
-    def expose(self, exposure_us: float) -> None:
-        """The camera's exposure [us] has changed. From any thread."""
-        self._detector.expose(exposure_us)
+    def tune(self, camera: CameraCalibration) -> None:
+        """The camera has another exposure or margin. From any thread."""
+        self._detector.tune(camera)
 
     def replace(self, detector: Changeable) -> None:
-        """Let `detector`, of the same markers and kind, take over. Not from the loop's thread: it may take a second.
-
-        Raises:
-            ValueError: It follows the light and the one in use does not, or the other way round.
-        """
-        if type(detector) is not self.kind:
-            raise ValueError(
-                "a detector that follows the light and one that does not cannot replace each other"
-            )
+        """Let `detector`, of the same markers, take over. Not from the loop's thread: it may take a second."""
         if isinstance(detector, FollowingDetector):
             try:
                 for image, t_ns in self._frames.following(LOOKS, TIMEOUT_S):
@@ -68,9 +66,25 @@ class ChangingDetector:
         self._next.append(detector)
 
     @property
-    def kind(self) -> type[Changeable]:
-        """What the detector in use is, and every other must be."""
-        return type(self._detector)
+    def newest(self) -> tuple[Image, int] | None:
+        """The last frame and its time [ns]; None before the first. From any thread."""
+        return self._frames.newest
+
+    def found(self, t_ns: int) -> Float | None:
+        """Centroids (M, 2) [px] in the frame of a time [ns], NaN: not seen; None: too long ago. From any thread."""
+        return next((uv for at_ns, uv in tuple(self._found) if at_ns == t_ns), None)
+
+    @property
+    def plain(self) -> MarkerDetector | None:
+        """What detects at present, with its colour table; None: no colour is known. From any thread."""
+        return _plain(self._detector)
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """Markers without a colour, which are not sought, or will not be from the next frame on. From any thread."""
+        coming = tuple(self._next)
+        latest = coming[-1] if coming else self._detector
+        return latest.missing if isinstance(latest, KnownDetector) else ()
 
     @property
     def follows(self) -> bool:
@@ -105,36 +119,40 @@ def marker_changes(
 
     def prepare(old: CameraFiles, new: CameraFiles) -> Callable[[], None] | None:
         made = None
-        if (new.camera.markers, new.rig.free_markers) != (old.camera.markers, old.rig.free_markers):
+        looks = [(files.camera.markers, files.rig.free_markers) for files in (old, new)]
+        if looks[0] != looks[1]:
             made = make(new.camera, new.rig)
-            _refuse_other_kind(detector, made)
-        if made is None and new.camera.exposure_us == old.camera.exposure_us:
+            _refuse_blinding(detector, made)
+        tuned = [(files.camera.exposure_us, files.camera.roi_margin) for files in (old, new)]
+        if made is None and tuned[0] == tuned[1]:
             return None
 
         def switch() -> None:
             if made is not None:
                 detector.replace(made)
-            detector.expose(new.camera.exposure_us)
+            detector.tune(new.camera)
 
         return switch
 
     return prepare
 
 
-def _refuse_other_kind(old: ChangingDetector, made: Changeable) -> None:
-    if type(made) is not old.kind:
-        change = "have" if old.follows else "did not have"
+def _refuse_blinding(old: ChangingDetector, made: Changeable) -> None:
+    if old.follows and isinstance(made, MarkerDetector):
         raise CalibrationError(
-            f"markers: reference_bgr_linear: the colours in use {change} it for every marker, and the light is "
-            f"{'followed' if old.follows else 'not followed'}: restart the slave to change that"
+            "markers: reference_bgr_linear: the colours in use have it for every marker, and the light is followed: "
+            "restart the slave to change that"
         )
 
 
+def _plain(detector: Changeable) -> MarkerDetector | None:
+    return detector if isinstance(detector, MarkerDetector) else detector.plain
+
+
 def _hand_over(old: Changeable, new: Changeable) -> None:
-    match old, new:
-        case (FollowingDetector(), FollowingDetector()):
-            new.adopt(old)
-        case (MarkerDetector(), MarkerDetector()):
-            new.adopt(old)
-        case _:
-            raise AssertionError("`replace` lets no other kind in")
+    if isinstance(old, FollowingDetector) and isinstance(new, FollowingDetector):
+        new.adopt(old)
+        return
+    before, after = _plain(old), _plain(new)
+    if before is not None and after is not None:
+        after.adopt(before)

@@ -21,6 +21,9 @@ from common.errors import CalibrationError
 
 Codes: TypeAlias = npt.NDArray[np.unsignedinteger]
 HUES = 180
+PLANES = (
+    16  # of the table that are made at once: a thread beside a busy loop waits for its turn at every step
+)
 COARSE = 0xF8F8F8  # the scan looks colours up in steps of 8 levels: what it uses of the table fits a cache
 # Skin of every tone lies between red and orange, less saturated than paint (Kalbfleisch: it collides with red, orange
 # and yellow markers, which is why those are not used).
@@ -67,8 +70,9 @@ class ColourTable:
         blue, green, red = tables
         cube = self._table.reshape(256, 256, 256)
         made = np.empty_like(cube)
-        for plane, source in zip(made, red, strict=True):
-            cube[source].take(green, axis=0).take(blue, axis=1, out=plane)
+        for start in range(0, 256, PLANES):
+            some = slice(start, start + PLANES)
+            cube[red[some]].take(green, axis=1).take(blue, axis=2, out=made[some])
         other = copy(self)
         other._table = made.reshape(-1)
         other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), made.dtype)
@@ -157,12 +161,14 @@ def _build(ranges: Sequence[HsvRange]) -> Codes:
     table = np.empty(
         (256, 256, 256), kind
     )  # red, green, blue: the byte order of a packed little-endian pixel
-    plane = np.empty((256, 256, 3), np.uint8)
-    plane[..., 0] = np.arange(256)[None, :]
-    plane[..., 1] = np.arange(256)[:, None]
-    for red, codes in enumerate(table):
-        plane[..., 2] = red
-        hue, saturation, value = np.asarray(cv2.split(cv2.cvtColor(plane, cv2.COLOR_BGR2HSV)), np.uint8)
+    planes = np.empty((PLANES, 256, 256, 3), np.uint8)
+    planes[..., 0] = np.arange(256)
+    planes[..., 1] = np.arange(256)[:, None]
+    for start in range(0, 256, PLANES):
+        planes[..., 2] = np.arange(start, start + PLANES)[:, None, None]
+        flat = cv2.cvtColor(planes.reshape(PLANES * 256, 256, 3), cv2.COLOR_BGR2HSV)
+        hue, saturation, value = np.asarray(cv2.split(flat), np.uint8)
+        codes = table[start : start + PLANES].reshape(PLANES * 256, 256)  # a view
         codes[:] = hues.take(hue) & saturations.take(saturation) & values.take(value)
     return table.reshape(-1)
 

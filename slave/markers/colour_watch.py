@@ -33,10 +33,14 @@ class ColourWarning:
     Attributes:
         marker: Its name; None: it concerns all.
         text: What is seen, and the fix.
+        twin: Another marker that looks like it; None: it is about this one alone.
+        hues: How far the two are apart, of 180.
     """
 
     marker: str | None
     text: str
+    twin: str | None = None
+    hues: float = 0.0
 
 
 def hsv(light: Float) -> Float:
@@ -133,6 +137,8 @@ class ColourWatch:
                 self._names[a],
                 f"markers {self._names[a]} and {self._names[b]} look alike, hues {hue[a]:.0f} and {hue[b]:.0f}: "
                 f"take brighter light, or repaint one",
+                self._names[b],
+                float(apart[a, b]),
             )
             for a, b in np.argwhere(np.triu(near, 1)).tolist()
         ]

@@ -72,7 +72,7 @@ def calibrate(image: Image, clicks: Mapping[str, tuple[float, float]]) -> list[C
     """
     hsv = cast(Image, cv2.cvtColor(image, cv2.COLOR_BGR2HSV))
     paint = {name: grow(hsv, name, uv) for name, uv in clicks.items()}
-    skin, background = _surroundings(hsv, paint)
+    skin, background = surroundings(hsv, paint)
     return rows_of({name: hsv[mask] for name, mask in paint.items()}, hsv[skin], hsv[background])
 
 
@@ -186,7 +186,7 @@ def _refuse_twins(hue: Mapping[str, float]) -> None:
             )
 
 
-def _surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
+def surroundings(hsv: Image, paint: Mapping[str, Bool]) -> tuple[Bool, Bool]:
     """Skin near the markers, and everything that is neither paint nor its rim."""
     union = np.any(list(paint.values()), axis=0).astype(np.uint8)
     rim = cv2.dilate(union, np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)) != 0

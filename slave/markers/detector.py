@@ -1,6 +1,7 @@
 """Frame in, marker centroids out: scan everything, decide which blob is which marker, measure it.
 
-A push machine. It holds one track per marker, nothing else; a new recording gets a new detector (`fresh`).
+A push machine. It holds one track per marker, and counts what is beside them; a new recording gets a new
+detector (`fresh`).
 
     scan     one table look-up on every second pixel, all colours at once         classify
     blobs    connected blobs per colour                                          blobs
@@ -15,7 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Float, Image
-from common.calibration import CameraCalibration
+from common.calibration import CameraCalibration, HsvRange
+from slave.markers.beside import Beside
 from slave.markers.blobs import SCALE, Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
 from slave.markers.classify import Codes, ColourTable, table_of
@@ -102,6 +104,7 @@ class MarkerDetector:
         """
         self._camera = camera
         self._exposure_s = camera.exposure_us * 1e-6
+        self._margin = camera.roi_margin
         self._names = markers
         self._table = table_of(markers, camera.markers, f"camera {camera.name!r}") if table is None else table
         self._free = tuple(markers.index(name) for name in free)
@@ -109,6 +112,7 @@ class MarkerDetector:
         engine.prepare(self._table)
         self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
         self._tracks: list[Track | None] = [None] * len(markers)
+        self.beside = Beside(markers)  # things of a marker's colour that are none
         self._turn = -1  # which further grid is next; negative before the first frame
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
@@ -132,6 +136,7 @@ class MarkerDetector:
         image = np.ascontiguousarray(image)
         codes, blobs = self._scan(image)
         chosen = self._decide(codes, blobs, t_ns)
+        self.beside.push(blobs, chosen)
         self._seeds = {}
         rows = list(chosen)
         rivals: dict[int, Blob] = {}
@@ -158,13 +163,33 @@ class MarkerDetector:
         np.round(result, DIGITS, out=result)
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
-    def adopt(self, other: "MarkerDetector") -> None:
-        """Go on with the tracks of a detector of the same markers."""
-        self._tracks, self._turn, self._seeds = other._tracks, other._turn, {}
+    @property
+    def table(self) -> ColourTable:
+        """The colour table in use; its bits are in the order of `markers`."""
+        return self._table
 
-    def expose(self, exposure_us: float) -> None:
-        """The camera's exposure [us] has changed: motion smears over it."""
-        self._exposure_s = exposure_us * 1e-6
+    @property
+    def ranges(self) -> Mapping[str, HsvRange]:
+        """Marker -> its range in the camera file, under the light of calibration."""
+        return self._camera.markers or {}
+
+    @property
+    def markers(self) -> tuple[str, ...]:
+        """What it seeks, in the order of its rows."""
+        return self._names
+
+    def adopt(self, other: "MarkerDetector") -> None:
+        """Go on with the tracks of another detector, of the markers that both seek."""
+        self._seeds = {}
+        if other._names == self._names:
+            self._tracks, self._turn, self.beside = other._tracks, other._turn, other.beside
+            return
+        tracks = dict(zip(other._names, other._tracks, strict=True))
+        self._tracks = [tracks.get(name) for name in self._names]
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """The file has another exposure, over which motion smears, or another margin. From any thread."""
+        self._exposure_s, self._margin = camera.exposure_us * 1e-6, camera.roi_margin
 
     def recolour(self, table: ColourTable) -> None:
         """Go on with another colour table of the same markers, prepared for the engine; tracks go on."""
@@ -204,7 +229,7 @@ class MarkerDetector:
         others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
         if track is not None and track.alive(t_ns):
             width = self._camera.width_px
-            others = [b for b in others if math.isfinite(track.cost(b, t_ns, width))]
+            others = [b for b in others if math.isfinite(track.cost(b, t_ns, width, self._margin))]
         foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
         others = [b for b in others if not on_fringe(b, foreign)]
         return max(others, key=lambda b: b.area) if others else None
@@ -248,7 +273,7 @@ class MarkerDetector:
             if track is None or not track.alive(t_ns):
                 certain = False
                 continue
-            costs = [track.cost(blob, t_ns, width) for blob in options]
+            costs = [track.cost(blob, t_ns, width, self._margin) for blob in options]
             cost = min(costs)
             if math.isfinite(cost):
                 tracked[m] = options[costs.index(cost)]

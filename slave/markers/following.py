@@ -85,14 +85,19 @@ class FollowingDetector:
         """Whether it may tell markers by their colours: the light is known, and its table made for it."""
         return self._light.trusted and apart(self.log_gains, self._in_use) <= REFUSE
 
+    @property
+    def plain(self) -> MarkerDetector:
+        """What detects, with the colours of the light as far as they are followed."""
+        return self._detector
+
     def adopt(self, other: "FollowingDetector") -> None:
-        """Go on with the tracks and counts of a detector of the same markers, under the light that this one knows."""
+        """Go on with the tracks and counts of another detector, under the light that this one knows."""
         self._detector.adopt(other._detector)
         self.refused, self.tables = other.refused, other.tables + self.tables
 
-    def expose(self, exposure_us: float) -> None:
-        """As of `MarkerDetector`; what it does to the colours is seen as a change of the light."""
-        self._detector.expose(exposure_us)
+    def tune(self, camera: CameraCalibration) -> None:
+        """As of `MarkerDetector`; what an exposure does to the colours is seen as a change of the light."""
+        self._detector.tune(camera)
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "FollowingDetector":
         """A detector of the same camera, under the same light, that has seen no marker yet."""

@@ -1,6 +1,6 @@
 """Say where a tracked marker is expected, and whether a blob there may be it.
 
-The region of interest is the marker's last box, moved by its velocity and widened by 40 px at 640 px image width
+The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
 (Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the
 marker; the scan has looked at the whole frame anyway, so a marker outside its window costs nothing.
 """
@@ -11,7 +11,6 @@ from typing import NamedTuple
 from slave.markers.blobs import Blob
 from slave.markers.centroid import Measured
 
-MARGIN = 40.0 / 640.0  # of the image width
 HOLD_NS = 500_000_000  # a marker not seen for longer is sought like a new one
 VELOCITY_NS = 100_000_000  # a velocity is trusted no longer than this
 GROWTH_PER_S = 1.0  # of the image width: about 1 m/s at 0.6 m
@@ -65,11 +64,14 @@ class Track(NamedTuple):
         dt_s = min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9
         return self.u + self.du * dt_s, self.v + self.dv * dt_s
 
-    def cost(self, blob: Blob, t_ns: int, image_width: int) -> float:
-        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible."""
+    def cost(self, blob: Blob, t_ns: int, image_width: int, roi_margin: float) -> float:
+        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible.
+
+        `roi_margin`: how much wider than the marker the window is, share of the image width.
+        """
         u, v = self.predicted(t_ns)
         growth = max(0.0, (t_ns - self.t_ns - VELOCITY_NS) * 1e-9) * GROWTH_PER_S
-        margin = image_width * (MARGIN + growth)
+        margin = image_width * (roi_margin + growth)
         x, y = abs(blob.u - u), abs(blob.v - v)
         if x > margin + self.width or y > margin + self.height or blob.area > LARGEST * self.whole + 40.0:
             return math.inf

@@ -4,6 +4,7 @@ frame -> strobe -> triple -- LED less ambient ---> seams between the fingers, fi
                          \\-- laser less ambient -> where the laser meets each finger
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from slave.wrist.registration import shifted
 from slave.wrist.strobe import Strobe, Triple
 from slave.wrist.view import WristView
 
+RECENT = 4  # triples
 _NONE = np.zeros(2)
 _NONE.flags.writeable = False
 
@@ -62,9 +64,10 @@ class WristFound:
 
 
 class WristDetector:
-    """Holds the strobe, which knows the frames since the last triple, and the view that the next triple is seen with.
+    """Holds the strobe, which knows the frames since the last triple, the view that the next triple is seen with, and
+    what was found of late, for whoever shows it.
 
-    Of a pose nothing is kept: two triples have nothing to do with each other.
+    Of a pose nothing is used again: two triples have nothing to do with each other.
     """
 
     def __init__(
@@ -80,6 +83,7 @@ class WristDetector:
         """
         self._strobe, self._led_shift = Strobe(frame_rate_hz), led_shift_px
         self._engine = engine
+        self._found: deque[tuple[int, Float, Float]] = deque(maxlen=RECENT)
         self._view = prepared(view, engine)
 
     @property
@@ -90,7 +94,18 @@ class WristDetector:
     def push(self, frame: Frame) -> WristFound | None:
         """Take the next frame of the camera; what was found, where it completes a triple."""
         triple = self._strobe.push(frame)
-        return None if triple is None else find(triple, self._view, self._led_shift, self._engine)
+        if triple is None:
+            return None
+        found = find(triple, self._view, self._led_shift, self._engine)
+        self._found.append((triple.led.t_ns, found.laser.uv, found.tips.uv))
+        return found
+
+    def found(self, t_ns: int) -> tuple[Float, Float] | None:
+        """Laser points and tips (5, 2) [px] of the triple whose LED frame is of that time [ns], NaN: not seen.
+
+        None: too long ago, or no such frame. From any thread.
+        """
+        return next(((laser, tips) for at_ns, laser, tips in tuple(self._found) if at_ns == t_ns), None)
 
     def replace(self, view: WristView) -> None:
         """See with another view, a prepared one, from the next triple on. From any thread."""

@@ -79,6 +79,7 @@ class Camera:
         keeps: What a written value becomes, by control name.
         resets: Control name -> value it falls back to when the stream starts.
         real_rate_hz: At which frames really come, if not as set.
+        keeps_rate: It sets no rate while it streams, as uvcvideo.
         queue: Frames ready at each wait (1: the program keeps up).
         skip: Frame numbers the camera lost.
         damaged: Frame numbers that arrive with the error flag.
@@ -99,6 +100,7 @@ class Camera:
     resets: dict[str, int] = field(default_factory=dict[str, int])
     refuses: dict[str, int] = field(default_factory=dict[str, int])
     real_rate_hz: float | None = None
+    keeps_rate: bool = False
     stepwise: tuple[int, int, int, int, int, int] | None = None
     capabilities: int = abi.CAP_CAPTURE | abi.CAP_STREAMING
     stamp_flags: int = abi.STAMP_MONOTONIC | abi.STAMP_START_OF_EXPOSURE
@@ -248,6 +250,8 @@ class FakeDevice:
         pix.sizeimage = self._bytes
 
     def _s_parm(self, asked: abi.StreamParameters) -> None:
+        if self.camera.keeps_rate and self._streaming:
+            raise _error(errno.EBUSY)
         sizes = self.camera.formats[self._format]
         wanted = asked.denominator / asked.numerator
         rates = next(iter(sizes.values())) if self.camera.stepwise else sizes[self._size]
@@ -305,7 +309,8 @@ class FakeDevice:
         if not self._full:
             raise _error(errno.EAGAIN)
         index, number, used = self._full.pop(0)
-        rate_hz = self.camera.real_rate_hz or self._rate_hz
+        exposure = self.camera.knob("Exposure Time").value  # 100 us: no frame is shorter
+        rate_hz = self.camera.real_rate_hz or min(self._rate_hz, 1e4 / exposure)
         stamp_us = (self.camera.stamp_zero_ns + round(number * 1e9 / rate_hz)) // 1000
         buffer.index, buffer.bytesused = index, used
         buffer.sequence = number if self.camera.counts else 0

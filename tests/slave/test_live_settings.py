@@ -133,7 +133,7 @@ def test_what_is_out_of_range_is_refused_before_anything_is_written(
     with reading(source), pytest.raises(CameraError, match=says):
         source.tune(changed(**changes))
     written = {value for _, controls in sensor.opened[0]._changes for value in controls.values()}
-    assert written <= {5000, 1.25, (0.83, 1.24)}
+    assert written <= {5000, 1.25, (0.83, 1.24), (33333, 33333)}, "what it had"
 
 
 def test_a_usb_camera_takes_an_exposure_while_it_is_read() -> None:
@@ -164,6 +164,58 @@ def test_what_a_usb_camera_does_not_take_is_named_and_the_old_exposure_comes_bac
             source.tune(changed(exposure_us=9000.0))
         assert str(error.value).endswith("the settings before are back")
     assert camera.knob("Exposure Time").value == 50
+
+
+def test_a_pi_camera_takes_another_rate_within_its_mode_unless_it_runs_in_step(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    source = pi(monkeypatch, Sensor())
+    with reading(source):
+        source.tune(changed(frame_rate_hz=20.0))
+        assert source.figures()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
+        with pytest.raises(CameraError, match=r"FrameDurationLimits 1000, 1000 is not within"):
+            source.tune(changed(frame_rate_hz=1000.0, exposure_us=500.0))
+        assert source.figures()["frame_rate_hz"] == pytest.approx(20.0, rel=2e-3)
+    install(monkeypatch, Sensor())
+    led = Picamera2Camera(FILE, Picamera2Options(sync="server"), SystemClock())
+    with (
+        reading(led),
+        pytest.raises(CameraError, match="30 cannot become 20 while it runs in step with others"),
+    ):
+        led.tune(changed(frame_rate_hz=20.0))
+
+
+def test_a_usb_camera_takes_another_rate_where_its_driver_does() -> None:
+    source = usb(Camera())
+    with reading(source):
+        source.tune(changed(frame_rate_hz=15.0))
+        assert source.figures()["frame_rate_hz"] == pytest.approx(15.0, rel=1e-2)
+        with pytest.raises(CameraError, match="exposure_us 70000 does not fit into a frame of 66667 us"):
+            source.tune(changed(frame_rate_hz=15.0, exposure_us=70_000.0))
+    source = usb(Camera(keeps_rate=True))
+    with reading(source):
+        with pytest.raises(
+            CameraError, match="while frames come: write it into the camera file, and restart"
+        ):
+            source.tune(changed(frame_rate_hz=15.0))
+        source.tune(changed(exposure_us=9000.0))
+        assert source.figures()["frame_rate_hz"] == pytest.approx(30.0, rel=1e-2)
+
+
+def test_a_usb_camera_takes_rate_and_exposure_together_in_the_order_that_it_can() -> None:
+    camera = Camera()
+    source = usb(camera)
+    slow, fast = changed(frame_rate_hz=15.0, exposure_us=50_000.0), changed(frame_rate_hz=30.0)
+    with reading(source):
+        for file in (slow, fast):
+            source.tune(file)
+            got = source.figures()
+            assert got["exposure_us"] == file.exposure_us
+            assert got["frame_rate_hz"] == pytest.approx(file.frame_rate_hz, rel=1e-2)
+        camera.real_rate_hz = 30.0  # the second step fails: the first one is taken back
+        with pytest.raises(CameraError, match="frame_rate_hz: wanted 15, frames come at 30 Hz"):
+            source.tune(changed(frame_rate_hz=15.0, exposure_us=4000.0))
+        assert source.figures()["exposure_us"] == fast.exposure_us
 
 
 def test_what_a_usb_camera_cannot_change_is_said() -> None:

@@ -218,3 +218,19 @@ def test_frames_are_handed_over_when_the_longer_exposure_is_over() -> None:
     frame = source.read()
     assert frame is not None
     assert 0 <= frame.ready_t_ns - frame.t_ns - READOUT_NS - 2_000_000 < 1_000
+
+
+def test_another_rate_holds_from_the_next_frame_on() -> None:
+    clock = StageClock(EPOCH_NS)
+    source = camera(clock)
+    times = [frame.t_ns for _ in range(3) if (frame := source.read()) is not None]
+    source.tune(msgspec.structs.replace(CAMERAS["left"], frame_rate_hz=30.0))
+    frames = [frame for _ in range(3) if (frame := source.read()) is not None]
+    assert [frame.seq for frame in frames] == [3, 4, 5], "none is counted as lost"
+    times += [frame.t_ns for frame in frames]
+    np.testing.assert_allclose(np.diff(times) * 1e-9, [1 / 60, 1 / 60, 1 / 60, 1 / 30, 1 / 30], atol=1e-8)
+    assert source.figures()["frame_rate_hz"] == 30.0
+    with pytest.raises(
+        CameraError, match="frame_rate_hz: wanted 120, the rows of a frame are read out in 9888 us"
+    ):
+        source.tune(msgspec.structs.replace(CAMERAS["left"], frame_rate_hz=120.0))

@@ -1,5 +1,6 @@
 """The settings of a running camera: commands over the bus, changed files; what is refused changes nothing."""
 
+import dataclasses
 import threading
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -131,7 +132,16 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
             "name: left cannot become right while it runs: restart the slave",
         ),
         ("load", text(changed(width_px=320)), "width_px: 640 cannot become 320 while it runs"),
-        ("load", text(changed(frame_rate_hz=90.0)), "frame_rate_hz: 60.0 cannot become 90.0 while it runs"),
+        ("load", text(changed(focus_m=0.5)), "focus_m: None cannot become 0.5 while it runs"),
+        ("set", '{"roi_margin": 0.6}', r"set: Expected `float` <= 0.5 - at `\$.roi_margin`"),
+        ("set", '{"markers": {"palm": null}}', "set: markers: the rig has no palm; it has thumb, index"),
+        (
+            "set",
+            '{"exposure_us": 9000, "markers": {"index": {"hsv_low": [60, 200, 64], "hsv_high": [76, 100, 255]}}}',
+            "set: markers.index: S of hsv_low is above hsv_high",
+        ),
+        ("pick", '{"marker": "index", "uv": [3, 4]}', "pick: this slave seeks no markers"),
+        ("pick", '{"marker": "index"}', "pick: Object missing required field `uv`"),
         ("settings", "{}", "takes no body"),
         ("save", text(FILE), "takes no body"),
     ],
@@ -375,3 +385,74 @@ def replaced(make: Callable[[], Any]) -> list[int]:
 def test_no_frame_is_lost_for_a_detector_that_takes_over() -> None:
     counts = replaced(lambda: detector_for(FILE, RIG.markers, Inline()))
     assert min(counts[1:]) == 6, counts
+
+
+def test_rate_margin_and_ranges_are_set_by_name_and_told(tuning: CameraTuning, knobs: Knobs) -> None:
+    ring = '{"hsv_low": [120, 1, 2], "hsv_high": [150, 4, 5]}'
+    body = f'{{"frame_rate_hz": 30, "roi_margin": 0.1, "markers": {{"ring": {ring}}}}}'
+    answer = tuning.commands()["set"](body)
+    (camera,) = knobs.tuned
+    assert FILE.markers is not None
+    assert camera.markers is not None
+    assert camera.frame_rate_hz == 30.0
+    assert camera.markers["ring"].hsv_low == (120, 1, 2)
+    assert camera.markers["ring"].reference_bgr_linear == FILE.markers["ring"].reference_bgr_linear
+    assert {name: colour for name, colour in camera.markers.items() if name != "ring"} == {
+        name: colour for name, colour in FILE.markers.items() if name != "ring"
+    }
+    assert (answer["roi_margin"], answer["wanted.frame_rate_hz"]) == (0.1, 30.0)
+    told = [answer[f"marker.ring.{key}"] for key in ("h_low", "s_low", "v_low", "h_high", "s_high", "v_high")]
+    assert told == [120, 1, 2, 150, 4, 5]
+    assert "marker.back2.h_low" not in answer, "it is no marker of this rig"
+    tuning.commands()["set"]('{"markers": {"ring": null}}')
+    assert "marker.ring.h_low" not in tuning.commands()["settings"]("")
+
+
+def test_a_wrist_device_keeps_its_rate(files: CameraFiles, knobs: Knobs) -> None:
+    rig = msgspec.structs.replace(RIG, kind="wrist")
+    tuning = CameraTuning(dataclasses.replace(files, rig=rig), knobs, None, lambda: True)
+    with pytest.raises(
+        CalibrationError, match=r"60.0 cannot become 30.0 while laser and LEDs flash in its time"
+    ):
+        tuning.commands()["set"]('{"frame_rate_hz": 30}')
+
+
+def test_what_others_write_into_the_file_and_what_was_set_here_stay_beside_each_other(
+    tuning: CameraTuning, files: CameraFiles
+) -> None:
+    """A lens is calibrated by the master, which writes it into the file, while colours are set here."""
+    save(files.camera_path, bare := changed(intrinsics=None))
+    tuning.look()
+    tuning.commands()["set"]('{"markers": {"ring": {"hsv_low": [120, 1, 2], "hsv_high": [150, 4, 5]}}}')
+    save(files.camera_path, FILE)  # the lens
+    tuning.look()
+    assert tuning.commands()["settings"]("")["marker.ring.h_low"] == 120
+    assert load(files.camera_path, CameraCalibration) == FILE, "not asked to save"
+    save(
+        files.camera_path, msgspec.structs.replace(bare, row_time_us=10.0)
+    )  # and once more, just before it saves
+    tuning.commands()["save"]("")
+    saved = load(files.camera_path, CameraCalibration)
+    assert (saved.intrinsics, saved.row_time_us) == (None, 10.0)
+    assert saved.markers is not None
+    assert saved.markers["ring"].hsv_low == (120, 1, 2)
+    assert saved.provenance["markers"].tool == "phalanx-slave set"
+    assert saved.provenance["markers"].data == ("ring",)
+
+
+def test_save_makes_the_file_that_is_not_there(tuning: CameraTuning, files: CameraFiles) -> None:
+    files.camera_path.unlink()
+    files.camera_path.parent.rmdir()
+    tuning.commands()["save"]("")
+    assert load(files.camera_path, CameraCalibration) == FILE
+
+
+def test_a_file_or_a_load_without_a_colour_that_is_in_use_is_refused(
+    files: CameraFiles, knobs: Knobs
+) -> None:
+    tuning = CameraTuning(files, knobs, lambda _old, _new: None, lambda: True)
+    with pytest.raises(CalibrationError, match=r"no HSV range for thumb, index, .* which have one in use"):
+        tuning.commands()["load"](text(changed(markers=None)))
+    save(files.camera_path, changed(markers=None))
+    tuning.look()
+    assert tuning.counts()["reload.refused"] == 1

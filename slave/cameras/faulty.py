@@ -1,0 +1,159 @@
+"""A simulated camera with faults that come and go, for rehearsals of the checklist: what is wrong is in a JSON file
+that is read again whenever it changes (`phalanx-slave run --camera synthetic --faults FILE`, docs/checklist.md).
+
+The pictures, settings and times are those of the camera inside; here they are spoiled as a real one spoils them.
+"""
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+from msgspec import Meta, Struct
+from msgspec.structs import replace as with_fields
+
+from common.arrays import Image
+from common.calibration import CameraCalibration
+from common.errors import CameraError
+from slave.cameras.source import Frame
+from slave.cameras.synthetic import SyntheticCamera
+
+LOOK_NS = 100_000_000
+_LOG = logging.getLogger(__name__)
+Byte = Annotated[int, Meta(ge=0, le=255)]
+
+
+class Patch(Struct, frozen=True, forbid_unknown_fields=True):
+    """A disc of one colour before the camera: its middle and radius [px], its colour in sRGB, blue first."""
+
+    uv: tuple[float, float]
+    radius_px: Annotated[float, Meta(gt=0.0, le=1000.0)]
+    bgr: tuple[Byte, Byte, Byte]
+
+
+class Faults(Struct, frozen=True, forbid_unknown_fields=True):
+    """What is wrong with the camera; by default nothing.
+
+    Attributes:
+        exposes: How many times as long as it was told it exposes: an automatic that was not switched off.
+        moved_px: How far the picture has moved since the calibration: somebody turned the camera a little.
+        patches: Things before the camera that the scene does not have.
+        keep_one_in: Of so many frames one is delivered: a camera, or a cable, that is too slow.
+        swap_every: Of so many frames two come in the wrong order: the strobe of a wrist device slips. 0: none.
+    """
+
+    exposes: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
+    moved_px: tuple[float, float] = (0.0, 0.0)
+    patches: tuple[Patch, ...] = ()
+    keep_one_in: Annotated[int, Meta(ge=1, le=100)] = 1
+    swap_every: Annotated[int, Meta(ge=0, le=1000)] = 0
+
+
+class FaultyCamera:
+    """A `FrameSource` and `Tunable` around a simulated one. Holds the faults, and what the camera was told last."""
+
+    def __init__(self, source: SyntheticCamera, camera: CameraCalibration, path: Path) -> None:
+        """Have the faults that `path` says; there need be no such file yet.
+
+        Raises:
+            CameraError: The file is broken.
+        """
+        self._source, self._camera, self._path = source, camera, path
+        self._faults = Faults()
+        self._stat: tuple[int, int] | None = None
+        self._looked_ns = 0
+        self._count = 0
+        self._held: Frame | None = None
+        self._look()
+
+    def read(self) -> Frame | None:
+        """The next frame, spoiled."""
+        while (frame := self._source.read()) is not None:
+            if frame.ready_t_ns - self._looked_ns >= LOOK_NS:
+                self._looked_ns = frame.ready_t_ns
+                try:
+                    self._look()
+                except CameraError as error:
+                    _LOG.warning("%s", error)
+            self._count += 1
+            if self._count % self._faults.keep_one_in:
+                continue
+            return replace(frame, image=self._spoiled(self._swapped(frame)))
+        return None
+
+    def close(self) -> None:
+        """End the stream."""
+        self._source.close()
+
+    def tune(self, camera: CameraCalibration) -> None:
+        """As of the camera inside.
+
+        Raises:
+            CameraError: As there.
+        """
+        self._source.tune(self._exposed(camera, self._faults))
+        self._camera = camera
+
+    def figures(self) -> dict[str, float]:
+        """Its settings as they are, which is not as they were told where it exposes by itself."""
+        return self._source.figures()
+
+    def counts(self) -> dict[str, int]:
+        """Those of the camera inside."""
+        return self._source.counts()
+
+    def _look(self) -> None:
+        """Read the file if it was changed.
+
+        Raises:
+            CameraError: It is broken; the faults stay as they were.
+        """
+        try:
+            status = self._path.stat()
+            stat, raw = (status.st_mtime_ns, status.st_ino), None
+            if stat != self._stat:
+                raw = self._path.read_bytes()
+        except OSError:
+            stat, raw = None, b"{}" if self._stat is not None else None
+        self._stat = stat
+        if raw is None:
+            return
+        try:
+            faults = msgspec.json.decode(raw, type=Faults)
+        except msgspec.MsgspecError as error:
+            raise CameraError(f"{self._path}: {error}") from error
+        if faults.exposes != self._faults.exposes:
+            self._source.tune(self._exposed(self._camera, faults))
+        self._faults = faults
+
+    def _exposed(self, camera: CameraCalibration, faults: Faults) -> CameraCalibration:
+        return with_fields(camera, exposure_us=camera.exposure_us * faults.exposes)
+
+    def _swapped(self, frame: Frame) -> Image:
+        """The picture that comes under the stamp of `frame`."""
+        held, self._held = self._held, None
+        if held is not None:
+            return held.image
+        if self._faults.swap_every and self._count % self._faults.swap_every == 0:
+            late = self._source.read()
+            if late is not None:
+                self._held = frame
+                return late.image
+        return frame.image
+
+    def _spoiled(self, image: Image) -> Image:
+        faults = self._faults
+        if faults.moved_px != (0.0, 0.0):
+            move = np.array([[1.0, 0.0, faults.moved_px[0]], [0.0, 1.0, faults.moved_px[1]]])
+            size = image.shape[1], image.shape[0]
+            image = np.asarray(cv2.warpAffine(image, move, size, borderMode=cv2.BORDER_REFLECT), np.uint8)
+        if faults.patches:
+            image = image.copy()
+            for patch in faults.patches:
+                middle = round(patch.uv[0]), round(patch.uv[1])
+                colour = patch.bgr if image.ndim == 3 else (patch.bgr[1],)
+                cv2.circle(image, middle, round(patch.radius_px), colour, cv2.FILLED, cv2.LINE_AA)
+        return image

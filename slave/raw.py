@@ -1,0 +1,279 @@
+"""Raw frames to disk while the slave goes on detecting: begun and ended by commands on the bus.
+
+    raw         begin a recording of raw frames (body: `common.raw_wish.RawWish`), or ask for it to go on
+    raw_stop    end it; the answer comes when every frame that waited is written
+
+What is written is a folder as `phalanx-slave record` makes it, by the same recorder. The loop hands a frame over when
+it comes back for the next one: what was found in it is out by then. It never waits, and no fault of the disk reaches
+it: the recording ends with what was complete, is counted and logged.
+"""
+
+import logging
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.calibration import CameraCalibration, load
+from common.clock import Clock
+from common.errors import CalibrationError, RecordingError
+from common.frame_recording import Manifest
+from common.raw_wish import RawWish
+from slave.cameras.source import Frame, FrameSource
+from slave.progress import Length, megabytes
+from slave.recorder import ENCODERS, RESERVE_BYTES, Recorder, clock_of
+from slave.tuning import CameraFiles
+
+GONE_S = 10.0  # a master that was away for so long ends it: nobody else could
+RESERVE_OPTION = "--raw-reserve-mb"
+NO_FOLDER = "{}: this slave keeps no raw frames: start it with `phalanx-slave run ... --raw-folder DIR`"
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class RawSettings:
+    """Where raw frames go.
+
+    Attributes:
+        folder: Where each recording is a folder.
+        reserve_bytes: Stays free on its disk.
+        skewed: How the slave's clock differs from the machine's; empty: it is the machine's.
+    """
+
+    folder: Path
+    reserve_bytes: int = RESERVE_BYTES
+    skewed: str = ""
+
+
+class RawFrames:
+    """Answers "raw" and "raw_stop", and counts, for `slave.report.Reporter`.
+
+    Holds the recorder while there is one, that of the last recording for its counts, and how often one ended by itself.
+    """
+
+    def __init__(
+        self,
+        camera: str,
+        settings: RawSettings | None,
+        files: Callable[[], CameraFiles],
+        clock: Clock,
+        here: Callable[[], bool],
+        free_bytes: Callable[[Path], int] = lambda folder: shutil.disk_usage(folder).free,
+    ) -> None:
+        """Nothing is recorded yet.
+
+        Args:
+            camera: Name of the camera.
+            settings: Where to; None: nowhere, and both commands are refused.
+            files: The files in use; whatever is recorded carries them.
+            clock: Clock of the frames' times.
+            here: Whether there is a master.
+            free_bytes: What is free on the disk of a folder.
+        """
+        self._camera, self._settings, self._files, self._clock = camera, settings, files, clock
+        self._here, self._free = here, free_bytes
+        self._turn = threading.Lock()  # of commands, and of whoever looks
+        self._lock = threading.Lock()  # the loop's: held for as long as a frame is handed over
+        self._recorder: Recorder | None = None
+        self._last: Recorder | None = None
+        self._name = ""
+        self._lease_s = self._until = self._here_at = 0.0
+        self._fault: RecordingError | None = None  # by the loop: an image that does not fit
+        self._failure: RecordingError | None = None  # why the recording of that name ended
+        self._closer: threading.Thread | None = None
+        self._ended = 0
+        self._tap: RawTap | None = None
+
+    def reading(self, source: FrameSource) -> FrameSource:
+        """The camera for the loop, all of whose frames are offered; without a folder the camera itself."""
+        if self._settings is None:
+            return source
+        self._tap = RawTap(source, self.offer)
+        return self._tap
+
+    def offer(self, frame: Frame) -> None:
+        """Take a frame while something is recorded; by the loop. Never waits, never raises."""
+        if self._recorder is None:
+            return
+        with self._lock:
+            self._hand_over(frame, self._recorder)
+
+    def commands(self) -> dict[str, Callable[[str], dict[str, float]]]:
+        """Verb -> what to do with its body; the gauges of the answer. Each may raise `PhalanxError`."""
+        return {"raw": self._raw, "raw_stop": self._raw_stop}
+
+    def counts(self) -> dict[str, int]:
+        """Of the present recording, or the last one, `raw.frames`, `raw.dropped`; how many `raw.ended` by a fault."""
+        if self._settings is None:
+            return {}
+        now = None if (last := self._last) is None else last.progress()
+        frames, dropped = (0, 0) if now is None else (now.frames, now.dropped)
+        return {"raw.frames": frames, "raw.dropped": dropped, "raw.ended": self._ended}
+
+    def figures(self) -> dict[str, float]:
+        """`raw.megabytes` of the same recording, and whether frames are taken now: `raw.on`."""
+        if self._settings is None:
+            return {}
+        written = 0 if (last := self._last) is None else last.progress().written_bytes
+        return {"raw.megabytes": round(written * 1e-6, 3), "raw.on": float(self._recorder is not None)}
+
+    def look(self) -> None:
+        """Once a period: end what has failed, what nobody asks for any more, and what has no master any more."""
+        with self._turn:
+            self._look()
+
+    def close(self) -> None:
+        """The slave ends: so does the recording, with the last frame that was read. Safe to call twice."""
+        if self._tap is not None:
+            self._tap.flush()
+        with self._turn:
+            self._end("the slave ends")
+            self._join()
+
+    def _raw(self, body: str) -> dict[str, float]:
+        settings = self._wanted("raw")
+        wish = RawWish.of(body)
+        with self._turn:
+            self._look()
+            if self._recorder is None:
+                if self._failure is not None and wish.name == self._name:
+                    raise RecordingError(f"raw: {self._failure}")
+                self._begin(wish, settings)
+            elif wish.name != self._name:
+                raise RecordingError(
+                    f"raw: {settings.folder / self._name} is being recorded: raw_stop ends it"
+                )
+            self._lease_s, self._until = wish.lease_s, time.monotonic() + wish.lease_s
+        return self.figures()
+
+    def _raw_stop(self, body: str) -> dict[str, float]:
+        self._wanted("raw_stop")
+        if body:
+            raise CalibrationError("raw_stop: takes no body")
+        with self._turn:
+            self._look()
+            self._end("raw_stop")
+            self._join()
+        return self.figures()
+
+    def _hand_over(self, frame: Frame, recorder: Recorder | None) -> None:
+        if recorder is None or self._fault is not None:  # ended meanwhile, or about to be
+            return
+        try:
+            recorder.offer(frame)
+        except RecordingError as error:
+            self._fault = error
+
+    def _wanted(self, verb: str) -> RawSettings:
+        if self._settings is None:
+            raise RecordingError(NO_FOLDER.format(verb))
+        return self._settings
+
+    def _begin(self, wish: RawWish, settings: RawSettings) -> None:
+        self._join()
+        try:
+            free = self._free(settings.folder)
+        except OSError as error:
+            raise RecordingError(f"raw: {settings.folder}: {error.strerror}") from error
+        if free < settings.reserve_bytes:
+            raise RecordingError(
+                f"raw: {settings.folder}: {megabytes(free)} are free on the disk and "
+                f"{megabytes(settings.reserve_bytes)} stay free ({RESERVE_OPTION}): make room"
+            )
+        recorder = Recorder(
+            settings.folder / wish.name,
+            self._manifest(settings),
+            self._camera,
+            Length(),
+            reserve_bytes=settings.reserve_bytes,
+            free_bytes=self._free,
+            encoders=max(min(ENCODERS, (os.cpu_count() or 1) - 1), 1),  # a core stays with the loop
+            reserve_option=RESERVE_OPTION,
+        )
+        self._name, self._failure, self._fault, self._here_at = wish.name, None, None, time.monotonic()
+        self._last = self._recorder = recorder
+        _LOG.info("raw frames into %s", settings.folder / wish.name)
+
+    def _manifest(self, settings: RawSettings) -> Manifest:
+        files = self._files()
+        others = {n: files.camera_path.with_name(f"{n}.json") for n in files.rig.cameras if n != self._camera}
+        try:
+            cameras = {name: load(path, CameraCalibration) for name, path in others.items()}
+        except CalibrationError as error:
+            raise CalibrationError(
+                f"raw: a recording carries the files of all cameras of rig {files.rig.name!r}: {error}"
+            ) from error
+        return Manifest(
+            version=1,
+            kind=files.rig.kind,
+            cameras={name: cameras.get(name, files.camera) for name in files.rig.cameras},
+            rig=files.rig,
+            clock=clock_of(self._clock, settings.skewed),
+            objects={profile.name: profile for profile in files.objects},
+        )
+
+    def _look(self) -> None:
+        recorder, now_s = self._recorder, time.monotonic()
+        if recorder is None:
+            return
+        if self._here():
+            self._here_at = now_s
+        if (failure := recorder.failure or self._fault) is not None:
+            self._failure = failure
+            self._ended += 1
+            _LOG.warning("raw frames ended: %s", failure)
+            self._end("a fault")
+        elif self._lease_s and now_s > self._until:
+            self._end(f"nobody has asked for more within {self._lease_s:g} s")
+        elif now_s > self._here_at + GONE_S:
+            self._end("the master is gone")
+
+    def _end(self, why: str) -> None:
+        """Take no more; what waits is written by a thread of its own, for this one has reports to send."""
+        with self._lock:
+            recorder, self._recorder = self._recorder, None
+        if recorder is None:
+            return
+
+        def close() -> None:
+            recorder.close()
+            now = recorder.progress()
+            _LOG.info("raw frames: %d recorded, %d dropped; ended: %s", now.frames, now.dropped, why)
+
+        self._closer = threading.Thread(target=close, name=f"{self._camera} raw", daemon=True)
+        self._closer.start()
+
+    def _join(self) -> None:
+        closer, self._closer = self._closer, None
+        if closer is not None:
+            closer.join()
+
+
+class RawTap:
+    """A camera all of whose frames are offered to somebody, each when the loop comes back for the next one.
+
+    Holds the frame that the loop is at.
+    """
+
+    def __init__(self, source: FrameSource, offer: Callable[[Frame], None]) -> None:
+        self._source, self._offer = source, offer
+        self._last: Frame | None = None
+
+    def read(self) -> Frame | None:
+        """The next frame (see `FrameSource.read`)."""
+        self.flush()
+        self._last = self._source.read()
+        return self._last
+
+    def flush(self) -> None:
+        """Offer the frame that the loop is at; once the loop has ended, by whoever ended it."""
+        last, self._last = self._last, None
+        if last is not None:
+            self._offer(last)
+
+    def close(self) -> None:
+        """Give the device back."""
+        self._source.close()

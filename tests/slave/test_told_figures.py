@@ -1,0 +1,75 @@
+"""All that the checklist of a master judges a slave by is in what the slave says of itself."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, cast
+
+from common.bus import LoopbackBus
+from common.camera_settings import WANTED, figures
+from common.clock import SystemClock
+from common.messages import Command, Health, decode, encode
+from master.checklist.slave_rules import BESIDE, OFF, OVERLAP, UNCOLOURED
+from master.checklist.unseen import COLOUR, SEEN
+from slave import live
+from slave.markers.engine import NUMPY
+from slave.report import Reporter
+from slave.tuning import CameraTuning
+from tests.network_helpers import until
+from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
+
+GAUGES = {
+    *(WANTED + setting for setting in OFF),
+    *OFF,
+    *(COLOUR + marker for marker in RIG.markers),
+    *("width_px", "height_px", "light_exposure", "disk_free_mb"),
+}
+COUNTS = {"frames", "uncalibrated", *(kind + marker for kind in (SEEN, BESIDE) for marker in RIG.markers)}
+
+
+class Camera(Knobs):
+    """It has what it was told."""
+
+    def figures(self) -> dict[str, float]:
+        return figures((self.tuned or [FILE])[-1])
+
+
+class Alone(Wire):
+    """An uplink that has found no master."""
+
+    zenoh_endpoint = None
+
+
+def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
+    files, clock, stop = tree(tmp_path), SystemClock(), threading.Event()
+    nothing = cast(Any, None)  # neither frames nor datagrams are needed to be asked
+    with ThreadPoolExecutor(1) as workers:
+        line = live._marker_line("left", files, nothing, nothing, clock, "follow", NUMPY, stop, workers)
+    tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.picker)
+    reporter = Reporter(
+        "left", Alone(), line.numbers, clock, lambda _: LoopbackBus(), stop.set, 0.01, camera=tuning
+    )
+
+    def ask(verb: str, body: str = "") -> Health:
+        told = decode(encode(reporter.answer(Command("left", verb, body))))
+        assert isinstance(told, Health)
+        return told
+
+    try:
+        assert until(lambda: "disk_free_mb" in ask("report").gauges)
+        health = ask("report")
+        assert not GAUGES - health.gauges.keys()
+        assert not COUNTS - health.counts.keys()
+        assert not [name for name in health.gauges if name.startswith(OVERLAP)]
+        ask(
+            "set",
+            '{"markers": {"back": {"hsv_low": [50, 60, 60], "hsv_high": [65, 255, 255]}, "ring": null}}',
+        )
+        assert until(lambda: OVERLAP + "index..back" in ask("report").gauges)
+        health = ask("report")
+        assert health.gauges[COLOUR + "back"] != 0.0
+        assert COLOUR + "ring" not in health.gauges
+        assert health.counts[UNCOLOURED + "ring"] == health.counts["uncalibrated"] == 1
+    finally:
+        reporter.close()
+        line.previews.close()
