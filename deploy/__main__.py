@@ -14,6 +14,7 @@ from deploy.summary import summary_lines
 _EXAMPLES = {
     "demo": """examples:
   phalanx demo                                  two simulated cameras and the master, in the Rerun viewer
+  phalanx demo --console --seconds 600          the console in a browser instead: watch, tune and record the demo
   phalanx demo --headless --seconds 60          without a screen: a picture, an .rrd and the figures
   phalanx demo --wrist                          a simulated wrist device in their place: laser, LEDs, one camera, an IMU
   phalanx demo --scene grasp                    both at once, while a hand closes round a bar: cameras lose its fingers
@@ -58,6 +59,7 @@ def _demo(options: argparse.Namespace) -> int:
         options.scene,
         options.web,
         bus=options.bus,
+        console=options.console,
     )
     summary = run_demo(settings, stop_on_signals(), _say)
     _finish(summary, options.json)
@@ -114,6 +116,11 @@ def _parser() -> argparse.ArgumentParser:
         "--headless", action="store_true", help="no viewer; hand.png and run.rrd are always written"
     )
     view.add_argument("--web", action="store_true", help="the viewer as a page on 127.0.0.1, not a window")
+    view.add_argument(
+        "--console",
+        action="store_true",
+        help="the console in the viewer's place: its address is printed, open it in a browser",
+    )
     demo.add_argument(
         "--seconds", type=_positive, default=30.0, metavar="N", help="length (default: %(default)s)"
     )

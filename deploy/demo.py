@@ -53,6 +53,7 @@ class DemoSettings:
         seed: Seed of the scene.
         scene: What moves, by the names of `common.sim.scenes`.
         web: The viewer is a page on 127.0.0.1 instead of a window.
+        console: The console, a page as well, takes the viewer's place.
         master: Module that is run as the master.
         bus: Endpoint of the master's bus; None: a port that is free.
     """
@@ -67,6 +68,7 @@ class DemoSettings:
     web: bool = False
     master: str = "master"
     bus: str | None = None
+    console: bool = False
 
     def sensors(self) -> list[Sensor]:
         """What is simulated. Raises DemoError: see `sensors_of`."""
@@ -179,7 +181,10 @@ def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], 
     files = ["--poses", str(settings.out / "poses.npz"), "--summary", str(settings.out / "live.json")]
     address = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", bus]
     rows.append(("master", [sys.executable, "-m", settings.master, "run", *place, *address, *files], key))
-    if not settings.headless:
+    if settings.console:
+        page = ["--port", "0"]
+        rows.append(("viewer", [sys.executable, "-m", "master", "console", *place, "--bus", bus, *page], key))
+    elif not settings.headless:
         page = ["--web", "--web-port", str(_free_port(socket.SOCK_STREAM))] if settings.web else []
         rows.append(("viewer", [sys.executable, "-m", "master", "view", *place, "--bus", bus, *page], key))
     return rows

@@ -1,9 +1,8 @@
-"""Command line of the master: `phalanx-master run | solve | view | report | camera | gestures | calibrate | ...`."""
+"""Command line of the master: `phalanx-master run | view | console | camera | gestures | calibrate | ...`."""
 
 import logging
 import os
 import sys
-import threading
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,16 +13,18 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
     ) from error
 
-from common.errors import BusError, PhalanxError
+from common.errors import PhalanxError
 from common.frame_recording import open_recording
-from common.keys import rig_key
+from common.keys import ENVIRONMENT, rig_key
 from common.sim.scenes import NAMES
 from common.sim.wrist.scene import WRIST_NAMES
-from common.zenoh_bus import ZenohBus
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
+from master.checklist.command import check
+from master.export.command import export
 from master.gestures.command import gestures_app
 from master.live import LiveSettings, run_live
+from master.master_bus import bus_of_master
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -38,7 +39,9 @@ from master.options import (
     address,
 )
 from master.outputs.files import path_of_hand
+from master.recording.command import info, play, record
 from master.rig import load_setups, setups_with_hands
+from master.send.command import send
 from master.solve import rigs_to_solve, solve_hands
 from master.stopping import stop_on_signals
 from master.study.command import evaluate_app
@@ -50,7 +53,6 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
 Level = Literal["fk", "ik", "auto"]
 Kind = Literal["markers", "wrist"]
-_TRY_AGAIN_S = 0.3
 
 
 @app.callback()
@@ -81,6 +83,13 @@ def run(
         ),
     ] = None,
     summary: Annotated[Path | None, typer.Option(help="Write the figures of the run to this .json.")] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(
+            help="Record all that is taken and told to this .mcap, from the first message on: `play` solves it again,"
+            " bit for bit."
+        ),
+    ] = None,
 ) -> None:
     """Track live until Ctrl-C; hands, objects, contact and gestures go to the bus (phalanx/hand/<name>, .../object/...)
     and, if asked, to files.
@@ -99,6 +108,8 @@ def run(
 
       phalanx-master run --rig desk-wand --poses out/poses.npz
 
+      phalanx-master run --rig desk --record out/wave.mcap
+
       phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
     """
     setups = load_setups(calibration, rig, hand)
@@ -110,6 +121,7 @@ def run(
         poses,
         summary,
         RigFiles(calibration, tuple(rig), hand),
+        record,
     )
     run_live(setups, rig_key(os.environ, key_file), settings, stop_on_signals(), _say)
 
@@ -193,7 +205,7 @@ def view(
 
     setups = load_setups(calibration, rig, hand)
     stop = stop_on_signals()
-    connection = _bus_of_master(bus, stop)
+    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"))
     if connection is None:
         return
     try:
@@ -209,6 +221,46 @@ def view(
         )
     finally:
         connection.close()
+
+
+@app.command()
+def console(
+    calibration: Calibration = CALIB_JSON,
+    rig: Annotated[
+        list[str] | None,
+        typer.Option("--rig", help="Rig that runs, once for each; default: desk, once its file is there."),
+    ] = None,
+    bus: BusEnd = HERE_BUS,
+    beacon: Beacon = HERE_BEACON,
+    bind: Bind = HERE_BIND,
+    key_file: KeyFile = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the page; 0: a free one.")] = 8080,
+    host: Annotated[
+        str, typer.Option(help="Address to serve on. Whoever reaches it can tune and stop the rig.")
+    ] = "127.0.0.1",
+) -> None:
+    """Serve the console: watch, tune, record and set up in a browser. A process of its own, which may come and go.
+
+    Needs no master and no file: the page sets a rig up from nothing. BEACON, BIND and the key are those of the
+    processes that the page starts.
+
+    Examples:
+
+      phalanx-master console
+
+      phalanx-master console --rig desk --rig wrist --port 8081
+
+      phalanx-master console --bus tcp/192.168.1.2:47802
+    """
+    from master.console.app import run_console
+    from master.console.state import ConsoleSettings
+
+    address(beacon, "--beacon")
+    address(bind, "--bind")
+    known = key_file is not None or ENVIRONMENT in os.environ
+    key = rig_key(os.environ, key_file) if known else None
+    settings = ConsoleSettings(calibration, tuple(rig or ()), bus, beacon, bind, key, port, host)
+    run_console(settings, stop_on_signals(), _say)
 
 
 @app.command()
@@ -253,27 +305,16 @@ def main() -> None:
     app.add_typer(evaluate_app(), name="evaluate")
     app.add_typer(gestures_app(), name="gestures")
     app.command()(camera)
+    app.command()(check)
+    app.command()(export)
+    for command in (record, play, info):
+        app.command()(command)
+    app.command()(send)
     try:
         app()
     except PhalanxError as error:
         print(f"phalanx-master: {error}", file=sys.stderr)
         sys.exit(1)
-
-
-def _bus_of_master(endpoint: str, stop: threading.Event) -> ZenohBus | None:
-    """The bus as the master sees it, once one listens there; None when stopped before."""
-    said = False
-    while not stop.is_set():
-        try:
-            return ZenohBus(None, endpoint, beyond=True)
-        except BusError as error:
-            if error.__cause__ is None:  # refused by us, not by the network: the endpoint is malformed
-                raise
-            if not said:
-                _say(f"waiting for a master: {error}")
-            said = True
-            stop.wait(_TRY_AGAIN_S)
-    return None
 
 
 def _say(line: str) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from common.bus import Bus
 from common.calibration import CameraCalibration, load
-from common.camera_settings import WANTED, CameraSettings
+from common.camera_settings import ROI_LEAST, ROI_MOST, WANTED, CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Health
 from common.streams import MASTER
@@ -21,7 +21,8 @@ ANSWER_S = (
 )
 APPEAR_S = 2.0  # whoever has just connected is not known everywhere yet
 STEP_S = 0.1
-_ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us")
+_ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us", "roi_margin")
+_MORE = ("control.", "marker.", "pick.")
 _EVENTS = ("camera.", "reload.")
 _MOST = 1e9
 
@@ -32,6 +33,17 @@ def camera(
     gain: Annotated[float | None, typer.Option(help="Analogue gain.")] = None,
     colour_gains: Annotated[
         str | None, typer.Option(metavar="RED,BLUE", help="Gains of red and blue relative to green.")
+    ] = None,
+    rate_hz: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+    roi_margin: Annotated[
+        float | None,
+        typer.Option(help="How far a marker may be from where it is expected, share of the width."),
+    ] = None,
+    pick: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MARKER@U,V", help="Colour of a marker from a pixel on its paint, in the newest frame."
+        ),
     ] = None,
     load_file: Annotated[
         Path | None, typer.Option("--load", help="Camera file to use in place of the present content.")
@@ -53,9 +65,14 @@ def camera(
 
       phalanx-master camera left --colour-gains 1.1,1.6 --save
 
+      phalanx-master camera left --rate-hz 30 --roi-margin 0.08
+
+      phalanx-master camera left --pick index@310,204 --save
+
       phalanx-master camera left --load new/left.json --save
     """
-    steps = commands(name, exposure_us, gain, colour_gains, load_file, save)
+    wanted = settings(exposure_us, gain, colour_gains, rate_hz, roi_margin)
+    steps = commands(name, wanted, pick, load_file, save)
     connection = ZenohBus(None, bus, beyond=True)
     try:
         health = tell(connection, steps)
@@ -64,18 +81,41 @@ def camera(
     typer.echo("\n".join(table(health)))
 
 
+def settings(
+    exposure_us: float | None = None,
+    gain: float | None = None,
+    colour_gains: str | None = None,
+    rate_hz: float | None = None,
+    roi_margin: float | None = None,
+) -> CameraSettings:
+    """What the options ask to be set.
+
+    Raises:
+        PhalanxError: A value is none.
+    """
+    if roi_margin is not None and not ROI_LEAST <= roi_margin <= ROI_MOST:
+        raise PhalanxError(f"--roi-margin {roi_margin:g}: must be from {ROI_LEAST:g} to {ROI_MOST:g}")
+    return CameraSettings(
+        exposure_us=_positive(exposure_us, "--exposure-us"),
+        analogue_gain=_positive(gain, "--gain"),
+        colour_gains=_pair(colour_gains),
+        frame_rate_hz=_positive(rate_hz, "--rate-hz"),
+        roi_margin=roi_margin,
+    )
+
+
 def commands(
     name: str,
-    exposure_us: float | None,
-    gain: float | None,
-    colour_gains: str | None,
-    load_file: Path | None,
-    save: bool,
+    wanted: CameraSettings,
+    pick: str | None = None,
+    load_file: Path | None = None,
+    save: bool = False,
 ) -> list[Command]:
     """What to tell the slave, one after the other; the last answer says how the camera is set then.
 
     Raises:
-        CalibrationError: The file is broken or of another camera, or a value is none.
+        CalibrationError: The file is broken or of another camera.
+        PhalanxError: The pick is none.
     """
     steps: list[Command] = []
     if load_file is not None:
@@ -85,13 +125,10 @@ def commands(
                 f"{load_file}: name: it is the file of camera {file.name!r}, not of {name!r}"
             )
         steps.append(Command(name, "load", msgspec.json.encode(file).decode()))
-    settings = CameraSettings(
-        exposure_us=_positive(exposure_us, "--exposure-us"),
-        analogue_gain=_positive(gain, "--gain"),
-        colour_gains=_pair(colour_gains),
-    )
-    if settings != CameraSettings():
-        steps.append(Command(name, "set", msgspec.json.encode(settings).decode()))
+    if wanted != CameraSettings():
+        steps.append(Command(name, "set", msgspec.json.encode(wanted).decode()))
+    if pick is not None:
+        steps.append(Command(name, "pick", msgspec.json.encode(_pick(pick)).decode()))
     if save:
         steps.append(Command(name, "save"))
     return steps or [Command(name, "settings")]
@@ -119,7 +156,7 @@ def table(health: Health) -> list[str]:
             setting = gauge.removeprefix(WANTED)
             got = health.gauges.get(setting)
             rows.append((setting, f"{value:.6g}", "-" if got is None else f"{got:.6g}"))
-    also = [gauge for gauge in health.gauges if gauge in _ALSO or gauge.startswith("control.")]
+    also = [gauge for gauge in health.gauges if gauge in _ALSO or gauge.startswith(_MORE)]
     rows += [(gauge, "", f"{health.gauges[gauge]:.6g}") for gauge in also]
     rows += [(event, "", str(n)) for event, n in health.counts.items() if event.startswith(_EVENTS)]
     return [f"{name:<22} {wanted:>10} {got:>10}".rstrip() for name, wanted, got in rows]
@@ -145,6 +182,15 @@ def _positive(value: float | None, option: str) -> float | None:
     if value is not None and not 0.0 < value <= _MOST:
         raise PhalanxError(f"{option} {value:g}: must be positive and at most {_MOST:g}")
     return value
+
+
+def _pick(text: str) -> ColourPick:
+    marker, _, place = text.rpartition("@")
+    try:
+        u, v = (float(part) for part in place.split(","))
+        return msgspec.convert({"marker": marker, "uv": (u, v)}, ColourPick)
+    except (ValueError, msgspec.ValidationError) as error:
+        raise PhalanxError(f"--pick {text}: write MARKER@U,V, for example index@310,204") from error
 
 
 def _pair(text: str | None) -> tuple[float, float] | None:

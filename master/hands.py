@@ -56,7 +56,7 @@ class Hands:
             {
                 f"{setup.hand.profile.name}.{event}"[:_NAME]: number
                 for setup, line in self._hands
-                for event, number in line.counts.items()
+                for event, number in dict(line.counts).items()  # the loop may add one: a copy is made at once
             }
         )
 

@@ -14,12 +14,16 @@ from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
+from master.checklist.feed import ChecklistFeed
+from master.checklist.files import FileWatch
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
 from master.outputs.devices import DevicePoses
 from master.outputs.files import RunFiles
 from master.outputs.sink import Sink
+from master.recording.child import RecorderProcess
+from master.recording.tap import Tap, Tapped
 from master.rig import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
@@ -44,6 +48,7 @@ class LiveSettings:
             contact and gestures in its folder.
         summary: Where to write the summary, or None.
         files: Where the setups were read: what changes there is used at once. None: they stay as they are.
+        record: Where to record all that is taken and told (MCAP), or None; needs `files`.
     """
 
     beacon: tuple[str, int]
@@ -53,6 +58,12 @@ class LiveSettings:
     poses: Path | None = None
     summary: Path | None = None
     files: RigFiles | None = None
+    record: Path | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a recording without the files that it carries."""
+        if self.record is not None and self.files is None:
+            raise ValueError("record: a recording carries the files of its rigs: give files, too")
 
 
 def run_live(
@@ -86,6 +97,12 @@ def run_live(
     with ExitStack() as stack:
         bus = ZenohBus(settings.bus, None)
         stack.callback(bus.close)
+        tap = Tap(bus, clock, always=settings.record is not None)
+        stack.callback(tap.close)
+        if settings.record is not None and settings.files is not None:
+            recorder = RecorderProcess(settings.record, settings.files, settings.bus, say, tap.end_always)
+            stack.callback(recorder.close)
+            recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
         sinks: list[Sink] = [BusSink(bus)]
@@ -109,19 +126,36 @@ def run_live(
             tuning,
             watch,
             figures,
+            tap,
             stop,
             say,
         )
+        watched_files = (
+            None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
+        )
+        writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
+        checklist = ChecklistFeed(
+            bus, clock, ingest, setups, pipelines, watched_files, reporter.session, writes_to
+        )
         thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
         thread.start()
+        in_use = None if tuning is None else lambda: tuning.setups
+        checking = threading.Thread(
+            target=checklist.work, args=(stop, in_use), name="master checklist", daemon=True
+        )
+        checking.start()
         for one in world.unplaced:
             say(unplaced_line(one.name, one.tracker or ""))
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        run(DevicePoses(ingest, bus), world, sinks, clock, figures, stop, watch.push)
+        source = Tapped(DevicePoses(ingest, bus), tap)
+        run(source, world, sinks, clock, figures, stop, watch.push)
+        source.flush()
+        tap.drain()
         stop.set()
         thread.join(_JOIN_S)
+        checking.join(_JOIN_S)
         summary: dict[str, object] = {
             **figures.summary(),
             "camera_hz": figures.rates.camera_hz,
@@ -184,15 +218,16 @@ class _Reporter:
         tuning: RigTuning | None,
         watch: TimeWatch,
         figures: RunFigures,
+        tap: Tap,
         stop: threading.Event,
         say: Callable[[str], None],
     ) -> None:
         """Be there on the bus from now on; `work` belongs to a thread."""
-        self._session = secrets.randbits(63)
+        self.session = secrets.randbits(63)
         self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
         self._ingest, self._world, self._figures = ingest, world, figures
         self._tuning, self._watch, self._odd = tuning, watch, odd
-        self._stop, self._say = stop, say
+        self._tap, self._stop, self._say = tap, stop, say
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
 
@@ -201,20 +236,22 @@ class _Reporter:
         events = self._ingest.counts.items()
         told = {name: number for name, number in events if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._world.counts) | told | changes
+        counts = dict(self._world.counts) | told | changes | self._tap.counts
         times = self._watch.gauges(self._ingest.clock_of)
-        return health(self._session, self._clock, self._figures, counts, times)
+        return health(self.session, self._clock, self._figures, counts, times)
 
     def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "stop" ends the master.
+        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "filter"
+        another 1 € filter for one rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
 
         Raises:
             CalibrationError: The files cannot be used; the old ones still are.
             ValueError: Another verb; the asker reads which ones there are.
         """
-        verbs = {"report": lambda: None, "stop": self._stop.set}
+        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._tap.lease}
         if self._tuning is not None:
-            verbs["reload"] = self._tuning.reload
+            tuning = self._tuning
+            verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
         if command.verb not in verbs:
             raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
         verbs[command.verb]()

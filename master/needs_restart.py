@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from common.errors import CalibrationError
 from master.rig import RigSetup
 
-_OF_CAMERA = ("width_px", "height_px", "frame_rate_hz")
+_OF_CAMERA = ("width_px", "height_px")
 _ALL = "restart all processes of the rig"
 _MASTER = "restart the master"
 

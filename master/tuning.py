@@ -15,9 +15,13 @@ from dataclasses import dataclass, replace
 from math import ceil, nan
 from pathlib import Path
 
+import msgspec
+
 from common.arrays import Float
-from common.errors import PhalanxError
-from common.messages import Detections
+from common.calibration import FilterCalibration, parse
+from common.calibration_parts import Part
+from common.errors import CalibrationError, PhalanxError
+from common.messages import Detections, Name
 from common.watching import WatchedFiles
 from master.ik.tracker import HandTracker
 from master.needs_restart import refuse_other_hands, refuse_restart
@@ -64,6 +68,13 @@ class RigFiles:
             if rig is not None
         ]
         return tuple(dict.fromkeys([*rigs, *cameras, *hands, *objects, *gestures]))
+
+
+class FilterTrial(Part, frozen=True):
+    """The body of the command "filter": which rig, and its filter as the rig file would have it."""
+
+    rig: Name
+    filter: FilterCalibration
 
 
 class _WhenOpen:
@@ -237,26 +248,59 @@ class RigTuning:
             CalibrationError: One is broken, they contradict each other, or they need a restart. Nothing has changed.
         """
         with self._turn:
-            try:
-                setups = self._files.load()
-                refuse_other_hands(self._setups, setups)
-                both = list(zip(self._setups, setups, self._pipelines, strict=True))
-                for old, new, _ in both:
-                    refuse_restart(old, new)
-                changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
-                switches = [line.prepare(new) for _, new, line in changed]
-                if self._world is not None and any(_beside(old) != _beside(new) for old, new, _ in both):
-                    switches.append(self._world.prepare(setups))
-            except PhalanxError:
-                self._refused += 1
-                raise
-            if not switches:
-                return
-            for switch in switches:
-                switch()
-            self._setups = setups
-            self._applied += 1
-        self._say("changed files are in use")
+            changed = self._use(self._files.load)
+        if changed:
+            self._say("changed files are in use")
+
+    def try_filter(self, body: str) -> None:
+        """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).
+
+        Raises:
+            CalibrationError: The body is none, or of a rig that does not run. Nothing has changed.
+        """
+        trial = parse(body.encode(), FilterTrial, "filter")
+        with self._turn:
+            self._use(lambda: _with_filter(self._setups, trial))
+
+    def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
+        """Have these setups in use, all or none; False if they were."""
+        try:
+            setups = tuple(get())
+            refuse_other_hands(self._setups, setups)
+            both = list(zip(self._setups, setups, self._pipelines, strict=True))
+            for old, new, _ in both:
+                refuse_restart(old, new)
+            changed = [(old, new, line) for old, new, line in both if _content(old) != _content(new)]
+            switches = [line.prepare(new) for _, new, line in changed]
+            if self._world is not None and any(_beside(old) != _beside(new) for old, new, _ in both):
+                switches.append(self._world.prepare(setups))
+        except PhalanxError:
+            self._refused += 1
+            raise
+        if not switches:
+            return False
+        for switch in switches:
+            switch()
+        self._setups = setups
+        self._applied += 1
+        return True
+
+
+def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:
+    """These setups with another filter for one rig.
+
+    Raises:
+        CalibrationError: None of them is of that rig.
+    """
+    names = [setup.rig.name for setup in setups]
+    if trial.rig not in names:
+        raise CalibrationError(f"filter: rig: {trial.rig!r} does not run here; there are {', '.join(names)}")
+    return [
+        replace(setup, rig=msgspec.structs.replace(setup.rig, filter=trial.filter))
+        if setup.rig.name == trial.rig
+        else setup
+        for setup in setups
+    ]
 
 
 def _told_per_frame(setup: RigSetup) -> int:

@@ -122,6 +122,7 @@ def write_rrd(
     truth: PosesTruth | None = None,
     images: Iterable[tuple[str, int, Image | bytes]] = (),
     told: Sequence[Told] = (),
+    tell: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> None:
     """Write a finished run as an .rrd, which `rerun FILE` opens with its layout.
 
@@ -133,6 +134,7 @@ def write_rrd(
         truth: Row by row with `poses`.
         images: (camera, t_ns, BGR image or JPEG); at most 10 Hz of each camera are kept.
         told: Objects, contact and gestures of the run, each in the order of time.
+        tell: Told how many poses of how many are written.
 
     Raises:
         RecordingError: The file cannot be written; nothing half written is left.
@@ -147,6 +149,7 @@ def write_rrd(
             count = bisect_right(rest, int(poses.t_ns[stop - 1]), key=lambda one: one.t_ns)
             scene.log_told(rest[:count])
             rest = rest[count:]
+            tell(stop, len(poses))
         scene.log_told(rest)
         for frames in (detections or {}).values():
             scene.log_detections(frames)

@@ -225,6 +225,16 @@ def test_others_read_along_at_the_bus_that_the_user_names(tmp_path: Path) -> Non
     assert master[master.index("--bus") + 1] == "tcp/127.0.0.1:47999"
 
 
+def test_the_console_takes_the_place_of_the_viewer(tmp_path: Path) -> None:
+    settings = demo.DemoSettings(1.0, False, tmp_path, ROOT / "calib_json", ("desk",), 7, console=True)
+    table = {name: command for name, command, _ in demo._table(settings, 10**12)}
+    assert list(table) == ["left", "right", "master", "viewer"]
+    viewer, master = table["viewer"], table["master"]
+    assert viewer[1:4] == ["-m", "master", "console"]
+    assert viewer[viewer.index("--bus") + 1] == master[master.index("--bus") + 1]
+    assert viewer[viewer.index("--port") + 1] == "0"  # a port that is free
+
+
 def test_a_tracker_on_an_object_is_a_slave_of_its_own(tmp_path: Path) -> None:
     table = rows("desk-tracker", ROOT / "calib_json", tmp_path, "object")
     assert list(table) == ["left", "right", "tracker", "master"]

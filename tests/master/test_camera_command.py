@@ -9,25 +9,19 @@ import pytest
 
 from common.bus import Bus, LoopbackBus
 from common.calibration import CameraCalibration, load
-from common.camera_settings import CameraSettings
+from common.camera_settings import CameraSettings, ColourPick
 from common.errors import BusError, CalibrationError, CameraError, PhalanxError
 from common.messages import Command, Health
 from master import camera_command
-from master.camera_command import commands, table, tell
+from master.camera_command import commands, settings, table, tell
 
 ROOT = Path(__file__).resolve().parents[2]
 LEFT = ROOT / "calib_json/cameras/left.json"
 
 
 def asked(**options: Any) -> list[Command]:
-    defaults: dict[str, Any] = {
-        "exposure_us": None,
-        "gain": None,
-        "colour_gains": None,
-        "load_file": None,
-        "save": False,
-    }
-    return commands("left", **(defaults | options))
+    told = {key: options.pop(key) for key in ("pick", "load_file", "save") if key in options}
+    return commands("left", settings(**options), **told)
 
 
 def test_without_options_it_only_asks() -> None:
@@ -41,6 +35,13 @@ def test_options_become_a_body_that_the_slave_understands() -> None:
         {"exposure_us": 4000.0, "colour_gains": [1.1, 1.6]},
     )
     assert msgspec.json.decode(told.body, type=CameraSettings).analogue_gain is None
+
+
+def test_rate_margin_and_a_pick_are_told_in_turn() -> None:
+    told, pick, save = asked(rate_hz=30.0, roi_margin=0.1, pick="index@310,204.5", save=True)
+    assert msgspec.json.decode(told.body) == {"frame_rate_hz": 30.0, "roi_margin": 0.1}
+    assert (pick.verb, save.verb) == ("pick", "save")
+    assert msgspec.json.decode(pick.body, type=ColourPick) == ColourPick(marker="index", uv=(310.0, 204.5))
 
 
 def test_a_file_is_loaded_then_changed_then_saved() -> None:
@@ -58,6 +59,11 @@ def test_a_file_is_loaded_then_changed_then_saved() -> None:
         ({"colour_gains": "1,2,3"}, "write RED,BLUE"),
         ({"colour_gains": "red,blue"}, "write RED,BLUE"),
         ({"colour_gains": "1.1,-1"}, "--colour-gains -1: must be positive"),
+        ({"rate_hz": 0.0}, "--rate-hz 0: must be positive"),
+        ({"roi_margin": 0.9}, "--roi-margin 0.9: must be from 0.01 to 0.5"),
+        ({"pick": "index"}, "--pick index: write MARKER@U,V"),
+        ({"pick": "index@3"}, "write MARKER@U,V"),
+        ({"pick": "@3,4"}, "write MARKER@U,V"),
         ({"load_file": LEFT.with_name("right.json")}, "the file of camera 'right', not of 'left'"),
         ({"load_file": LEFT.with_name("none.json")}, "none.json: cannot read"),
     ],

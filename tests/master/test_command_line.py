@@ -11,7 +11,7 @@ HEAVY = (
     "scipy.stats",
     "scipy.optimize",
 )  # seconds, on a machine that is busy tracking
-COMMANDS = ("run", "solve", "view", "report", "camera")
+COMMANDS = ("run", "solve", "view", "report", "camera", "send")
 
 
 @pytest.mark.parametrize("command", COMMANDS)

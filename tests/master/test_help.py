@@ -9,6 +9,9 @@ from typer.testing import CliRunner
 from master.__main__ import app
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
+from master.export.command import export
+from master.recording.command import info, play, record
+from master.send.command import send
 
 WIDE = {"COLUMNS": "4000", "TERMINAL_WIDTH": "4000"}
 
@@ -18,7 +21,8 @@ def whole() -> typer.Typer:
     top = typer.Typer()
     top.add_typer(app, name="master")
     top.add_typer(calibrate_app(), name="calibrate")
-    top.command()(camera)
+    for command in (camera, export, record, play, info, send):
+        top.command()(command)
     return top
 
 

@@ -1,0 +1,149 @@
+"""What is wrong with the calibration files as they are on the disk: missing, or older than what they rest on."""
+
+from collections.abc import Iterator, Mapping
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TypeVar
+
+from msgspec import Struct
+
+from common.calibration import CameraCalibration, HandProfile, RigCalibration, load
+from common.calibration_parts import Provenance
+from common.errors import CalibrationError
+from common.messages import CheckItem
+from common.watching import WatchedFiles
+from master.checklist.facts import CameraPlan, Plan
+
+TOGETHER = timedelta(minutes=1)  # one calibration writes several parts, one after the other
+PartT = TypeVar("PartT", bound=Struct)
+
+
+class FileWatch:
+    """Looks at the files of the rigs that run. Holds how they were, and what was wrong with them."""
+
+    def __init__(self, calibration: Path, rigs: tuple[str, ...]) -> None:
+        """Watch these rigs of a calib_json tree, and what they name."""
+        self._calibration, self._rigs = calibration, rigs
+        self._watched = WatchedFiles()
+        self._hands: dict[Path, None] = {}  # that ever were: one that is gone has changed, too
+        self._plan: Plan | None = None
+        self._found: tuple[CheckItem, ...] = ()
+
+    def look(self, plan: Plan) -> tuple[CheckItem, ...]:
+        """What is wrong now; costs one `stat` a file where none was changed."""
+        cameras = [self._calibration / "cameras" / f"{one.name}.json" for one in plan.cameras]
+        rigs = [self._calibration / "rigs" / f"{name}.json" for name in self._rigs]
+        self._hands |= dict.fromkeys(sorted((self._calibration / "hands").glob("*.json")))
+        if self._watched.changed([*rigs, *cameras, *self._hands]) or plan != self._plan:
+            self._plan = plan
+            self._found = judge(self._calibration, self._rigs, plan)
+        return self._found
+
+
+def judge(calibration: Path, rigs: tuple[str, ...], plan: Plan) -> tuple[CheckItem, ...]:
+    """What is wrong with the files of these rigs, each code and subject once.
+
+    Args:
+        calibration: calib_json tree.
+        rigs: Names of rigs that run.
+        plan: What the files said that are in use.
+    """
+    found: dict[tuple[str, str], CheckItem] = {}
+    for name in rigs:
+        for item in _judge_rig(calibration, name, {one.name: one for one in plan.cameras}):
+            found.setdefault((item.code, item.subject), item)
+    return tuple(found.values())
+
+
+def _judge_rig(calibration: Path, name: str, used: Mapping[str, CameraPlan]) -> Iterator[CheckItem]:
+    rig = _read(calibration / "rigs" / f"{name}.json", RigCalibration)
+    if isinstance(rig, str):
+        yield _absent(name, f"The file of rig {name} cannot be used: {rig}", _MEND)
+        return
+    hand = _read(calibration / "hands" / f"{rig.hand}.json", HandProfile)
+    if isinstance(hand, str):
+        yield _absent(rig.hand, f"The file of hand {rig.hand} cannot be used: {hand}", _MEND)
+    if rig.kind == "markers" and not rig.T_rig_camera:
+        yield _absent(
+            name,
+            f"Rig {name}: the places of its cameras are not measured.",
+            "`phalanx-master calibrate stereo`.",
+        )
+    for key in ("laser_plane", "T_camera_palm") if rig.kind == "wrist" else ():
+        if getattr(rig, key) is None:
+            yield _absent(
+                name, f"Rig {name}: {key} is not measured.", "`phalanx-master calibrate --help`: wrist."
+            )
+    if rig.imu is not None and not rig.imu.placed:
+        yield _absent(
+            rig.imu.name,
+            f"IMU {rig.imu.name}: how it is mounted is not known; its orientation is not used.",
+            "`phalanx-master calibrate mounting`.",
+        )
+    for camera in rig.cameras:
+        yield from _judge_camera(calibration, rig, camera, used.get(camera))
+
+
+def _judge_camera(
+    calibration: Path, rig: RigCalibration, name: str, used: CameraPlan | None
+) -> Iterator[CheckItem]:
+    file = _read(calibration / "cameras" / f"{name}.json", CameraCalibration)
+    if isinstance(file, str):
+        yield _absent(name, f"The file of camera {name} cannot be used: {file}", _MEND)
+        return
+    if file.intrinsics is None:
+        yield _absent(
+            name, f"Camera {name}: its lens is not measured.", "`phalanx-master calibrate intrinsics`."
+        )
+    if used is not None and (file.width_px, file.height_px) != used.size_px:
+        yield _stale(
+            name,
+            f"The file of camera {name} says {file.width_px} x {file.height_px} pixels, in use are"
+            f" {used.size_px[0]} x {used.size_px[1]}.",
+            "Measure the lens with the size that is used, or start master and slave anew.",
+        )
+    lens = file.provenance.get("intrinsics")
+    for key, part in (("T_rig_camera", "the places of the cameras"), *_RESTS_ON_LENS[rig.kind]):
+        if _older(rig.provenance.get(key), lens):
+            yield _stale(
+                name,
+                f"The lens of camera {name} was measured after {part} of rig {rig.name}, which rest on it.",
+                f"Measure {part} anew: `phalanx-master calibrate --help`.",
+            )
+    law = rig.depth_model
+    if law != "stereo" and _older(rig.provenance.get(law), rig.provenance.get("T_rig_camera")):
+        yield _stale(
+            rig.name,
+            f"The cameras of rig {rig.name} were placed anew after its depth model was fitted.",
+            "Fit it anew: `phalanx-master calibrate depth`.",
+        )
+
+
+_MEND = "Mend it, or take the copy that was in use; meanwhile everything goes on with what was read before."
+_RESTS_ON_LENS = {
+    "markers": (),
+    "wrist": (("laser_plane", "the plane of the laser"), ("T_camera_palm", "the palm")),
+}
+
+
+def _older(part: Provenance | None, base: Provenance | None) -> bool:
+    """Whether `part` was measured before `base`, on which it rests; of a part without a date nothing is known."""
+    if part is None or base is None:
+        return False
+    return datetime.fromisoformat(part.date) + TOGETHER < datetime.fromisoformat(base.date)
+
+
+def _read(path: Path, kind: type[PartT]) -> PartT | str:
+    """The file, or why it cannot be used."""
+    try:
+        return load(path, kind)
+    except CalibrationError as error:
+        return str(error).replace(str(path), path.name)
+
+
+def _absent(subject: str, sentence: str, fix: str) -> CheckItem:
+    return CheckItem("calibration_absent", subject, sentence[:500], fix)
+
+
+def _stale(subject: str, sentence: str, fix: str) -> CheckItem:
+    return CheckItem("calibration_stale", subject, sentence[:500], fix)

@@ -1,0 +1,206 @@
+"""What the master hears, or does not: senders that are away, lost datagrams, clocks, rates. And its disk."""
+
+from collections.abc import Iterator
+
+from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow, Verdict, beyond
+from master.checklist.said import Said
+from master.checklist.window import Window
+
+GRACE_NS = 5_000_000_000  # from the first look: processes come up one after another
+SETTLED_NS = 2_000_000_000  # a sender that has just come has a clock, and frames, after that
+SPAN_NS = 1_400_000_000  # what counts as now: with two looks to notice it stays below two seconds
+CLOCK_SETTLED_NS = 1_000_000_000  # a clock is known after five echoes, a hundred a second
+MUTE_NS = 1_200_000_000  # connected and nothing comes: the sensor is away
+LOSS, LOSS_WELL = (
+    0.03,
+    0.01,
+)  # share of the messages; tracks bridge single frames, at 3 % two in a row are daily
+LOSS_LEAST = 2  # messages in the window: one that is lost is no trend
+SLOW, SLOW_WELL = 0.85, 0.92  # of the rate of the file; a camera that halves its rate for the light has 0.5
+CLOCK_NS, CLOCK_WELL_NS = 1.0e6, 0.7e6  # 1.5 ms between two cameras cost 2 % of depth at 1 m/s (docs/sync.md)
+RESERVE_MB, RESERVE_WELL_MB = 200.0, 250.0  # as much as a recording leaves free
+
+
+class _Heard:
+    """How one sender was heard so far."""
+
+    def __init__(self) -> None:
+        self.since_ns: int | None = None  # connected since
+        self.ever = False
+        self.came_ns = 0  # last message
+        self.messages = Window(SPAN_NS)
+        self.frames = Window(
+            SPAN_NS
+        )  # of the slave's reports: of a wrist device not every frame is a message
+        self.report = 0
+
+    def push(self, t_ns: int, now: SenderNow) -> None:
+        if not now.connected:
+            self.since_ns = None
+            self.messages.clear()
+            self.frames.clear()
+            return
+        if self.since_ns is None:
+            self.since_ns = self.came_ns = t_ns
+        self.ever = True
+        self.messages.push(t_ns, now.received, now.missed)
+        if self.messages.moved:
+            self.came_ns = t_ns
+
+    def settled(self, t_ns: int, after_ns: int = SETTLED_NS) -> bool:
+        return self.since_ns is not None and t_ns - self.since_ns >= after_ns
+
+
+class LinkRules:
+    """Push machine. Holds when the first look was, and how each sender was heard."""
+
+    def __init__(self) -> None:
+        """Nobody was heard yet."""
+        self._first_ns: int | None = None
+        self._started_ns: int | None = None
+        self._heard: dict[str, _Heard] = {}
+
+    def present(self, name: str) -> bool:
+        """Whether a sender is there, as of the last look."""
+        heard = self._heard.get(name)
+        return heard is not None and heard.since_ns is not None
+
+    def look(self, plan: Plan, now: MasterNow, said: dict[str, Said], t_ns: int) -> Iterator[Verdict]:
+        """What the links of all senders are like."""
+        self._first_ns = t_ns if self._first_ns is None else self._first_ns
+        if now.started and self._started_ns is None:
+            self._started_ns = t_ns
+        for name, sender in now.senders.items():
+            self._heard.setdefault(name, _Heard()).push(t_ns, sender)
+        for camera in plan.cameras:
+            sender = now.senders.get(camera.name)
+            if sender is not None:
+                yield self._camera_absent(camera, sender, said.get(camera.name), t_ns)
+                yield self._slow(camera, said.get(camera.name), t_ns)
+                yield from self._way(camera.name, sender, t_ns)
+        for name in plan.imus:
+            sender = now.senders.get(name)
+            if sender is not None:
+                yield self._imu_silent(name, sender, t_ns)
+                yield from self._way(name, sender, t_ns)
+        if now.disk_free_mb is not None:
+            yield disk_verdict("master", now.disk_free_mb)
+
+    def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
+        """Whether it is not heard: at once where it was there, after a grace where it never was."""
+        assert self._first_ns is not None
+        if sender.connected:
+            return False
+        return self._heard[name].ever or t_ns - self._first_ns >= GRACE_NS or None
+
+    def _mute(self, name: str, t_ns: int) -> bool:
+        """Whether it is heard, and sends nothing though it should."""
+        heard = self._heard[name]
+        started = self._started_ns is not None and t_ns - self._started_ns >= SETTLED_NS
+        return started and heard.settled(t_ns) and t_ns - heard.came_ns >= MUTE_NS
+
+    def _camera_absent(self, camera: CameraPlan, sender: SenderNow, said: Said | None, t_ns: int) -> Verdict:
+        name, away = camera.name, self._away(camera.name, sender, t_ns)
+        if away or away is None:
+            never = not self._heard[name].ever
+            return Verdict(
+                "camera_absent",
+                name,
+                away,
+                f"Camera {name} {'was never heard' if never else 'is not heard any more'}.",
+                f"Is its slave running (phalanx-slave run --name {name}), on this network, with the same rig key?",
+            )
+        if camera.wrist:  # without a hand there are no triples: it is the frames that count
+            frames = None if said is None or not said.fresh(t_ns) else said.grown("frames")
+            mute = frames == 0 and self._mute(name, t_ns)
+        else:
+            mute = self._mute(name, t_ns)
+        return Verdict(
+            "camera_absent",
+            name,
+            mute,
+            f"The slave of camera {name} is there, but no frame comes.",
+            "Is the camera plugged in? The slave opens it again by itself; its log says why it cannot.",
+        )
+
+    def _imu_silent(self, name: str, sender: SenderNow, t_ns: int) -> Verdict:
+        away, never = self._away(name, sender, t_ns), not self._heard[name].ever
+        if away is False and self._mute(name, t_ns):
+            return Verdict(
+                "imu_silent",
+                name,
+                True,
+                f"The slave of IMU {name} is there, but no sample comes.",
+                "Is the IMU plugged in and switched on? The slave opens it again by itself; its log says more.",
+            )
+        return Verdict(
+            "imu_silent",
+            name,
+            away,
+            f"IMU {name} {'was never heard' if never else 'is not heard any more'}.",
+            f"Is its slave running (phalanx-slave imu --name {name}), and the IMU plugged in?",
+        )
+
+    def _slow(self, camera: CameraPlan, said: Said | None, t_ns: int) -> Verdict:
+        """Of what is sent, not of what comes: loss has a code of its own."""
+        heard, rate_hz = self._heard[camera.name], float("nan")
+        if camera.wrist:
+            if said is not None and said.fresh(t_ns) and said.number != heard.report:
+                heard.report = said.number
+                heard.frames.push(said.t_ns, said.counts.get("frames", 0))
+                if heard.settled(t_ns) and heard.frames.full and heard.frames.moved:
+                    rate_hz = heard.frames.grown()[0] / heard.frames.seconds
+        elif heard.settled(t_ns) and heard.messages.full and heard.messages.moved:
+            rate_hz = sum(heard.messages.grown()) / heard.messages.seconds
+        share = rate_hz / camera.rate_hz
+        wrong = beyond(-share, -SLOW, -SLOW_WELL) if share == share else None
+        return Verdict(
+            "rate_low",
+            camera.name,
+            wrong,
+            f"Camera {camera.name} gives {rate_hz:.0f} frames per second, its file says {camera.rate_hz:g}.",
+            "Too slow a computer, USB hub or exposure: see detect_us and camera.skipped of its health, or lower"
+            f" frame_rate_hz of cameras/{camera.name}.json.",
+        )
+
+    def _way(self, name: str, sender: SenderNow, t_ns: int) -> Iterator[Verdict]:
+        """Loss, and the clock."""
+        heard = self._heard[name]
+        settled = heard.settled(t_ns)
+        clocked = heard.settled(t_ns, CLOCK_SETTLED_NS)
+        came, missed = heard.messages.grown() or (0, 0)
+        share = missed / max(came + missed, 1)
+        lossy = beyond(share, LOSS, LOSS_WELL) if settled and heard.messages.full else None
+        if lossy and missed < LOSS_LEAST:
+            lossy = None
+        yield Verdict(
+            "packet_loss",
+            name,
+            lossy,
+            f"{100.0 * share:.0f} % of what {name} sends is lost on the way.",
+            "Use a cable instead of Wi-Fi, another channel, or a switch that is not overloaded.",
+        )
+        sigma = sender.clock_sigma_ns
+        if sigma is None:
+            said, wrong = "is not known", clocked or None
+        else:
+            said = f"is known to {1e-6 * sigma:.1f} ms only"
+            wrong = beyond(sigma, CLOCK_NS, CLOCK_WELL_NS) if clocked else None
+        yield Verdict(
+            "clock_unsynchronised",
+            name,
+            wrong,
+            f"The clock of {name} against the master's {said}: its times are worth nothing for moving hands.",
+            "The network is slow or uneven: use a cable; wait half a minute after it was mended.",
+        )
+
+
+def disk_verdict(subject: str, free_mb: float) -> Verdict:
+    """Whether a disk is full."""
+    return Verdict(
+        "disk_full",
+        subject,
+        beyond(-free_mb, -RESERVE_MB, -RESERVE_WELL_MB),
+        f"The disk of {subject} has {free_mb:.0f} MB left; below {RESERVE_MB:g} MB nothing is recorded.",
+        "Move recordings away, or delete some.",
+    )

@@ -1,0 +1,57 @@
+"""Whether the rays of the cameras still meet: of a camera that was knocked they miss those of the others."""
+
+from collections.abc import Iterator, Mapping
+
+from master.checklist.facts import Verdict, beyond
+from master.checklist.window import Window
+
+SPAN_NS = 1_000_000_000
+LEAST_POSES = 6  # in the window: fewer are a hand that comes or goes
+APART, APART_WELL = 0.15, 0.05  # share of the hand's markers whose rays miss each other, two cameras
+MOSTLY, MOSTLY_WELL = 0.5, 0.2  # share of the poses that leave most of what a camera sees out, three or more
+_NAME = 64  # characters of a name in counts
+
+
+class MovedRule:
+    """Push machine over what one pipeline counts. Holds its counters of the last second."""
+
+    def __init__(self) -> None:
+        """Nothing was counted yet."""
+        self._window = Window(SPAN_NS)
+        self._cameras: tuple[str, ...] = ()
+
+    def clear(self) -> None:
+        """What was counted so far was of something else: a camera was away."""
+        self._window.clear()
+
+    def look(
+        self, cameras: tuple[str, ...], markers: int, counts: Mapping[str, int], t_ns: int
+    ) -> Iterator[Verdict]:
+        """Judge the poses of the last second."""
+        if cameras != self._cameras:
+            self._cameras = cameras
+            self._window.clear()
+        out = [counts.get(f"mostly_left_out.{name}"[:_NAME], 0) for name in cameras]
+        self._window.push(t_ns, counts.get("poses", 0), counts.get("epipolar_misfits", 0), *out)
+        poses, apart, *left_out = self._window.grown()
+        enough = self._window.full and poses >= LEAST_POSES
+        if len(cameras) == 2:
+            share = apart / max(poses * markers, 1)
+            yield _verdict(
+                cameras,
+                beyond(share, APART, APART_WELL) if enough else None,
+                f"What cameras {' and '.join(cameras)} see does not fit together: the rays of"
+                f" {100.0 * share:.0f} % of the markers miss each other.",
+            )
+            return
+        for name, number in zip(cameras, left_out, strict=True):
+            yield _verdict(
+                (name,),
+                beyond(number / max(poses, 1), MOSTLY, MOSTLY_WELL) if enough else None,
+                f"What camera {name} sees does not fit what the others see; it is left out.",
+            )
+
+
+def _verdict(cameras: tuple[str, ...], wrong: bool | None, sentence: str) -> Verdict:
+    fix = "A camera was knocked, or has another lens: measure the places anew, `phalanx-master calibrate stereo`."
+    return Verdict("camera_moved", "-".join(cameras), wrong, sentence, fix, cameras)

@@ -1,0 +1,221 @@
+"""What slaves say of themselves: camera settings, light, colours, markers, temperature, disk, strobe."""
+
+from collections.abc import Iterator
+from math import log
+
+from common.camera_settings import WANTED
+from master.checklist.facts import CameraPlan, Verdict, beyond
+from master.checklist.link_rules import disk_verdict
+from master.checklist.said import Said
+from master.checklist.unseen import UnseenMarkers
+
+# Setting -> relative and absolute distance from which what is read back is another setting. Cameras round exposure to
+# rows (20 to 30 us) and gains to register codes (1/16); what an automatic does is much more.
+OFF = {
+    "exposure_us": (0.05, 100.0),
+    "analogue_gain": (0.05, 0.125),
+    "red_gain": (0.03, 0.03),
+    "blue_gain": (0.03, 0.03),
+}
+DIGITAL = 1.3  # gain behind the sensor: rounding needs less
+BRIGHT, BRIGHT_WELL = (
+    1.5,
+    1.35,
+)  # against calibration, either way; the slave follows up to 2.5 (docs/light.md)
+TWIN = "twins."  # gauges of the slave: hues between two markers as they are seen,
+OVERLAP = "overlap."  # and by which the ranges in use of two markers overlap
+BETWEEN = ".."  # the names of the two
+BESIDE = "beside."  # count: frames in which something beside the hand had the colour of a marker
+UNCOLOURED = "uncalibrated."  # count: 1 of a marker without a colour
+BESIDE_SHARE, BESIDE_WELL = 0.5, 0.1  # of the frames
+HOT_WELL_C = 5.0
+FLAGS = {1: "the supply is too weak", 2: "the clock is capped", 4: "it is throttled", 8: "it is too warm"}
+SLIPPED, SLIPPED_LEAST = (
+    0.04,
+    2,
+)  # share and number of the frames between two reports that the strobe has elsewhere
+
+
+class SlaveRules:
+    """Push machine over the reports of one slave. Holds what each rule that needs two reports found last."""
+
+    def __init__(self, camera: CameraPlan | None) -> None:
+        """Of a camera, or of an IMU (None)."""
+        self._camera = camera
+        self._unseen = [] if camera is None else [UnseenMarkers(camera.name, hand) for hand in camera.hands]
+        self._judged = -1
+        self._kept: list[Verdict] = []
+
+    def look(self, name: str, said: Said, t_ns: int) -> Iterator[Verdict]:
+        """All that its last reports tell; nothing where they are old."""
+        if not said.fresh(t_ns):
+            return
+        if said.number != self._judged:
+            self._judged = said.number
+            self._kept = [] if self._camera is None else list(self._of_two(self._camera, said))
+        yield from self._kept
+        if self._camera is not None:
+            yield from _settings(name, said)
+            yield from _light(name, said)
+            yield from _collisions(name, said)
+            yield from _file(self._camera, said)
+        yield from _machine(name, said)
+
+    def _of_two(self, camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+        """What happened between two reports."""
+        for unseen in self._unseen:
+            yield from unseen.push(said)
+        yield from _background(camera, said)
+        if camera.wrist:
+            yield from _strobe(camera.name, said)
+
+
+def _settings(name: str, said: Said) -> Iterator[Verdict]:
+    """Whether the camera has what it was told."""
+    gauges = said.gauges
+    wrong: list[str] = []
+    for setting, (share, least) in OFF.items():
+        want, got = gauges.get(WANTED + setting), gauges.get(setting)
+        if want is not None and got is not None and abs(got - want) > max(share * want, least):
+            wrong.append(f"{setting} is {got:.4g}, not {want:.4g}")
+    if (digital := gauges.get("digital_gain", 1.0)) > DIGITAL:
+        wrong.append(f"digital_gain is {digital:.3g}")
+    wrong += [
+        f"{auto.removeprefix('auto.')} is on"
+        for auto in sorted(gauges)
+        if auto.startswith("auto.") and gauges[auto]
+    ]
+    yield Verdict(
+        "auto_mode",
+        name,
+        bool(wrong),
+        f"Camera {name} reads back other settings than it was given: {'; '.join(wrong)}.",
+        f"Something else sets it, or an automatic is on: close other programs that use it, then `phalanx-master"
+        f" camera {name}`, or start its slave anew.",
+    )
+
+
+def _light(name: str, said: Said) -> Iterator[Verdict]:
+    """Whether the picture is as bright as at calibration."""
+    exposure = said.gauges.get("light_exposure")
+    if exposure is None or exposure <= 0.0:
+        return
+    yield Verdict(
+        "exposure_drift",
+        name,
+        beyond(abs(log(exposure)), log(BRIGHT), log(BRIGHT_WELL)),
+        f"The picture of camera {name} is {exposure:.2g} times as bright as when its colours were calibrated.",
+        "Light the scene as then, set the exposure back, or calibrate the colours under this light.",
+    )
+
+
+def _collisions(name: str, said: Said) -> Iterator[Verdict]:
+    """Whether two markers share colours, by their ranges or by their looks."""
+    for gauge, hues in said.gauges.items():
+        if gauge.startswith(OVERLAP):
+            pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
+            what = f"the colour ranges of {' and '.join(pair)} overlap by {hues:.0f} hues"
+        elif gauge.startswith(TWIN):
+            pair = tuple(gauge.removeprefix(TWIN).split(BETWEEN))
+            what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
+        else:
+            continue
+        yield Verdict(
+            "colour_collision",
+            f"{name}.{'-'.join(pair)}",
+            True,
+            f"Camera {name}: {what}: one can be taken for the other.",
+            "Calibrate the colours anew, or repaint one of the two in a colour that no other has.",
+            (name,),
+            pair,
+        )
+
+
+def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+    """Whether the slave has colours, and a file of the same camera as the master's."""
+    name = camera.name
+    bare = tuple(event.removeprefix(UNCOLOURED) for event in said.counts if event.startswith(UNCOLOURED))
+    yield Verdict(
+        "calibration_absent",
+        name,
+        bool(bare),
+        f"Camera {name} has no colour for {', '.join(bare)}: it does not see {'it' if len(bare) == 1 else 'them'}.",
+        "Pick it in the picture: the set-up of the console; or calibrate all with `phalanx-slave colours`.",
+        (name,),
+        bare,
+    )
+    width, height = said.gauges.get("width_px"), said.gauges.get("height_px")
+    if width is None or height is None:
+        return
+    yield Verdict(
+        "calibration_stale",
+        name,
+        (width, height) != camera.size_px,
+        f"Camera {name} gives {width:.0f} x {height:.0f} pixels, the master's file was measured with"
+        f" {camera.size_px[0]} x {camera.size_px[1]}.",
+        f"Give slave and master the same cameras/{name}.json, and calibrate the lens with that size.",
+    )
+
+
+def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
+    """Whether things beside the hand have the colour of a marker."""
+    frames = said.grown("frames")
+    if not frames:
+        return
+    for event in said.counts:
+        if not event.startswith(BESIDE):
+            continue
+        marker, share = event.removeprefix(BESIDE), (said.grown(event) or 0) / frames
+        u, v = said.gauges.get(f"{event}.u"), said.gauges.get(f"{event}.v")
+        where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
+        yield Verdict(
+            "background_in_range",
+            f"{camera.name}.{marker}",
+            beyond(share, BESIDE_SHARE, BESIDE_WELL),
+            f"Camera {camera.name} sees something else in the colour of marker {marker}{where}.",
+            "Take it away or cover it; or paint the marker in another colour.",
+            (camera.name,),
+            (marker,),
+        )
+
+
+def _strobe(name: str, said: Said) -> Iterator[Verdict]:
+    """Whether laser and LEDs are on in the frames in which they should be."""
+    frames, out = said.grown("frames"), said.grown("strobe.out_of_step")
+    unconfirmed, unlit = said.grown("strobe.unconfirmed"), said.grown("strobe.unlit")
+    if not frames or out is None:
+        return
+    elsewhere = out + (unconfirmed or 0)
+    wrong = beyond(elsewhere / frames, SLIPPED, 0.5 * SLIPPED)
+    if wrong and (elsewhere < SLIPPED_LEAST or (unlit or 0) > 0.5 * frames):
+        wrong = None  # one frame that slipped; or nothing is lit, because there is no hand
+    yield Verdict(
+        "strobe_slipped",
+        name,
+        wrong,
+        f"Wrist device {name}: in {elsewhere} of {frames} frames laser or LEDs are on in the wrong one.",
+        "Check the wires of the lights and lead_us of the strobe; a slave that is too slow loses frames: see dropped.",
+    )
+
+
+def _machine(name: str, said: Said) -> Iterator[Verdict]:
+    """Whether the slave's computer is hot, throttled, or its disk full."""
+    gauges = said.gauges
+    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    hot: bool | None = False
+    why: list[str] = []
+    if now is not None and limit is not None:
+        hot = beyond(now, limit, limit - HOT_WELL_C)
+        why = [f"{now:.0f} °C, {limit:.0f} are its limit"] if now >= limit else []
+    flags = int(gauges.get("throttled", 0.0))
+    held = [text for bit, text in FLAGS.items() if flags & bit]
+    if now is not None or "throttled" in gauges:
+        yield Verdict(
+            "too_hot",
+            name,
+            True if held else hot,
+            f"The computer of {name}: {'; '.join(why + held) or 'still warm'}.",
+            "Give it air, a heat sink or a fan, and a supply of its own that is strong enough (Pi 5: 5 A).",
+        )
+    if (free := gauges.get("disk_free_mb")) is not None:
+        yield disk_verdict(name, free)

@@ -1,0 +1,50 @@
+"""What hands say, as a person follows it: what lasts now, and the last things that were said. Bounded."""
+
+import time
+from collections import deque
+from dataclasses import dataclass
+
+from common.messages import Gesture
+
+LASTS_S = 0.5  # a gesture is repeated with every pose of its hand: not heard for so long, it is over
+KEPT = 30
+_MOST = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """One thing that a hand said: when it was heard [s, monotonic], and the message that began or ended it."""
+
+    heard_s: float
+    gesture: Gesture
+
+
+class GesturesHeard:
+    """Holds the newest message of each gesture that lasts, and the last begins, ends and taps."""
+
+    def __init__(self) -> None:
+        """Nothing was said."""
+        self._lasting: dict[tuple[str, str], Said] = {}
+        self._events: deque[Said] = deque(maxlen=KEPT)
+
+    def push(self, gesture: Gesture, now_s: float) -> None:
+        """Hear one message at `now_s` [s], monotonic."""
+        key = (gesture.hand, gesture.kind)
+        said = Said(now_s, gesture)
+        if gesture.phase != "update":
+            self._events.append(said)
+        if gesture.phase == "end":
+            self._lasting.pop(key, None)
+        elif key in self._lasting or len(self._lasting) < _MOST:
+            self._lasting[key] = said
+
+    def lasting(self, now_s: float | None = None) -> dict[tuple[str, str], Gesture]:
+        """(hand, kind) -> what lasts at `now_s` [s], by default now."""
+        now_s = time.monotonic() if now_s is None else now_s
+        return {
+            key: said.gesture for key, said in list(self._lasting.items()) if now_s - said.heard_s < LASTS_S
+        }
+
+    def events(self) -> list[Said]:
+        """The last begins, ends and taps, newest first."""
+        return list(self._events)[::-1]

@@ -1,0 +1,215 @@
+"""Processes of this machine that the console starts by command line: cameras, a master, calibrations. They end with it.
+
+Each runs in a process group of its own; its lines are read on a thread. A `warden` process holds the list of groups and
+ends them when the console is gone, so that a console that was killed leaves no camera busy.
+"""
+
+import codecs
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import IO, TypeVar
+
+from common.errors import PhalanxError
+from master.console.warden import ENDS_S
+
+TAIL = 200
+T = TypeVar("T")
+_KILLED_S = 2.0
+_CHUNK = 8192
+
+
+class LocalProcess:
+    """One command that runs. Holds the child, its last lines, and what it said without ending the line: a question."""
+
+    def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        """Start it.
+
+        Args:
+            name: For messages.
+            command: Program and arguments.
+            environment: Added to this process's own.
+
+        Raises:
+            PhalanxError: The program cannot be started.
+        """
+        self.name, self.command = name, tuple(command)
+        self.lines: deque[str] = deque(maxlen=TAIL)
+        self.prompt = ""
+        self._stopped = False
+        try:
+            self._child = subprocess.Popen(
+                self.command,
+                env={**os.environ, "PYTHONUNBUFFERED": "1", **environment},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise PhalanxError(f"{name}: cannot start {self.command[0]}: {error.strerror}") from error
+        assert self._child.stdout is not None
+        self._reader = threading.Thread(target=self._read, args=(self._child.stdout,), daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process id, which is that of its group."""
+        return self._child.pid
+
+    def ended(self) -> int | None:
+        """Its exit code; None while it runs. Negative: the signal that ended it."""
+        return self._child.poll()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether `stop` was called: then an exit code is no failure."""
+        return self._stopped
+
+    def tail(self, count: int = 12) -> list[str]:
+        """Its last lines."""
+        return list(self.lines)[-count:]
+
+    def send(self, line: str = "") -> None:
+        """A line for its keyboard, as Enter; nothing happens once it has ended."""
+        if self._child.stdin is None:
+            return
+        try:
+            self._child.stdin.write(f"{line}\n".encode())
+            self._child.stdin.flush()
+        except (OSError, ValueError):
+            return  # it ended meanwhile, which `ended` says
+
+    def interrupt(self) -> None:
+        """Ask it to end (SIGINT), as Ctrl-C does; does not wait."""
+        self._stopped = True
+        self._signal(signal.SIGINT)
+
+    def stop(self, ends_s: float = ENDS_S) -> int:
+        """End it, wait until it has ended, and return its exit code; kill it after `ends_s` [s]."""
+        self._stopped = True
+        if self._child.poll() is None:
+            self._signal(signal.SIGTERM)
+            try:
+                self._child.wait(ends_s)
+            except subprocess.TimeoutExpired:
+                self._signal(signal.SIGKILL)
+                self._child.wait(_KILLED_S)
+        self._reader.join(_KILLED_S)
+        if self._child.stdin is not None:
+            with suppress(OSError):  # what was not read any more
+                self._child.stdin.close()
+        return self._child.returncode
+
+    def _signal(self, number: int) -> None:
+        try:
+            os.killpg(self._child.pid, number)
+        except ProcessLookupError:
+            return  # ended by itself
+
+    def _read(self, output: IO[bytes]) -> None:
+        decoder = codecs.getincrementaldecoder("utf-8")(errors="replace")
+        with output:
+            # What is there, not whole lines: a command that asks waits on the line of its question.
+            while chunk := os.read(output.fileno(), _CHUNK):
+                *whole, rest = (self.prompt + decoder.decode(chunk)).replace("\r\n", "\n").split("\n")
+                self.lines.extend(line.rpartition("\r")[2] for line in whole)
+                self.prompt = rest.rpartition("\r")[2][-_CHUNK:]
+        if self.prompt:
+            self.lines.append(self.prompt)
+            self.prompt = ""
+
+
+class LocalProcesses:
+    """All that the console started, by name. Holds the warden; one process of a name at a time."""
+
+    def __init__(self) -> None:
+        """Start the warden.
+
+        Raises:
+            PhalanxError: This interpreter cannot be started.
+        """
+        self._lock = threading.Lock()
+        self._all: dict[str, LocalProcess] = {}
+        self._shared: dict[type, object] = {}
+        try:
+            self._warden = subprocess.Popen(
+                [sys.executable, "-m", "master.console.warden"],
+                stdin=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise PhalanxError(f"console: cannot start {sys.executable}: {error.strerror}") from error
+
+    def start(self, name: str, command: Sequence[str], environment: Mapping[str, str]) -> LocalProcess:
+        """Start a command under a name; one of that name that still runs is ended first.
+
+        Raises:
+            PhalanxError: The program cannot be started.
+        """
+        self.stop(name)
+        process = LocalProcess(name, command, environment)
+        self._tell(f"+{process.pid}")
+        with self._lock:
+            self._all[name] = process
+        return process
+
+    def get(self, name: str) -> LocalProcess | None:
+        """The process started last under a name, which may have ended."""
+        with self._lock:
+            return self._all.get(name)
+
+    def running(self) -> dict[str, LocalProcess]:
+        """Those that run."""
+        with self._lock:
+            return {name: one for name, one in self._all.items() if one.ended() is None}
+
+    def shared(self, kind: type[T], make: Callable[[], T]) -> T:
+        """The one object of a type that leads these processes, made when first asked for: all pages see the same."""
+        with self._lock:
+            found = self._shared.get(kind)
+            if not isinstance(found, kind):
+                self._shared[kind] = found = make()
+            return found
+
+    def stop(self, name: str) -> None:
+        """End one and wait until it has; nothing happens if there is none."""
+        process = self.get(name)
+        if process is None:
+            return
+        process.stop()
+        self._tell(f"-{process.pid}")
+
+    def close(self) -> None:
+        """End all at once, then the warden. Safe to call twice."""
+        running = list(self.running().values())
+        stoppers = [threading.Thread(target=one.stop, daemon=True) for one in running]
+        for thread in stoppers:
+            thread.start()
+        for thread in stoppers:
+            thread.join(ENDS_S + _KILLED_S)
+        for one in running:
+            self._tell(f"-{one.pid}")
+        if self._warden.stdin is not None and not self._warden.stdin.closed:
+            self._warden.stdin.close()
+        try:
+            self._warden.wait(ENDS_S + _KILLED_S)
+        except subprocess.TimeoutExpired:
+            self._warden.kill()
+            self._warden.wait(_KILLED_S)
+
+    def _tell(self, line: str) -> None:
+        pipe = self._warden.stdin
+        if pipe is None or pipe.closed:
+            return
+        try:
+            pipe.write(line + "\n")
+            pipe.flush()
+        except OSError:
+            return  # the warden was killed: the processes still end with `close`

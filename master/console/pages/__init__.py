@@ -1,0 +1,1 @@
+"""The pages of the console, one file each: `build(state)` fills the shell of `master.console.app`."""

@@ -1,0 +1,139 @@
+"""Panel of step 1: how many cameras, what kind, which sensor in which mode."""
+
+from pathlib import Path
+
+from msgspec.structs import replace
+from nicegui import ui
+
+from common.errors import CalibrationError
+from master.console.setup.commands import world_of_project
+from master.console.setup.files import WORLDS, CameraPlan, Plan
+from master.console.setup.modes import KINDS, SIMULATED, Kind, modes_of
+from master.console.setup.parts import Desk, heading
+
+NAMES = ("left", "right", "left2", "right2", "camera5", "camera6", "camera7", "camera8")
+_TALK = {
+    "usb": "Device, such as /dev/v4l/by-id/…",
+    "pi": "Host of the Pi, such as pi@left.local",
+}
+
+
+def build(desk: Desk) -> None:
+    """Fill the panel."""
+    heading(
+        "Choose cameras",
+        "Two or more. Lenses, places and colours are measured by the next steps.",
+    )
+    rows = _Rows(desk.session.plan)
+    with ui.row().classes("items-end"):
+        kind = ui.select(KINDS, label="Kind of cameras", value=rows.kind).classes("w-72")
+        count = ui.select(rows.counts(), label="How many cameras", value=rows.count).classes("w-48")
+    table = ui.column().classes("w-full")
+
+    def show() -> None:
+        table.clear()
+        with table:
+            rows.show()
+
+    def change() -> None:
+        rows.choose(kind.value or "simulated", int(count.value or 2))
+        count.set_options(rows.counts(), value=rows.count)
+        show()
+
+    kind.on_value_change(change)
+    count.on_value_change(change)
+    show()
+
+    async def write() -> None:
+        desk.complain("")
+        try:
+            plan = rows.plan()
+        except CalibrationError as error:
+            desk.complain(str(error))
+            return
+        done = await desk.attempt(lambda: desk.session.choose_cameras(plan) or True)
+        if done:
+            desk.go("rig")
+
+    ui.button("Write camera files", on_click=write).props('icon="save"')
+
+
+class _Rows:
+    """The cameras as they are entered. Holds the plan that they change."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._cameras = list(plan.cameras)
+        self._truth = plan.truth
+        self.kind: Kind = self._cameras[0].kind if self._cameras else "simulated"
+        self.count = len(self._cameras) or 2
+        self.choose(self.kind, self.count)
+
+    def counts(self) -> list[int]:
+        return list(WORLDS) if self.kind == "simulated" else list(range(2, len(NAMES) + 1))
+
+    def choose(self, kind: Kind, count: int) -> None:
+        """Take another kind for all, or another number."""
+        if kind != self.kind:
+            self._cameras = []
+        self.kind = kind
+        self.count = count if count in self.counts() else 2
+        mode = next(iter(modes_of(kind)))
+        more = [
+            CameraPlan(name=name, kind=kind, mode=mode) for name in NAMES[len(self._cameras) : self.count]
+        ]
+        self._cameras = [*self._cameras[: self.count], *more]
+
+    def show(self) -> None:
+        for place in range(len(self._cameras)):
+            self._row(place)
+        if self.kind == "simulated":
+            if not self._truth:
+                try:
+                    self._truth = str(world_of_project())
+                except CalibrationError as error:
+                    ui.label(str(error)).classes("setup-error")
+            truth = ui.input("Folder of the simulated world", value=self._truth).classes("w-full max-w-xl")
+            truth.on_value_change(lambda event: self._see(event.value))
+            ui.label(
+                "Simulated cameras see a drawn hand. What they are told is measured from their pictures, as with"
+                " real ones; only the paints and lenses of that world stand in its folder."
+            ).classes("setup-text")
+
+    def plan(self) -> Plan:
+        """What was entered.
+
+        Raises:
+            CalibrationError: A name or a mode is missing.
+        """
+        if any(not camera.name.strip() for camera in self._cameras):
+            raise CalibrationError("each camera needs a name")
+        truth = str(Path(self._truth).resolve()) if self.kind == "simulated" else ""
+        return replace(self._plan, cameras=tuple(self._cameras), truth=truth)
+
+    def _see(self, truth: str | None) -> None:
+        self._truth = truth or ""
+
+    def _row(self, place: int) -> None:
+        camera = self._cameras[place]
+
+        def put(**values: str) -> None:
+            self._cameras[place] = replace(self._cameras[place], **values)
+
+        number = f"of camera {place + 1}"
+        with ui.row().classes("items-end w-full"):
+            name = ui.input(f"Name {number}", value=camera.name).classes("w-40")
+            name.on_value_change(lambda event: put(name=str(event.value or "")))
+            if camera.kind == "simulated":
+                name.props("readonly")
+            modes = modes_of(camera.kind)
+            chosen = camera.mode if camera.mode in modes else SIMULATED
+            mode = ui.select(modes, label=f"Sensor and mode {number}", value=chosen).classes("w-96")
+            mode.on_value_change(lambda event: put(mode=str(event.value)))
+            if camera.kind != "simulated":
+                device = ui.input(f"{_TALK[camera.kind]} ({place + 1})", value=camera.device).classes("w-80")
+                device.on_value_change(lambda event: put(device=str(event.value or "").strip()))
+                options = ui.input(f"More options of its slave ({place + 1})", value=camera.options).classes(
+                    "w-80"
+                )
+                options.on_value_change(lambda event: put(options=str(event.value or "").strip()))

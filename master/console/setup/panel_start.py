@@ -1,0 +1,64 @@
+"""Panel of step 3: the cameras run, here or on their Pis, and are seen on the bus."""
+
+from nicegui import ui
+
+from master.console.setup.commands import VIEWS
+from master.console.setup.parts import Desk, command_line, heading, previews
+
+_LOOK_S = 0.5
+
+
+def build(desk: Desk) -> None:
+    """Fill the panel."""
+    session = desk.session
+    heading("Start cameras", "They run without lens, place and colours until these are measured.")
+    here = [camera for camera in session.plan.cameras if camera.kind != "pi"]
+    for camera in session.plan.cameras:
+        if camera.kind == "pi":
+            copy, run = session.commands.pi(camera)
+            command_line(f"For {camera.name}, first here: bring the files to its Pi", copy)
+            command_line(f"then on the Pi of {camera.name}: start its slave; it appears below by itself", run)
+    if session.state.settings.beacon.startswith("127.") and len(here) < len(session.plan.cameras):
+        ui.label(
+            "This console speaks to this computer only. For Pis start it as: phalanx-master console --beacon"
+            " 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/THIS_COMPUTER:47802"
+        ).classes("setup-error")
+    view = None
+    if session.plan.simulated:
+        chosen = session.view if session.view in VIEWS else "still"
+        view = ui.select(VIEWS, label="What the simulated cameras look at", value=chosen).classes("w-96")
+
+    def go() -> bool:
+        if here:
+            session.start_cameras(session.view if view is None else str(view.value))
+        if session.master is None and not session.foreign_master:
+            session.start_master()
+        return True
+
+    def end() -> None:
+        session.stop_cameras()
+        session.stop_master()
+
+    async def start() -> None:
+        await desk.attempt(go)
+
+    async def stop() -> None:
+        await desk.attempt(end)
+
+    with ui.row():
+        ui.button("Start cameras" if here else "Look for cameras", on_click=start).props('icon="play_arrow"')
+        ui.button("Stop", on_click=stop).props('flat icon="stop"')
+        ui.button("Next: lenses and places", on_click=lambda: desk.go("lens")).props("flat")
+    who = ui.label().props('role="status"')
+    wrong = ui.label().classes("setup-error").props('role="alert"')
+    previews(desk)
+
+    def look() -> None:
+        alive = session.state.alive
+        names = [camera.name for camera in session.plan.cameras]
+        absent = [name for name in names if name not in alive]
+        who.set_text(f"waiting for {', '.join(absent)}" if absent else f"all {len(names)} cameras are there")
+        wrong.set_text("\n".join(session.failures()))
+
+    look()
+    ui.timer(_LOOK_S, look)

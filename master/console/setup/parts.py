@@ -1,0 +1,117 @@
+"""Parts that all panels of the set-up page use: actions off the event loop, errors, commands to copy, live pictures."""
+
+import base64
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TypeVar
+
+from nicegui import run, ui
+
+from common.errors import PhalanxError
+from master.console.setup.session import Session
+
+T = TypeVar("T")
+_PICTURE_S = 0.2
+_EMPTY = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///ywAAAAAAQABAAACAUwAOw=="
+
+
+@dataclass(slots=True)
+class Desk:
+    """One window of the set-up page. Holds the session and where a panel says what went wrong.
+
+    Attributes:
+        session: Of the console.
+        go: Shows the panel of a step.
+        complain: Shows an error until the next action; empty: none.
+    """
+
+    session: Session
+    go: Callable[[str], None]
+    complain: Callable[[str], None]
+
+    async def attempt(self, action: Callable[[], T]) -> T | None:
+        """Do what may take a while off the event loop; what goes wrong is shown, and None returned."""
+        self.complain("")
+        try:
+            return await run.io_bound(action)
+        except PhalanxError as error:
+            self.complain(str(error))
+            return None
+
+
+def jpeg_url(jpeg: bytes) -> str:
+    """A JPEG as the address of an image."""
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
+
+
+def png_url(png: bytes) -> str:
+    """A PNG as the address of an image."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+
+
+def heading(title: str, text: str) -> None:
+    """Title of a panel and a sentence about it."""
+    ui.label(title).classes("text-h6").props('role="heading" aria-level="2"')
+    ui.label(text).classes("setup-text")
+
+
+def command_line(about: str, text: str) -> None:
+    """A command to run elsewhere, with a button that copies it."""
+    ui.label(about).classes("setup-text")
+    with ui.row().classes("items-center no-wrap w-full"):
+        ui.label(text).classes("setup-command").props('tabindex=0 role="textbox" aria-readonly="true"')
+        copy = ui.button(icon="content_copy", on_click=lambda: ui.clipboard.write(text)).props("flat round")
+        copy.props(f'aria-label="Copy: {about}"')
+
+
+def previews(desk: Desk) -> None:
+    """What all cameras see now, side by side, while the panel is open."""
+    state = desk.session.state
+    with ui.row().classes("setup-previews"):
+        shown = {camera.name: _preview(camera.name) for camera in desk.session.plan.cameras}
+
+    def update() -> None:
+        for name, (image, text) in shown.items():
+            state.look(name)
+            picture = state.preview(name)
+            if picture is not None:
+                image.set_source(jpeg_url(picture.jpeg))
+            there = name in state.alive
+            text.set_text(f"{name}: {'live' if picture else 'there' if there else 'waiting for it'}")
+
+    ui.timer(_PICTURE_S, update)
+
+
+def _preview(name: str) -> tuple[ui.image, ui.label]:
+    with ui.column().classes("setup-preview"):
+        image = (
+            ui.image(_EMPTY).props(f'alt="what {name} sees" no-spinner no-transition').classes("setup-image")
+        )
+        text = ui.label().props('aria-live="polite"')
+    return image, text
+
+
+CSS = """
+.setup { display: grid; grid-template-columns: 15rem minmax(0, 1fr); gap: 1.5rem; align-items: start; width: 100% }
+.setup-steps { display: flex; flex-direction: column; gap: .25rem; width: 100% }
+.setup-steps .q-btn__content { justify-content: flex-start; text-align: left; flex-wrap: nowrap; width: 100% }
+.setup-steps .q-btn { text-transform: none; width: 100% }
+.setup-step-why { font-size: .75rem; opacity: .75; line-height: 1.2; white-space: normal }
+.setup-panel { display: flex; flex-direction: column; gap: .75rem; min-width: 0 }
+.setup-text { max-width: 46rem; white-space: pre-line }
+.setup-error { color: var(--q-negative); font-weight: 600; white-space: pre-line }
+.setup-command { font-family: monospace; padding: .5rem; border: 1px solid currentColor; border-radius: 4px;
+  overflow-x: auto; white-space: pre; flex: 1; min-width: 0 }
+.setup-previews { gap: 1rem; width: 100% }
+.setup-preview { gap: .25rem; flex: 1 1 16rem; max-width: 26rem }
+.setup-image { width: 100%; min-height: 8rem; background: #8882 }
+.setup-lines { font-family: monospace; font-size: .8rem; white-space: pre-wrap; max-height: 16rem; overflow-y: auto;
+  width: 100%; padding: .5rem; background: #8882 }
+.setup-result { max-width: 100%; width: 52rem }
+.setup-cards { display: grid; grid-template-columns: repeat(auto-fill, minmax(15rem, 1fr)); gap: .75rem; width: 100% }
+.setup-cards .q-btn { text-transform: none }
+.body--dark .setup .q-btn--flat, .body--dark .setup .q-btn--outline { --q-primary: #8ab4f8 }
+.setup ol { list-style: decimal; padding-left: 1.5rem }
+.body--dark .setup-error { color: #ff8a80 }
+@media (max-width: 800px) { .setup { grid-template-columns: minmax(0, 1fr) } }
+"""

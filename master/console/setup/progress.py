@@ -1,0 +1,39 @@
+"""How far a calibration is, read off the lines that it prints: `7 of 25`, `40 %`, or a step with its number."""
+
+import re
+from collections.abc import Iterable
+
+_COUNT = re.compile(r"\b(\d+) of (\d+)\b")
+_SHARE = re.compile(r"\b(\d{1,3}) %")
+
+
+def share_of(line: str) -> float | None:
+    """What share of the work a line tells is done, 0..1; None: it tells none."""
+    if found := _COUNT.search(line):
+        done, whole = int(found[1]), int(found[2])
+        return min(done / whole, 1.0) if whole else None
+    if found := _SHARE.search(line):
+        return min(int(found[1]) / 100, 1.0)
+    return None
+
+
+def progress(lines: Iterable[str]) -> float | None:
+    """The last share that any line tells; None: none does."""
+    last = None
+    for line in lines:
+        share = share_of(line)
+        last = last if share is None else share
+    return last
+
+
+def fault(lines: Iterable[str]) -> str:
+    """What a command that failed said last: its error, with what to do, as its author wrote it."""
+    told = [line.strip() for line in lines if line.strip()]
+    prefix = "phalanx-master: "
+    for place, line in reversed(list(enumerate(told))):
+        if line.startswith((prefix, "phalanx-slave: ", "meet: ")):
+            return " ".join([line.partition(": ")[2], *told[place + 1 :]])
+    boxed = [
+        line.strip("│ ").strip() for line in told if line.startswith("│")
+    ]  # typer draws a box round wrong usage
+    return " ".join(boxed) or (told[-1] if told else "it said nothing")

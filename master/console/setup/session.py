@@ -1,0 +1,326 @@
+"""What the set-up page has under way: the plan, the cameras and the master it started, and the calibrations that run.
+
+One of it for all windows of a console. Its methods wait for processes, so pages call them off the event loop.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+from common.errors import CalibrationError, PhalanxError
+from common.streams import MASTER
+from master.console.local import LocalProcess
+from master.console.setup.commands import Commands, epoch_of
+from master.console.setup.fields import Value
+from master.console.setup.files import Plan, load_plan, plan_of_rig, write_cameras, write_rig
+from master.console.setup.job import Job, JobState, Stage
+from master.console.setup.progress import fault
+from master.console.setup.recording import recording_stages
+from master.console.setup.steps import Done, Step, steps_of
+from master.console.setup.wizards import WIZARDS, Wizard
+from master.console.state import ConsoleState
+
+_LOG = logging.getLogger(__name__)
+WORK = Path("console") / "work"
+LENS = "lens"  # the job of the main line: capture, then stereo
+
+
+class Session:
+    """Holds plan, the step that was opened last, view of the simulated cameras, and jobs by the command they are of."""
+
+    def __init__(self, state: ConsoleState) -> None:
+        """Go on where the files of the console's tree are.
+
+        Raises:
+            CalibrationError: The plan's file is broken.
+        """
+        self.state = state
+        self.plan = _plan(state)
+        self.view = "still"
+        self.here = ""
+        self.jobs: dict[str, Job] = {}
+        self._lock = threading.RLock()
+        self._bring_back = (False, False)  # cameras, master: what a job that borrows them found running
+
+    @property
+    def tree(self) -> Path:
+        """The calib_json tree."""
+        return self.state.settings.calibration
+
+    @property
+    def commands(self) -> Commands:
+        """Command lines of the plan as it is now."""
+        return Commands(self.state.settings, self.plan)
+
+    @property
+    def cameras_running(self) -> dict[str, LocalProcess]:
+        """Slaves of this console that run."""
+        names = {f"camera {camera.name}" for camera in self.plan.cameras}
+        return {name: one for name, one in self.state.local.running().items() if name in names}
+
+    @property
+    def master(self) -> LocalProcess | None:
+        """The master of this console that runs: one that tracks, one that only meets, or a calibration."""
+        return self.state.local.running().get(MASTER)
+
+    @property
+    def foreign_master(self) -> bool:
+        """Whether a master tracks that the console did not start."""
+        return self.master is None and MASTER in self.state.alive
+
+    @property
+    def busy(self) -> Job | None:
+        """The job that runs, if any."""
+        return next((job for job in self.jobs.values() if job.state is JobState.RUNNING), None)
+
+    def steps(self) -> tuple[Step, ...]:
+        """The steps whose results are files."""
+        return steps_of(self.tree, self.plan, keyed=self.state.settings.key is not None)
+
+    def failures(self) -> list[str]:
+        """What ended by itself though it should run, and why."""
+        told: list[str] = []
+        for name in (*(f"camera {camera.name}" for camera in self.plan.cameras), MASTER):
+            process = self.state.local.get(name)
+            if process is not None and process.ended() not in (None, 0) and not process.stopped:
+                told.append(f"{name} ended: {fault(process.lines)}")
+        return told
+
+    def choose_cameras(self, plan: Plan) -> None:
+        """Write camera files; a rig that is there already gets the cameras, too.
+
+        Raises:
+            CalibrationError: As of `write_cameras`.
+        """
+        with self._lock:
+            write_cameras(self.tree, plan)
+            self._stop_own()
+            self.plan = plan
+            if (self.tree / "rigs" / f"{plan.rig}.json").exists():
+                write_rig(self.tree, plan)
+
+    def choose_rig(self, plan: Plan) -> None:
+        """Write rig, hand and key.
+
+        Raises:
+            PhalanxError: As of `write_rig`; the rig is none that the console was told to show.
+        """
+        shown = self.state.settings.rigs
+        if shown and plan.rig not in shown:
+            raise CalibrationError(f"this console was started for rig {shown[0]!r}; use that name")
+        with self._lock:
+            try:
+                write_rig(self.tree, plan)
+            except ValueError as error:  # of a hand that nobody has
+                raise CalibrationError(str(error)) from error
+            self._stop_own()
+            self.plan = plan
+
+    def start_cameras(self, view: str) -> None:
+        """Start, or start anew, all cameras of this machine; simulated ones look at `view`.
+
+        Raises:
+            PhalanxError: There is no rig or no key yet, or a process cannot be started.
+        """
+        with self._lock:
+            self._needs_rig()
+            environment, epoch_ns = self.commands.environment(), epoch_of(view)
+            self.view = view
+            self.stop_cameras()
+            for camera in self.plan.cameras:
+                if camera.kind != "pi":
+                    command = self.commands.camera(camera, view, epoch_ns)
+                    self.state.local.start(f"camera {camera.name}", command, environment)
+
+    def show(self, view: str) -> None:
+        """Let simulated cameras look at `view`; others, and those that do already, go on."""
+        if (
+            self.plan.simulated and (view != self.view or not self.cameras_running)
+        ) or not self.cameras_running:
+            self.start_cameras(view)
+
+    def stop_cameras(self) -> None:
+        """End the cameras of this machine."""
+        with self._lock:
+            running = [threading.Thread(target=one.stop) for one in self.cameras_running.values()]
+            for thread in running:
+                thread.start()
+            for thread in running:
+                thread.join()
+
+    def start_master(self) -> None:
+        """Start the master: one that tracks if lenses and places are known, else one that only meets the cameras.
+
+        Raises:
+            PhalanxError: There is no rig or no key yet; another master runs; a process cannot be started.
+        """
+        with self._lock:
+            self._needs_rig()
+            if self.foreign_master:
+                raise CalibrationError("a master runs that this console did not start: end it first")
+            known = {step.key: step.state for step in self.steps()}
+            command = self.commands.meet() if known["lens"] is Done.TO_DO else self.commands.run()
+            self.state.local.start(MASTER, command, self.commands.environment())
+
+    def stop_master(self) -> None:
+        """End the master of this console."""
+        self.state.local.stop(MASTER)
+
+    def start_lens(self, values: Mapping[str, Value]) -> Job:
+        """Pictures of the board from all cameras, then the fit of lenses and places.
+
+        Args:
+            values: Fields of `calibrate capture`.
+
+        Raises:
+            PhalanxError: A field is none; another calibration runs.
+        """
+        with self._lock:
+            self._refuse_busy()
+            work = self._work(LENS)
+            capture = self.commands.calibrate("capture", values, work, live=False)
+            board: dict[str, Value] = {
+                name: value for name, value in values.items() if name in _OF_BOARD and value not in (None, "")
+            }
+            stereo = self.commands.calibrate(
+                "stereo", {**board, "source": str(work / "views")}, work, live=False
+            )
+            self.show("board")
+            self._bring_back = (True, True)
+            stages = [
+                lambda: Stage("taking pictures of the board", {MASTER: capture}),
+                lambda: Stage("fitting lenses and places", {"calibrate": stereo}),
+            ]
+            return self._begin(LENS, "Lenses and places", stages, work)
+
+    def start(self, wizard: Wizard, values: Mapping[str, Value], *, record: bool = False) -> Job:
+        """Begin a calibration with the form's values.
+
+        Args:
+            wizard: Which.
+            values: By field.
+            record: First make the recording that it is of, with the cameras of this machine.
+
+        Raises:
+            PhalanxError: A field is none; another calibration runs; what it needs is not there.
+        """
+        with self._lock:
+            self._refuse_busy()
+            work = self._work(wizard.command)
+            stages: list[Callable[[], Stage]] = []
+            self._bring_back = (bool(self.cameras_running), self.master is not None)
+            if record:
+                stages, values = recording_stages(self.commands, wizard, values, work)
+                self.stop_cameras()
+            live = wizard.live and not any(
+                values.get(name) for name in ("source", "recording", "poses", "motion")
+            )
+            line = self.commands.calibrate(wizard.command, values, work, live=live)
+            if wizard.master == "run" and live and self.master is None and not self.foreign_master:
+                self.start_master()
+            if wizard.master != "none" and not record and self.plan.simulated and self.tree:
+                self.show(wizard.scene)
+            keyed = wizard.master != "none"
+            name = MASTER if wizard.master == "capture" and (live or not wizard.live) else "calibrate"
+            stages.append(lambda: Stage(wizard.title, {name: line}, wizard.keyboard and live))
+            return self._begin(wizard.command, wizard.title, stages, work, keyed=keyed)
+
+    def use(self, job: Job) -> tuple[Path, ...]:
+        """Write a job's results into the tree; a master that only meets the cameras gives way to one that tracks.
+
+        Raises:
+            PhalanxError: As of `Job.use` and `start_master`.
+        """
+        written = job.use()
+        if self.meets:
+            self.start_master()
+        return written
+
+    @property
+    def meets(self) -> bool:
+        """Whether the console's own master runs and only meets the cameras."""
+        return (master := self.master) is not None and master.command == tuple(self.commands.meet())
+
+    @property
+    def tracks(self) -> bool:
+        """Whether a master tracks, the console's own or another."""
+        own = (master := self.master) is not None and master.command == tuple(self.commands.run())
+        return own or self.foreign_master
+
+    def _begin(
+        self, key: str, title: str, stages: list[Callable[[], Stage]], work: Path, *, keyed: bool = True
+    ) -> Job:
+        job = Job(
+            title,
+            stages,
+            self.state.local,
+            self.commands.environment() if keyed else {},
+            self.tree,
+            work,
+            self._after,
+        )
+        self.jobs[key] = job
+        return job
+
+    def _after(self) -> None:
+        """A job ended: cameras that it borrowed come back, and somebody must carry the bus again."""
+        try:
+            with self._lock:
+                cameras, master = self._bring_back
+                if cameras and not self.cameras_running:
+                    self.start_cameras(self.view)
+                if master and self.master is None and not self.foreign_master:
+                    self.start_master()
+        except PhalanxError as error:
+            _LOG.warning("after a calibration: %s", error)
+
+    def _stop_own(self) -> None:
+        """Cameras and master of the plan before end: they would go on with other files."""
+        self.stop_cameras()
+        self.stop_master()
+
+    def _refuse_busy(self) -> None:
+        if (job := self.busy) is not None:
+            raise CalibrationError(f"{job.title} runs: finish or cancel it first")
+
+    def _needs_rig(self) -> None:
+        if not self.plan.cameras or not (self.tree / "rigs" / f"{self.plan.rig}.json").exists():
+            raise CalibrationError("choose cameras, markers and hand first (steps 1 and 2)")
+
+    def _work(self, name: str) -> Path:
+        date = datetime.now(UTC).strftime("%Y-%m-%dT%H-%M-%S-%fZ")
+        return (self.tree / WORK / f"{name}-{date}").resolve()
+
+
+_OF_BOARD = ("board", "square_mm", "marker_mm", "dictionary")
+
+
+def session_of(state: ConsoleState) -> Session:
+    """The session of a console.
+
+    Raises:
+        CalibrationError: The plan's file is broken.
+    """
+    return state.local.shared(Session, lambda: Session(state))
+
+
+def wizard_named(command: str) -> Wizard:
+    """The wizard of a command.
+
+    Raises:
+        CalibrationError: There is none.
+    """
+    if command not in WIZARDS:
+        raise CalibrationError(f"no calibration {command!r}; there are {', '.join(WIZARDS)}")
+    return WIZARDS[command]
+
+
+def _plan(state: ConsoleState) -> Plan:
+    """What the page was told, if that is of a rig that the console was told to show; else what the rig's file says."""
+    tree, rigs = state.settings.calibration, state.settings.rigs
+    plan = load_plan(tree)
+    if plan.cameras and (not rigs or plan.rig in rigs):
+        return plan
+    return plan_of_rig(tree, rigs[0] if rigs else plan.rig)

@@ -1,0 +1,154 @@
+"""The console's own web sockets: pictures of a camera as the slave made them, and hands for the 3D view.
+
+Each message is sent when the page has shown the one before, so a slow page or network sees fewer, never old ones. An
+open socket is a look at the camera: when it closes, the camera stops showing itself within seconds.
+"""
+
+import asyncio
+import struct
+from collections.abc import AsyncGenerator, Callable
+from contextlib import asynccontextmanager
+from typing import Annotated
+
+import msgspec
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
+from nicegui import app as nicegui_app
+
+from common.messages import MAX_MARKERS, HandPose, Name, ObjectPose
+from master.console.state import ConsoleState
+from master.web import object_json, static_dir, three_js_path, webxr_json
+
+_POLL_S = 0.03
+_LOOK_S = 1.0
+_MOST_CHARACTERS = 8192
+_NOT_OURS = 4004
+_TIME = struct.Struct(">q")  # before each picture: when it was taken [ns]
+
+
+class _Wish(msgspec.Struct):
+    """What a page says of the picture it wants."""
+
+    mask: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_MARKERS)]
+
+
+class Shown:
+    """What the page at the other end said: whether it has shown the last message, and which markers it wants tinted."""
+
+    def __init__(self) -> None:
+        """It wants the first message."""
+        self.ready = True
+        self.mask: tuple[str, ...] = ()
+
+    def hear(self, text: str) -> None:
+        """Take one message of the page; what is none of ours is left alone."""
+        if text == "next":
+            self.ready = True
+        elif len(text) <= _MOST_CHARACTERS:
+            self.mask = _mask(text, self.mask)
+
+
+def _mask(text: str, before: tuple[str, ...]) -> tuple[str, ...]:
+    try:
+        return msgspec.json.decode(text, type=_Wish).mask
+    except msgspec.MsgspecError:
+        return before
+
+
+def serve_sockets(app: FastAPI, state: ConsoleState) -> None:
+    """Add the web sockets to `app`, and the files of the 3D view to the pages."""
+    nicegui_app.add_static_file(local_file=three_js_path(), url_path="/hand-view/three.js")
+    nicegui_app.add_static_files("/hand-view", static_dir())
+
+    async def camera_socket(socket: WebSocket, camera: str) -> None:
+        if camera not in state.cameras():
+            await socket.close(_NOT_OURS)
+            return
+        async with _page(socket) as shown:
+            await _send_pictures(socket, state, camera, shown)
+
+    async def hands_socket(socket: WebSocket) -> None:
+        async with _page(socket) as shown:
+            await _send_hands(socket, state, shown)
+
+    app.add_api_websocket_route("/console/camera/{camera}", camera_socket)
+    app.add_api_websocket_route("/console/hands", hands_socket)
+
+
+@asynccontextmanager
+async def _page(socket: WebSocket) -> AsyncGenerator[Shown]:
+    """Accept the page, and listen to it beside the block, which ends when the page goes."""
+    await socket.accept()
+    shown = Shown()
+    sending = asyncio.current_task()
+
+    async def listen() -> None:
+        try:
+            while True:
+                shown.hear(await socket.receive_text())
+        except (WebSocketDisconnect, RuntimeError, KeyError):
+            if sending is not None:
+                sending.cancel()
+
+    listener = asyncio.create_task(listen())
+    try:
+        yield shown
+    except (asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+        pass  # the page is gone
+    finally:
+        listener.cancel()
+
+
+async def _send_pictures(socket: WebSocket, state: ConsoleState, camera: str, shown: Shown) -> None:
+    loop = asyncio.get_running_loop()
+    look_at, last_ns, note = 0.0, None, None
+    asked = shown.mask
+    while True:
+        if loop.time() >= look_at or shown.mask != asked:
+            asked, look_at = shown.mask, loop.time() + _LOOK_S
+            state.look(camera, shown.mask)
+        picture = state.preview(camera)
+        if picture is None:
+            why = state.preview_error(camera) or "waiting for a picture …"
+            if why != note:
+                await socket.send_text(note := why)
+                shown.ready = True
+        elif shown.ready and picture.t_ns != last_ns:
+            shown.ready, last_ns, note = False, picture.t_ns, None
+            await socket.send_bytes(_TIME.pack(picture.t_ns) + picture.jpeg)
+        await asyncio.sleep(_POLL_S)
+
+
+async def _send_hands(socket: WebSocket, state: ConsoleState, shown: Shown) -> None:
+    last: dict[str, int] = {}
+    while True:
+        if shown.ready:
+            lines = _new_lines(state.poses, last, _hand_line) + _new_lines(state.objects, last, _object_line)
+            if lines:
+                shown.ready = False
+                await socket.send_text("\n".join(lines))
+        await asyncio.sleep(_POLL_S)
+
+
+def _new_lines(
+    poses: dict[str, HandPose] | dict[str, ObjectPose],
+    last: dict[str, int],
+    line: Callable[[HandPose | ObjectPose], str],
+) -> list[str]:
+    """What was not sent yet, one line each."""
+    out: list[str] = []
+    for name, pose in poses.items():
+        key = f"{type(pose).__name__} {name}"
+        if last.get(key) != pose.t_ns:
+            last[key] = pose.t_ns
+            out.append(line(pose))
+    return out
+
+
+def _hand_line(pose: HandPose | ObjectPose) -> str:
+    assert isinstance(pose, HandPose)
+    return webxr_json(pose).decode()
+
+
+def _object_line(pose: HandPose | ObjectPose) -> str:
+    assert isinstance(pose, ObjectPose)
+    return object_json(pose).decode()

@@ -1,0 +1,239 @@
+"""What the console knows: read from the bus on threads of its own, shown by the pages, which hold no data."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Generic, TypeVar
+
+from common.bus import Bus
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.errors import CalibrationError
+from common.messages import (
+    Checklist,
+    Contact,
+    Gesture,
+    HandPose,
+    Health,
+    Message,
+    ObjectPose,
+    Preview,
+)
+from common.streams import MASTER
+from common.zenoh_bus import ZenohBus
+from master.console.gestures_heard import GesturesHeard
+from master.console.history import STEP_S, History
+from master.console.link import Link
+from master.console.local import LocalProcesses
+from master.console.looking import Looking
+from master.console.tuner import Tuner
+from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
+
+STALE_S = 3.0  # what was not told again for so long is no longer shown as present
+MAX_NAMES = 64  # kept of each kind: a bus on which names are invented costs no memory
+_LATENCIES = 4096
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+@dataclass(frozen=True, slots=True)
+class ConsoleSettings:
+    """How the console was started.
+
+    Attributes:
+        calibration: The calib_json tree that it shows and edits.
+        rigs: Rigs of it that run; may be empty, and their files need not be there yet: then the page sets them up.
+        bus: Endpoint of the master's bus.
+        beacon, bind: ADDRESS:PORT for slaves and data, of the processes that the page starts.
+        key: Rig key, for these processes; None: none was given.
+        port, host: Where the page is served; port 0: a free one.
+    """
+
+    calibration: Path
+    rigs: tuple[str, ...] = ()
+    bus: str = HERE_BUS
+    beacon: str = HERE_BEACON
+    bind: str = HERE_BIND
+    key: bytes | None = None
+    port: int = 8080
+    host: str = "127.0.0.1"
+
+
+class Newest(Generic[MessageT]):
+    """Holds the newest message of each sender, at most 64, and when it was heard."""
+
+    def __init__(self) -> None:
+        """Nothing was heard."""
+        self._heard: dict[str, tuple[float, MessageT]] = {}
+
+    def put(self, name: str, message: MessageT) -> None:
+        """Hear one."""
+        if name in self._heard or len(self._heard) < MAX_NAMES:
+            self._heard[name] = (time.monotonic(), message)
+
+    def get(self, name: str, within_s: float = STALE_S) -> MessageT | None:
+        """The newest of one sender, unless it is older than `within_s`."""
+        heard_s, message = self._heard.get(name, (-within_s, None))
+        return message if time.monotonic() - heard_s < within_s else None
+
+    def present(self, within_s: float = STALE_S) -> dict[str, MessageT]:
+        """The newest of all that were heard of late."""
+        now_s = time.monotonic()
+        return {name: one for name, (heard_s, one) in list(self._heard.items()) if now_s - heard_s < within_s}
+
+
+class ConsoleState:
+    """Holds the link to the bus, the newest of all that came by it, figures of the last minute, and local processes."""
+
+    def __init__(self, settings: ConsoleSettings, open_bus: Callable[[], Bus] | None = None) -> None:
+        """Begin to listen.
+
+        Args:
+            settings: How the console was started.
+            open_bus: Opens another bus than that of the settings.
+        """
+        self.settings = settings
+        self.history = History()
+        self.gestures_heard = GesturesHeard()
+        self.local = LocalProcesses()
+        self._poses, self._health = Newest[HandPose](), Newest[Health]()
+        self._objects, self._contacts = Newest[ObjectPose](), Newest[Contact]()
+        self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
+        self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
+        self._closing = threading.Event()
+        self.link = Link(open_bus or (lambda: ZenohBus(None, settings.bus, beyond=True)), _takers(self))
+        self._looking = Looking(self.link.ask)
+        self._tuners: dict[str, Tuner] = {}
+        self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)
+        self._sampler.start()
+
+    @property
+    def alive(self) -> frozenset[str]:
+        """Names of the processes on the bus."""
+        return self.link.alive
+
+    @property
+    def poses(self) -> dict[str, HandPose]:
+        """Hand -> its newest pose, of those heard within 3 s."""
+        return self._poses.present()
+
+    @property
+    def objects(self) -> dict[str, ObjectPose]:
+        """Object -> its newest pose, of those heard within 3 s."""
+        return self._objects.present()
+
+    @property
+    def contacts(self) -> dict[str, Contact]:
+        """HAND/OBJECT -> the newest contact, of those heard within 3 s."""
+        return self._contacts.present()
+
+    @property
+    def health(self) -> dict[str, Health]:
+        """Process -> its newest report, of those heard within 3 s."""
+        return self._health.present()
+
+    @property
+    def checklist(self) -> Checklist | None:
+        """What is not as it should be; None: no master says."""
+        return self._checklists.get(MASTER)
+
+    @property
+    def gestures(self) -> dict[tuple[str, str], Gesture]:
+        """(hand, kind) -> the gesture that lasts now."""
+        return self.gestures_heard.lasting()
+
+    def preview(self, camera: str) -> Preview | None:
+        """The newest picture of a camera, unless it is older than 3 s."""
+        return self._previews.get(camera)
+
+    def look(self, camera: str, mask: tuple[str, ...] = ()) -> None:
+        """A page shows this camera for the next 3 s, with the pixels of these markers tinted. Never waits."""
+        self._looking.look(camera, mask)
+
+    def preview_error(self, camera: str) -> str:
+        """Why there is no picture of a camera that somebody looks at; empty while it answers."""
+        return self._looking.error(camera)
+
+    def tuner(self, camera: str) -> Tuner:
+        """What tunes a camera, the same for every page: all revert to what it was before the first change."""
+        if camera not in self._tuners:
+            self._tuners[camera] = Tuner(camera, self.link.ask)
+        return self._tuners[camera]
+
+    @property
+    def rig_names(self) -> tuple[str, ...]:
+        """Those that run; when none was named: `desk`, once it is there."""
+        return self.settings.rigs or (("desk",) if self.rig_path("desk").exists() else ())
+
+    def rig_path(self, rig: str) -> Path:
+        """The file of a rig."""
+        return self.settings.calibration / "rigs" / f"{rig}.json"
+
+    def camera_path(self, camera: str) -> Path:
+        """The file of a camera, on this machine."""
+        return self.settings.calibration / "cameras" / f"{camera}.json"
+
+    def rigs(self) -> dict[str, RigCalibration]:
+        """The rigs whose files are there and right; what is wrong with another one is what the Set-up page is for."""
+        found: dict[str, RigCalibration] = {}
+        for name in self.rig_names:
+            try:
+                found[name] = load(self.rig_path(name), RigCalibration)
+            except CalibrationError:
+                continue
+        return found
+
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras of the rigs; without any, those that send something like a camera's report."""
+        named = tuple(dict.fromkeys(camera for rig in self.rigs().values() for camera in rig.cameras))
+        return named or tuple(sorted(name for name, one in self.health.items() if "frames" in one.counts))
+
+    def camera(self, name: str) -> CameraCalibration:
+        """The file of a camera on this machine.
+
+        Raises:
+            CalibrationError: It is missing or broken.
+        """
+        return load(self.camera_path(name), CameraCalibration)
+
+    def close(self) -> None:
+        """End what the console started, and leave the bus. Safe to call twice."""
+        self._closing.set()
+        self.local.close()
+        self.link.close()
+        self._sampler.join()
+
+    def hear(self, message: Message) -> None:
+        """Take one message from the bus; from any thread."""
+        match message:
+            case HandPose():
+                self._latencies_ms.append(message.latency_ns * 1e-6)
+                self._poses.put(message.hand, message)
+            case Health():
+                self._health.put(message.source, message)
+            case ObjectPose():
+                self._objects.put(message.object, message)
+            case Contact():
+                self._contacts.put(f"{message.hand}/{message.object}", message)
+            case Gesture():
+                self.gestures_heard.push(message, time.monotonic())
+            case Preview():
+                self._previews.put(message.camera, message)
+            case Checklist():
+                self._checklists.put(message.source, message)
+            case _:
+                pass
+
+    def _sample(self) -> None:
+        while not self._closing.wait(STEP_S):
+            taken = [self._latencies_ms.popleft() for _ in range(len(self._latencies_ms))]
+            self.history.push(time.monotonic(), taken, self.health)
+
+
+_STREAMS = ("hand", "object", "contact", "gesture", "health", "checklist", "preview")
+
+
+def _takers(state: ConsoleState) -> dict[str, Callable[[Message], None]]:
+    return dict.fromkeys(_STREAMS, state.hear)

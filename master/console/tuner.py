@@ -1,0 +1,148 @@
+"""How a camera is set, as the page tunes it: what was read back, what it was when the tuning began, and back to that.
+
+Every method asks the slave over the bus and waits for its answer: never on the thread of the page.
+"""
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import nan
+
+import msgspec
+
+from common.camera_settings import WANTED, ColourPick
+from common.errors import BusError
+from common.messages import Command, Health
+
+MARKER = "marker."
+_CHANNELS = ("h", "s", "v")
+PLAIN = ("exposure_us", "analogue_gain", "frame_rate_hz", "roi_margin")
+GAINS = ("red_gain", "blue_gain")
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """The colour of a marker in OpenCV's HSV (H 0-179); low[0] above high[0]: it wraps through red."""
+
+    low: tuple[int, int, int]
+    high: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class InUse:
+    """What an answer of a slave says.
+
+    Attributes:
+        wanted: Setting -> what its camera file in use says, by the names of gauges.
+        read: Setting -> what was read back from the camera; absent where it does not tell.
+        markers: Marker -> its colours in use; absent: it has none.
+    """
+
+    wanted: Mapping[str, float] = field(default_factory=dict[str, float])
+    read: Mapping[str, float] = field(default_factory=dict[str, float])
+    markers: Mapping[str, Range] = field(default_factory=dict[str, Range])
+
+    @classmethod
+    def of(cls, health: Health) -> "InUse":
+        """Read an answer."""
+        names = (*PLAIN, *GAINS)
+        gauges = health.gauges
+        read = {name: gauges[name] for name in names if name in gauges}
+        wanted = {name: gauges.get(WANTED + name, gauges.get(name, nan)) for name in names}
+        markers: dict[str, Range] = {}
+        for gauge in gauges:
+            name = gauge.removeprefix(MARKER).removesuffix(".h_low")
+            if gauge == f"{MARKER}{name}.h_low":
+                markers[name] = _range(gauges, name)
+        known = {name: value for name, value in wanted.items() if value == value}
+        return cls(known, read, markers)
+
+    def body(self) -> dict[str, object]:
+        """The body of the command "set" that brings all this back."""
+        out: dict[str, object] = {name: self.wanted[name] for name in PLAIN if name in self.wanted}
+        if all(name in self.wanted for name in GAINS):
+            out["colour_gains"] = [self.wanted[name] for name in GAINS]
+        if self.markers:
+            out["markers"] = markers_over(self, ())
+        return out
+
+
+def markers_over(used: InUse, known: Iterable[str]) -> dict[str, object]:
+    """The part `markers` of the command "set" after which those of `used` hold and no other of `known`."""
+    out: dict[str, object] = {}
+    out.update(dict.fromkeys(sorted(set(known) - used.markers.keys())))
+    out.update({name: colour_body(colour) for name, colour in used.markers.items()})
+    return out
+
+
+def colour_body(colour: Range) -> dict[str, list[int]]:
+    """A colour as the command "set" has it."""
+    return {"hsv_low": list(colour.low), "hsv_high": list(colour.high)}
+
+
+class Tuner:
+    """Tunes one camera. Holds what was in use when the tuning began or was saved last."""
+
+    def __init__(self, camera: str, ask: Callable[[Command], Health]) -> None:
+        """Nothing was asked yet; `ask` sends a command and waits."""
+        self.camera = camera
+        self._ask = ask
+        self._begun: InUse | None = None
+
+    @property
+    def begun(self) -> InUse | None:
+        """What `revert` goes back to; None: the slave has never answered."""
+        return self._begun
+
+    def refresh(self) -> InUse:
+        """What is in use now.
+
+        Raises:
+            BusError: The slave does not answer, or refuses; as all methods here.
+        """
+        now = self._tell("settings", "")
+        if self._begun is None:
+            self._begun = now
+        return now
+
+    def set(self, change: Mapping[str, object]) -> InUse:
+        """Use other settings at once: keys and units of the command "set"."""
+        self._begin()
+        return self._tell("set", json.dumps(change))
+
+    def pick(self, marker: str, uv: Sequence[float], t_ns: int | None = None) -> InUse:
+        """Take the colour of a marker from about a pixel of the whole frame, if known of that taken at `t_ns` [ns]."""
+        self._begin()
+        pick = ColourPick(marker=marker, uv=(round(float(uv[0]), 2), round(float(uv[1]), 2)), t_ns=t_ns)
+        return self._tell("pick", msgspec.json.encode(pick).decode())
+
+    def forget(self, marker: str) -> InUse:
+        """Use no colour for a marker: it is looked for no more."""
+        return self.set({"markers": {marker: None}})
+
+    def save(self) -> InUse:
+        """Write what is in use to the slave's own camera file."""
+        self._begun = self._tell("save", "")
+        return self._begun
+
+    def revert(self) -> InUse:
+        """Use again what was in use when the tuning began, or was saved last."""
+        if self._begun is None:
+            raise BusError(f"{self.camera!r} has not answered yet: there is nothing to go back to")
+        markers = markers_over(self._begun, self.refresh().markers)
+        return self._tell("set", json.dumps(self._begun.body() | {"markers": markers}))
+
+    def _begin(self) -> None:
+        if self._begun is None:
+            self.refresh()
+
+    def _tell(self, verb: str, body: str) -> InUse:
+        return InUse.of(self._ask(Command(self.camera, verb, body)))
+
+
+def _range(gauges: Mapping[str, float], name: str) -> Range:
+    low, high = (
+        tuple(round(gauges.get(f"{MARKER}{name}.{channel}_{end}", 0.0)) for channel in _CHANNELS)
+        for end in ("low", "high")
+    )
+    return Range((low[0], low[1], low[2]), (high[0], high[1], high[2]))

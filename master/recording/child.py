@@ -1,0 +1,105 @@
+"""The recorder that `phalanx-master run --record FILE` starts: a process of its own, with an end of its own.
+
+It is there before the first message is taken, so that a replay is what was told live from the first pose on. Its
+standard input is a pipe from this process: when that closes, because we end it or because we died, it ends its file. It
+is in a group of its own, so that Ctrl-C stops the tracking first and the recorder then.
+"""
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from common.bus import Bus
+from common.errors import RecordingError
+from master.tuning import RigFiles
+
+READY_S = 60.0  # Python, numpy and the bus on a busy machine
+_END_S = 20.0
+_STEP_S = 0.05
+
+
+class RecorderProcess:
+    """A running recorder. Holds the process and the thread that passes on what it says."""
+
+    def __init__(
+        self,
+        path: Path,
+        files: RigFiles,
+        endpoint: str,
+        say: Callable[[str], None],
+        ended: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Start it.
+
+        Args:
+            path: The file.
+            files: Files of calibration of the rigs.
+            endpoint: Of our bus, which is open already.
+            say: Told each line that it says.
+            ended: Called, on another thread, once it is gone.
+        """
+        self._say, self._ended, self._path = say, ended, path
+        self._name = f"recorder-{os.getpid()}"
+        self._process = subprocess.Popen(
+            _command(path, files, endpoint, self._name),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
+        self._last = ""
+        self._thread = threading.Thread(target=self._listen, name="recorder lines", daemon=True)
+        self._thread.start()
+
+    def wait_ready(self, bus: Bus, timeout_s: float = READY_S) -> None:
+        """Wait until it hears all that is published from here on.
+
+        Raises:
+            RecordingError: It ended, or does not come in time.
+        """
+        deadline = time.monotonic() + timeout_s
+        while self._name not in bus.alive():
+            if self._process.poll() is not None:
+                self._thread.join(1.0)
+                raise RecordingError(
+                    f"{self._path}: the recorder ended at once: {self._last or 'it said nothing'}"
+                )
+            if time.monotonic() > deadline:
+                self.close()
+                raise RecordingError(f"{self._path}: the recorder was not ready within {timeout_s:g} s")
+            time.sleep(_STEP_S)
+
+    def close(self) -> None:
+        """Let it write what is on its way and end its file; the bus must be open still. Safe to call twice."""
+        if self._process.stdin is not None:
+            self._process.stdin.close()
+        try:
+            code = self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            code = self._process.wait()
+        self._thread.join(1.0)
+        if code:
+            self._say(f"the recording is not whole: {self._last}")
+
+    def _listen(self) -> None:
+        assert self._process.stdout is not None  # it is a pipe
+        with self._process.stdout:
+            for line in self._process.stdout:
+                self._last = line.strip()
+                self._say(self._last)
+        self._ended()
+
+
+def _command(path: Path, files: RigFiles, endpoint: str, name: str) -> list[str]:
+    """The command line of the recorder."""
+    command = [sys.executable, "-m", "master", "record", str(path), "--bus", endpoint, "--owned", name]
+    command += ["--calibration", str(files.calibration)]
+    for rig in files.rigs:
+        command += ["--rig", rig]
+    return command if files.hand is None else [*command, "--hand", str(files.hand)]

@@ -1,0 +1,252 @@
+"""The player as a process: on the bus as the master whose messages it plays, with commands of its own.
+
+Whatever listens to a live master (viewer, console, outputs) sees the recording as if it were live, with the times of
+then.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from math import isfinite
+from pathlib import Path
+
+import msgspec
+
+from common.bus import Bus
+from common.clock import SystemClock, now_ns
+from common.errors import PhalanxError, RecordingError
+from common.messages import WIRE_VERSION, Command, Health, Message
+from common.recording import MessageRecording, open_messages
+from common.streams import MASTER
+from master.outputs.bus import BusSink
+from master.outputs.files import RunFiles
+from master.outputs.sink import Sink
+from master.recording.files import recorded_setups
+from master.recording.player import Passed, Player
+from master.recording.tap import Tap
+
+_REPORT_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlaySettings:
+    """What is played, and how.
+
+    Attributes:
+        path: The recording.
+        speed: 1: as it was; 0: as fast as it goes.
+        from_s, to_s: The stretch, from the beginning of the recording [s]; None: all.
+        out: Folder for poses.npz and what else there is, or None.
+        loop: Begin again at the end.
+        solved: Tell what was told live instead of solving.
+    """
+
+    path: Path
+    speed: float = 1.0
+    from_s: float | None = None
+    to_s: float | None = None
+    out: Path | None = None
+    loop: bool = False
+    solved: bool = False
+
+
+def run_play(
+    settings: PlaySettings,
+    bus: Bus | None,
+    stop: threading.Event,
+    say: Callable[[str], None],
+    show: Callable[[float, float], None] = lambda _position_s, _length_s: None,
+) -> Passed:
+    """Play until the end, or until stopped.
+
+    Args:
+        settings: What, and how.
+        bus: Where it is told; None: nowhere. Left open.
+        stop: Set by a signal handler, or by the command "stop".
+        say: Told a line when something happens.
+        show: Told once a second where it is [s], of how much.
+
+    Returns:
+        The last pass.
+
+    Raises:
+        RecordingError: The file cannot be read, or carries no files of calibration, or a result cannot be written.
+        CalibrationError: Its files are broken.
+        PhalanxError: The stretch or speed is none.
+    """
+    recording = open_messages(settings.path)
+    _check(recording, settings, say)
+    setups = recorded_setups(recording)
+    with ExitStack() as stack:
+        sinks: list[Sink] = [] if bus is None else [BusSink(bus)]
+        if settings.out is not None:
+            settings.out.mkdir(parents=True, exist_ok=True)
+            counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+            objects = [one.name for setup in setups for one in setup.objects]
+            sinks.append(RunFiles(settings.out / "poses.npz", counts, objects))
+            stack.callback(sinks[-1].close)
+        tap = None if bus is None else Tap(bus, SystemClock())
+        if tap is not None:
+            stack.callback(tap.close)
+
+        def again(stream: str, name: str, message: Message) -> None:
+            if bus is not None:
+                bus.publish(stream, name, message)
+
+        def at(seconds: float | None) -> int | None:
+            return None if seconds is None else recording.begin_t_ns + round(seconds * 1e9)
+
+        try:
+            player = Player(
+                recording,
+                setups,
+                sinks,
+                speed=settings.speed,
+                from_ns=at(settings.from_s),
+                to_ns=at(settings.to_s),
+                solved=settings.solved,
+                again=again,
+                taken=(lambda _message: None) if tap is None else tap.show,
+                say=say,
+            )
+        except ValueError as error:
+            raise PhalanxError(f"{settings.path}: {error}") from error
+        host = _Host(player, recording, bus, tap, stop, show)
+        stack.callback(host.close)
+        passed = player.run()
+        while settings.loop and not stop.is_set():
+            say("again from the beginning")
+            passed = player.run()
+        show(host.position_s, host.length_s)
+        return passed
+
+
+def _check(recording: MessageRecording, settings: PlaySettings, say: Callable[[str], None]) -> None:
+    """Refuse what cannot be played, and say what has to be known of what can.
+
+    Raises:
+        RecordingError: There is nothing to play.
+        PhalanxError: The settings contradict each other.
+    """
+    if settings.loop and settings.out is not None:
+        raise PhalanxError("--loop and --out: the files of a run have an end; leave out one of them")
+    wanted = "hand" if settings.solved else "taken"
+    if not recording.counts.get(wanted):
+        raise RecordingError(f"{recording.path}: nothing to play: it has no messages of stream {wanted!r}")
+    if recording.cut:
+        say("the recording was not ended: it is played up to the cut")
+    if recording.broken:
+        say(f"{recording.broken} chunks or files of the recording are broken and left out")
+    if recording.about.get("wire") != str(WIRE_VERSION):
+        say(
+            f"recorded with wire version {recording.about.get('wire', '?')}, this program speaks {WIRE_VERSION}:"
+            " messages that it does not know are left out"
+        )
+
+
+class _Host:
+    """Answers for the player and reports on it. Holds its id and the thread that reports."""
+
+    def __init__(
+        self,
+        player: Player,
+        recording: MessageRecording,
+        bus: Bus | None,
+        tap: Tap | None,
+        stop: threading.Event,
+        show: Callable[[float, float], None],
+    ) -> None:
+        self._player, self._bus, self._tap, self._stop, self._show = player, bus, tap, stop, show
+        self._begin_ns = recording.begin_t_ns
+        self.length_s = (recording.end_t_ns - recording.begin_t_ns) * 1e-9
+        self._session = secrets.randbits(63)
+        self._rate = 0.0
+        self._closing = threading.Event()
+        if bus is not None:
+            bus.announce(MASTER)
+            bus.serve(MASTER, self.answer)
+        self._threads = [
+            threading.Thread(target=work, name=f"play {work.__name__}", daemon=True)
+            for work in (self._report, self._watch_stop)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def position_s(self) -> float:
+        """Where it is, from the beginning of the recording [s]."""
+        return (self._player.at_ns - self._begin_ns) * 1e-9
+
+    def health(self) -> Health:
+        """How it is, as the master's report: also play.position_s, .length_s, .speed and .paused (0, 1)."""
+        gauges = {
+            "play.position_s": round(self.position_s, 3),
+            "play.length_s": round(self.length_s, 3),
+            "play.speed": self._player.speed,
+            "play.paused": float(self._player.paused),
+            "poses_per_s": round(self._rate, 2),
+        }
+        counts = {"poses": self._player.poses} | ({} if self._tap is None else self._tap.counts)
+        return Health(MASTER, self._session, now_ns(), counts, gauges)
+
+    def answer(self, command: Command) -> Health:
+        """Obey "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".
+
+        Raises:
+            ValueError: Another verb, or a body that does not fit; the asker reads what does.
+        """
+        verbs: dict[str, Callable[[], None]] = {
+            "report": lambda: None,
+            "pause": self._player.pause,
+            "resume": self._player.resume,
+            "seek": lambda: self._player.seek(self._begin_ns + round(_number(command, "t_s") * 1e9)),
+            "speed": lambda: self._player.set_speed(_number(command, "factor")),
+            "tap": lambda: None if self._tap is None else self._tap.lease(),
+            "stop": self._stop.set,
+        }
+        if command.verb not in verbs:
+            raise ValueError(f"{MASTER} (playing): no command {command.verb!r}; there are {', '.join(verbs)}")
+        verbs[command.verb]()
+        return self.health()
+
+    def close(self) -> None:
+        """Report no more. Safe to call twice."""
+        self._closing.set()
+        self._stop_player()
+        for thread in self._threads:
+            thread.join()
+
+    def _stop_player(self) -> None:
+        self._player.stop()
+
+    def _watch_stop(self) -> None:
+        while not self._closing.is_set():
+            if self._stop.wait(0.1):
+                self._stop_player()
+                return
+
+    def _report(self) -> None:
+        poses = self._player.poses
+        while not self._closing.wait(_REPORT_S):
+            self._rate, poses = (self._player.poses - poses) / _REPORT_S, self._player.poses
+            if self._bus is not None:
+                self._bus.publish("health", MASTER, self.health())
+            self._show(self.position_s, self.length_s)
+
+
+def _number(command: Command, key: str) -> float:
+    """The one number in the body of a command.
+
+    Raises:
+        ValueError: It is another body.
+    """
+    text = f'{command.verb}: the body must be {{"{key}": a number}}, not {command.body!r}'
+    try:
+        body = msgspec.json.decode(command.body, type=dict[str, float])
+    except msgspec.MsgspecError as error:
+        raise ValueError(text) from error
+    if set(body) != {key} or not isfinite(body[key]):
+        raise ValueError(text)
+    return body[key]

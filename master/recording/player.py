@@ -1,0 +1,250 @@
+"""Plays a recording: what the master took goes through the very same `World` again, at any speed, from any moment.
+
+What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
+same, bit for bit, however fast. To begin anywhere but at the start, a new world is shown what came two seconds before,
+silently: filters and tracks have settled by then, but what it tells from there on is near to that of a whole pass, not
+equal to it.
+"""
+
+import threading
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+from common.clock import now_ns
+from common.messages import Contact, Gesture, HandPose, Message, Told
+from common.recording import MessageRecording, Recorded
+from master.app import Solved
+from master.link import Taken
+from master.outputs.sink import Sink
+from master.recording.clock import ReplayClock
+from master.recording.digest import ToldDigest
+from master.recording.lines import EventWatch
+from master.rig import RigSetup
+from master.stages import StageTimes
+from master.tuning import LivePipeline
+from master.world import World
+
+SETTLE_NS = 2_000_000_000
+SOLVED = ("hand", "object", "contact", "gesture")
+BESIDE = ("health", "checklist", "preview", "still")  # told again as they were told
+_OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """One pass over a recording.
+
+    Attributes:
+        digest: Over all that was told.
+        seconds: How long it took [s].
+        whole: From the beginning to the end that was asked for, without a jump.
+    """
+
+    digest: ToldDigest
+    seconds: float
+    whole: bool
+
+    @property
+    def poses_per_s(self) -> float:
+        """Poses of hands over the time of the pass."""
+        return self.digest.counts["poses"] / max(self.seconds, 1e-9)
+
+
+def world_of(setups: Sequence[RigSetup]) -> World:
+    """The world as a live master builds it.
+
+    Raises:
+        CalibrationError: The files do not fit together.
+    """
+    stages = StageTimes()
+    return World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+
+
+class Player:
+    """Plays one recording. Holds the clock, the world of the present pass, and where a jump is to go.
+
+    `run` belongs to one thread; the other methods are called on any.
+    """
+
+    def __init__(
+        self,
+        recording: MessageRecording,
+        setups: Sequence[RigSetup],
+        sinks: Sequence[Sink],
+        *,
+        speed: float = 0.0,
+        from_ns: int | None = None,
+        to_ns: int | None = None,
+        solved: bool = False,
+        again: Callable[[str, str, Message], None] = lambda _stream, _name, _message: None,
+        taken: Callable[[Message], None] = lambda _message: None,
+        say: Callable[[str], None] = lambda _line: None,
+    ) -> None:
+        """Stand at the beginning.
+
+        Args:
+            recording: What is played.
+            setups: What watched each hand.
+            sinks: Take what is told.
+            speed: 1: as it was; 0: as fast as it goes.
+            from_ns, to_ns: The stretch that is played, log times [ns]; None: all.
+            solved: Tell what was told live instead of solving.
+            again: Takes reports, lists and pictures that were recorded beside.
+            taken: Shown each message that was taken, once all that it tells is out.
+            say: Told a line where something happened that a replay cannot repeat.
+
+        Raises:
+            ValueError: The speed is none, or the stretch is empty.
+        """
+        self._recording, self._setups, self._sinks, self._solved = recording, setups, sinks, solved
+        self._again, self._taken, self._say = again, taken, say
+        self.first_ns = recording.begin_t_ns if from_ns is None else max(from_ns, recording.begin_t_ns)
+        self.last_ns = recording.end_t_ns if to_ns is None else min(to_ns, recording.end_t_ns)
+        if self.first_ns > self.last_ns:
+            raise ValueError("nothing of the recording lies between the times asked for")
+        self._clock = ReplayClock(self.first_ns, speed, now_ns())
+        self._changed = threading.Condition()
+        self._jump: int | None = None
+        self._stopped = False
+        self._said: set[str] = set()
+        self.poses = 0
+        self.at_ns = self.first_ns
+
+    @property
+    def speed(self) -> float:
+        """As which factor of live; 0: as fast as it goes."""
+        return self._clock.speed
+
+    @property
+    def paused(self) -> bool:
+        """Whether it stands still."""
+        return self._clock.paused
+
+    def pause(self) -> None:
+        """Stand still."""
+        with self._changed:
+            self._clock.pause(now_ns())
+
+    def resume(self) -> None:
+        """Go on."""
+        with self._changed:
+            self._clock.resume(now_ns())
+            self._changed.notify()
+
+    def set_speed(self, factor: float) -> None:
+        """Go on at another speed.
+
+        Raises:
+            ValueError: Below 0, or no number.
+        """
+        with self._changed:
+            self._clock.set_speed(factor, now_ns())
+            self._changed.notify()
+
+    def seek(self, t_ns: int) -> None:
+        """Go on from `t_ns`.
+
+        Raises:
+            ValueError: Outside of what is played.
+        """
+        if not self.first_ns <= t_ns <= self.last_ns:
+            begin = self._recording.begin_t_ns
+            first, last = ((one - begin) * 1e-9 for one in (self.first_ns, self.last_ns))
+            raise ValueError(f"t_s {(t_ns - begin) * 1e-9:g}: must be {first:.3f} to {last:.3f}")
+        with self._changed:
+            self._jump = t_ns
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """End `run` soon."""
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+
+    def run(self) -> Passed:
+        """Play until the end, with all jumps on the way.
+
+        Raises:
+            RecordingError: The file cannot be read any more.
+            PhalanxError: A sink fails.
+        """
+        start_ns, whole = self.first_ns, self.first_ns == self._recording.begin_t_ns
+        digest, began_ns = ToldDigest(), now_ns()
+        while True:
+            with self._changed:
+                self._clock.seek(start_ns, now_ns())
+            self.at_ns = start_ns  # also while it stands still there
+            ended = self._pass(start_ns, digest)
+            with self._changed:
+                jump, self._jump = self._jump, None
+                if jump is None or self._stopped:
+                    return Passed(digest, (now_ns() - began_ns) * 1e-9, whole and ended)
+            start_ns, whole = jump, False
+
+    def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
+        """Play from `start_ns`; False: not to the end."""
+        world = None if self._solved else world_of(self._setups)
+        events = EventWatch(self._recording.begin_t_ns)
+        with self._changed:
+            self._clock.seek(start_ns, now_ns())  # to build a world took its time
+        streams = (*BESIDE, *(SOLVED if self._solved else ("taken",)))
+        for one in self._recording.read(streams, start_ns - SETTLE_NS, self.last_ns):
+            silent = one.t_ns < start_ns
+            if not silent and not self._due(one.t_ns):
+                return False
+            if one.stream == "health":
+                self._tell_events(events.push(one.t_ns, one.message))
+                if events.restarted and world is not None:
+                    world = world_of(self._setups)
+            told = self._told(world, one)
+            if not silent:
+                self._write(told, digest)
+                self._beside(one)
+                self.at_ns = one.t_ns
+            else:
+                for _ in told:
+                    pass
+        return True
+
+    def _due(self, t_ns: int) -> bool:
+        """Wait until it is time; False: stopped, or a jump is to be made."""
+        with self._changed:
+            while not self._stopped and self._jump is None:
+                wait_s = self._clock.wait_s(t_ns, now_ns())
+                if wait_s == 0.0:
+                    return True
+                self._changed.wait(wait_s)
+            return False
+
+    def _told(self, world: World | None, one: Recorded) -> Iterable[Told]:
+        """What a message tells: the world makes it, or it was told live."""
+        if one.stream in SOLVED:
+            return (cast(Told, one.message),)
+        if one.stream != "taken" or world is None:
+            return ()
+        return (_plain(solved) for solved in world.push(cast(Taken, one.message)))
+
+    def _write(self, told: Iterable[Told], digest: ToldDigest) -> None:
+        for message in told:
+            digest.take(message)
+            for sink in self._sinks:
+                sink.write(message)
+            self.poses += isinstance(message, HandPose)
+
+    def _beside(self, one: Recorded) -> None:
+        if one.stream == "taken":
+            self._taken(one.message)
+        elif one.stream in BESIDE and one.name not in _OWN:
+            self._again(one.stream, one.name, one.message)
+
+    def _tell_events(self, lines: Sequence[str]) -> None:
+        for line in lines:
+            if line not in self._said:  # not again with every jump
+                self._said.add(line)
+                self._say(line)
+
+
+def _plain(solved: Solved) -> Told:
+    """As it is published; how long it took to be solved here is nobody's latency."""
+    return solved if isinstance(solved, Contact | Gesture) else solved.pose

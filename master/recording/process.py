@@ -1,0 +1,249 @@
+"""The recorder as a process of its own: on the bus as "recorder", fed from it, never in the way of the tracking.
+
+It waits for the master, goes on when that was started again, answers `report` and `stop`, and ends its file whatever
+ends it.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.bus import Bus
+from common.clock import now_ns
+from common.errors import BusError
+from common.messages import Command, Health
+from common.recording import MessageWriter
+from master.recording.feed import Feed, MasterClock, StillAsker, TapLease
+from master.recording.files import carried_files, rigs_text
+from master.recording.raw import RawAsker, raw_text
+from master.recording.recorder import MessageRecorder, Progress
+from master.tuning import RigFiles
+
+NAME = "recorder"
+KEPT = ("taken", "hand", "object", "contact", "gesture", "health", "checklist")
+_STEP_S = 0.1
+_PERIOD_NS = 1_000_000_000
+_DRAIN_S, _OWNED_DRAIN_S = 0.5, 10.0
+_TRIES = 3  # a master that does not answer so often is gone
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSettings:
+    """What is recorded.
+
+    Attributes:
+        path: The file.
+        files: Files of calibration of the rigs.
+        seconds: Length [s]; None: until stopped.
+        frames_hz: Whole frames of each camera a second; 0: none.
+        previews: Keep the small pictures that somebody looks at, and ask for them.
+        reserve_bytes: Stays free on the disk.
+        ready_as: A name to be announced once it listens; None: nobody waits for that.
+        raw: Have the slaves of all cameras keep raw frames beside it.
+    """
+
+    path: Path
+    files: RigFiles
+    seconds: float | None = None
+    frames_hz: float = 0.0
+    previews: bool = False
+    reserve_bytes: int = 200_000_000
+    ready_as: str | None = None
+    raw: bool = False
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """The streams that are kept."""
+        also = (("preview", self.previews), ("still", self.frames_hz > 0.0))
+        return KEPT + tuple(stream for stream, wanted in also if wanted)
+
+
+def run_recorder(
+    settings: RecordSettings,
+    connect: Callable[[threading.Event], Bus | None],
+    stop: threading.Event,
+    say: Callable[[str], None],
+    show: Callable[[Progress, int], None],
+) -> Progress:
+    """Record until stopped, until the length is reached, or until the disk is full.
+
+    Args:
+        settings: What.
+        connect: Waits for the master's bus; None once stopped.
+        stop: Set by a signal handler, or by the command "stop".
+        say: Told a line when something changes.
+        show: Told once a second how it is, and how many messages never came.
+
+    Returns:
+        How it was at the end.
+
+    Raises:
+        RecordingError: The file cannot be made, or the disk is full; what was written is readable.
+        CalibrationError: The rig's files are broken.
+        BusError: The master cannot be tapped.
+    """
+    setups = settings.files.load()
+    carried = carried_files(settings.files, setups)
+    cameras = tuple(dict.fromkeys(name for setup in setups for name in setup.camera_names))
+    clock = MasterClock()
+    raw = RawAsker(
+        settings.path.stem,
+        cameras if settings.raw else (),
+        say,
+        lambda told: recorder.offer("health", told, clock.now_ns()),
+    )
+    about = {"rigs": rigs_text(settings.files.rigs)}
+    if settings.raw:
+        about["raw"] = raw_text(settings.path.stem, cameras)
+    writer = MessageWriter(settings.path, carried, about)
+    recorder = MessageRecorder(writer, settings.path.absolute().parent, settings.reserve_bytes)
+    run = _Run(settings, cameras, clock, recorder, raw, stop, say, show)
+    try:
+        while not run.over and (bus := connect(stop)) is not None:
+            try:
+                run.listen(bus)
+            finally:
+                bus.close()
+    finally:
+        recorder.close()
+    if recorder.failure is not None:
+        raise recorder.failure
+    return recorder.progress()
+
+
+class _Run:
+    """One recording over all its connections. Holds its id, and what was lost on connections that are gone."""
+
+    def __init__(
+        self,
+        settings: RecordSettings,
+        cameras: tuple[str, ...],
+        clock: MasterClock,
+        recorder: MessageRecorder,
+        raw: RawAsker,
+        stop: threading.Event,
+        say: Callable[[str], None],
+        show: Callable[[Progress, int], None],
+    ) -> None:
+        self._settings, self._recorder, self._stop, self._say, self._show = (
+            settings,
+            recorder,
+            stop,
+            say,
+            show,
+        )
+        self._cameras, self._raw = cameras, raw
+        self._session = secrets.randbits(63)
+        self._clock = clock
+        self._gone_lost = self._gone_dropped = 0
+        self._lease: TapLease | None = None
+        self._feed: Feed | None = None
+        self._master: int | None = None
+        self._reloads = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to be recorded."""
+        seconds = self._settings.seconds
+        full = seconds is not None and self._recorder.seconds >= seconds
+        return self._stop.is_set() or self._recorder.failure is not None or full
+
+    def listen(self, bus: Bus) -> None:
+        """Record what comes by one connection, until it is over or the master is gone.
+
+        Raises:
+            BusError: The master refuses to be tapped.
+        """
+        with ExitStack() as stack:
+            self._feed = Feed(bus, self._settings.streams, self._recorder, self._clock)
+            stack.callback(self._close_feed, self._feed)
+            self._lease = TapLease(bus, self._feed, self._clock)
+            bus.serve(NAME, self.answer)
+            bus.announce(NAME)
+            if self._settings.ready_as is not None:
+                bus.announce(self._settings.ready_as)
+            for wanted, verb, period_s in (
+                (self._settings.previews, "preview", 2.0),
+                (self._settings.frames_hz > 0.0, "still", 1.0 / max(self._settings.frames_hz, 1e-3)),
+            ):
+                if wanted:
+                    stack.callback(StillAsker(bus, self._cameras, verb, period_s).close)
+            self._raw.attach(bus)
+            stack.callback(lambda: self._raw.end(bus) if self.over else self._raw.detach())
+            self._keep(bus, self._lease)
+
+    def health(self) -> Health:
+        """How it is: gauges recorder.seconds, .megabytes, .megabytes_per_s, .free_gb; messages by stream, `dropped`
+        (no room in our queues) and `lost` (shown by the master, never came).
+        """
+        now = self._recorder.progress()
+        counts = now.counts | {"dropped": self._dropped(now), "lost": self._lost()}
+        gauges = {
+            "recorder.seconds": round(now.seconds, 3),
+            "recorder.megabytes": round(now.written_bytes * 1e-6, 3),
+            "recorder.megabytes_per_s": round(now.bytes_per_s * 1e-6, 3),
+            "recorder.free_gb": round(now.free_bytes * 1e-9, 3),
+        }
+        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges)
+
+    def answer(self, command: Command) -> Health:
+        """Obey "report" or "stop".
+
+        Raises:
+            ValueError: Another verb.
+        """
+        if command.verb not in ("report", "stop"):
+            raise ValueError(f"{NAME}: no command {command.verb!r}; there are report, stop")
+        if command.verb == "stop":
+            self._stop.set()
+        return self.health()
+
+    def _keep(self, bus: Bus, lease: TapLease) -> None:
+        missed, due_ns = 0, now_ns()
+        while not self.over and missed < _TRIES:
+            if now_ns() < due_ns:
+                self._stop.wait(_STEP_S)
+                continue
+            due_ns = max(due_ns + _PERIOD_NS, now_ns())
+            try:
+                told = lease.ask()
+            except BusError as error:
+                if "refused" in str(error):
+                    raise
+                missed += 1
+                continue
+            missed = 0
+            self._look(told)
+            bus.publish("health", NAME, self.health())
+            self._show(self._recorder.progress(), self._lost())
+        if missed:
+            self._say("the master is gone; waiting for it")
+
+    def _look(self, told: Health) -> None:
+        """Say what the player of this file has to know, and keep in the file where a master was started anew."""
+        if told.session != self._master:
+            self._recorder.offer("health", told, self._clock.now_ns())
+            if self._master is None:
+                self._say(f"recording into {self._settings.path}")
+            else:
+                self._say("the master was started again; recording goes on")
+            self._master, self._reloads = told.session, told.counts.get("reload.applied", 0)
+        if told.counts.get("reload.applied", 0) != self._reloads:
+            self._reloads = told.counts.get("reload.applied", 0)
+            self._say("files of the rig were changed: from here on a replay is not what was told live")
+
+    def _lost(self) -> int:
+        return self._gone_lost + (0 if self._lease is None else self._lease.lost)
+
+    def _dropped(self, now: Progress) -> int:
+        feed = {} if self._feed is None else self._feed.dropped
+        return self._gone_dropped + sum(now.dropped.values()) + sum(feed.values())
+
+    def _close_feed(self, feed: Feed) -> None:
+        # One that owns us has stopped, and all that it said is to be kept; another one goes on without us.
+        feed.close(_DRAIN_S if self._settings.ready_as is None else _OWNED_DRAIN_S)
+        self._gone_lost, self._gone_dropped = self._lost(), self._gone_dropped + sum(feed.dropped.values())
+        self._lease = self._feed = None

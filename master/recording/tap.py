@@ -1,0 +1,144 @@
+"""Shows what the master is told, in the order in which it is told, while somebody records.
+
+A message goes on the bus (stream `taken`) once all that it tells is out, with those of the same fifth of a second,
+on a thread of its own: no pose waits for it. That thread may wait for a reader, so that none is lost on the way; where
+it waits for too long, what does not fit its queue is dropped and counted. While nobody taps, there is no thread, and a
+message costs one comparison.
+"""
+
+import threading
+import time
+from collections import deque
+from typing import Generic, TypeVar
+
+from common.bus import Bus
+from common.clock import Clock
+from common.errors import BusError
+from common.messages import Message
+from common.recording import sender_of
+from master.outputs.devices import Taking
+
+LEASE_NS = 3_000_000_000
+ROOM = 20_000  # messages, some seconds
+_DRAIN_S = 5.0
+_STEP_S = 0.01
+_TOGETHER_S = 0.2  # to wake a thread and a link for each message would cost several times as much
+
+TakenT = TypeVar("TakenT", bound=Message)
+
+
+class Tap:
+    """Whether somebody taps, and what is to be shown. The bus belongs to the caller.
+
+    Holds the lease, the queue, and the thread while there is one. `show` belongs to the loop; the rest is called on any
+    thread.
+    """
+
+    def __init__(self, bus: Bus, clock: Clock, *, always: bool = False) -> None:
+        """Show nothing until `lease`; with `always` everything from the first message on."""
+        self._bus, self._clock, self._always = bus, clock, always
+        self._until_ns = 0
+        self._queue: deque[Message] = deque()
+        self._turn = threading.Lock()
+        self._thread: threading.Thread | None = None
+        self._hurry = threading.Event()
+        self._busy = self._closed = False
+        self._shown = self._dropped = 0
+        if always:
+            self._start()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """`tap.shown`, and of those `tap.dropped`, once there were any; a recorder tells from it what never came."""
+        # What waits to be published can be nobody's loss yet.
+        return (
+            {"tap.shown": self._shown - len(self._queue), "tap.dropped": self._dropped} if self._shown else {}
+        )
+
+    def lease(self) -> None:
+        """Show everything for three seconds from now."""
+        self._until_ns = self._clock.now_ns() + LEASE_NS
+        self._start()
+
+    def show(self, message: Message) -> None:
+        """Publish it soon, if somebody taps."""
+        if not self._always:
+            if self._until_ns == 0:
+                return
+            if self._clock.now_ns() >= self._until_ns:
+                self._until_ns = 0
+                return
+        self._shown += 1
+        if len(self._queue) >= ROOM:
+            self._dropped += 1
+        else:
+            self._queue.append(message)  # nobody is woken: the thread looks by itself
+
+    def end_always(self) -> None:
+        """Show nothing any more but to who taps: the recorder that wanted everything is gone."""
+        self._always = False
+
+    def drain(self) -> None:
+        """Wait until all that was shown is on its way, at most some seconds."""
+        self._start()
+        self._hurry.set()
+        deadline = time.monotonic() + _DRAIN_S
+        while (self._queue or self._busy) and time.monotonic() < deadline:
+            time.sleep(_STEP_S)
+        self._hurry.clear()
+
+    def close(self) -> None:
+        """Show nothing any more. Safe to call twice."""
+        with self._turn:
+            self._closed, thread = True, self._thread
+        self._queue.clear()
+        self._hurry.set()
+        if thread is not None:
+            thread.join(_DRAIN_S)
+
+    def _start(self) -> None:
+        with self._turn:
+            if self._thread is None and not self._closed:
+                self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
+                self._thread.start()
+
+    def _work(self) -> None:
+        """Publish what there is, all at once, so that it travels together; end when nobody taps any more."""
+        while True:
+            while self._queue and not self._closed:
+                self._busy = True
+                message = self._queue.popleft()
+                try:
+                    self._bus.publish("taken", sender_of(message), message)
+                except BusError:
+                    self._dropped += 1  # the bus is closed: the master ends
+            self._busy = False
+            with self._turn:
+                if self._closed or not (self._always or self._until_ns or self._queue):
+                    self._thread = None
+                    return
+            self._hurry.wait(_STEP_S if self._hurry.is_set() else _TOGETHER_S)
+
+
+class Tapped(Generic[TakenT]):
+    """A source of messages that shows each when the next is asked for: what reads it has made of it all it can by then.
+
+    Holds the last message.
+    """
+
+    def __init__(self, source: Taking[TakenT], tap: Tap) -> None:
+        """Stand between a source and who reads it."""
+        self._source, self._tap = source, tap
+        self._last: TakenT | None = None
+
+    def get(self, timeout_s: float) -> TakenT | None:
+        """The next message, or None when none came in time."""
+        self.flush()
+        self._last = self._source.get(timeout_s)
+        return self._last
+
+    def flush(self) -> None:
+        """At the end: the last message, too."""
+        last, self._last = self._last, None
+        if last is not None:
+            self._tap.show(last)

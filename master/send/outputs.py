@@ -1,0 +1,81 @@
+"""The live outputs by name: what each takes, where it sends to, and how it is made.
+
+An output is a `Sink`. Its file is imported when it is switched on: what its library is, nobody else needs.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from common.messages import Contact, Gesture, HandPose, ObjectPose, Told
+from common.output_settings import OutputPart, OutputSettings
+from master.outputs.sink import Sink
+from master.send.times import Times
+
+
+@dataclass(frozen=True, slots=True)
+class Output:
+    """One row of the registry.
+
+    Attributes:
+        takes: Types of messages that it is for; others never come to it.
+        part: Its settings; where they differ, it is made anew.
+        where: Where it sends to, for a person.
+        make: Opens it. Called on a thread of its own; a `PhalanxError` or `OSError` is told, and it is tried again.
+    """
+
+    takes: tuple[type[Told], ...]
+    part: Callable[[OutputSettings], OutputPart]
+    where: Callable[[OutputSettings], str]
+    make: Callable[[OutputSettings, Times], Sink]
+
+
+def _osc(settings: OutputSettings, times: Times) -> Sink:
+    from master.send.osc import OscSink
+
+    return OscSink(settings.osc, times)
+
+
+def _vmc(settings: OutputSettings, times: Times) -> Sink:
+    from master.send.vmc import VmcSink
+
+    return VmcSink(settings.vmc, times)
+
+
+def _lsl(settings: OutputSettings, times: Times) -> Sink:
+    from master.send.lsl import LslSink
+
+    return LslSink(settings.lsl, times)
+
+
+def _ros2(settings: OutputSettings, times: Times) -> Sink:
+    from master.send.ros2 import Ros2Sink
+
+    return Ros2Sink(settings.ros2, times)
+
+
+def _web(settings: OutputSettings, times: Times) -> Sink:
+    from master.send.web import WebSink
+
+    return WebSink(settings.web)
+
+
+EVERYTHING: tuple[type[Told], ...] = (HandPose, ObjectPose, Contact, Gesture)
+OUTPUTS: dict[str, Output] = {
+    "osc": Output(EVERYTHING, lambda s: s.osc, lambda s: f"udp {s.osc.host}:{s.osc.port}", _osc),
+    "vmc": Output((HandPose,), lambda s: s.vmc, lambda s: f"udp {s.vmc.host}:{s.vmc.port}", _vmc),
+    "ros2": Output(
+        (HandPose, ObjectPose),
+        lambda s: s.ros2,
+        lambda s: f"router {s.ros2.router}, domain {s.ros2.domain_id}",
+        _ros2,
+    ),
+    "lsl": Output((HandPose,), lambda s: s.lsl, lambda s: f"streams {s.lsl.name}-HAND ({s.lsl.scope})", _lsl),
+    "web": Output(
+        (HandPose, ObjectPose), lambda s: s.web, lambda s: f"http://{s.web.host}:{s.web.port}/", _web
+    ),
+}
+
+
+def switched_on(settings: OutputSettings) -> dict[str, bool]:
+    """Output -> whether its settings have it on."""
+    return {name: output.part(settings).on for name, output in OUTPUTS.items()}

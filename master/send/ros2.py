@@ -1,0 +1,42 @@
+"""ROS 2 as a live output: hands and objects on standard topics, by rmw_zenoh's own network, without ROS."""
+
+from common.errors import BusError
+from common.messages import HandPose, ObjectPose, Told
+from common.output_settings import Ros2Output
+from master.send.ros2_link import RosPublishers
+from master.send.ros2_messages import hand_messages, object_messages
+from master.send.times import Times
+
+
+class Ros2Sink:
+    """A `Sink`. Holds the node `phalanx` in ROS's network."""
+
+    def __init__(self, settings: Ros2Output, times: Times) -> None:
+        """Join the router.
+
+        Raises:
+            BusError: It is not there.
+        """
+        self._times, self._router = times, settings.router
+        self._publishers = RosPublishers(settings.router, settings.domain_id, "/", "phalanx")
+
+    def write(self, message: Told) -> None:
+        """Publish a hand or an object.
+
+        Raises:
+            BusError: The router is gone.
+        """
+        if not self._publishers.joined:
+            raise BusError(f"ros2: the router at {self._router} is gone")
+        if isinstance(message, HandPose):
+            told = hand_messages(message, self._times.wall_ns(message.t_ns))
+        elif isinstance(message, ObjectPose):
+            told = object_messages(message, self._times.wall_ns(message.t_ns))
+        else:
+            return
+        for topic, payload in told:
+            self._publishers.publish(topic, payload)
+
+    def close(self) -> None:
+        """Leave ROS's network. Safe to call twice."""
+        self._publishers.close()

@@ -1,0 +1,284 @@
+"""Feeds the live outputs from the bus: follows their settings file, obeys commands, reports.
+
+On the bus it is called "outputs". Commands: `on` and `off`, body {"output": "osc"}, switch one until the file says
+otherwise; `report` says how it is; `stop` ends it.
+"""
+
+import secrets
+import threading
+from collections.abc import Callable, Collection
+from pathlib import Path
+
+import msgspec
+from msgspec import Struct
+
+from common.bus import Bus, Subscription
+from common.calibration import load
+from common.clock import Clock, SystemClock
+from common.errors import BusError, PhalanxError
+from common.messages import Command, Health, Message, Told
+from common.output_settings import OutputSettings, default_outputs
+from common.streams import MASTER
+from common.watching import WatchedFiles
+from master.send.line import OutputLine, Tally
+from master.send.outputs import OUTPUTS, switched_on
+from master.send.times import MasterTimes
+
+NAME = "outputs"
+STREAMS = ("hand", "object", "contact", "gesture")
+_DEPTH = 512  # of each stream; it is emptied at once
+_POLL_S = 0.02
+
+
+class Switch(Struct, frozen=True, forbid_unknown_fields=True):
+    """Body of the commands `on` and `off`."""
+
+    output: str
+
+
+def settings_of(path: Path) -> OutputSettings:
+    """The settings file; where there is none called default.json, the defaults.
+
+    Raises:
+        CalibrationError: It is broken, or there is none.
+    """
+    if path.name == "default.json" and not path.exists():
+        return default_outputs()
+    return load(path, OutputSettings)
+
+
+class Sender:
+    """Holds the settings, which outputs are on, a line for each of those, and what each did."""
+
+    def __init__(
+        self,
+        settings: OutputSettings,
+        only: Collection[str],
+        say: Callable[[str], None],
+        clock: Clock | None = None,
+    ) -> None:
+        """Switch on what the settings have on, or, whatever they say, exactly what `only` names.
+
+        Raises:
+            PhalanxError: `only` names an output that there is not.
+        """
+        for name in only:
+            _known(name)
+        self._settings, self._say = settings, say
+        self._clock: Clock = SystemClock() if clock is None else clock
+        self._only = frozenset(only)
+        self._session = secrets.randbits(63)
+        self.times = MasterTimes()
+        self.tallies = {name: Tally() for name in OUTPUTS}
+        self._lines: dict[str, OutputLine] = {}
+        self._received = 0
+        self._lock = threading.RLock()  # commands come on a thread of the bus
+        for name, on in switched_on(settings).items():
+            if name in self._only or (on and not self._only):
+                self.switch(name, on=True)
+
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Names of the outputs that are switched on."""
+        with self._lock:
+            return tuple(name for name in OUTPUTS if name in self._lines)
+
+    def where(self, name: str) -> str:
+        """Where an output sends to, for a person."""
+        return OUTPUTS[name].where(self._settings)
+
+    def switch(self, name: str, *, on: bool) -> None:
+        """Switch one output.
+
+        Raises:
+            PhalanxError: There is no such output.
+        """
+        _known(name)
+        with self._lock:
+            line = self._lines.pop(name, None)
+            if on and line is not None:
+                self._lines[name] = line
+            elif on:
+                make, settings = OUTPUTS[name].make, self._settings
+                self._lines[name] = OutputLine(
+                    name, lambda: make(settings, self.times), self.tallies[name], self._say
+                )
+        if line is not None and not on:
+            line.close()
+            self.tallies[name].trouble = ""
+
+    def use(self, settings: OutputSettings) -> None:
+        """Other settings from now on: what is on and is set otherwise is made anew; a changed `on` switches.
+
+        Outputs that were chosen by name (`only`) stay chosen, whatever the file says.
+        """
+        with self._lock:
+            before, self._settings = self._settings, settings
+        was_on, is_on = switched_on(before), switched_on(settings)
+        for name, output in OUTPUTS.items():
+            if output.part(before) == output.part(settings):
+                continue
+            switched = was_on[name] != is_on[name] and not self._only
+            on = is_on[name] if switched else name in self.on
+            self.switch(name, on=False)
+            self.switch(name, on=on)
+            self._say(f"{name}: {self.where(name)}" if on else f"{name}: off")
+
+    def push(self, message: Told) -> None:
+        """Give a message to every output that is on and takes it; never waits."""
+        self._received += 1
+        with self._lock:
+            for name, line in self._lines.items():
+                if isinstance(message, OUTPUTS[name].takes):
+                    line.offer(message)
+
+    def health(self, lost: int = 0) -> Health:
+        """The report of this moment; `lost`: messages that this process was too slow to take from the bus."""
+        counts = {"received": self._received, "lost": lost}
+        gauges: dict[str, float] = {}
+        with self._lock:
+            for name, tally in self.tallies.items():
+                line = self._lines.get(name)
+                counts[f"sent.{name}"] = tally.sent
+                counts[f"failed.{name}"] = tally.failed
+                counts[f"dropped.{name}"] = tally.dropped
+                gauges[f"on.{name}"] = float(line is not None)
+                gauges[f"open.{name}"] = float(line is not None and line.open)
+        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges)
+
+    def obey(self, command: Command) -> None:
+        """Do what a command says, but for `stop`.
+
+        Raises:
+            PhalanxError: Unknown verb or output, or a body that is none. The text lists what there is.
+        """
+        if command.verb in ("on", "off"):
+            try:
+                body = msgspec.json.decode(command.body, type=Switch)
+            except msgspec.MsgspecError as error:
+                raise PhalanxError(
+                    f'{command.verb}: body {command.body!r}: {error}; write {{"output": "osc"}}'
+                ) from error
+            self.switch(body.output, on=command.verb == "on")
+            self._say(f"{body.output}: {self.where(body.output) if command.verb == 'on' else 'off'}")
+        elif command.verb not in ("report", "stop"):
+            raise PhalanxError(f"unknown verb {command.verb!r}; there are on, off, report, stop")
+
+    def close(self) -> None:
+        """Send what waits and close every output."""
+        with self._lock:
+            lines, self._lines = list(self._lines.values()), {}
+        for line in lines:
+            line.close()
+
+
+class Beside:
+    """What goes on beside the sending, on a thread of its own: file, report, echoes of the master's clock.
+
+    Holds the bus and the file, which belong to the caller.
+    """
+
+    def __init__(self, sender: Sender, bus: Bus, path: Path, feeds: Collection[Subscription]) -> None:
+        self._sender, self._bus, self._path, self._feeds = sender, bus, path, feeds
+        self._watched = WatchedFiles()
+        self._watched.changed([path])  # as it was read
+        self._clock = SystemClock()
+
+    def step(self, say: Callable[[str], None]) -> None:
+        """Once: use the file if it changed, ask the master for its time, publish the report.
+
+        Raises:
+            BusError: The bus is closed.
+        """
+        if self._watched.changed([self._path]):
+            try:
+                self._sender.use(settings_of(self._path))
+            except PhalanxError as error:
+                say(f"{error}; the settings stay as they were")
+        self._echo()
+        self._bus.publish("health", NAME, self.health())
+
+    def health(self) -> Health:
+        """The report, with what was lost on the way here."""
+        return self._sender.health(sum(feed.dropped for feed in self._feeds))
+
+    def _echo(self) -> None:
+        asked_ns = self._clock.now_ns()
+        try:
+            master_ns = self._bus.ask(Command(MASTER, "report"), 0.5).t_ns
+        except BusError:
+            return  # no master now: nothing comes from it either
+        self._sender.times.push(asked_ns, master_ns, self._clock.now_ns())
+
+
+def run_sender(
+    bus: Bus,
+    settings: OutputSettings,
+    path: Path,
+    only: Collection[str],
+    stop: threading.Event,
+    say: Callable[[str], None],
+) -> None:
+    """Send until `stop` is set or the command `stop` comes. The bus belongs to the caller.
+
+    Raises:
+        BusError: The bus is closed.
+        PhalanxError: `only` names an output that there is not.
+    """
+    feeds = [bus.subscribe(stream, depth=_DEPTH) for stream in STREAMS]
+    sender = Sender(settings, only, say)
+    beside = Beside(sender, bus, path, feeds)
+
+    def obey(command: Command) -> Health:
+        sender.obey(command)
+        if command.verb == "stop":
+            stop.set()
+        return beside.health()
+
+    bus.serve(NAME, obey)
+    bus.announce(NAME)
+    for name in sender.on:
+        say(f"{name}: {sender.where(name)}")
+    if not sender.on:
+        say(f"all outputs are off; switch them on in {path}, or name them: --only osc,vmc")
+    thread = threading.Thread(target=lambda: _beside(beside, stop, say), name="outputs report", daemon=True)
+    thread.start()
+    try:
+        while not stop.is_set():
+            _drain(feeds, sender)
+    finally:
+        stop.set()
+        thread.join(2.0)
+        sender.close()
+        for feed in feeds:
+            feed.close()
+
+
+def _beside(beside: Beside, stop: threading.Event, say: Callable[[str], None]) -> None:
+    while not stop.wait(1.0):
+        try:
+            beside.step(say)
+        except BusError:
+            return  # closing
+
+
+def _drain(feeds: list[Subscription], sender: Sender) -> None:
+    """Hand on all that has come; wait for a hand, which the others come with, if there is nothing."""
+    hands, *others = feeds
+    message = hands.get(_POLL_S)
+    while message is not None:
+        _push(sender, message)
+        message = hands.get(0.0)
+    for feed in others:
+        while (message := feed.get(0.0)) is not None:
+            _push(sender, message)
+
+
+def _push(sender: Sender, message: Message) -> None:
+    if isinstance(message, Told):
+        sender.push(message)
+
+
+def _known(name: str) -> None:
+    if name not in OUTPUTS:
+        raise PhalanxError(f"output {name!r}: unknown; there are {', '.join(OUTPUTS)}")

@@ -1,0 +1,82 @@
+"""Hands as bones of a VRM avatar, by the Virtual Motion Capture protocol (OSC over UDP, protocol.vmc.info, 3.1).
+
+Two datagrams a pose, each below the size that a network splits: what is available, the time and the root; then the
+bones of the hand. Bones of which nothing is known are left out, so that the avatar keeps them as they are.
+"""
+
+import numpy as np
+
+from common.arrays import Bool, Float
+from common.geometry import quaternion_to_matrix
+from common.messages import HandPose, Told
+from common.output_settings import VmcOutput
+from common.wrist_bend import forearm_palm
+from master.send.osc_packets import Blank, BlankBundle, floats, ints
+from master.send.sides import Side, side_of
+from master.send.times import Times
+from master.send.udp import UdpSender
+from master.send.vmc_bones import BoneMap, bone_names
+
+OK, TIME, ROOT, BONE = "/VMC/Ext/OK", "/VMC/Ext/T", "/VMC/Ext/Root/Pos", "/VMC/Ext/Bone/Pos"
+_LOADED = ints([1, 3, 0])  # a model is loaded, it is calibrated, normal mode
+_ORIGIN = floats([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
+_STILL = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+class VmcSink:
+    """A `Sink` that sends every pose as bones; other messages are nothing to it. Holds the socket and the blanks."""
+
+    def __init__(self, settings: VmcOutput, times: Times) -> None:
+        """Open the socket.
+
+        Raises:
+            PhalanxError: The host is unknown.
+        """
+        self._settings, self._times = settings, times
+        rotation = quaternion_to_matrix(np.array(settings.q_avatar_rig))
+        sides: tuple[Side, ...] = ("left", "right")
+        self._maps = {side: BoneMap(side, rotation) for side in sides}
+        self._bones = {
+            side: BlankBundle([Blank(BONE, (name,), "f" * 7) for name in bone_names(side)]) for side in sides
+        }
+        self._state = BlankBundle(
+            [Blank(OK, (), "iii"), Blank(TIME, (), "f"), Blank(ROOT, ("root",), "f" * 7)]
+        )
+        self._began_ns: int | None = None
+        self._udp = UdpSender(settings.host, settings.port, "vmc")
+
+    def write(self, message: Told) -> None:
+        """Send one pose.
+
+        Raises:
+            PhalanxError: This machine cannot send there.
+        """
+        if not isinstance(message, HandPose):
+            return
+        side = side_of(message)
+        if side is None:
+            return  # nothing of it is known
+        if self._began_ns is None:
+            self._began_ns = message.t_ns
+        wall_ns = self._times.wall_ns(message.t_ns)
+        since = floats([1e-9 * (message.t_ns - self._began_ns)])
+        self._udp.send(self._state.filled(wall_ns, np.concatenate([_LOADED, since, _ORIGIN])))
+        place, turn = self._rows(message, side)
+        rows: Float = np.concatenate([place, turn], axis=1)
+        known: Bool = np.asarray(np.isfinite(rows).all(axis=1))
+        self._udp.send(self._bones[side].filled(wall_ns, floats(rows).ravel(), known))
+
+    def close(self) -> None:
+        """Give the socket back."""
+        self._udp.close()
+
+    def _rows(self, pose: HandPose, side: Side) -> tuple[Float, Float]:
+        """Positions (16, 3) [m] and rotations xyzw (16, 4), as the settings want the hand's own bone."""
+        bones = self._maps[side].bones(pose)
+        place, turn = bones.position_m, bones.rotation_xyzw
+        place[0] = (self._settings.forearm_m if side == "right" else -self._settings.forearm_m, 0.0, 0.0)
+        if self._settings.hand == "rest":
+            turn[0] = _STILL
+        elif self._settings.hand == "bend":
+            turn[0] = self._maps[side].bent(forearm_palm(pose.wrist_bend_rad))
+        return place, turn

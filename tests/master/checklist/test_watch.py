@@ -1,0 +1,324 @@
+"""Each rule of the checklist: its fault shows within two seconds, alone, says whom and what to do, and goes with it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import pytest
+
+from common.messages import CheckItem
+from master.checklist.facts import Verdict
+from master.checklist.moved_rule import MovedRule
+from master.checklist.watch import CODES
+from tests.master.checklist.checked import MARKERS, Bench
+
+WITHIN_S = 2.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault: how it comes and goes, and what must be told."""
+
+    code: str
+    subject: str
+    put: Callable[[Bench], object]
+    take: Callable[[Bench], object]
+    says: str
+    fix: str
+
+
+def _gauge(name: str, **gauges: float) -> Callable[[Bench], object]:
+    return lambda bench: bench.gauges.setdefault(name, {}).update(gauges)
+
+
+def _named(name: str, gauges: dict[str, float]) -> Callable[[Bench], object]:
+    return lambda bench: bench.gauges.setdefault(name, {}).update(gauges)
+
+
+def _event(name: str, event: str, per_s: float) -> Callable[[Bench], object]:
+    return lambda bench: bench.per_s.setdefault(name, {}).update({event: per_s})
+
+
+def _set(what: str, name: str, value: object) -> Callable[[Bench], object]:
+    return lambda bench: getattr(bench, what).update({name: value})
+
+
+def _unseen(bench: Bench) -> None:
+    """Another range for the index finger, in which nothing is."""
+    bench.seconds(0.25)  # between two reports: in the next one there are frames of before
+    bench.gauges.setdefault("left", {})["colour.index"] = 2.0
+    _event("left", "seen.index", 0.0)(bench)
+
+
+def _apart(share: float) -> Callable[[Bench], object]:
+    return lambda bench: setattr(bench, "apart", share)
+
+
+def _disk(free_mb: float) -> Callable[[Bench], object]:
+    return lambda bench: setattr(bench, "disk_mb", free_mb)
+
+
+def _files(*items: CheckItem) -> Callable[[Bench], object]:
+    return lambda bench: setattr(bench, "files", items)
+
+
+LENS = CheckItem(
+    "calibration_absent", "left", "Camera left: its lens is not measured.", "calibrate intrinsics"
+)
+OLD = CheckItem("calibration_stale", "left", "The lens of camera left was measured after.", "calibrate")
+CASES = [
+    Case(
+        "camera_absent",
+        "left",
+        lambda b: b.away.add("left"),
+        lambda b: b.away.clear(),
+        "not heard any more",
+        "slave",
+    ),
+    Case(
+        "auto_mode",
+        "left",
+        _gauge("left", exposure_us=7000.0),
+        _gauge("left", exposure_us=5000.0),
+        "7000, not 5000",
+        "automatic",
+    ),
+    Case(
+        "exposure_drift",
+        "left",
+        _gauge("left", light_exposure=0.5),
+        _gauge("left", light_exposure=1.0),
+        "0.5 times",
+        "calibrate",
+    ),
+    Case(
+        "colour_collision",
+        "left.index-back",
+        _named("left", {"overlap.index..back": 3.0}),
+        lambda b: b.gauges["left"].clear(),
+        "index and back overlap by 3 hues",
+        "repaint",
+    ),
+    Case(
+        "colour_collision",
+        "left.index-ring",
+        _named("left", {"twins.index..ring": 4.0}),
+        lambda b: b.gauges["left"].clear(),
+        "look alike, 4 hues apart",
+        "repaint",
+    ),
+    Case(
+        "marker_unseen",
+        "left.index",
+        _unseen,
+        _event("left", "seen.index", 60.0),
+        "not once since its colours were changed",
+        "calibrate its colours",
+    ),
+    Case(
+        "background_in_range",
+        "left.back",
+        _event("left", "beside.back", 60.0),
+        _event("left", "beside.back", 0.0),
+        "colour of marker back",
+        "cover it",
+    ),
+    Case("calibration_absent", "left", _files(LENS), _files(), "not measured", "calibrate intrinsics"),
+    Case(
+        "calibration_absent",
+        "left",
+        lambda b: b.counts.update(left={"uncalibrated": 1, "uncalibrated.ring": 1, "uncalibrated.back": 1}),
+        lambda b: b.counts.update(left={"uncalibrated": 0}),
+        "no colour for ring, back: it does not see them",
+        "phalanx-slave colours",
+    ),
+    Case("calibration_stale", "left", _files(OLD), _files(), "after", "calibrate"),
+    Case(
+        "calibration_stale",
+        "left",
+        _gauge("left", width_px=1280.0),
+        _gauge("left", width_px=640.0),
+        "1280 x 480",
+        "same cameras/left.json",
+    ),
+    Case("camera_moved", "left-right", _apart(0.8), _apart(0.0), "miss each other", "calibrate stereo"),
+    Case(
+        "clock_unsynchronised",
+        "right",
+        _set("sigma_ns", "right", 4e6),
+        _set("sigma_ns", "right", 5e4),
+        "4.0 ms",
+        "cable",
+    ),
+    Case(
+        "clock_unsynchronised",
+        "right",
+        _set("sigma_ns", "right", None),
+        _set("sigma_ns", "right", 5e4),
+        "not known",
+        "cable",
+    ),
+    Case("packet_loss", "right", _set("loss", "right", 0.1), _set("loss", "right", 0.0), "10 %", "cable"),
+    Case(
+        "rate_low",
+        "left",
+        _set("rate", "left", 30.0),
+        _set("rate", "left", 60.0),
+        "30 frames",
+        "frame_rate_hz",
+    ),
+    Case(
+        "rate_low",
+        "wrist",
+        _set("rate", "wrist", 60.0),
+        _set("rate", "wrist", 90.0),
+        "60 frames",
+        "frame_rate_hz",
+    ),
+    Case(
+        "too_hot",
+        "left",
+        _gauge("left", temperature_c=86.0),
+        _gauge("left", temperature_c=50.0),
+        "86 °C",
+        "fan",
+    ),
+    Case(
+        "too_hot",
+        "imu",
+        _gauge("imu", throttled=1.0),
+        _gauge("imu", throttled=0.0),
+        "supply is too weak",
+        "supply",
+    ),
+    Case(
+        "disk_full",
+        "left",
+        _gauge("left", disk_free_mb=60.0),
+        _gauge("left", disk_free_mb=900.0),
+        "60 MB",
+        "recordings",
+    ),
+    Case("disk_full", "master", _disk(60.0), _disk(900.0), "60 MB", "recordings"),
+    Case(
+        "strobe_slipped",
+        "wrist",
+        _event("wrist", "strobe.out_of_step", 20.0),
+        _event("wrist", "strobe.out_of_step", 0.0),
+        "in the wrong one",
+        "lead_us",
+    ),
+    Case(
+        "imu_silent",
+        "imu",
+        lambda b: b.away.add("imu"),
+        lambda b: b.away.clear(),
+        "not heard any more",
+        "phalanx-slave imu",
+    ),
+]
+
+
+def test_every_code_has_a_case() -> None:
+    assert {case.code for case in CASES} == set(CODES)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.code}-{case.subject}")
+def test_a_fault_shows_alone_within_two_seconds_and_is_gone_within_two(case: Case) -> None:
+    bench = Bench()
+    assert not any(items for _, items in bench.seconds(12.0))
+    case.put(bench)
+    told = bench.seconds(6.0)
+    first = next(s for s, items in told if items)
+    assert first <= WITHIN_S
+    for s, items in told:
+        if s >= first:
+            assert [(item.code, item.subject) for item in items] == [(case.code, case.subject)], s
+    item = told[-1][1][0]
+    assert case.says in item.sentence
+    assert case.subject.split(".")[0].split("-")[0] in item.sentence
+    assert case.fix in item.fix
+    case.take(bench)
+    told = bench.seconds(6.0)
+    assert {(item.code, item.subject) for _, items in told for item in items} <= {(case.code, case.subject)}
+    assert not any(items for s, items in told if s > WITHIN_S)
+
+
+def test_who_never_came_is_told_after_a_grace() -> None:
+    bench = Bench(away={"right", "imu"})
+    told = bench.seconds(8.0)
+    assert not any(items for s, items in told if s < 5.0)
+    assert [(i.code, i.subject) for i in told[-1][1]] == [("camera_absent", "right"), ("imu_silent", "imu")]
+    assert "never heard" in told[-1][1][0].sentence
+
+
+def test_a_camera_that_gives_no_frames_is_absent_though_its_slave_is_there() -> None:
+    bench = Bench()
+    bench.seconds(8.0)
+    bench.rate["left"] = 0.0
+    items = bench.seconds(2.0)[-1][1]
+    assert [(item.code, item.subject) for item in items] == [("camera_absent", "left")]
+    assert "no frame comes" in items[0].sentence
+
+
+def test_what_a_camera_that_is_away_would_also_be_is_not_told_nor_when_it_comes_back() -> None:
+    bench = Bench()
+    bench.seconds(8.0)
+    bench.away.add("left")
+    bench.seconds(5.0)
+    bench.away.clear()
+    bench.session["left"] = 2  # another process
+    assert not any(items for s, items in bench.seconds(6.0) if s > 0.25)
+
+
+def test_a_hidden_marker_is_no_fault_and_one_that_is_gone_is() -> None:
+    bench = Bench()
+    bench.seconds(8.0)
+    _event("left", "seen.index", 0.0)(bench)
+    assert not any(items for _, items in bench.seconds(25.0))
+    items = bench.seconds(8.0)[-1][1]
+    assert [(item.code, item.subject) for item in items] == [("marker_unseen", "left.index")]
+    assert "for 3" in items[0].sentence
+
+
+def test_no_marker_is_missed_while_the_hand_is_away() -> None:
+    bench = Bench()
+    for marker in MARKERS:
+        _event("left", f"seen.{marker}", 0.0)(bench)
+    assert not any(items for _, items in bench.seconds(60.0))
+
+
+def test_between_two_bounds_nothing_flickers() -> None:
+    bench = Bench()
+    bench.seconds(8.0)
+    shown: list[bool] = []
+    for exposure in (1.4, 1.45, 1.6, 1.45, 1.4, 1.45, 1.3, 1.4, 1.45):
+        bench.gauges["left"] = {"light_exposure": exposure}
+        shown.append(bool(bench.seconds(1.0)[-1][1]))
+    assert shown == [False, False, True, True, True, True, False, False, False]
+
+
+def test_causes_silence_what_follows_from_them_and_nothing_else() -> None:
+    bench = Bench()
+    bench.seconds(8.0)
+    bench.gauges["left"] = {"overlap.index..back": 3.0}
+    bench.per_s["left"] = {"beside.back": 60.0, "beside.ring": 60.0}
+    bench.loss["right"] = 0.2
+    bench.apart = 0.9
+    items = bench.seconds(4.0)[-1][1]
+    assert [(item.code, item.subject) for item in items] == [
+        ("colour_collision", "left.index-back"),
+        ("background_in_range", "left.ring"),
+        ("packet_loss", "right"),
+    ]
+
+
+def test_of_three_cameras_the_one_that_moved_is_named() -> None:
+    rule, verdicts = MovedRule(), list[Verdict]()
+    for k in range(20):
+        counts = {"poses": 15 * k, "mostly_left_out.top": 14 * k}
+        verdicts = list(rule.look(("left", "right", "top"), 6, counts, 250_000_000 * k))
+    assert [(one.subject, one.wrong) for one in verdicts] == [
+        ("left", False),
+        ("right", False),
+        ("top", True),
+    ]

@@ -1,0 +1,226 @@
+"""What the console knows and tells, without a browser: tuning, looking, figures, gestures, files, its guard."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from common.bus import LoopbackBus
+from common.calibration import CameraCalibration, RigCalibration, load, save
+from common.errors import BusError, CalibrationError, PhalanxError
+from common.messages import Command, Gesture, Health
+from common.output_settings import OutputSettings
+from master.console.elements import full_frame_uv
+from master.console.filter_trial import save_filter, try_filter
+from master.console.gestures_heard import KEPT, GesturesHeard
+from master.console.guard import names_of, refusal
+from master.console.history import History
+from master.console.looking import Looking
+from master.console.output_files import change_output
+from master.console.own_copy import update_copy
+from master.console.play_panel import start_playing
+from master.console.recording_panel import recording_path
+from master.console.state import ConsoleSettings, ConsoleState, Newest
+from master.console.tuner import Range, Tuner
+from master.console.words import hand_line
+from tests.master.console.fakes import FakeSlave, pose, tree
+from tests.network_helpers import until
+
+
+@pytest.fixture
+def slave(tmp_path: Path) -> FakeSlave:
+    return FakeSlave(LoopbackBus(), tree(tmp_path) / "cameras" / "left.json")
+
+
+def test_a_tuner_goes_back_to_what_was_before_the_first_change_or_saved_last(slave: FakeSlave) -> None:
+    tuner = Tuner("left", slave.answer)
+    assert tuner.set({"exposure_us": 6500.0}).wanted["exposure_us"] == 6500.0
+    tuner.pick("index", (159.5, 100.0), 123)
+    assert slave.verbs("pick")[-1]["t_ns"] == 123
+    assert tuner.refresh().markers["index"] == Range((44, 80, 60), (44, 250, 250))
+    back = tuner.revert()
+    assert back.wanted["exposure_us"] == 5000.0
+    assert back.markers["index"] == Range((15, 90, 40), (25, 255, 255))
+    assert back.markers["back"] == Range((170, 90, 40), (0, 255, 255)), (
+        "a hue that wraps comes back as it was"
+    )
+    assert "ring" not in tuner.forget("ring").markers
+    assert "ring" in tuner.revert().markers
+    tuner.forget("ring")
+    tuner.save()
+    tuner.pick("ring", (300.0, 100.0))
+    assert "ring" not in tuner.revert().markers, "what had no colour has none again"
+    tuner.set({"exposure_us": 7000.0})
+    tuner.save()
+    tuner.set({"exposure_us": 8000.0})
+    assert tuner.revert().wanted["exposure_us"] == 7000.0
+
+
+def test_what_a_slave_elsewhere_saves_comes_to_the_copy_of_this_machine(
+    slave: FakeSlave, tmp_path: Path
+) -> None:
+    copy = tmp_path / "copy.json"
+    save(copy, slave.camera)
+    tuner = Tuner("left", slave.answer)
+    assert not update_copy(copy, tuner.save()), "the same: nothing is written"
+    tuner.set({"exposure_us": 7001.5, "colour_gains": [1.25, 0.75], "roi_margin": 0.25})
+    tuner.forget("ring")
+    tuner.pick("index", (159.5, 100.0))
+    assert update_copy(copy, tuner.save())
+    made, there = load(copy, CameraCalibration), load(slave.path, CameraCalibration)
+    assert (made.exposure_us, made.colour_gains, made.roi_margin) == (7001.5, (1.25, 0.75), 0.25)
+    assert made.markers == there.markers
+    assert made.intrinsics == there.intrinsics
+    assert made.provenance["markers"].tool == "console"
+
+
+def test_a_tuner_passes_on_what_a_slave_refuses_and_has_nothing_to_revert_before_it_answered() -> None:
+    def silent(command: Command) -> Health:
+        raise BusError(f"no answer from {command.target!r}")
+
+    tuner = Tuner("left", silent)
+    with pytest.raises(BusError, match="no answer from 'left'"):
+        tuner.set({"exposure_us": 1.0})
+    with pytest.raises(BusError, match="nothing to go back to"):
+        tuner.revert()
+
+
+def test_the_corners_of_a_picture_are_the_edges_of_the_frames_corner_pixels() -> None:
+    assert full_frame_uv(0.0, 0.0, 640, 480) == (-0.5, -0.5)
+    assert full_frame_uv(1.0, 1.0, 640, 480) == (639.5, 479.5)
+
+
+def test_a_filter_is_tried_by_command_and_saved_with_its_source(tmp_path: Path) -> None:
+    told: list[Command] = []
+
+    def ask(command: Command) -> Health:
+        told.append(command)
+        return Health("master", 1, 2, {}, {})
+
+    path = tree(tmp_path) / "rigs" / "desk.json"
+    before = load(path, RigCalibration)
+    try_filter(ask, "desk", {"beta": 80.0})
+    assert json.loads(told[0].body) == {"rig": "desk", "filter": {"beta": 80.0}}
+    save_filter(path, {"beta": 80.0})
+    after = load(path, RigCalibration)
+    assert (after.filter.beta, after.filter.min_cutoff_hz) == (80.0, before.filter.min_cutoff_hz)
+    assert after.provenance["filter"].tool == "console"
+    with pytest.raises(CalibrationError, match="min_cutoff_hz"):
+        save_filter(path, {"min_cutoff_hz": -1.0})
+    assert load(path, RigCalibration) == after, "a value out of range changes nothing"
+
+
+def test_looking_asks_for_all_that_anybody_wants_tinted_and_ends() -> None:
+    asked: list[Command] = []
+
+    def ask(command: Command, timeout_s: float) -> Health:
+        asked.append(command)
+        raise BusError("nobody there")
+
+    looking = Looking(ask)
+    looking.look("left")
+    looking.look("left", ("index",))
+    assert until(lambda: any("index" in one.body for one in asked))
+    assert looking.error("left") == "nobody there"
+    assert looking.looked_at == {"left"}
+    assert until(lambda: not looking.looked_at), "no thread is left when nobody looks"
+    assert not looking.error("left")
+
+
+def test_history_keeps_a_minute_and_parts_what_masters_and_senders_say() -> None:
+    history = History()
+    for k in range(300):
+        gauges = {"camera_hz.left": 90.0, "left.clock_offset_us": 1500.0, "left.clock_sigma_us": 30.0}
+        counts = {"left.received": 45 * k} | ({"left.lost": 2 * (k - 100)} if k > 100 else {})
+        master = Health("master", 1, k * 500_000_000, counts, gauges)
+        slave = Health("left", 1, k, {}, {"soc_celsius": 50.0})
+        history.push(0.5 * k, [5.0, 7.0, 100.0], {"master": master, "left": slave})
+    assert history.latest("latency_p50_ms") == 7.0
+    assert history.latest("poses_per_s") == 6.0
+    assert history.latest("lost_per_s.left") == pytest.approx(4.0)
+    assert history.latest("offset_ms.left") == 1.5
+    assert history.latest("celsius.left") == 50.0
+    rates = history.series("rate_hz.left")
+    assert len(rates) == 120
+    assert rates[0] == (-59.5, 90.0), "what arrives, not what the camera takes"
+    assert history.series("lost_per_s.left")[0][1] == pytest.approx(4.0)
+    assert history.latest("celsius.right") is None
+
+
+def test_gestures_last_until_they_end_or_are_not_heard_and_events_are_bounded() -> None:
+    heard = GesturesHeard()
+
+    def say(phase: str, now_s: float, kind: str = "pinch") -> None:
+        heard.push(Gesture("me", 0, kind, "index", phase, 0, 1.0), now_s)  # pyright: ignore[reportArgumentType]
+
+    say("begin", 1.0)
+    say("update", 1.2)
+    assert set(heard.lasting(1.4)) == {("me", "pinch")}
+    assert not heard.lasting(1.8), "not repeated: over"
+    say("end", 2.0)
+    assert not heard.lasting(2.0)
+    for k in range(100):
+        say("end", 3.0 + k, "tap")
+    assert len(heard.events()) == KEPT
+    assert heard.events()[0].heard_s == 102.0
+
+
+def test_the_bus_cannot_fill_the_memory_with_names() -> None:
+    newest: Newest[Health] = Newest()
+    for k in range(1000):
+        newest.put(f"p{k}", Health(f"p{k}", 1, 1, {}, {}))
+    assert len(newest.present()) == 64
+    assert newest.get("p0") is not None
+    assert newest.get("p0", within_s=0.0) is None, "what is old is not present"
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "passes"),
+    [
+        ("127.0.0.1:8080", None, True),
+        ("localhost:8080", "http://localhost:8080", True),
+        ("127.0.0.1:8080", "http://evil.example", False),
+        ("127.0.0.1:8080", "http://127.0.0.1:9999", False),
+        ("127.0.0.1:8080", "null", False),
+        ("evil.example:8080", "http://evil.example:8080", False),  # a name that was made to point here
+        (None, None, False),
+    ],
+)
+def test_only_own_pages_are_answered(host: str | None, origin: str | None, passes: bool) -> None:
+    assert (refusal(host, origin, names_of("127.0.0.1")) is None) == passes
+    assert names_of("0.0.0.0") == frozenset(), (
+        "served everywhere: by any name, but still only to its own pages"
+    )
+
+
+def test_a_hand_is_told_in_words() -> None:
+    assert hand_line(pose(1)) == "22 of 26 joints seen now: 4 measured, 18 solved, 4 held"
+
+
+def test_state_reads_the_bus_and_files_and_refuses_paths(tmp_path: Path) -> None:
+    bus = LoopbackBus()
+    calibration = tree(tmp_path)
+    state = ConsoleState(ConsoleSettings(calibration), bus.join)
+    try:
+        assert state.rig_names == ("desk",)
+        assert state.cameras() == ("left", "right")
+        bus.announce("master")
+        assert until(lambda: state.alive == {"master"})
+        assert until(lambda: (bus.publish("hand", "me", pose(1)), bool(state.poses))[1])
+        assert not state.checklist
+        for bad in ("../x", "a/b", "", ".hidden", "x" * 80):
+            with pytest.raises(PhalanxError, match="is called by letters"):
+                recording_path(state, bad)
+        with pytest.raises(PhalanxError, match="choose a recording"):
+            start_playing(state, "../../etc/passwd")
+        with pytest.raises(CalibrationError, match="port"):
+            change_output(state, "osc", {"port": 70_000})
+        change_output(state, "osc", {"port": 9001})
+        assert load(calibration / "outputs" / "default.json", OutputSettings).osc.port == 9001
+        assert not state.local.running(), "nothing is on: nothing runs"
+        with pytest.raises(BusError, match="not on the bus"):
+            state.link.ask(Command("left", "settings"))
+    finally:
+        state.close()
+    (calibration / "rigs" / "desk.json").unlink()
+    assert state.rig_names == (), "an empty tree is nothing to fail about"

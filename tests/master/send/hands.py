@@ -1,0 +1,49 @@
+"""Hands for the tests of the outputs: of a profile, in any pose."""
+
+import numpy as np
+
+from common.arrays import Float
+from common.geometry import matrix_to_quaternion, rigid, rotation_vector_to_matrix
+from common.hand_model import HandModel
+from common.hand_profiles import generated_profile
+from common.messages import HandPose
+
+FLAT = np.zeros((5, 4))
+MODELS = {side: HandModel.of(generated_profile(f"my-{side}", side)) for side in ("left", "right")}
+
+
+def hand_pose(
+    side: str,
+    angles_rad: Float = FLAT,
+    turn: Float | None = None,
+    place_m: tuple[float, float, float] = (0.05, -0.02, 0.4),
+    t_ns: int = 5_000_000_000,
+) -> HandPose:
+    """A hand with these angles (5, 4), its palm turned by a rotation vector (3,) and at a place, rig frame."""
+    model = MODELS[side]
+    rotation = rotation_vector_to_matrix(np.zeros(3) if turn is None else turn)
+    joints = model.forward(rigid(rotation, np.array(place_m)), angles_rad)
+    return pose_of(model.profile.name, joints.position_m, joints.rotation, angles_rad, t_ns)
+
+
+def pose_of(name: str, position_m: Float, rotation: Float, angles_rad: Float, t_ns: int) -> HandPose:
+    """A pose of joints (26, 3) and (26, 3, 3), all known."""
+    known = np.ones(26, dtype=bool)
+    none = np.empty((0, 3))
+    return HandPose(
+        name,
+        t_ns,
+        position_m,
+        matrix_to_quaternion(rotation),
+        np.full(26, 0.008),
+        known,
+        known,
+        np.full((26, 3, 3), 1e-6),
+        np.full(26, 2, np.uint8),
+        angles_rad,
+        none,
+        none,
+        np.empty((0, 3, 3)),
+        known,
+        latency_ns=12_000_000,
+    )
