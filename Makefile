@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo test check format bench instructions schema clean
+.PHONY: help install demo browser api test check format bench instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -27,13 +27,24 @@ demo: $(STAMP) ## two simulated cameras and the master as live processes on this
 	@headless=; [ -n "$${DISPLAY-}$${WAYLAND_DISPLAY-}" ] || headless=--headless; \
 	  exec $(BIN)/phalanx demo $$headless --seconds $(DEMO_SECONDS) --out out/demo --json out/demo/summary.json $(DEMO_ARGS)
 
-test: check ## check, then all tests
-	@$(BIN)/python -m pytest -n 2 --dist loadfile $(TEST_ARGS)
+browser: ## a Chromium for the tests of the console's pages; without root it says what to install
+	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || { \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    echo "installing Chromium for the tests of the console ..."; \
+	    { apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium fonts-dejavu-core; } >/dev/null 2>&1 \
+	      || echo "Chromium could not be installed: the tests of the console's pages are skipped"; \
+	  else echo "no Chromium: the tests of the console's pages are skipped (Debian: apt install chromium)"; fi; }
+
+api: $(STAMP) ## the reference of the API from the docstrings, as pages below out/api
+	@$(BIN)/pdoc -o out/api -d google common slave master deploy && echo "open out/api/index.html"
+
+test: check browser ## check, then all tests
+	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
 check: $(STAMP) ## lint, format and strict types
 	@$(BIN)/ruff check
 	@$(BIN)/ruff format --check
-	@$(BIN)/python -m pyright --pythonpath $(BIN)/python
+	@$(BIN)/python -m pyright --threads 2 --pythonpath $(BIN)/python
 
 format: $(STAMP) ## rewrite the layout of all files, and mend what lint can mend
 	@$(BIN)/ruff check --fix --quiet || true

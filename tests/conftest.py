@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -17,6 +19,33 @@ settings.register_profile(
     "house", derandomize=True, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile("house")
+
+
+# Several processes or a browser each: beside one another they would starve, so one worker has them all, from the start.
+LIVE = (
+    "tests/loopback/",
+    "tests/docs/examples/",
+    "tests/master/console/",
+    "tests/master/web/test_page.py",
+    "tests/master/export/test_export_gltf.py",
+)
+
+
+class LiveScheduling(LoadFileScheduling):
+    """Each file goes to one worker whole, and all that is live goes to the same one."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        return "live" if nodeid.startswith(LIVE) else super()._split_scope(nodeid)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveScheduling:
+    """What spreads the tests over the workers."""
+    return LiveScheduling(config, log)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """What is live begins first: it lasts longest."""
+    items.sort(key=lambda item: not item.nodeid.startswith(LIVE))
 
 
 @pytest.fixture(scope="session")

@@ -26,7 +26,8 @@ FORBIDDEN: dict[str, frozenset[str]] = {
 }
 # The only files that know a library.
 ONLY_IN: dict[str, tuple[str, ...]] = {
-    "zenoh": ("common/zenoh_bus.py",),
+    "zenoh": ("common/zenoh_bus.py", "master/send/ros2_link.py"),  # the second: ROS 2's own network
+    "nicegui": ("master/console/*.py",),
     "rerun": ("master/outputs/rerun*.py",),
     "rerun_cli": ("master/outputs/rerun*.py",),
     "serial": ("slave/imu/*.py",),
@@ -37,6 +38,8 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "libcamera": ("slave/cameras/picamera2*.py",),
     "numba": ("slave/markers/fast*.py",),
     "openvr": ("slave/objects/openvr*.py",),
+    "pylsl": ("master/send/lsl*.py",),
+    "pythonosc": ("master/send/osc*.py",),
 }
 NEVER = frozenset({"pickle", "cPickle", "marshal", "shelve", "dill", "cloudpickle", "joblib"})
 # Import name -> name in pyproject.toml, where they differ. picamera2 and libcamera come with the Pi's system.
@@ -44,12 +47,16 @@ DISTRIBUTION = {
     "cv2": "opencv-python-headless",
     "zenoh": "eclipse-zenoh",
     "serial": "pyserial",
+    "pythonosc": "python-osc",
     "rerun": "rerun-sdk",
     "rerun_cli": "rerun-sdk",
 }
 SYSTEM = frozenset({"picamera2", "libcamera"})
 # Files of common that the slave never loads may use what only the PC has.
-PC_ONLY = {"common/recording.py": frozenset({"mcap"})}
+PC_ONLY = {
+    "common/recording.py": frozenset({"mcap"}),
+    "common/mcap_file.py": frozenset({"mcap", "zstandard"}),
+}
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(
     {
@@ -125,6 +132,8 @@ def undeclared(path: str, text: str) -> set[str]:
         promised += project["optional-dependencies"]["fast"]
     if fnmatch(path, "slave/objects/openvr*.py"):
         promised += project["optional-dependencies"]["vive"]
+    if fnmatch(path, "master/send/lsl*.py"):
+        promised += project["optional-dependencies"]["lsl"]
     have = {re.split(r"[\[<>=~!; ]", item)[0] for item in promised} | SYSTEM | PC_ONLY.get(path, frozenset())
     names = set(imported(text)) - OURS - sys.stdlib_module_names
     return {name for name in names if DISTRIBUTION.get(name, name) not in have}

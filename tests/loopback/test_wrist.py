@@ -121,7 +121,7 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
         assert until(lambda: wrist.ask("report").counts["reload.applied"] == 1)
         save(path, msgspec.structs.replace(rig, laser_plane=None))
         assert until(lambda: wrist.ask("report").counts["reload.refused"] == 1)
-        assert "laser_plane" in wrist.log.read_text()
+        assert until(lambda: "laser_plane" in wrist.log.read_text())  # counted, then said
         while wrist.ingest.get(0.0) is not None:
             pass
         wrist.triples(2)  # it goes on

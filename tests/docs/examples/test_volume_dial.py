@@ -207,7 +207,7 @@ def test_as_a_process_it_waits_for_the_master_and_follows_it(root: Path) -> None
             lines += (line := app.stdout.readline())
             assert line
         app.send_signal(signal.SIGINT)
-        assert app.wait(10.0) == 0
+        assert app.wait(60.0) == 0
         master.close()
     finally:
         app.kill()

@@ -1,0 +1,59 @@
+"""The subscriber of docs/examples as a program of its own, beside a bus on which a hand is published."""
+
+import ast
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from common.hand_model import JOINTS
+from common.zenoh_bus import ZenohBus
+from tests.master.send.hands import hand_pose
+from tests.network_helpers import free_endpoint
+
+
+def test_it_prints_the_tip_of_the_index_finger(root: Path) -> None:
+    endpoint = free_endpoint()
+    bus = ZenohBus(endpoint, None)
+    pose = hand_pose("right", t_ns=12_345_000_000)
+    program = subprocess.Popen(
+        [sys.executable, str(root / "docs" / "examples" / "subscriber.py"), endpoint],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=root / "docs",  # from where nothing of ours can be imported
+    )
+    heard = threading.Event()
+
+    def publish() -> None:
+        while not heard.wait(0.05):
+            bus.publish("hand", "my-right", pose)
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        assert program.stdout is not None
+        line = program.stdout.readline()
+    finally:
+        heard.set()
+        thread.join()
+        program.kill()
+        program.wait()
+        bus.close()
+    name, at, unit, x, y, z, _ = line.split()
+    assert (name, at, unit) == ("my-right", "12.345", "s:")
+    tip = pose.position_m[JOINTS.index("index-finger-tip")]
+    np.testing.assert_allclose([float(x), float(y), float(z)], tip, atol=5.1e-5)
+
+
+def test_it_is_at_most_20_lines_and_needs_nothing_of_ours(root: Path) -> None:
+    text = (root / "docs" / "examples" / "subscriber.py").read_text()
+    assert len(text.splitlines()) <= 20
+    imports = {
+        alias.name
+        for node in ast.walk(ast.parse(text))
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+    assert imports == {"json", "struct", "sys", "msgspec", "zenoh"}

@@ -1,0 +1,99 @@
+"""The checklist of a real master over real slaves: each fault that is brought about is told, alone, and goes with it.
+
+The time is counted in the master's reports, one a second: two are two seconds on a machine that keeps up. How much a
+machine is behind is measured by how long a sleep of ours really takes.
+"""
+
+import statistics
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from bench.checklist import clean, rehearse
+from bench.checklist_faults import of_markers, of_wrist
+from bench.checklist_rig import Rig
+
+FAULTS = {fault.code: fault for fault in (*of_markers(), *of_wrist())}
+# The others take a fresh process or a slow way to come about, or are the same path as one of these with another number:
+# `python -m bench.checklist` has all sixteen.
+LIVE = ("auto_mode", "colour_collision", "background_in_range", "calibration_stale", "camera_moved", "packet_loss",
+        "too_hot", "imu_silent")  # fmt: skip
+NOMINAL = 2  # reports
+STEP_S = 0.02
+AFTER_S = 1.2  # the bench waits longer
+# A machine that is behind draws fewer pictures than it should: then that is told as well, and it is true.
+BEHIND = {"rate_low"}
+
+
+class Lag:
+    """How much longer than they should the sleeps of this process take: the machine has other things to do."""
+
+    def __init__(self) -> None:
+        self._late: list[float] = []
+        self._stop = threading.Event()
+        threading.Thread(target=self._measure, daemon=True).start()
+
+    @property
+    def reports(self) -> int:
+        """How many reports more than nominal are the machine's own doing."""
+        worst = statistics.quantiles(self._late or [0.0, 0.0], n=10)[-1]
+        return 1 + round(
+            20.0 * worst
+        )  # twenty things happen one after the other between a fault and its line
+
+    def close(self) -> None:
+        self._stop.set()
+
+    def _measure(self) -> None:
+        while not self._stop.is_set():
+            began = time.monotonic()
+            time.sleep(STEP_S)
+            self._late.append(time.monotonic() - began - STEP_S)
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rig]:
+    folder: Path = tmp_path_factory.mktemp("checklist") / "desk"
+    made = Rig(folder, "desk")
+    try:
+        yield made
+    finally:
+        made.close()
+
+
+@pytest.fixture(scope="module")
+def lag() -> Iterator[Lag]:
+    made = Lag()
+    yield made
+    made.close()
+
+
+def test_nothing_is_told_while_nothing_is_wrong(rig: Rig) -> None:
+    assert {code for code, _ in clean(rig, 4.0)} <= BEHIND
+
+
+@pytest.mark.parametrize("code", LIVE)
+def test_a_fault_is_told_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
+    shown = rehearse(rig, FAULTS[code], AFTER_S)
+    assert shown.shown_s is not None
+    assert shown.cleared_s is not None
+    assert shown.subjects
+    assert shown.subjects <= shown.fault.subjects
+    assert {other for other, _ in shown.others} <= BEHIND
+    assert shown.shown_reports <= NOMINAL + lag.reports
+    assert shown.cleared_reports <= NOMINAL + lag.reports
+    for key, (sentence, fix) in rig.lists.sentences.items():
+        if key[0] == code:
+            assert key[1].split(".")[0].split("-")[0] in sentence
+            assert fix
+
+
+def test_a_killed_slave_is_told_alone_until_it_is_there_again(rig: Rig, lag: Lag) -> None:
+    shown = rehearse(rig, FAULTS["camera_absent"], AFTER_S)
+    assert shown.subjects == {"right"}
+    assert {other for other, _ in shown.others} <= BEHIND
+    assert shown.shown_reports <= NOMINAL + lag.reports
+    assert shown.cleared_reports <= NOMINAL + lag.reports
