@@ -1,7 +1,7 @@
 """What it costs a master to be watched: processor time of its process per pose, with console, recording and four live
 outputs, against the same process without them, in turns of one run.
 
-Two cameras at 60 Hz that are told, not drawn (`bench.told_sender`), over sealed UDP. Watchers are processes of their
+Two cameras at 30 Hz that are told, not drawn (`bench.told_sender`), over sealed UDP. Watchers are processes of their
 own and share the machine; what they cost themselves is a row of its own. Nothing may be lost.
 """
 
@@ -30,7 +30,7 @@ from common.zenoh_bus import ZenohBus
 from master.send.sender import NAME as SENDER
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
-TURNS, SECONDS, SETTLE_S, READY_S = 4, 10.0, 6.0, 60.0
+TURNS, SECONDS, SETTLE_S, READY_S, RATE_HZ = 6, 12.0, 6.0, 60.0, 30.0
 OUTPUTS = ("osc", "vmc", "ros2", "web")
 _TICKS = os.sysconf("SC_CLK_TCK")
 _BROWSER = ("chromium", "chromium-browser", "google-chrome")
@@ -91,7 +91,7 @@ class _Run:
         place = ["--beacon", f"127.255.255.255:{beacon}", "--bind", f"127.0.0.1:{data}", "--bus", self._end]
         self._master = self._start("master", ["-m", "master", "run", "--rig", "desk", *place])
         stack.callback(end, self._master)
-        sender = self._start("sender", ["-m", "bench.told_sender", str(beacon), "3600"])
+        sender = self._start("sender", ["-m", "bench.told_sender", str(beacon), "3600", str(RATE_HZ)])
         stack.callback(end, sender)
         self._bus = self._join()
         stack.callback(self._bus.close)

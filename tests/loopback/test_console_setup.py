@@ -110,9 +110,10 @@ def press(page: Page, name: str, then: Locator) -> None:
     then.wait_for(timeout=PATIENCE_MS)
 
 
-def shot(page: Page, name: str) -> None:
-    """Keep a picture of the page, if somebody wants them."""
+def shot(page: Page, name: str, settled_s: float = 0.0) -> None:
+    """Keep a picture of the page, if somebody wants them: of what it shows once all has settled for so long."""
     if folder := os.environ.get("PHALANX_SCREENSHOTS"):
+        page.wait_for_timeout(1e3 * settled_s)
         Path(folder).mkdir(parents=True, exist_ok=True)
         page.screenshot(path=f"{folder}/{name}.png")
 
@@ -245,7 +246,8 @@ def test_from_an_empty_folder_to_a_tracked_hand(console: tuple[str, str, Path], 
         press(page, "Start tracking", page.get_by_test_id("tracking").filter(has_text="A hand is tracked"))
         moving = poses(bus, POSES)
         page.get_by_text("6 of 6 markers seen").wait_for()
-        shot(page, "setup_track")
+        page.get_by_role("button", name="Step 3: Start cameras, done").wait_for()  # they found its bus
+        shot(page, "setup_track", 15.0)
     assert [len(still), len(moving)] == [POSES, POSES], "no poses with tracked tips of all fingers"
     joints_m, markers_m = error_m(still, scene, still_epoch_ns)
     assert joints_m < STILL_M

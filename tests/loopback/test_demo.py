@@ -119,36 +119,62 @@ def _held_up_ns(pid: int) -> int:
     return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
 
 
-@pytest.mark.parametrize("victim", ["right", "master"])
-def test_a_killed_process_is_back_within_two_seconds_and_nobody_else_is_touched(
-    victim: str, tmp_path: Path
+def _wait_until_back(demo: subprocess.Popen[str], log: Path, ready: str, pid: int) -> int:
+    """Until a process that was started again says so; how long [ns] it could have run and another had the core."""
+    held_up_ns = 0
+    while log.read_text().count(ready) < 2 and demo.poll() is None:
+        held_up_ns = _held_up_ns(pid)
+        time.sleep(0.02)
+    return held_up_ns
+
+
+def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_sums_up(
+    tmp_path: Path,
 ) -> None:
-    ready = {"right": "right: ready", "master": "listening on"}[victim]
     demo = _demo(tmp_path, 60.0)
     heard: list[str] = []
-    killed_ns = held_up_ns = 0
+    killed_ns: dict[str, int] = {}
+    held_up_ns: dict[str, int] = {}
     pids: dict[str, int] = {}
+
+    def kill(victim: str) -> None:
+        killed_ns[victim] = time.monotonic_ns()
+        os.kill(pids[victim], signal.SIGKILL)
+
     for line in _lines(demo):
         heard.append(line)
         pids = pids or _pids(line)
         if "2 of 60 s" in line and not killed_ns:
-            killed_ns = time.monotonic_ns()
-            os.kill(pids[victim], signal.SIGKILL)
-        if f"{victim} ended with code -9: started again" in line:
-            pid, log = _new_child(demo, pids), tmp_path / f"{victim}.log"
-            while log.read_text().count(ready) < 2 and demo.poll() is None:
-                held_up_ns = _held_up_ns(pid)
-                time.sleep(0.02)
-            time.sleep(3.0)
-            demo.send_signal(signal.SIGINT)
+            kill("master")  # first: rows that it had not yet written are lost with it
+        for victim, ready in (("right", "right: ready"), ("master", "listening on")):
+            if f"{victim} ended with code -9: started again" in line:
+                new = _new_child(demo, pids)
+                held_up_ns[victim] = _wait_until_back(demo, tmp_path / f"{victim}.log", ready, new)
+                pids[victim] = new
+                time.sleep(3.0)
+                if victim == "master":
+                    kill("right")
+                else:
+                    demo.send_signal(signal.SIGINT)
     assert demo.wait(60) == 0, "\n".join(heard)
-    assert json.loads((tmp_path / "summary.json").read_text())["restarts"] == {victim: 1}
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["restarts"] == {"right": 1, "master": 1}
+    assert summary["poses"] > 10
+    assert _gone(pids)
+    for name in ("left", "right", "master"):
+        log = (tmp_path / f"{name}.log").read_text()
+        assert "Traceback" not in log
+        assert "FATAL" not in log
     poses = load_poses(tmp_path / "poses.npz")
     measured = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0  # two cameras contributed again
-    after = poses.t_ns[(poses.t_ns > killed_ns + 300_000_000) & measured]
-    assert len(after) > 5  # it goes on; how fast is up to the machine
-    # Two seconds are the promise, and a loaded machine gets one more. What it waited for a core is not its own.
-    assert (after[0] - killed_ns - held_up_ns) * 1e-9 < 3.0
+    after = {
+        victim: poses.t_ns[(poses.t_ns > killed + 300_000_000) & measured]
+        for victim, killed in killed_ns.items()
+    }
+    for victim, killed in killed_ns.items():
+        assert len(after[victim]) > 5  # it goes on; how fast is up to the machine
+        # Two seconds are the promise, and a loaded machine gets one more. What it waited for a core is not its own.
+        assert (after[victim][0] - killed - held_up_ns[victim]) * 1e-9 < 3.0
 
 
 def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_path: Path) -> None:
@@ -190,22 +216,6 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     assert poses.valid[alone & measured].all()
     assert poses.valid[-1].all()
     assert _gone(pids)
-
-
-def test_ctrl_c_ends_every_process_and_still_sums_up(tmp_path: Path) -> None:
-    demo = _demo(tmp_path, 60.0)
-    heard: list[str] = []
-    for line in _lines(demo):
-        heard.append(line)
-        if "2 of 60 s" in line:
-            demo.send_signal(signal.SIGINT)
-    assert demo.wait(30) == 0, "\n".join(heard)
-    assert json.loads((tmp_path / "summary.json").read_text())["poses"] > 10
-    assert _gone(_pids(heard[0]))
-    for name in ("left", "right", "master"):
-        log = (tmp_path / f"{name}.log").read_text()
-        assert "Traceback" not in log
-        assert "FATAL" not in log
 
 
 def test_a_second_ctrl_c_ends_at_once_and_leaves_nobody_behind(tmp_path: Path) -> None:

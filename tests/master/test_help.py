@@ -1,10 +1,13 @@
 """What the help of a command shows is what was written: the markup of the help swallows text in square brackets."""
 
+import contextlib
+import io
+import os
 from typing import Annotated
+from unittest.mock import patch
 
 import pytest
 import typer
-from typer.testing import CliRunner
 
 from master.__main__ import app
 from master.calibrate.cli import calibrate_app
@@ -26,18 +29,19 @@ def whole() -> typer.Typer:
     return top
 
 
-def swallowed(top: typer.Typer, path: tuple[str, ...] = ()) -> tuple[int, list[str]]:
-    """How many texts of options and arguments the commands below `path` have, and those that are not shown whole."""
-    command = typer.main.get_command(top)
-    for name in path:
-        command = command.commands[name]  # type: ignore[attr-defined]
-    shown = " ".join(CliRunner().invoke(top, [*path, "--help"], env=WIDE).output.split())
-    texts = [text for one in command.params if (text := getattr(one, "help", None))]
-    lost = [f"{' '.join(path)}: {text}" for text in texts if " ".join(text.split()) not in shown]
-    count = len(texts)
-    for name in getattr(command, "commands", {}):
-        more, below = swallowed(top, (*path, name))
-        count, lost = count + more, lost + below
+def swallowed(top: typer.Typer) -> tuple[int, list[str]]:
+    """How many texts of options and arguments the commands have, and those that are not shown whole."""
+    count, lost = 0, list[str]()
+    waiting = [("", typer.main.get_command(top))]
+    while waiting:
+        path, command = waiting.pop()
+        with contextlib.redirect_stdout(io.StringIO()) as out, patch.dict(os.environ, WIDE):
+            command.main(["--help"], standalone_mode=False)
+        shown = " ".join(out.getvalue().split())
+        texts = [text for one in command.params if (text := getattr(one, "help", None))]
+        count += len(texts)
+        lost += [f"{path}: {text}" for text in texts if " ".join(text.split()) not in shown]
+        waiting += [(f"{path} {name}", one) for name, one in getattr(command, "commands", {}).items()]
     return count, lost
 
 
