@@ -115,7 +115,7 @@ def messages_of(path: Path, chunks: list[ChunkPlace]) -> Iterator[tuple[ChunkPla
     try:
         with path.open("rb") as file:
             for place in chunks:
-                records = _opened(os.pread(file.fileno(), place.length, place.offset))
+                records = _opened(_bytes(file.fileno(), place.length, place.offset))
                 yield place, None if records is None else [r for r in records if isinstance(r, Message)]
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
@@ -140,6 +140,11 @@ def _walk(fd: int, at: int, end: int) -> Iterator[_Place]:
         at += length
 
 
+def _bytes(fd: int, length: int, at: int) -> bytes:
+    """So many bytes from there on; none where an index that lies points out of the file."""
+    return os.pread(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
+
+
 def _stream(data: bytes) -> ReadDataStream:
     return ReadDataStream(io.BytesIO(data))
 
@@ -159,13 +164,13 @@ def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:
         return None
     footer = Footer(*_FOOTER.unpack(tail[9:29]))
-    summary = os.pread(fd, max(size - 37 - footer.summary_start, 0), footer.summary_start)
+    summary = _bytes(fd, size - 37 - footer.summary_start, footer.summary_start)
     if not summary or zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
         return None
     content = McapContent(profile)
     try:
         for opcode, at, length in _walk(fd, footer.summary_start, size - 37):
-            _take_summary(content, fd, opcode, _stream(os.pread(fd, length, at)))
+            _take_summary(content, fd, opcode, _stream(_bytes(fd, length, at)))
     except _BROKEN:
         return None
     return content
@@ -183,10 +188,10 @@ def _take_summary(content: McapContent, fd: int, opcode: int, stream: ReadDataSt
         content.chunks.append(ChunkPlace(*place, one.message_start_time, one.message_end_time))
     elif opcode == Opcode.ATTACHMENT_INDEX:
         kept = AttachmentIndex.read(stream)
-        content.add(_attachment(os.pread(fd, kept.length - _HEAD.size, kept.offset + _HEAD.size)))
+        content.add(_attachment(_bytes(fd, kept.length - _HEAD.size, kept.offset + _HEAD.size)))
     elif opcode == Opcode.METADATA_INDEX:
         told = MetadataIndex.read(stream)
-        content.add(_metadata(os.pread(fd, told.length - _HEAD.size, told.offset + _HEAD.size)))
+        content.add(_metadata(_bytes(fd, told.length - _HEAD.size, told.offset + _HEAD.size)))
 
 
 def _scanned(fd: int, size: int, profile: str) -> McapContent:

@@ -3,13 +3,16 @@
 import errno
 import os
 import random
+import struct
 import subprocess
 import sys
+import zlib
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 
 from common.errors import RecordingError
@@ -19,6 +22,8 @@ from tests.network_helpers import detections, triple
 
 FILES = {"rigs/desk.json": b'{"version": 1}', "cameras/left.json": b"{}"}
 STEP_NS = 50_000_000
+SUMMARY_START = 28  # bytes before the end: where the footer says where the summary begins
+RECORD = struct.Struct("<BQ")  # what it is, and the length of what follows
 
 
 def tags(seq: int, t_ns: int) -> TagDetections:
@@ -181,6 +186,43 @@ def test_flipped_bytes_cost_what_they_hit_and_no_more(tmp_path: Path) -> None:
             assert FILES.get(name, content) == content
         most = max(most, len(messages) - len(read))
     assert most > 0, "no flip has hit anything: the check would pass on nothing"
+
+
+@pytest.mark.parametrize("bit", range(64))
+def test_a_footer_that_points_nowhere_is_none(bit: int, tmp_path: Path) -> None:
+    data = bytearray(written(tmp_path / "a.mcap", few()))
+    begin = len(data) - SUMMARY_START
+    (start,) = struct.unpack_from("<Q", data, begin)
+    struct.pack_into("<Q", data, begin, start ^ 1 << bit)
+    (tmp_path / "b.mcap").write_bytes(data)
+    recording = open_messages(tmp_path / "b.mcap")
+    assert recording.cut
+    assert same(list(recording.read()), plain(few()))
+
+
+@pytest.mark.parametrize("offset", [0, 2**31, 2**63 - 1, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("length", [0, 8, 9, 2**40, 2**63, 2**64 - 1])
+def test_an_index_that_points_nowhere_costs_its_chunk_though_its_sum_is_right(
+    offset: int, length: int, tmp_path: Path
+) -> None:
+    data = bytearray(written(tmp_path / "a.mcap", few()))
+    footer = len(data) - SUMMARY_START
+    (at,) = struct.unpack_from("<Q", data, footer)
+    begin, forged = at, 0
+    while at < footer - RECORD.size:
+        opcode, size = RECORD.unpack_from(data, at)
+        if opcode == Opcode.CHUNK_INDEX and not forged:
+            struct.pack_into("<QQ", data, at + RECORD.size + 16, offset, length)  # behind its two times
+            forged += 1
+        at += RECORD.size + size
+    assert forged
+    struct.pack_into("<I", data, footer + 16, zlib.crc32(data[begin : footer + 16]))
+    (tmp_path / "b.mcap").write_bytes(data)
+    recording = open_messages(tmp_path / "b.mcap")
+    assert not recording.cut
+    read = list(recording.read())
+    assert recording.broken == 1
+    assert 0 < len(read) < len(few())
 
 
 @pytest.mark.parametrize(
