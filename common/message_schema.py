@@ -7,6 +7,7 @@ a byte each). Shapes stand in the descriptions and in docs/wire.md; a NaN in an 
 """
 
 import inspect
+from collections.abc import Sequence
 from math import isnan
 from typing import Any
 
@@ -24,19 +25,7 @@ _REF = "#/$defs/{name}"
 def bus_schema() -> bytes:
     """Streams of the bus with their keys, and the messages they carry; the same bytes on every Python version."""
     kinds = sorted({row.message for row in STREAMS.values()} - {Message}, key=lambda kind: kind.__name__)
-    _, parts = msgspec.json.schema_components(kinds, schema_hook=_array, ref_template=_REF)
-    for part in parts.values():
-        # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.
-        part["description"] = inspect.cleandoc(part["description"])
-    for kind in kinds:
-        fields = parts[kind.__name__]["properties"]
-        for field in msgspec.structs.fields(kind):
-            if field.type in _DTYPES:
-                fields[field.encode_name] = {"x-msgpack": "bin", "x-dtype": _DTYPES[field.type]}
-            elif fields[field.encode_name].pop("contentEncoding", None):  # how msgspec writes bytes in JSON
-                fields[field.encode_name] = {"x-msgpack": "bin"}
-            elif isinstance(field.default, float) and isnan(field.default):  # for which JSON has no word
-                del fields[field.encode_name]["default"]
+    parts = _parts(kinds)
     streams = {
         name: {
             "key": row.key,
@@ -61,9 +50,32 @@ def bus_schema() -> bytes:
     return msgspec.json.format(msgspec.json.encode(content), indent=1)
 
 
+def message_schema(kind: type[Message]) -> bytes:
+    """The schema of one message, with its docstring: what its fields mean."""
+    return msgspec.json.encode({"$ref": _REF.format(name=kind.__name__), "$defs": _parts([kind])})
+
+
 def datagrams() -> list[str]:
     """Names of the messages that come as datagrams, which the stream `taken` shows."""
     return sorted({row.message.__name__ for row in STREAMS.values() if row.path is Path.DATAGRAM})
+
+
+def _parts(kinds: Sequence[type[Message]]) -> dict[str, Any]:
+    """Name -> schema of these messages and of what they are made of."""
+    _, parts = msgspec.json.schema_components(kinds, schema_hook=_array, ref_template=_REF)
+    for part in parts.values():
+        # Python 3.13 takes the indentation out of docstrings when it compiles them, earlier ones do not.
+        part["description"] = inspect.cleandoc(part["description"])
+    for kind in kinds:
+        fields = parts[kind.__name__]["properties"]
+        for field in msgspec.structs.fields(kind):
+            if field.type in _DTYPES:
+                fields[field.encode_name] = {"x-msgpack": "bin", "x-dtype": _DTYPES[field.type]}
+            elif fields[field.encode_name].pop("contentEncoding", None):  # how msgspec writes bytes in JSON
+                fields[field.encode_name] = {"x-msgpack": "bin"}
+            elif isinstance(field.default, float) and isnan(field.default):  # for which JSON has no word
+                del fields[field.encode_name]["default"]
+    return parts
 
 
 def _array(kind: type) -> dict[str, Any]:

@@ -9,7 +9,6 @@ and given to the system at once: what is lost with the process is that half seco
 to the cut (`common.mcap_file`).
 """
 
-import inspect
 import io
 import os
 from collections import Counter
@@ -21,12 +20,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Protocol, cast
 
-import msgspec
-import numpy as np
 from mcap.writer import Writer
 
 from common.errors import MessageError, RecordingError
 from common.mcap_file import McapContent, messages_of, read_content
+from common.message_schema import message_schema
 from common.messages import (
     WIRE_VERSION,
     AnyMessage,
@@ -43,7 +41,6 @@ from common.messages import (
 PROFILE = "phalanx"
 _CHUNK_NS = 500_000_000
 _CHUNK_BYTES = 512 << 10
-_ARRAYS = {"type": "string", "description": "Little-endian bytes of the array (msgpack bin)."}
 
 
 class Disk(Protocol):
@@ -173,7 +170,7 @@ class MessageWriter:
 
     def _channel(self, stream: str, name: str, kind: str, type_: type[Message]) -> int:
         if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, "jsonschema", schema_of(type_))
+            self._schemas[kind] = self._writer.register_schema(kind, "jsonschema", message_schema(type_))
         about = {"stream": stream, "name": name}
         return self._writer.register_channel(
             f"phalanx/{stream}/{name}", "msgpack", self._schemas[kind], about
@@ -311,17 +308,3 @@ def sender_of(message: Message) -> str:
     if isinstance(message, Command):
         return message.target
     return cast(str, getattr(message, "camera", None) or getattr(message, "source", ""))
-
-
-def schema_of(kind: type[Message]) -> bytes:
-    """JSON schema of a message, with its docstring: what its fields mean."""
-    content = msgspec.json.schema(kind, schema_hook=_array)
-    for part in content["$defs"].values():
-        part["description"] = inspect.cleandoc(part.get("description", ""))
-    return msgspec.json.encode(content)
-
-
-def _array(kind: type) -> dict[str, str]:
-    if not issubclass(kind, np.ndarray):
-        raise NotImplementedError(f"no schema of {kind}")
-    return _ARRAYS

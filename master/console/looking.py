@@ -1,12 +1,12 @@
 """Asks cameras for their pictures while somebody looks at them, and not a moment longer."""
 
-import json
 import threading
 import time
 from collections.abc import Callable
 
 from common.errors import BusError
 from common.messages import Command, Health
+from common.preview_wish import PreviewWish
 
 LEASE_S = 3.0  # so long a look holds: whoever still looks says so again before
 ASK_EVERY_S = 1.0  # a camera shows itself for 3 s after each request
@@ -46,7 +46,7 @@ class Looking:
 
     def _work(self, camera: str) -> None:
         while (mask := self._mask(camera)) is not None:
-            body = json.dumps({"mask": list(mask), "found": True}) if mask else ""
+            body = PreviewWish(mask=mask, found=True).body() if mask else ""
             try:
                 self._ask(Command(camera, "preview", body), _ANSWER_S)
                 self._errors.pop(camera, None)

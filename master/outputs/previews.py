@@ -2,9 +2,10 @@
 
 import logging
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from common.bus import Bus
+from common.clock import now_ns
 from common.errors import BusError
 from common.messages import Command
 
@@ -14,16 +15,30 @@ TIMEOUT_S = 0.9
 _log = logging.getLogger(__name__)
 
 
-class PreviewAsker:
+class PictureAsker:
     """Asks each camera by a thread of its own: one that is not there keeps no other waiting. Holds the threads."""
 
-    def __init__(self, bus: Bus, cameras: Iterable[str], period_s: float = PERIOD_S) -> None:
-        """Begin to ask `cameras` on `bus`, which must stay open until `close`."""
-        self._bus = bus
-        self._period_s = period_s
+    def __init__(
+        self,
+        bus: Bus,
+        cameras: Iterable[str],
+        verb: str = "preview",
+        period_s: float = PERIOD_S,
+        say: Callable[[str], None] = _log.info,
+    ) -> None:
+        """Begin to ask.
+
+        Args:
+            bus: Must stay open until `close`.
+            cameras: Whom.
+            verb: "preview", which a camera shows for three seconds, or "still", one whole frame.
+            period_s: From one question to the next.
+            say: Told once when a camera does not answer, and again after it was there.
+        """
+        self._bus, self._verb, self._period_s, self._say = bus, verb, period_s, say
         self._closing = threading.Event()
         self._threads = [
-            threading.Thread(target=self._work, args=(camera,), name=f"ask {camera}", daemon=True)
+            threading.Thread(target=self._work, args=(camera,), name=f"{verb} {camera}", daemon=True)
             for camera in cameras
         ]
         for thread in self._threads:
@@ -36,16 +51,17 @@ class PreviewAsker:
             thread.join()
 
     def _work(self, camera: str) -> None:
-        silent = False
-        while not self._closing.is_set():
+        silent, due_ns = False, now_ns()
+        while not self._closing.wait(max(due_ns - now_ns(), 0) * 1e-9):
+            # Never faster than it answers, and no burst after it was away.
+            due_ns = max(due_ns + round(self._period_s * 1e9), now_ns())
             try:
-                self._bus.ask(Command(camera, "preview"), TIMEOUT_S)
+                self._bus.ask(Command(camera, self._verb), TIMEOUT_S)
                 silent = False
             except BusError as error:
-                if not silent and not self._closing.is_set():  # said once, not every two seconds
-                    _log.info("no picture of camera %s yet: %s", camera, error)
+                if not silent and not self._closing.is_set():
+                    self._say(f"no picture of camera {camera} yet: {error}")
                 silent = True
-            self._closing.wait(self._period_s)
 
 
 def jpeg_size(data: bytes) -> tuple[int, int] | None:

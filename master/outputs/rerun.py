@@ -26,7 +26,7 @@ from common.errors import PhalanxError, RecordingError
 from common.messages import Detections, HandPose, Health, Message, Preview, Told
 from common.streams import MASTER
 from master.outputs.poses import Poses
-from master.outputs.previews import PreviewAsker
+from master.outputs.previews import PictureAsker
 from master.outputs.rerun_blueprint import blueprint
 from master.outputs.rerun_process import ViewerProcess
 from master.outputs.rerun_scene import RerunScene
@@ -109,7 +109,7 @@ def run_viewer(
         recording, alive = stack.enter_context(_opened(mode, path, web_port, on_ready))
         recording.send_blueprint(blueprint(setups, live=mode != "save", with_truth=False))
         scene = RerunScene(recording, setups)
-        asker = PreviewAsker(bus, tuple(dict.fromkeys(name for one in setups for name in one.camera_names)))
+        asker = PictureAsker(bus, tuple(dict.fromkeys(name for one in setups for name in one.camera_names)))
         stack.callback(asker.close)
         return _pump(scene, recording, feeds, lambda: alive() and not stop.is_set())
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 from common.bus import Bus, Subscription
 from common.clock import now_ns
-from common.errors import BusError
 from common.messages import Command, Health, Message
 from master.recording.recorder import MessageRecorder
 
@@ -127,34 +126,3 @@ class TapLease:
             # What is on its way comes soon, what is lost stays away.
             self.lost = max(self.lost, min(self._behind))
         return health
-
-
-class StillAsker:
-    """Asks each camera for a whole frame, again and again, by a thread of its own. The bus belongs to the caller."""
-
-    def __init__(self, bus: Bus, cameras: Sequence[str], verb: str, period_s: float) -> None:
-        """Begin: `verb` is "still", or "preview", which a camera shows for three seconds."""
-        self._bus, self._verb, self._period_s = bus, verb, period_s
-        self._closing = threading.Event()
-        self._threads = [
-            threading.Thread(target=self._work, args=(camera,), name=f"{verb} {camera}", daemon=True)
-            for camera in cameras
-        ]
-        for thread in self._threads:
-            thread.start()
-
-    def close(self) -> None:
-        """Ask no more. Safe to call twice."""
-        self._closing.set()
-        for thread in self._threads:
-            thread.join()
-
-    def _work(self, camera: str) -> None:
-        due_ns = now_ns()
-        while not self._closing.wait(max(due_ns - now_ns(), 0) * 1e-9):
-            # Never faster than it answers, and no burst after it was away.
-            due_ns = max(due_ns + round(self._period_s * 1e9), now_ns())
-            try:
-                self._bus.ask(Command(camera, self._verb), _ASK_S)
-            except BusError:
-                continue  # it is not there now; the recording's table shows how much of it there is

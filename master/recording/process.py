@@ -16,7 +16,8 @@ from common.clock import now_ns
 from common.errors import BusError
 from common.messages import Command, Health
 from common.recording import MessageWriter
-from master.recording.feed import Feed, MasterClock, StillAsker, TapLease
+from master.outputs.previews import PictureAsker
+from master.recording.feed import Feed, MasterClock, TapLease
 from master.recording.files import carried_files, rigs_text
 from master.recording.raw import RawAsker, raw_text
 from master.recording.recorder import MessageRecorder, Progress
@@ -170,7 +171,9 @@ class _Run:
                 (self._settings.frames_hz > 0.0, "still", 1.0 / max(self._settings.frames_hz, 1e-3)),
             ):
                 if wanted:
-                    stack.callback(StillAsker(bus, self._cameras, verb, period_s).close)
+                    # Nothing is said of one that is away: the recording's table shows how much of it there is.
+                    asker = PictureAsker(bus, self._cameras, verb, period_s, lambda _line: None)
+                    stack.callback(asker.close)
             self._raw.attach(bus)
             stack.callback(lambda: self._raw.end(bus) if self.over else self._raw.detach())
             self._keep(bus, self._lease)

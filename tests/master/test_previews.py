@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health
-from master.outputs.previews import PreviewAsker, jpeg_size
+from master.outputs.previews import PictureAsker, jpeg_size
 from tests.network_helpers import until
 
 
@@ -34,7 +34,7 @@ class OneDeaf(LoopbackBus):
 
 def test_a_camera_that_keeps_silent_does_not_delay_the_others() -> None:
     bus = OneDeaf()
-    asker = PreviewAsker(bus, ("deaf", "left"), period_s=0.005)
+    asker = PictureAsker(bus, ("deaf", "left"), period_s=0.005)
     try:
         assert until(lambda: bus.asked.count("left") >= 5)
         assert bus.asked.count("deaf") == 1
@@ -48,7 +48,7 @@ def test_a_camera_that_keeps_silent_does_not_delay_the_others() -> None:
 def test_absence_is_said_once_and_again_after_the_camera_was_there(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     bus = LoopbackBus()
-    asker = PreviewAsker(bus, ("left",), period_s=0.005)
+    asker = PictureAsker(bus, ("left",), period_s=0.005)
     answered = threading.Event()
 
     def answer(command: Command) -> Health:
