@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from bench.local_rig import free_port, join_bus
 from bench.udp_relay import UdpRelay
 from common.errors import BusError, PhalanxError
 from common.messages import Checklist, Command, Health
@@ -104,8 +105,8 @@ class Rig:
         (zone / "type").write_text("cpu-thermal\n")
         self.warm(48.0)
         self.disk(9000.0)
-        self._beacon = _free_port(socket.SOCK_DGRAM)
-        self._end = f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+        self._beacon = free_port(socket.SOCK_DGRAM)
+        self._end = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
         self._key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
         self._epoch_ns = time.monotonic_ns() + round(_BEGIN_S * 1e9)
         self.relay = UdpRelay(self._beacon)
@@ -184,7 +185,7 @@ class Rig:
         self._popen("master", ["master", "run", *place, *link], {})
         for name in (*self.cameras, *([] if self.imu is None else [self.imu])):
             self.start_slave(name)
-        self._bus = self._connect()
+        self._bus = join_bus(self._end, UP_S)
         self.lists = Lists(self._bus)
         if not until(lambda: self._tracking(), UP_S):
             raise RehearsalError(f"rig {self._rig}: no poses; logs are in {self._folder}")
@@ -194,16 +195,6 @@ class Rig:
             return self.ask(MASTER, "report").counts.get("poses", 0) > 2 * MARKER_HZ
         except BusError:
             return False
-
-    def _connect(self) -> ZenohBus:
-        deadline = time.monotonic() + UP_S
-        while True:
-            try:
-                return ZenohBus(None, self._end, beyond=True)
-            except BusError:
-                if time.monotonic() > deadline:
-                    raise
-                time.sleep(0.2)
 
     def _popen(self, name: str, command: list[str], environment: Mapping[str, str]) -> None:
         log = (self._folder / f"{name}.log").open("ab")
@@ -262,9 +253,3 @@ def _put(path: Path, text: str) -> None:
     new = path.with_name(path.name + ".new")
     new.write_text(text)
     new.replace(path)
-
-
-def _free_port(kind: int) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])

@@ -21,12 +21,12 @@ from statistics import median
 
 import zenoh
 
+from bench.local_rig import free_port, join_bus
 from bench.row import Row
 from common.errors import BusError
 from common.keys import new_key
 from common.messages import Command, Health
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
 from master.send.sender import NAME as SENDER
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
@@ -93,7 +93,7 @@ class _Run:
         stack.callback(end, self._master)
         sender = self._start("sender", ["-m", "bench.told_sender", str(beacon), "3600", str(RATE_HZ)])
         stack.callback(end, sender)
-        self._bus = self._join()
+        self._bus = join_bus(self._end, READY_S)
         stack.callback(self._bus.close)
 
     def report(self) -> Health:
@@ -175,16 +175,6 @@ class _Run:
             environment = os.environ | {"PHALANX_RIG_KEY": self._key}
             return subprocess.Popen([sys.executable, *command], env=environment, stdout=log, stderr=log)
 
-    def _join(self) -> ZenohBus:
-        until = time.monotonic() + READY_S
-        while True:
-            try:
-                return ZenohBus(None, self._end, beyond=True)
-            except BusError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.3)
-
 
 def cpu_s(pid: int) -> float:
     """Processor time of a process and all its threads since it began [s]."""
@@ -210,13 +200,6 @@ def end(process: subprocess.Popen[bytes]) -> None:
     killer.start()
     process.wait()
     killer.cancel()
-
-
-def free_port(kind: int) -> int:
-    """A port of this machine that nobody has now."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def wait_for_port(port: int) -> None:

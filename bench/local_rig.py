@@ -1,0 +1,30 @@
+"""What rigs of real processes on this machine need: ports that nobody has, and the bus once its master listens."""
+
+import socket
+import time
+
+from common.errors import BusError
+from common.zenoh_bus import ZenohBus
+
+
+def free_port(kind: int) -> int:
+    """A port of 127.0.0.1 that nobody has now, for `socket.SOCK_DGRAM` or `socket.SOCK_STREAM`."""
+    with socket.socket(socket.AF_INET, kind) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def join_bus(endpoint: str, patience_s: float) -> ZenohBus:
+    """Join the bus of a master that is about to listen at `endpoint`.
+
+    Raises:
+        BusError: It did not within `patience_s`.
+    """
+    until = time.monotonic() + patience_s
+    while True:
+        try:
+            return ZenohBus(None, endpoint, beyond=True)
+        except BusError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.2)
