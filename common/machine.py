@@ -11,8 +11,12 @@ lays its own files, with the room of the disk in `disk_free_mb`.
 import contextlib
 import os
 import shutil
+import socket
 from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
 ROOT = "PHALANX_SYSTEM_ROOT"
 HOT_C = 80.0  # from here on a Raspberry Pi lowers its clock (its documentation, "Frequency management")
@@ -22,6 +26,23 @@ _ZONES = "sys/class/thermal"
 _THROTTLED = "sys/devices/platform/soc/soc:firmware/get_throttled"
 _TRIPS = ("passive", "hot", "critical")
 _NOW = 0xF  # bits of what holds now; those above are of what has been since the start
+
+
+class Program(NamedTuple):
+    """Where a program runs and which it is, as `Health` tells it."""
+
+    host: str
+    version: str
+
+
+@cache
+def program() -> Program:
+    """This program on this machine; its version is empty where it was never installed."""
+    try:
+        installed = version("phalanx-hand")
+    except PackageNotFoundError:
+        installed = ""
+    return Program(socket.gethostname()[:64], installed[:64])
 
 
 class Machine:

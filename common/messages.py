@@ -20,7 +20,7 @@ from msgspec import Meta, Struct, field
 from common.arrays import Bool, Code, Float, Ids
 from common.errors import MessageError
 
-WIRE_VERSION = 9
+WIRE_VERSION = 10
 MAX_MARKERS = 48
 MAX_TAGS = 16  # in one frame: their corners fit one Ethernet packet
 JOINT_COUNT = 26
@@ -507,6 +507,8 @@ class Health(Message, frozen=True, eq=False, tag=True):
         t_ns: Moment of the report [ns], clock of the source.
         counts: Event name -> how often (frames, dropped, refused by reason, ...).
         gauges: Quantity name with its unit -> value now (rate_hz, offset_us, ...).
+        host: Name of the machine that the process runs on; empty: not told.
+        version: Of the program; empty: not told.
     """
 
     source: Name
@@ -514,6 +516,8 @@ class Health(Message, frozen=True, eq=False, tag=True):
     t_ns: TimeNs
     counts: Annotated[dict[Name, Count], Meta(max_length=512)]
     gauges: Annotated[dict[Name, Finite], Meta(max_length=512)]
+    host: Annotated[str, Meta(max_length=64)] = ""
+    version: Annotated[str, Meta(max_length=64)] = ""
 
 
 class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 
 from common.clock import Clock
+from common.machine import program
 from common.messages import (
     Contact,
     Detections,
@@ -166,4 +167,5 @@ def health(
     gauges |= {f"camera_hz.{camera}"[:_NAME]: hz for camera, hz in figures.rates.camera_hz.items()}
     gauges |= times or {}
     told = {name: number for name, number in figures.told.items() if number}
-    return Health("master", session, clock.now_ns(), {"poses": figures.poses} | told | counts, gauges)
+    events = {"poses": figures.poses} | told | counts
+    return Health("master", session, clock.now_ns(), events, gauges, *program())

@@ -13,7 +13,7 @@ from typing import Protocol
 from common.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
-from common.machine import Machine
+from common.machine import Machine, program
 from common.messages import Command, Health
 
 PERIOD_S = (
@@ -149,7 +149,7 @@ class Reporter:
         for part in self._parts:
             counts |= part.counts()
         gauges = self._gauges | dict(now or {})
-        return Health(self._name, self._link.session, self._clock.now_ns(), counts, gauges)
+        return Health(self._name, self._link.session, self._clock.now_ns(), counts, gauges, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey a command.

@@ -290,7 +290,7 @@ SAMPLES: tuple[Message, ...] = (
     Gesture("right", 5, "pinch", "index", "begin", 5, 0.9, 0.004, 0.8),
     ImuSample("imu", 1, 2, 3, np.zeros(3), np.ones(3), np.full(3, np.nan), np.array([1.0, 0.0, 0.0, 0.0])),
     sample_pose(),
-    Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}),
+    Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}, "pi-left", "0.1.0"),
     Checklist("master", 1, 2, (CheckItem("camera_absent", "left", "It is not there.", "Start its slave."),)),
     Command("left", "stop"),
     Preview("left", 2, b"\xff\xd8\xff\xe0jpeg"),
