@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo browser api test check format bench instructions schema clean
+.PHONY: help install demo browser emulator hosts-tools api test test-deploy test-nightly check format audit bench soak scale instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -8,6 +8,8 @@ DEMO_SECONDS ?= 30
 DEMO_ARGS ?=
 TEST_ARGS ?=
 BENCH_ARGS ?=
+SOAK_ARGS ?=
+SCALE_ARGS ?=
 INSTRUCTIONS_ARGS ?=
 
 BIN := .venv/bin
@@ -38,8 +40,31 @@ browser: ## a Chromium for the tests of the console's pages; without root it say
 api: $(STAMP) ## the reference of the API from the docstrings, as pages below out/api
 	@$(BIN)/pdoc -o out/api -d google common slave master deploy && echo "open out/api/index.html"
 
-test: check browser ## check, then all tests
+# $(call apt,what for,packages,a command that one of them brings): as root of a Debian; elsewhere it says what is left out.
+define apt
+	@missing=; for tool in $(3); do command -v "$$tool" >/dev/null || missing="$$missing $$tool"; done; \
+	  if [ -n "$$missing" ]; then \
+	  if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+	    echo "installing for $(1): $(2) ..."; \
+	    { apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends $(2); } >/dev/null 2>&1 \
+	      || echo "could not be installed: $(1) will be skipped"; \
+	  else echo "missing:$$missing; $(1) will be skipped (Debian: apt install $(2))"; fi; fi
+endef
+
+emulator: ## what runs aarch64 programs in the tests; without root it says what to install
+	$(call apt,the tests on aarch64,qemu-user mmdebstrap,qemu-aarch64 mmdebstrap)
+
+hosts-tools: emulator ## what the tests with whole machines need; without root it says what to install
+	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump,qemu-system-aarch64 systemd-nspawn rsync ssh ip tcpdump)
+
+test: check browser emulator ## check, then all tests
 	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+
+test-deploy: $(STAMP) hosts-tools ## deploy by ssh to two small machines and an emulated arm64 board; as root, 15 min
+	@$(BIN)/python -m pytest tests/hosts $(TEST_ARGS)
+
+test-nightly: $(STAMP) hosts-tools ## cameras, I2C and a bad network through the kernel's own drivers, in emulation; as root, 20 min
+	@$(BIN)/python -m pytest tests/nightly $(TEST_ARGS)
 
 check: $(STAMP) ## lint, format and strict types
 	@$(BIN)/ruff check
@@ -52,6 +77,15 @@ format: $(STAMP) ## rewrite the layout of all files, and mend what lint can mend
 
 bench: $(STAMP) ## the table of performance, each row against a baseline of the same run
 	@$(BIN)/python -m bench $(BENCH_ARGS)
+
+soak: $(STAMP) ## an hour with both sensors: memory, latency, loss; SOAK_ARGS='--minutes 5' for less
+	@$(BIN)/python -m bench.soak $(SOAK_ARGS)
+
+scale: $(STAMP) ## 2, 4, 8, 16 simulated cameras: cost of each, loss, latency
+	@$(BIN)/python -m bench.scale $(SCALE_ARGS)
+
+audit: $(STAMP) ## known vulnerabilities of everything that is locked; asks the registry's advisories
+	@$(BIN)/python -m pip_audit --requirement constraints.txt --disable-pip --no-deps --progress-spinner off --strict
 
 instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
 	@$(BIN)/python -m bench.aarch64 count $(INSTRUCTIONS_ARGS)

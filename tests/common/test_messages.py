@@ -532,6 +532,7 @@ DEFAULTED = {
     *("wrist_bend_rad", "wrist_bend_sigma_rad"),
     *("heading_sigma_rad", "t_sigma_ns", "exposure_us", "body"),
     *("strength", "angle_rad", "origin_m", "direction"),
+    *("host", "version"),
 }
 
 
