@@ -84,6 +84,8 @@ CheckCode = Literal[
     "disk_full",
     "strobe_slipped",
     "imu_silent",
+    "twin_sender",
+    "version_mismatch",
 ]
 
 

@@ -63,6 +63,12 @@ class Hello(Handshake, frozen=True):
     master_nonce: Nonce
 
 
+class _AnyHello(Struct, frozen=True):
+    """What a hello of any wire version has; unknown fields are left."""
+
+    name: Name
+
+
 class Welcome(Handshake, frozen=True):
     """The master's share of the session's keys, for the hello with this `slave_nonce`."""
 
@@ -108,6 +114,7 @@ _BODIES: Mapping[Kind, type[Handshake]] = {
 }
 _DECODERS = {kind: msgspec.msgpack.Decoder(body) for kind, body in _BODIES.items()}
 _KINDS: Mapping[type[Handshake], Kind] = {body: kind for kind, body in _BODIES.items()}
+_ANY_HELLO = msgspec.msgpack.Decoder(_AnyHello)
 _ENCODER = msgspec.msgpack.Encoder()
 
 
@@ -161,6 +168,14 @@ class RigKeys:
             return Refusal.FORGED
         message = read(header.kind, body)
         return message if isinstance(message, expected) else Refusal.UNDECODABLE
+
+    def name_in(self, header: Header, datagram: bytes) -> str | None:
+        """Return who says a hello of another wire version, if its seal fits; the header is alike in all versions."""
+        body = self.open(header, datagram)
+        try:
+            return None if body is None else _ANY_HELLO.decode(body).name
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return None
 
     def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
         """Return the keys of the session that `hello` and the master's `session_nonce` make."""

@@ -21,6 +21,7 @@ from common.session import Random
 from common.udp import UdpSocket
 from master.link import MasterLink, Taken
 from master.sequence import CameraCounts
+from master.turned_away import Away
 
 QUEUE = 64  # frames, or triples, that may wait
 ROOM = {
@@ -151,6 +152,13 @@ class Ingest:
         """
         with self._lock:
             return self._link.counts_of(sender)
+
+    def turned_away(self) -> tuple[dict[str, Away], dict[str, Away]]:
+        """Sender -> where a second process of its name was turned away lately; and where it speaks another version."""
+        t_ns = self._clock.now_ns()
+        with self._lock:
+            away = self._link.turned_away
+            return away.twins(t_ns), away.versions(t_ns)
 
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """Return how the clock of `camera` runs against this one; None while unknown.

@@ -3,6 +3,9 @@
 Rules that must stay in step with `slave.link` and docs/wire.md:
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
+- A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns. Who was
+  silent for longer is replaced by whoever says hello.
+- A message whose time is yet to come is not taken: the slave's clock was stepped, and the echoes will tell how far.
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
   first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
@@ -23,6 +26,7 @@ from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
 from common.messages import (
+    WIRE_VERSION,
     Detections,
     ImuSample,
     MarkerDetections,
@@ -48,6 +52,7 @@ from common.session import (
     seal,
 )
 from master.sequence import TRIPLE, CameraCounts, Counted, Sequence
+from master.turned_away import TurnedAway
 
 BEACON_NS = 100_000_000
 ECHO_FAST_NS = 10_000_000  # in the first two seconds, and until the clock is settled
@@ -57,6 +62,8 @@ ECHO_NS = 200_000_000
 EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
+WELL_NS = 500_000_000  # a slave heard this recently is well, and twins are refused
+AHEAD_NS = 50_000_000  # no time that a slave tells is further ahead than that and the doubt of its clock
 START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
 START_AGAIN_NS = 50_000_000
 OLD_NONCES = 64
@@ -171,12 +178,15 @@ class MasterLink:
         self._outbox: list[tuple[bytes, Address]] = []
         self.refused: Counter[Refusal] = Counter()
         self.unsynchronised = 0
+        self.turned_away = TurnedAway(self._keys, self._senders)
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> Taken | None:
         """Take one datagram that arrived from `address` at `t_ns`; return what it brought."""
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
             result = header
+            if header is Refusal.VERSION:
+                self.turned_away.other_version(datagram, address[0], t_ns)
         elif header.kind is Kind.HELLO:
             result = self._hear_hello(header, datagram, address, t_ns)
         elif header.kind in (Kind.ECHO_ANSWER, Kind.STARTED, Kind.DATA):
@@ -261,6 +271,10 @@ class MasterLink:
                 return None
         if hello.slave_nonce in sender.old_nonces:
             return Refusal.REPLAYED
+        live = sender.live
+        if live is not None and live.hello.process != hello.process and t_ns - live.heard_ns < WELL_NS:
+            self.turned_away.twin(hello.name, address[0], WIRE_VERSION, t_ns)
+            return Refusal.TWIN
         if sender.pending is not None:  # a newer attempt of the slave, which has given that one up
             sender.old_nonces.append(sender.pending.hello.slave_nonce)
             del self._sessions[sender.pending.key_id]
@@ -298,7 +312,7 @@ class MasterLink:
         if opened.reordered:
             sender.main.sequence.reordered()
         if header.kind is Kind.DATA:
-            return self._take_data(session, sender, opened, header.counter)
+            return self._take_data(session, sender, opened, header.counter, t_ns)
         if opened.reordered:
             sender.fill(header.counter)
         message = read(header.kind, opened.body)
@@ -322,7 +336,7 @@ class MasterLink:
             self._first_ns = t_ns
 
     def _take_data(
-        self, session: _Session, sender: _Sender, opened: Opened, counter: int
+        self, session: _Session, sender: _Sender, opened: Opened, counter: int, now_ns: int
     ) -> Taken | Refusal | None:
         try:
             message = decode(opened.body)
@@ -344,6 +358,9 @@ class MasterLink:
             self.unsynchronised += 1
             return None
         t_ns = clock.to_local(message.t_ns)
+        if t_ns - now_ns > AHEAD_NS + clock.bound_ns:
+            self.unsynchronised += 1
+            return None
         if isinstance(message, ImuSample | TrackerPose):
             return msgspec.structs.replace(message, t_ns=t_ns)
         return msgspec.structs.replace(

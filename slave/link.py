@@ -5,14 +5,18 @@ Rules that must stay in step with `master.link` and docs/wire.md:
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it; the session changes only then.
 - A session that the master's beacons do not list for a second is lost to it: say hello again.
+- Whoever is not welcomed though the beacons list its name has a twin. It goes on saying hello: the master takes it as
+  soon as the other one is silent.
+- To a beacon of its rig in another wire version it says a hello in its own, once a second: the master cannot take it,
+  and can tell who it is.
 """
 
 from collections import Counter
 from dataclasses import dataclass
 
 from common.clock import Clock
-from common.datagram import Address, Header, Kind, Opener, Refusal, Sealer, parse
-from common.messages import Message, encode
+from common.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
+from common.messages import WIRE_VERSION, Message, encode
 from common.session import (
     NONCE_BYTES,
     Beacon,
@@ -34,6 +38,11 @@ VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
 UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
+TWIN_NS = 1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
+STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
+LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
+_TWIN = "the master has another process that is {!r}: two of one name, end one of them"
+_OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
 
 
 @dataclass(slots=True)
@@ -46,6 +55,7 @@ class _Offer:
     address: Address
     heard_ns: int
     next_ns: int
+    since_ns: int
 
 
 @dataclass(slots=True)
@@ -86,7 +96,16 @@ class SlaveLink:
         self._session: _Session | None = None
         self._offer: _Offer | None = None
         self._outbox: list[tuple[bytes, Address]] = []
+        self._next_strange_ns: int | None = None
+        self._wrong: tuple[int, str] | None = None
         self.refused: Counter[Refusal] = Counter()
+
+    @property
+    def wrong(self) -> str | None:
+        """Why no master takes this slave, where that is known: a twin, another wire version."""
+        if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < LATELY_NS:
+            return None
+        return self._wrong[1]
 
     @property
     def started(self) -> bool:
@@ -137,7 +156,12 @@ class SlaveLink:
         """Return the datagrams to send now, each with its destination."""
         t_ns = self._clock.now_ns()
         offer = self._offer
-        if offer is not None and t_ns - offer.heard_ns < OFFER_NS and t_ns >= offer.next_ns:
+        # A clock that was set back is no reason to be silent until it is there again.
+        if (
+            offer is not None
+            and t_ns - offer.heard_ns < OFFER_NS
+            and not 0 < offer.next_ns - t_ns <= HELLO_AGAIN_NS
+        ):
             self._say_hello(offer, t_ns)
         outbox, self._outbox = self._outbox, []
         return outbox
@@ -149,6 +173,8 @@ class SlaveLink:
     def _hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         header = parse(datagram, self._keys.rig_tag)
         if isinstance(header, Refusal):
+            if header is Refusal.VERSION:
+                self._answer_stranger(datagram, address, t_ns)
             return header
         if header.kind is not Kind.BEACON:
             return Refusal.UNEXPECTED
@@ -167,12 +193,38 @@ class SlaveLink:
             elif t_ns - session.heard_ns < WELL_NS:
                 return Refusal.RIVAL
         self._answer(beacon, header.counter, address, t_ns)
-        return None
+        return self._has_twin(beacon, t_ns)
 
     def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
-        nonce = self._random(NONCE_BYTES) if self._offer is None else self._offer.slave_nonce
-        self._offer = _Offer(nonce, beacon, counter, address, heard_ns=t_ns, next_ns=t_ns)
+        old, since_ns = self._offer, t_ns
+        if old is not None and old.beacon.master_nonce == beacon.master_nonce and t_ns - old.heard_ns < OFFER_NS:
+            since_ns = old.since_ns
+        nonce = self._random(NONCE_BYTES) if old is None else old.slave_nonce
+        self._offer = _Offer(nonce, beacon, counter, address, heard_ns=t_ns, next_ns=t_ns, since_ns=since_ns)
         self._say_hello(self._offer, t_ns)
+
+    def _has_twin(self, beacon: Beacon, t_ns: int) -> Refusal | None:
+        """Whether the master says no more than that it has somebody of this name already."""
+        listed = beacon.sessions.get(self._name)
+        ours = None if self._session is None else self._session.key_id
+        if self._offer is None or listed in (None, ours) or not t_ns - self._offer.since_ns >= TWIN_NS:
+            return None
+        self._wrong = t_ns, _TWIN.format(self._name)
+        return Refusal.TWIN
+
+    def _answer_stranger(self, datagram: bytes, address: Address, t_ns: int) -> None:
+        """Say who we are to a master of this rig that cannot understand us; its word is not proven, so seldom."""
+        if len(datagram) < OVERHEAD:
+            return
+        _, version, kind, _, rig, _, _ = HEADER.unpack_from(datagram)
+        if kind != Kind.BEACON or rig != self._keys.rig_tag:
+            return
+        if self._next_strange_ns is not None and 0 < self._next_strange_ns - t_ns <= STRANGE_NS:
+            return
+        self._next_strange_ns = t_ns + STRANGE_NS
+        self._wrong = t_ns, _OTHER_VERSION.format(address[0], version, WIRE_VERSION)
+        hello = Hello(self._name, self.process, self._random(NONCE_BYTES), bytes(NONCE_BYTES))
+        self._outbox.append((seal(self._sealer, hello), address))
 
     def _say_hello(self, offer: _Offer, t_ns: int) -> None:
         offer.next_ns = t_ns + HELLO_AGAIN_NS

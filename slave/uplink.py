@@ -96,6 +96,12 @@ class Uplink:
             return self._link.zenoh_endpoint
 
     @property
+    def wrong(self) -> str | None:
+        """Why no master takes this slave, where that is known: a twin, another wire version."""
+        with self._lock:
+            return self._link.wrong
+
+    @property
     def counts(self) -> dict[str, int]:
         """Event -> how often: sent, unsent (no start), would_block, send_failed, refused.<reason>."""
         with self._lock:
@@ -140,11 +146,12 @@ class Uplink:
         self._data.close()
 
     def _hear(self, source: UdpSocket, take: Callable[[bytes, Address, int], None]) -> None:
+        said: str | None = None
         while not self._closing.is_set():
             arrived = source.receive()
             t_ns = self._clock.now_ns()
             with self._lock:
-                endpoint = self._link.zenoh_endpoint
+                endpoint, wrong = self._link.zenoh_endpoint, self._link.wrong
                 if arrived is not None:
                     take(*arrived, t_ns)
                 for datagram, address in self._link.due():
@@ -152,6 +159,9 @@ class Uplink:
                 changed = self._link.zenoh_endpoint != endpoint
             if changed:
                 _LOG.info("session with the master whose bus is %s", self._link.zenoh_endpoint)
+            if source is self._beacons and wrong != said and wrong is not None:
+                _LOG.warning("%s", wrong)
+            said = wrong
 
 
 def _hosts(bind: str) -> tuple[str, str]:

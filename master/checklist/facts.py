@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
 from master.rig import RigSetup
+from master.turned_away import Away
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +50,16 @@ class SenderNow:
         connected: Heard within the last second.
         received, missed: Messages that were taken, and that were sent and could not be (lost, or too late), so far.
         clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
+        twin: Where a second process under its name was turned away lately; None: there was none.
+        stranger: Where it speaks another wire version, and which; None: it does not.
     """
 
     connected: bool
     received: int
     missed: int
     clock_sigma_ns: float | None
+    twin: Away | None = None
+    stranger: Away | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from master.checklist.files import FileWatch
 from master.checklist.watch import ChecklistWatch
 from master.rig import RigSetup
 from master.sequence import CameraCounts
+from master.turned_away import Away
 
 LOOK_S = 0.2
 EVERY_NS = 1_000_000_000  # and at once where it changes
@@ -43,6 +44,10 @@ class Heard(Protocol):
 
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """How its clock runs."""
+        ...
+
+    def turned_away(self) -> tuple[Mapping[str, Away], Mapping[str, Away]]:
+        """Sender -> where a second process of its name was turned away lately; and where it speaks another version."""
         ...
 
 
@@ -125,13 +130,15 @@ class ChecklistFeed:
 
     def _now(self, t_ns: int) -> MasterNow:
         connected = self._heard.connected
+        twins, strangers = self._heard.turned_away()
         names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
         senders: dict[str, SenderNow] = {}
         for name in names:
             counts, clock = self._heard.counts_of(name), self._heard.clock_of(name)
             sigma_ns = None if clock is None else clock.sigma_at(t_ns)
             missed = counts.lost + counts.late
-            senders[name] = SenderNow(name in connected, counts.received, missed, sigma_ns)
+            away = twins.get(name), strangers.get(name)
+            senders[name] = SenderNow(name in connected, counts.received, missed, sigma_ns, *away)
         groups = [
             line.counts
             for setup, line in zip(self._setups, self._pipelines, strict=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from common.messages import WIRE_VERSION
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow, Verdict, beyond
 from master.checklist.said import Said
 from master.checklist.window import Window
@@ -78,13 +79,35 @@ class LinkRules:
                 yield self._camera_absent(camera, sender, said.get(camera.name), t_ns)
                 yield self._slow(camera, said.get(camera.name), t_ns)
                 yield from self._way(camera.name, sender, t_ns)
+                yield from self._turned_away(camera.name, sender)
         for name in plan.imus:
             sender = now.senders.get(name)
             if sender is not None:
                 yield self._imu_silent(name, sender, t_ns)
                 yield from self._way(name, sender, t_ns)
+                yield from self._turned_away(name, sender)
         if now.disk_free_mb is not None:
             yield disk_verdict("master", now.disk_free_mb)
+
+    def _turned_away(self, name: str, sender: SenderNow) -> Iterator[Verdict]:
+        """Who says that it is `name` and is not taken."""
+        twin, stranger = sender.twin, sender.stranger
+        host = None if twin is None else twin.host
+        yield Verdict(
+            "twin_sender",
+            name,
+            twin is not None,
+            f"Two processes say that they are {name}; the one at {host} is not taken while the other is well.",
+            "End one of them, or give it its own name (--name) and files.",
+        )
+        host, version = (None, None) if stranger is None else stranger
+        yield Verdict(
+            "version_mismatch",
+            name,
+            stranger is not None,
+            f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
+            "Install the same version of Phalanx on both, for example by phalanx deploy.",
+        )
 
     def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether it is not heard: at once where it was there, after a grace where it never was."""

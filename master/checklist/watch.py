@@ -32,7 +32,8 @@ _ABSENT: frozenset[CheckCode] = frozenset(("camera_absent", "imu_silent"))
 _COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_range"))
 _LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
 _MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
-_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT
+_NOT_TAKEN: frozenset[CheckCode] = frozenset(("twin_sender", "version_mismatch"))
+_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN
 # Cause -> what is not told of the same camera, its markers, or a group with it in it.
 _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "camera_absent": _OF_SENDER,
@@ -45,6 +46,7 @@ _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "clock_unsynchronised": _MOVED,
     "strobe_slipped": frozenset[CheckCode](("rate_low",)),
     "too_hot": frozenset[CheckCode](("rate_low",)),
+    "version_mismatch": _ABSENT,
 }
 
 

@@ -9,6 +9,7 @@ from common.messages import CheckItem
 from master.checklist.facts import Verdict
 from master.checklist.moved_rule import MovedRule
 from master.checklist.watch import CODES
+from master.turned_away import Away
 from tests.master.checklist.checked import MARKERS, Bench
 
 WITHIN_S = 2.0
@@ -55,6 +56,17 @@ def _apart(share: float) -> Callable[[Bench], object]:
 
 def _disk(free_mb: float) -> Callable[[Bench], object]:
     return lambda bench: setattr(bench, "disk_mb", free_mb)
+
+
+def _stranger(bench: Bench) -> None:
+    """Who speaks another version has no session: it is away, too."""
+    bench.stranger["right"] = Away("10.0.0.8", 9)
+    bench.away.add("right")
+
+
+def _as_ours(bench: Bench) -> None:
+    bench.stranger.clear()
+    bench.away.clear()
 
 
 def _files(*items: CheckItem) -> Callable[[Bench], object]:
@@ -214,6 +226,22 @@ CASES = [
         lambda b: b.away.clear(),
         "not heard any more",
         "phalanx-slave imu",
+    ),
+    Case(
+        "twin_sender",
+        "left",
+        _set("twin", "left", Away("10.0.0.7", 10)),
+        _set("twin", "left", None),
+        "the one at 10.0.0.7 is not taken",
+        "--name",
+    ),
+    Case(
+        "version_mismatch",
+        "right",
+        _stranger,
+        _as_ours,
+        "right at 10.0.0.8 speaks wire version 9",
+        "Install the same version",
     ),
 ]
 

@@ -1,0 +1,60 @@
+"""Who was turned away lately, by name: second processes under one name, and slaves of another wire version.
+
+A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
+the rig, and forgotten `LATELY_NS` after the last time.
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from common.datagram import HEADER, MAGIC, Header, Kind
+from common.session import RigKeys
+
+LATELY_NS = 1_500_000_000  # both say hello again within a second
+_LOOK_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
+
+
+class Away(NamedTuple):
+    """Where somebody who was turned away speaks from: host, and what wire version."""
+
+    host: str
+    version: int
+
+
+class TurnedAway:
+    """Push machine. Holds of each sender of the rig when it was last turned away, and from where."""
+
+    def __init__(self, keys: RigKeys, names: Iterable[str]) -> None:
+        """Nobody was, yet; `names` are those of the rig."""
+        self._keys, self._names = keys, frozenset(names)
+        self._twins: dict[str, tuple[int, Away]] = {}
+        self._versions: dict[str, tuple[int, Away]] = {}
+        self._next_ns: int | None = None
+
+    def twin(self, name: str, host: str, version: int, t_ns: int) -> None:
+        """A second process under `name` said hello at `t_ns` [ns] while the first one was well."""
+        self._twins[name] = t_ns, Away(host, version)
+
+    def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
+        """Take a datagram of another wire version; what is no hello of this rig, rightly sealed, is left."""
+        if len(datagram) < HEADER.size or (self._next_ns is not None and t_ns < self._next_ns):
+            return
+        magic, version, kind, _, rig, key_id, counter = HEADER.unpack_from(datagram)
+        if magic != MAGIC or kind != Kind.HELLO or rig != self._keys.rig_tag:
+            return
+        self._next_ns = t_ns + _LOOK_NS
+        name = self._keys.name_in(Header(Kind.HELLO, key_id, counter), datagram)
+        if name in self._names:
+            self._versions[name] = t_ns, Away(host, version)
+
+    def twins(self, t_ns: int) -> dict[str, Away]:
+        """Name -> where its second process is, as of `t_ns` [ns]."""
+        return _lately(self._twins, t_ns)
+
+    def versions(self, t_ns: int) -> dict[str, Away]:
+        """Name -> where it is and what it speaks, as of `t_ns` [ns]."""
+        return _lately(self._versions, t_ns)
+
+
+def _lately(seen: dict[str, tuple[int, Away]], t_ns: int) -> dict[str, Away]:
+    return {name: away for name, (seen_ns, away) in seen.items() if t_ns - seen_ns < LATELY_NS}
