@@ -1,0 +1,82 @@
+"""Debian 13 as a folder, made once by mmdebstrap: systemd, sshd, Python and rsync as Raspberry Pi OS has them."""
+
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
+PACKAGES = (
+    *("systemd", "systemd-sysv", "dbus", "iproute2", "procps", "sudo"),
+    *("openssh-server", "rsync", "chrony", "python3", "python3-venv", "libgomp1"),
+)
+# The tool, and the Debian package that brings it.
+TOOLS = {
+    "mmdebstrap": "mmdebstrap",
+    "systemd-nspawn": "systemd-container",
+    "ip": "iproute2",
+    "rsync": "rsync",
+    "ssh": "openssh-client",
+    "ssh-keygen": "openssh-client",
+    "tcpdump": "tcpdump",
+}
+ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64"}
+
+
+def why_not() -> str | None:
+    """What keeps this machine from running hosts, and the way out of it; None: nothing."""
+    if os.geteuid() != 0:
+        return "needs root: whole machines are started by systemd-nspawn on a bridge (sudo make test-deploy)"
+    if absent := sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None}):
+        return f"missing here: {', '.join(absent)} (Debian: apt install {' '.join(absent)})"
+    if control_groups() is None:
+        return "needs control groups of version 2 (mount -t cgroup2)"
+    return None if platform.machine() in ARCHITECTURES else f"no Debian for {platform.machine()} known here"
+
+
+def control_groups() -> Path | None:
+    """Folder of the control groups of version 2, if there is one."""
+    for line in Path("/proc/mounts").read_text().splitlines():
+        if (fields := line.split())[2] == "cgroup2":
+            return Path(fields[1])
+    return None
+
+
+def root_tree() -> Path:
+    """Folder with a Debian that nothing was changed in; made if it is not there (half a minute, 75 MB to load).
+
+    It is below PHALANX_CACHE, by default ~/.cache/phalanx.
+
+    Raises:
+        RuntimeError: mmdebstrap failed; its own words.
+    """
+    usual = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
+    cache = Path(os.environ.get("PHALANX_CACHE", usual)) / "hosts"
+    architecture = ARCHITECTURES[platform.machine()]
+    recipe = hashlib.sha256(f"{SUITE} {PACKAGES} {MIRROR}".encode()).hexdigest()[:12]
+    place = cache / f"{SUITE}-{architecture}-{recipe}"
+    if place.is_dir():
+        return place
+    cache.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=cache, prefix="unfinished-") as unfinished:
+        folder = Path(unfinished) / "root"
+        command = [
+            "mmdebstrap",
+            "--quiet",
+            "--variant=minbase",
+            f"--arch={architecture}",
+            "--format=directory",
+        ]
+        what = [f"--include={','.join(PACKAGES)}", "--skip=check/empty", SUITE, str(folder), MIRROR]
+        made = subprocess.run([*command, *what], capture_output=True, text=True, check=False)
+        if made.returncode != 0:
+            raise RuntimeError(f"mmdebstrap failed:\n{made.stderr[-2000:]}")
+        try:
+            folder.rename(place)
+        except OSError:
+            if not place.is_dir():  # else another run was faster, and made the same
+                raise
+    return place

@@ -1,0 +1,102 @@
+"""Two hosts on one bridge, and the machine that runs the tests as the PC beside them."""
+
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+from types import TracebackType
+
+from tests.hosts.debian import root_tree
+from tests.hosts.host import Host
+from tests.hosts.tap import Tap
+from tests.hosts.undo import Undo
+
+USERS = {"left": "pi", "right": "root"}  # with sudo as on Raspberry Pi OS, and without
+MASTER_PORT = 47801
+
+
+class Fleet:
+    """Hosts `left` and `right`, started; holds the bridge between them and takes all of it back on leaving."""
+
+    def __init__(self) -> None:
+        """Make bridge, keys of ssh and hosts, and boot them.
+
+        Raises:
+            RuntimeError: A command failed; its own words.
+        """
+        base = root_tree()
+        self.undo = Undo()
+        self.folder = Path(tempfile.mkdtemp(prefix="phalanx-hosts-"))
+        self.undo.later("remove folder", str(self.folder))
+        self.boot_s: dict[str, float] = {}
+        try:
+            self._connect(base)
+        except BaseException:
+            self.undo.now()
+            raise
+
+    def _connect(self, base: Path) -> None:
+        number = os.getpid() % 250 + 1  # runs beside one another have networks of their own
+        self.network, self.bridge = f"10.173.{number}", f"phx{number}"
+        self.address, self.broadcast = f"{self.network}.1", f"{self.network}.255"
+        self.undo.later("delete link", self.bridge)
+        _ip(f"link add {self.bridge} type bridge")
+        _ip(f"addr add {self.address}/24 broadcast {self.broadcast} dev {self.bridge}")
+        _ip(f"link set {self.bridge} up")
+        self.tap = Tap(self.bridge, MASTER_PORT)
+        public_key = self._ssh_files(base)
+        self.hosts = {name: self._host(name, 11 + i, user) for i, (name, user) in enumerate(USERS.items())}
+        for host in self.hosts.values():
+            host.make_disk(base, public_key)
+        for host in self.hosts.values():
+            self.boot_s[host.name] = host.boot()
+
+    def _host(self, name: str, number: int, user: str) -> Host:
+        machine = f"{self.bridge}-{name}"
+        ssh = ("-F", str(self.folder / "ssh_config"))
+        address = f"{self.network}.{number}"
+        return Host(name, machine, address, user, self.folder / name, self.bridge, ssh, self.undo)
+
+    def _ssh_files(self, base: Path) -> str:
+        """Keys for this run, and what the hosts' own are: ssh asks nothing and trusts nobody else."""
+        key = self.folder / "id"
+        subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
+        of_hosts = (base / "etc/ssh/ssh_host_ed25519_key.pub").read_text()
+        (self.folder / "known_hosts").write_text(f"{self.network}.* {of_hosts}")
+        (self.folder / "ssh_config").write_text(
+            f"IdentityFile {key}\nIdentitiesOnly yes\nUserKnownHostsFile {self.folder}/known_hosts\n"
+            "StrictHostKeyChecking yes\nBatchMode yes\nConnectTimeout 5\nLogLevel ERROR\n"
+        )
+        self.path = self.folder / "bin"
+        self.path.mkdir()
+        real = shutil.which("ssh")
+        (self.path / "ssh").write_text(f'#!/bin/sh\nexec {real} -F {self.folder}/ssh_config "$@"\n')
+        (self.path / "ssh").chmod(0o755)
+        return key.with_suffix(".pub").read_text()
+
+    def environment(self) -> dict[str, str]:
+        """Of a command in which `ssh` knows the hosts of this run, as a user's ~/.ssh/config would say."""
+        return os.environ | {"PATH": f"{self.path}:{os.environ['PATH']}"}
+
+    def set_link(self, host: Host, up: bool) -> None:
+        """Pull or plug the cable of a host."""
+        _ip(f"link set {host.link} {'up' if up else 'down'}")
+
+    def __enter__(self) -> "Fleet":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Everything as it was before."""
+        self.tap.close()
+        for host in self.hosts.values():
+            host.cut_power()
+        self.undo.now()
+
+
+def _ip(arguments: str) -> None:
+    done = subprocess.run(["ip", *arguments.split()], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise RuntimeError(f"ip {arguments}: {done.stderr.strip()}")
