@@ -1,9 +1,12 @@
-"""The console as a program: its pages, the shell around them, and the server on 127.0.0.1."""
+"""The console as a program: its pages, the shell around them, and the server, with what guards it."""
 
+import os
 import socket
+import ssl
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import uvicorn
 from fastapi import FastAPI
@@ -11,11 +14,15 @@ from nicegui import ui
 
 from common.errors import PhalanxError
 from master.console.guard import OwnPagesOnly, names_of
+from master.console.login import PasswordHash, kept_password, password_from
+from master.console.login_page import LoginRequired
+from master.console.neighbours import same_user
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
 from master.console.setup import page as setup_page
 from master.console.shell import Entry, shell
 from master.console.sockets import serve_sockets
 from master.console.state import ConsoleSettings, ConsoleState
+from master.listening import is_loopback, page_certificate, private_folder
 
 TITLE = "Phalanx"
 _AWAY_S = 30.0  # a page that was not heard for so long, as on a busy machine, goes on where it was
@@ -48,13 +55,13 @@ def start_page(state: ConsoleState) -> str:
     return PAGES[0].route if state.rigs() else "/setup"
 
 
-def register(state: ConsoleState) -> None:
-    """Make every page known to NiceGUI. Once in a process."""
+def register(state: ConsoleState, logout: bool = False) -> None:
+    """Make every page known to NiceGUI, with a button that logs out where there is a login. Once in a process."""
     entries = tuple(Entry(page.route, page.title, page.icon) for page in PAGES)
 
     def add(page: Page) -> None:
         def show() -> None:
-            with shell(state, entries, page.route):
+            with shell(state, entries, page.route, logout=logout):
                 page.build(state)
 
         ui.page(page.route, title=f"{page.title} · {TITLE}", response_timeout=20.0)(show)
@@ -67,20 +74,66 @@ def register(state: ConsoleState) -> None:
         ui.navigate.to(start_page(state))
 
 
+@dataclass(frozen=True, slots=True)
+class Door:
+    """What stands before the pages.
+
+    Attributes:
+        password: Who knows it may come in; None: whoever is the same user of this machine.
+        tls: Encrypts; None: plain.
+    """
+
+    password: PasswordHash | None = None
+    tls: ssl.SSLContext | None = None
+
+
+def door_of(settings: ConsoleSettings, folder: Path, say: Callable[[str], None]) -> Door:
+    """The door of a console: none on this machine alone; elsewhere a password, and TLS unless it is to be open.
+
+    Args:
+        settings: How the console was started.
+        folder: Where password and certificate are kept.
+        say: Told the password when it is made, and how to know the certificate.
+
+    Raises:
+        PhalanxError: A file of the password or of the certificate cannot be used.
+    """
+    here = is_loopback(settings.host)
+    if settings.password_file is not None:
+        password = password_from(settings.password_file)
+    else:
+        password = None if here else kept_password(folder, say)
+    if here:
+        return Door(password)
+    if settings.open_links:
+        say(
+            "console: WARNING: --open: the page is not encrypted; whoever listens to the network reads the password"
+        )
+        return Door(password)
+    certificate = page_certificate(folder, settings.host)
+    say(
+        "console: the browser asks once whether to trust this page: compare what it shows with SHA-256"
+        f" {certificate.fingerprint}"
+    )
+    return Door(password, certificate.context)
+
+
 def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[[str], None]) -> None:
     """Serve the console until `stop` is set.
 
     Raises:
-        PhalanxError: The address cannot be bound.
+        PhalanxError: The address cannot be bound, or its password or certificate cannot be used.
     """
+    door = door_of(settings, private_folder(os.environ), say)
     listening = _listen(settings.host, settings.port)
     host, port = listening.getsockname()[:2]
     state = ConsoleState(settings)
     try:
-        register(state)
-        server = _server(state, settings)
+        register(state, logout=door.password is not None)
+        server = _server(console_app(state, settings.host, port, door), door)
         threading.Thread(target=_end_with, args=(stop, server), name="console stop", daemon=True).start()
-        say(f"console: http://{f'[{host}]' if ':' in host else host}:{port}/")
+        scheme = "http" if door.tls is None else "https"
+        say(f"console: {scheme}://{f'[{host}]' if ':' in host else host}:{port}/")
         server.run(sockets=[listening])
     finally:
         stop.set()
@@ -88,9 +141,9 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[
         listening.close()
 
 
-def _server(state: ConsoleState, settings: ConsoleSettings) -> uvicorn.Server:
+def console_app(state: ConsoleState, host: str, port: int, door: Door) -> FastAPI:
+    """All that the console serves, behind its guards: own pages only, then the login (or: the same user)."""
     app = FastAPI(openapi_url=None)
-    app.add_middleware(OwnPagesOnly, allowed=names_of(settings.host))
     serve_sockets(app, state)
     ui.run_with(
         app,
@@ -101,9 +154,30 @@ def _server(state: ConsoleState, settings: ConsoleSettings) -> uvicorn.Server:
         show_welcome_message=False,
         reconnect_timeout=_AWAY_S,
     )
+    if door.password is not None:
+        app.add_middleware(
+            LoginRequired,
+            password=door.password,
+            cookie=f"phalanx-{port}",
+            secure=door.tls is not None,
+            pages=[page.route for page in PAGES],
+        )
+    neighbours = same_user if door.password is None else None
+    app.add_middleware(OwnPagesOnly, allowed=names_of(host), same_user=neighbours)  # the outermost
+    return app
+
+
+def _server(app: FastAPI, door: Door) -> uvicorn.Server:
     config = uvicorn.Config(
-        app, log_level="warning", timeout_graceful_shutdown=_LEAVE_S, access_log=False, lifespan="on"
+        app,
+        log_level="warning",
+        timeout_graceful_shutdown=_LEAVE_S,
+        access_log=False,
+        lifespan="on",
+        proxy_headers=False,  # who asks is who is connected, whatever a header says
     )
+    config.load()
+    config.ssl = door.tls
     return uvicorn.Server(config)
 
 

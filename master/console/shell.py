@@ -7,6 +7,7 @@ from pathlib import Path
 
 from nicegui import ui
 
+from master.console.login_page import LOGOUT
 from master.console.state import ConsoleState
 
 _UPDATE_S = 1.0
@@ -26,8 +27,8 @@ class Entry:
 
 
 @contextmanager
-def shell(state: ConsoleState, entries: Sequence[Entry], here: str) -> Generator[None]:
-    """Build header and navigation; what is built within stands in the middle of the page."""
+def shell(state: ConsoleState, entries: Sequence[Entry], here: str, logout: bool = False) -> Generator[None]:
+    """Build header and navigation, and a way to log out; what is built within stands in the middle of the page."""
     ui.add_css(_STYLE)
     ui.colors(primary=_PRIMARY)
     with ui.header(elevated=False).classes("console-header items-center gap-2 q-px-md"):
@@ -39,6 +40,8 @@ def shell(state: ConsoleState, entries: Sequence[Entry], here: str) -> Generator
         _connection(state)
         _badge(state)
         _theme()
+        if logout:
+            _logout()
     with ui.element("div").classes("console-main") as main:
         yield
     # What is pressed before the page is connected may be lost with a reload: it cannot be pressed until then.
@@ -90,6 +93,15 @@ def _badge(state: ConsoleState) -> None:
 
     update()
     ui.timer(_UPDATE_S, update)
+
+
+def _logout() -> None:
+    with ui.element("form").props(f'method="post" action="{LOGOUT}"'):
+        button = ui.button(icon="logout").props(
+            'flat round dense color=inherit type="submit" aria-label="Log out"'
+        )
+        with button.classes("console-theme"):
+            ui.tooltip("log out")
 
 
 def _theme() -> None:

@@ -49,6 +49,8 @@ class ConsoleSettings:
         beacon, bind: ADDRESS:PORT for slaves and data, of the processes that the page starts.
         key: Rig key, for these processes; None: none was given.
         port, host: Where the page is served; port 0: a free one.
+        password_file: Asks for the password in it; None: elsewhere than on this machine one is made.
+        open_links: The page may be plain where other machines reach it.
     """
 
     calibration: Path
@@ -59,6 +61,8 @@ class ConsoleSettings:
     key: bytes | None = None
     port: int = 8080
     host: str = "127.0.0.1"
+    password_file: Path | None = None
+    open_links: bool = False
 
 
 class Newest(Generic[MessageT]):

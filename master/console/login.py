@@ -1,0 +1,131 @@
+"""The console's password: made or read at the start, kept as its scrypt hash, compared in constant time.
+
+It is needed wherever the page can be reached from another machine (docs/security.md). scrypt is slow and takes memory
+on purpose: who steals the file of the hash tries a dozen passwords a second, not millions.
+"""
+
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from common.errors import PhalanxError
+
+HASH_FILE = "console.password"
+LEAST_CHARACTERS = 12
+MOST_BYTES = 1024
+_ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 that are not taken for one another: 5 bits each
+_GROUPS, _GROUP = 4, 5  # 100 bits
+_N, _R, _P, _BYTES = 2**15, 8, 1, 32  # 32 MiB and about 0.1 s
+_MOST_N = 2**20
+_OWNER_ONLY = 0o600
+
+
+@dataclass(frozen=True, slots=True)
+class PasswordHash:
+    """What is kept of a password: `scrypt`, its cost n, r, p, salt and hash."""
+
+    n: int
+    r: int
+    p: int
+    salt: bytes
+    digest: bytes
+
+    @classmethod
+    def of(cls, password: str, n: int = _N) -> "PasswordHash":
+        """Hash a password with a salt of its own; n is the cost, a power of two."""
+        salt = secrets.token_bytes(16)
+        return cls(n, _R, _P, salt, _scrypt(password, salt, n, _R, _P))
+
+    @classmethod
+    def parse(cls, text: str, where: str) -> "PasswordHash":
+        """Read what `text` wrote.
+
+        Raises:
+            PhalanxError: It is something else.
+        """
+        try:
+            kind, n, r, p, salt, digest = text.strip().split("$")
+            found = cls(int(n), int(r), int(p), bytes.fromhex(salt), bytes.fromhex(digest))
+        except ValueError as error:
+            raise PhalanxError(
+                f"{where}: not the hash of a password; delete it, and a new one is made"
+            ) from error
+        if kind != "scrypt" or not 2 <= found.n <= _MOST_N or len(found.digest) != _BYTES:
+            raise PhalanxError(f"{where}: not the hash of a password; delete it, and a new one is made")
+        return found
+
+    def text(self) -> str:
+        """One line for a file."""
+        return f"scrypt${self.n}${self.r}${self.p}${self.salt.hex()}${self.digest.hex()}\n"
+
+    def fits(self, password: str) -> bool:
+        """Whether this is the password; takes as long for a wrong one."""
+        return hmac.compare_digest(_scrypt(password, self.salt, self.n, self.r, self.p), self.digest)
+
+
+def new_password() -> str:
+    """A password of 100 random bits, in groups that can be read aloud."""
+    return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(_GROUP)) for _ in range(_GROUPS))
+
+
+def password_from(file: Path) -> PasswordHash:
+    """Of the password that stands in the first line of a file.
+
+    Raises:
+        PhalanxError: It cannot be read, others can read it, or the password is too short.
+    """
+    text = _private_text(file)
+    password = text.splitlines()[0].strip() if text.strip() else ""
+    if len(password) < LEAST_CHARACTERS:
+        raise PhalanxError(
+            f"{file}: the password needs at least {LEAST_CHARACTERS} characters in the first line"
+        )
+    return PasswordHash.of(password)
+
+
+def kept_password(folder: Path, say: Callable[[str], None]) -> PasswordHash:
+    """Of the password whose hash is kept in a folder; at the first start it is made, and said this once.
+
+    Raises:
+        PhalanxError: The file is there and cannot be used, or it cannot be written.
+    """
+    path = folder / HASH_FILE
+    if path.exists():
+        say(
+            f"console: the password is the one that was said when {path} was made; forgotten: delete that file"
+        )
+        return PasswordHash.parse(_private_text(path), str(path))
+    password = new_password()
+    kept = PasswordHash.of(password)
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _OWNER_ONLY)
+        with os.fdopen(handle, "w", encoding="ascii") as file:
+            file.write(kept.text())
+    except OSError as error:
+        raise PhalanxError(f"{path}: cannot keep the password: {error.strerror}") from error
+    say(f"console: the password is {password}   (said only now; its hash is kept in {path})")
+    return kept
+
+
+def _private_text(path: Path) -> str:
+    try:
+        mode = path.stat().st_mode
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES)
+        text = data.decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise PhalanxError(f"{path}: cannot read the password: {error}") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PhalanxError(f"{path}: others can read the password; run: chmod 600 {path}")
+    return text
+
+
+def _scrypt(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:
+    memory = 2 * 128 * n * r  # what it needs, twice: OpenSSL counts a little more than that
+    return hashlib.scrypt(password.encode(), salt=salt, n=n, r=r, p=p, dklen=_BYTES, maxmem=memory)

@@ -1,0 +1,147 @@
+"""Pages that other machines may open: encrypted by a certificate of this machine's own, or plain where it is said.
+
+The certificate signs itself. It is not of the rig's authority on purpose: a certificate of that may be shown by whoever
+listens only to be the master (docs/security.md), and nobody should have to trust a rig's authority in his browser.
+The browser asks once; what it shows is compared with the fingerprint that is printed at the start.
+"""
+
+import os
+import socket
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from ipaddress import ip_address
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from common.errors import PhalanxError
+
+OPEN = "PHALANX_OPEN"
+LIFE = timedelta(days=397)  # browsers refuse a longer life
+_RENEW_BEFORE = timedelta(days=14)
+_ANYWHERE = frozenset({"0.0.0.0", "::"})
+
+
+@dataclass(frozen=True, slots=True)
+class PageCertificate:
+    """A page's own certificate.
+
+    Attributes:
+        context: For the server's sockets: TLS 1.2 or later.
+        fingerprint: SHA-256 as browsers show it, in pairs of hexadecimal digits.
+    """
+
+    context: ssl.SSLContext
+    fingerprint: str
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address to listen on is reached from this machine alone; a name is, where all it means is."""
+    try:
+        return ip_address(host).is_loopback
+    except ValueError:
+        pass
+    try:
+        found = {str(one[4][0]) for one in socket.getaddrinfo(host, None)}
+    except OSError:
+        return False
+    return bool(found) and all(ip_address(one.split("%", 1)[0]).is_loopback for one in found)
+
+
+def is_open(environment: Mapping[str, str]) -> bool:
+    """Whether PHALANX_OPEN=1 says that links may be plain."""
+    return environment.get(OPEN, "") == "1"
+
+
+def private_folder(environment: Mapping[str, str]) -> Path:
+    """Where this user's passwords and certificates of pages are kept: ~/.config/phalanx; made by who writes."""
+    base = environment.get("XDG_CONFIG_HOME") or str(Path("~/.config").expanduser())
+    return Path(base) / "phalanx"
+
+
+def page_certificate(folder: Path, host: str, now: datetime | None = None) -> PageCertificate:
+    """The certificate kept in `folder` (page.pem, with its key); made anew where there is none, or it does not fit.
+
+    Args:
+        folder: Made with mode 0700 where it is missing.
+        host: Address that is listened on; the certificate names it, and this machine.
+        now: The present.
+
+    Raises:
+        PhalanxError: The file is broken, others can read it, or it cannot be written.
+    """
+    path = folder / "page.pem"
+    now = now or datetime.now(UTC)
+    try:
+        if not path.exists() or not _fits(path.read_bytes(), host, now):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _write(path, _made(host, now))
+        if path.stat().st_mode & 0o077:
+            raise PhalanxError(f"{path}: others can read the key of the page; run: chmod 600 {path}")
+        context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
+        context.minimum_version = ssl.TLSVersion.TLSv1_2
+        context.load_cert_chain(path)
+        digest = x509.load_pem_x509_certificate(path.read_bytes()).fingerprint(hashes.SHA256()).hex().upper()
+    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        raise PhalanxError(f"{path}: cannot use the certificate of the page ({error}); delete it") from error
+    return PageCertificate(context, ":".join(digest[i : i + 2] for i in range(0, len(digest), 2)))
+
+
+def machine_names() -> frozenset[str]:
+    """Names under which this machine is reached."""
+    machine = socket.gethostname().lower()
+    return frozenset({"localhost", machine, f"{machine.split('.')[0]}.local"})
+
+
+def _fits(pem: bytes, host: str, now: datetime) -> bool:
+    certificate = x509.load_pem_x509_certificate(pem)
+    names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    return now + _RENEW_BEFORE < certificate.not_valid_after_utc and _name(host) in (None, *names)
+
+
+def _name(host: str) -> x509.GeneralName | None:
+    if host in _ANYWHERE:
+        return None
+    try:
+        return x509.IPAddress(ip_address(host))
+    except ValueError:
+        return x509.DNSName(host.lower())
+
+
+def _made(host: str, now: datetime) -> bytes:
+    private = ec.generate_private_key(ec.SECP256R1())
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "Phalanx page")])
+    names = {x509.DNSName(one) for one in machine_names()} | {x509.IPAddress(ip_address("127.0.0.1"))}
+    own = _name(host)
+    certificate = (
+        x509.CertificateBuilder()
+        .subject_name(name)
+        .issuer_name(name)
+        .public_key(private.public_key())
+        .serial_number(x509.random_serial_number())
+        .not_valid_before(now - timedelta(days=1))
+        .not_valid_after(now + LIFE - timedelta(days=1))
+        .add_extension(
+            x509.SubjectAlternativeName([*names, *([own] if own and own not in names else [])]), False
+        )
+        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+        .add_extension(x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), critical=False)
+        .sign(private, hashes.SHA256())
+    )
+    return certificate.public_bytes(serialization.Encoding.PEM) + private.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+
+
+def _write(path: Path, pem: bytes) -> None:
+    """Under its name only when it is whole, and never readable by others."""
+    half = path.with_suffix(f".{os.getpid()}")
+    half.unlink(missing_ok=True)
+    with os.fdopen(os.open(half, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        file.write(pem)
+    half.replace(path)
