@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.checklist_rig import Rig, measured, until
+from bench.udp_relay import Impairment
 from common.messages import CheckCode
 
 _COLOUR_OF_BACK = (64, 178, 130)  # sRGB, blue first: the reference colour of the marker
@@ -141,7 +142,7 @@ def _move(rig: Rig) -> None:
 
 
 def _lose(rig: Rig) -> None:
-    rig.relay.loss = 0.2
+    rig.relay.way = Impairment(loss=0.2)
 
 
 def _slow_way(rig: Rig) -> None:
@@ -150,13 +151,13 @@ def _slow_way(rig: Rig) -> None:
     rig.processes["imu"].kill()
     rig.processes["imu"].wait()
     until(lambda: silent in rig.lists.now(), 20.0)
-    rig.relay.delay_s = 0.012
+    rig.relay.way = Impairment(delay_s=0.012)
     rig.start_slave("imu")
     until(lambda: silent not in rig.lists.now(), 60.0)
 
 
 def _clear_way(rig: Rig) -> None:
-    rig.relay.loss, rig.relay.delay_s = 0.0, 0.0
+    rig.relay.way = Impairment()
 
 
 def _halve(rig: Rig) -> None:

@@ -181,7 +181,7 @@ class Rig:
 
     def _start(self) -> None:
         place = ["--rig", self._rig, "--calibration", str(self.master), "--bus", self._end]
-        link = ["--beacon", self.relay.beacon, "--bind", "127.0.0.1:0"]
+        link = ["--beacon", "{}:{}".format(*self.relay.beacon), "--bind", "127.0.0.1:0"]
         self._popen("master", ["master", "run", *place, *link], {})
         for name in (*self.cameras, *([] if self.imu is None else [self.imu])):
             self.start_slave(name)

@@ -1,7 +1,9 @@
-"""A network that can be made worse while it is used: UDP between a master and its slaves, with loss and delay.
+"""A network that can be made worse while it is used: UDP between a master and its slaves, with loss, delay, jitter,
+reordering and duplicates by a seed, and a cable that can be out.
 
 It stands between them like an address-translating router: beacons come in on `beacon` and go out as loopback
-broadcasts; each slave that answers gets a socket of its own towards the master. No privilege is needed.
+broadcasts; each slave that answers gets a socket of its own towards the master. Kernel impairment (netem) is not
+everywhere; this needs no privilege.
 """
 
 import heapq
@@ -11,6 +13,8 @@ import select
 import socket
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from common.datagram import Address
 
@@ -18,18 +22,47 @@ _BROADCAST = "127.255.255.255"
 _LONGEST = 8192
 
 
-class UdpRelay:
-    """Forwards until closed. Holds sockets, a thread, what waits; `loss`, `delay_s` and `cut` may change at any time.
+@dataclass(slots=True)
+class Impairment:
+    """What happens to each datagram, on each way alike. May be changed at any time.
 
     Attributes:
-        loss: Probability of a datagram to be lost, either way.
-        delay_s: Every datagram is so late [s]; their order stays.
-        cut: Nothing goes through: a cable is out.
+        loss: Probability of being lost.
+        delay_s: Every datagram is this late [s].
+        jitter_s: And up to this much more, evenly [s].
+        reorder: Probability of being held back by `held_s`, so that others overtake.
+        held_s: How long a held datagram waits [s].
+        duplicate: Probability of coming twice, each independently delayed.
     """
 
-    def __init__(self, slave_beacon_port: int, seed: int = 1) -> None:
+    loss: float = 0.0
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    reorder: float = 0.0
+    held_s: float = 0.02
+    duplicate: float = 0.0
+
+    @property
+    def late(self) -> bool:
+        """Whether anything waits at all."""
+        return bool(self.delay_s or self.jitter_s or self.reorder)
+
+
+class UdpRelay:
+    """Forwards between one master and its slaves until closed. Holds sockets, a thread, what waits.
+
+    Attributes:
+        way: What happens to datagrams.
+        cut: Nothing goes through: a cable is out.
+        forwarded, lost: Datagrams.
+        seen: Told every datagram that came, and whether it was for the master; None: nobody is.
+    """
+
+    def __init__(self, slave_beacon_port: int, seed: int = 1, way: Impairment | None = None) -> None:
         """Forward to the slaves that listen on a port of this machine."""
-        self.loss, self.delay_s, self.cut = 0.0, 0.0, False
+        self.way = Impairment() if way is None else way
+        self.cut, self.forwarded, self.lost = False, 0, 0
+        self.seen: Callable[[bytes, bool], None] | None = None
         self._random = random.Random(seed)
         self._slaves: Address = (_BROADCAST, slave_beacon_port)
         self._inlet, self._front = _socket(), _socket()  # hears the master's beacons; speaks with the slaves
@@ -42,10 +75,19 @@ class UdpRelay:
         self._thread.start()
 
     @property
-    def beacon(self) -> str:
-        """Where the master has to send its beacons, ADDRESS:PORT."""
-        host, port = self._inlet.getsockname()
-        return f"{host}:{port}"
+    def beacon(self) -> Address:
+        """Where the master has to send its beacons."""
+        address: Address = self._inlet.getsockname()
+        return address
+
+    @property
+    def master(self) -> Address | None:
+        """Where the master speaks from, once it did."""
+        return self._master
+
+    def slaves(self) -> tuple[Address, ...]:
+        """Where the slaves speak from that ever answered."""
+        return tuple(self._backs)
 
     def close(self) -> None:
         """Forward no more."""
@@ -64,9 +106,11 @@ class UdpRelay:
                 self._route(one, *one.recvfrom(_LONGEST))
             while self._waiting and self._waiting[0][0] <= time.monotonic():
                 _, _, one, datagram, to = heapq.heappop(self._waiting)
-                one.sendto(datagram, to)
+                self._send(one, datagram, to)
 
     def _route(self, one: socket.socket, datagram: bytes, source: Address) -> None:
+        if self.seen is not None:
+            self.seen(datagram, one is self._front)
         if one is self._inlet:
             self._master = source
             self._forward(self._front, datagram, self._slaves)
@@ -80,12 +124,20 @@ class UdpRelay:
             self._forward(self._front, datagram, slave)
 
     def _forward(self, one: socket.socket, datagram: bytes, to: Address) -> None:
-        if self.cut or self._random.random() < self.loss:
-            return
-        if self.delay_s <= 0.0 and not self._waiting:
-            one.sendto(datagram, to)
-            return
-        heapq.heappush(self._waiting, (time.monotonic() + self.delay_s, next(self._order), one, datagram, to))
+        way, draw = self.way, self._random.random
+        for _ in range(2 if way.duplicate and draw() < way.duplicate else 1):
+            if self.cut or draw() < way.loss:
+                self.lost += 1
+                continue
+            if not (way.late or self._waiting):
+                self._send(one, datagram, to)
+                continue
+            late_s = way.delay_s + draw() * way.jitter_s + (way.held_s if draw() < way.reorder else 0.0)
+            heapq.heappush(self._waiting, (time.monotonic() + late_s, next(self._order), one, datagram, to))
+
+    def _send(self, one: socket.socket, datagram: bytes, to: Address) -> None:
+        self.forwarded += 1
+        one.sendto(datagram, to)
 
 
 def _socket() -> socket.socket:

@@ -30,7 +30,7 @@ class SystemClock:
 
 
 class SkewedClock:
-    """The clock of a simulated foreign machine: another zero and another rate.
+    """The clock of a simulated foreign machine: another zero and another rate, and steps where a test wants them.
 
     Holds the moment of its construction, at which it is `offset_ns` ahead of the true clock.
     """
@@ -47,6 +47,10 @@ class SkewedClock:
         self._rate_ppb = round(rate_ppm * 1000)
         if self._rate_ppb <= -(10**9):
             raise ValueError(f"rate_ppm={rate_ppm}: must be above -1e6")
+
+    def step(self, by_ns: int) -> None:
+        """Jump by so much [ns], as no monotonic clock should: a machine that was asleep, or restored."""
+        self._offset_ns += by_ns
 
     def now_ns(self) -> int:
         """Return the time on this clock [ns]."""

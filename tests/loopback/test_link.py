@@ -6,11 +6,11 @@ from contextlib import ExitStack
 
 import pytest
 
+from bench.udp_relay import Impairment, UdpRelay
 from common.clock import Clock, SkewedClock, SystemClock
 from common.messages import MarkerDetections
 from master.ingest import Ingest
 from slave.uplink import Uplink
-from tests.loopback.relay import Impairment, Relay
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))
@@ -32,8 +32,8 @@ class Rig:
         }
         self.seq = {"left": 0, "right": 0}
 
-    def through(self, impairment: Impairment, seed: int) -> Relay:
-        relay = Relay(self.port, impairment, seed)
+    def through(self, impairment: Impairment, seed: int) -> UdpRelay:
+        relay = UdpRelay(self.port, seed, impairment)
         self.stack.callback(relay.close)
         self.beacon = relay.beacon
         return relay
@@ -173,10 +173,10 @@ def test_a_pulled_cable_is_noticed_on_both_ends_and_its_return_too(rig: Rig) -> 
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     ingest = rig.master()
     assert until(all_started(slaves), 5)
-    relay.cable_out = True
+    relay.cut = True
     assert until(lambda: not ingest.connected, 5)
     assert until(lambda: not any(uplink.started for uplink in slaves.values()), 5)
-    relay.cable_out = False
+    relay.cut = False
     assert until(all_started(slaves), 5)
     got, _ = stream(rig, slaves, ingest, 0.3)
     assert min(got.values()) == 30
