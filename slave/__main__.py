@@ -23,6 +23,7 @@ from slave.arguments import CAMERAS, parser
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 from slave.lights.opening import SWITCHED, SYNTHETIC, choose, limits_for, open_guarded
+from slave.service import COMPILE_S, Away, Service, nobody
 
 if TYPE_CHECKING:
     from slave.cameras.synthetic import LitBy
@@ -43,6 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return COMMANDS[options.command](options)
     except PhalanxError as error:
         print(f"phalanx-slave: {error}", file=sys.stderr)
+        Service(os.environ).failed(str(error))
         return 1
     except KeyboardInterrupt:  # while detecting offline; a live run ends by its event
         return 130
@@ -57,9 +59,11 @@ def _run(options: argparse.Namespace) -> int:
     from slave.uplink import Uplink
     from slave.wrist import engine as wrist_engine
 
-    stop = threading.Event()
+    stop, service = threading.Event(), Service(os.environ)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: stop.set())
+    if options.engine == "numba":
+        service.starting(COMPILE_S)
     rig, camera = _calibration(options)
     files = CameraFiles(*_paths(options), camera, rig, objects=tuple(_objects(options, rig).values()))
     if rig.kind == "wrist" and options.colours != "none":  # with none, fingers need not be known
@@ -70,13 +74,13 @@ def _run(options: argparse.Namespace) -> int:
     key = rig_key(os.environ, options.key_file)
     raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if rig.kind == "wrist" else marker_engine).engine_named(options.engine)
-    source = _lit_source(options, rig, camera, clock, true_clock, stop)
+    source = _lit_source(options, rig, camera, clock, true_clock, stop, service.away)
     uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
 
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
-    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say, raw)
+    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say, service, raw)
     return 0
 
 
@@ -120,15 +124,16 @@ def _imu(options: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
+    service = Service(os.environ, noun="samples")
     with _stop_by_signal() as stop:
         if options.imu == "synthetic":
             epoch_ns = true_clock.now_ns() if options.scene_epoch_ns is None else options.scene_epoch_ns
             imu = imu_of(options.imu, *_world(options, rig), options.scene, options.seed)
             source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
         else:
-            source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop)
+            source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, source, orientation, uplink, clock, stop, say)
+        run_live(options.name, source, orientation, uplink, clock, stop, say, service)
     return 0
 
 
@@ -147,6 +152,7 @@ def _tracker(options: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
+    service = Service(os.environ, noun="poses")
     with _stop_by_signal() as stop:
         if options.device == "synthetic":
             from slave.objects.synthetic import SyntheticTracker
@@ -156,14 +162,15 @@ def _tracker(options: argparse.Namespace) -> int:
             tracker = tracker_of(*_world(options, rig), options.scene, options.seed, profile)
             source: TrackerSource = SyntheticTracker(options.name, tracker, epoch_ns, clock, stop)
         else:
-            source = open_real(options.name, options.device, options.serial, options.program, clock, stop)
+            named = options.device, options.serial, options.program
+            source = open_real(options.name, *named, clock, stop, service.away)
         try:
             uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
         except PhalanxError:
             source.close()
             raise
         run_live(
-            options.name, source, uplink, clock, stop, say, recorded=options.device.startswith("survive:")
+            options.name, source, uplink, clock, stop, say, service, options.device.startswith("survive:")
         )
     return 0
 
@@ -204,11 +211,12 @@ def _lit_source(
     clock: Clock,
     true_clock: Clock,
     stop: threading.Event | None = None,
+    away: Away = nobody,
 ) -> FrameSource:
     """Open the camera as `_source` does, and the lights of a wrist device, which are dark before it is opened."""
     lights = choose(options.lights, rig, str(options.camera))
     if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
-        return _source(options, rig, camera, clock, true_clock, stop)
+        return _source(options, rig, camera, clock, true_clock, stop, away=away)
     from slave.lights.controller import StrobeController
     from slave.lights.simulated import SimulatedStrobe
     from slave.lights.strobed import StrobedCamera, schedule_of
@@ -220,7 +228,7 @@ def _lit_source(
         return StrobedCamera(source, camera, rig, strobe)
     guard = open_guarded(lights, rig)
     try:
-        source = _source(options, rig, camera, clock, true_clock, stop)
+        source = _source(options, rig, camera, clock, true_clock, stop, away=away)
     except PhalanxError:
         guard.close()
         raise
@@ -235,10 +243,12 @@ def _source(
     true_clock: Clock,
     stop: threading.Event | None = None,
     lights: "LitBy | None" = None,
+    away: Away = nobody,
 ) -> FrameSource:
     """Open the camera; with `stop`, a real one that is lost later is opened again until that is set."""
     wrist = rig.kind == "wrist"
-    if (found := real.open_real(options.camera, options, camera, clock, stop, wrist=wrist)) is not None:
+    found = real.open_real(options.camera, options, camera, clock, stop, wrist=wrist, away=away)
+    if found is not None:
         return found
     kind, _, folder = str(options.camera).partition(":")
     if kind == "replay" and folder:

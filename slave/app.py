@@ -68,9 +68,14 @@ POLL_S = 0.2
 DARK_AFTER = 9  # frames without a triple, 0.1 s at 90 Hz: then every frame is shown, lit or not
 
 
-def wait_for_start(barrier: Barrier, stop: threading.Event) -> bool:
-    """Wait for the master as long as it takes; False if told to stop before."""
+def nothing() -> None:
+    """For whom nobody needs to be told that a loop came round."""
+
+
+def wait_for_start(barrier: Barrier, stop: threading.Event, alive: Callable[[], None] = nothing) -> bool:
+    """Wait for the master as long as it takes; False if told to stop before. `alive` is called every `POLL_S`."""
     while not stop.is_set():
+        alive()
         if barrier.wait_for_start(POLL_S):
             return True
     return False
@@ -85,10 +90,12 @@ def run(
     stop: threading.Event,
     show: Callable[[Frame], None] = lambda _frame: None,
     tags: Tags | None = None,
+    alive: Callable[[], None] = nothing,
 ) -> None:
     """Detect and send until the source ends or `stop` is set. A frame without any marker is sent as well.
 
     Tags are sought once the markers of the frame are sent. `show` is offered every frame after that; it must not wait.
+    `alive` is called when a frame is done with.
 
     Raises:
         CameraError: The camera is gone.
@@ -115,6 +122,7 @@ def run(
         if tags is not None and (seen := tags.push(frame, sender.session, detect_ns)) is not None:
             sender.send(seen)
         show(frame)
+        alive()
 
 
 def run_wrist(
@@ -125,10 +133,12 @@ def run_wrist(
     tally: Tally,
     stop: threading.Event,
     show: Callable[[Frame], None] = lambda _frame: None,
+    alive: Callable[[], None] = nothing,
 ) -> None:
     """Detect and send until the source ends or `stop` is set. A triple without any finger is sent as well.
 
-    `show` is offered the frame under the LEDs of every triple, and every frame while there are no triples.
+    `show` is offered the frame under the LEDs of every triple, and every frame while there are no triples. `alive` is
+    called for every frame.
 
     Raises:
         CameraError: The camera is gone.
@@ -139,6 +149,7 @@ def run_wrist(
         began_ns = time.perf_counter_ns()
         found = detector.push(frame)
         took_ns.append(time.perf_counter_ns() - began_ns)
+        alive()
         if found is None:
             tally.part(frame.seq)
             parts += 1

@@ -27,6 +27,7 @@ from slave.picker import LivePicker
 from slave.preview import Previews
 from slave.raw import RawFrames, RawSettings
 from slave.report import Numbers, Reporter
+from slave.service import Service
 from slave.tags.live import LiveTags, finder_of
 from slave.tally import Tally
 from slave.tuning import CameraFiles, CameraTuning, Prepare
@@ -58,6 +59,7 @@ def run_live(
     engine: Engine | WristEngine,
     stop: threading.Event,
     say: Callable[[str], None],
+    service: Service,
     raw_frames: RawSettings | None = None,
 ) -> None:
     """Wait for the master, then detect and send until `stop` is set or the source ends; closes source and uplink.
@@ -72,6 +74,7 @@ def run_live(
         engine: What scans and measures for markers, or what does the inner loops before a wrist device.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
+        service: Told what it does, for the system's service manager.
         raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
 
     Raises:
@@ -82,9 +85,9 @@ def run_live(
     raw = RawFrames(name, raw_frames, lambda: tuning.files, clock, lambda: uplink.started)
     read = raw.reading(source)
     if isinstance(engine, WristEngine):
-        line = _wrist_line(name, files, read, uplink, clock, colours, engine, stop)
+        line = _wrist_line(name, files, read, uplink, clock, colours, engine, stop, service)
     else:
-        line = _marker_line(name, files, read, uplink, clock, colours, engine, stop, workers)
+        line = _marker_line(name, files, read, uplink, clock, colours, engine, stop, workers, service)
     tuning = CameraTuning(
         files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.picker
     )
@@ -103,9 +106,11 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
-        if wait_for_start(uplink, stop):
+        service.ready(lambda: uplink.started)
+        if wait_for_start(uplink, stop, service.waiting):
             line.run()
     finally:
+        service.stopping()
         reporter.close()
         line.previews.close()
         uplink.close()
@@ -144,13 +149,19 @@ def _marker_line(
     engine: Engine,
     stop: threading.Event,
     workers: ThreadPoolExecutor,
+    service: Service,
 ) -> _Line:
-    rig = files.rig
+    rig, alive = files.rig, service.working
     tags = LiveTags(files.camera, files.objects)
     if colours == "none":
         blind, tally = BlindDetector(len(rig.markers)), Tally(rig.markers, tags.counts)
         plain = Previews(name, clock)
-        return _Line(lambda: run(source, blind, uplink, name, tally, stop, plain.offer), tally, plain, None)
+        return _Line(
+            lambda: run(source, blind, uplink, name, tally, stop, plain.offer, alive=alive),
+            tally,
+            plain,
+            None,
+        )
     make = _maker(files, colours, engine, workers)
     detector = ChangingDetector(make(files.camera, rig))
     tally = Tally(
@@ -164,7 +175,7 @@ def _marker_line(
         numbers = LightReport(name, detector, tally, rig.markers, previews.offer)
         seen = numbers.offer
     return _Line(
-        lambda: run(source, detector, uplink, name, tally, stop, seen, tags),
+        lambda: run(source, detector, uplink, name, tally, stop, seen, tags, alive),
         numbers,
         previews,
         _both(marker_changes(detector, make), _tag_changes(tags)),
@@ -210,11 +221,13 @@ def _wrist_line(
     colours: Colours,
     engine: WristEngine,
     stop: threading.Event,
+    service: Service,
 ) -> _Line:
+    alive = service.working
     if colours == "none":
         tally, plain = Tally(()), Previews(name, clock)
         return _Line(
-            lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, plain.offer),
+            lambda: run_wrist(source, BlindWrist(), uplink, name, tally, stop, plain.offer, alive),
             tally,
             plain,
             None,
@@ -224,7 +237,7 @@ def _wrist_line(
     tally = Tally(names, lambda: {f"strobe.{event}": count for event, count in detector.counts.items()})
     previews = Previews(name, clock, WristOverlay(detector))
     return _Line(
-        lambda: run_wrist(source, detector, uplink, name, tally, stop, previews.offer),
+        lambda: run_wrist(source, detector, uplink, name, tally, stop, previews.offer, alive),
         tally,
         previews,
         wrist_changes(detector),

@@ -3,6 +3,7 @@
 import argparse
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from common.calibration import CameraCalibration
@@ -14,6 +15,7 @@ from slave.cameras.picamera2_settings import Picamera2Options
 from slave.cameras.reopening import ReopeningCamera
 from slave.cameras.source import FrameSource
 from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.service import AWAY_S, Away, nobody
 
 CAMERAS = "picamera2[:INDEX] | v4l2[:DEVICE]"
 DRIVERS = ("picamera2", "v4l2")
@@ -73,6 +75,7 @@ def open_real(
     stop: threading.Event | None,
     *,
     wrist: bool = False,
+    away: Away = nobody,
 ) -> FrameSource | None:
     """Open the camera that `--camera DRIVER[:PLACE]` names.
 
@@ -83,6 +86,7 @@ def open_real(
         clock: The slave's clock.
         stop: Set when the slave is to end; until then a lost camera is opened again. None: losing it is an error.
         wrist: Whether it is the camera of a wrist device, whose frames are grey.
+        away: Told when it takes time to open it, now or again.
 
     Returns:
         The camera, or None if the driver is none of a real camera.
@@ -98,10 +102,13 @@ def open_real(
             raise CameraError(f"{flag} is an option of --camera {owner}, not of {driver}: leave it away")
     if kind == "picamera2":
         pi = Picamera2Options(_index(place), options.sync, options.sync_timeout, pixels=pixels)
-        return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop)
+        if options.sync != "off":  # the others may have to be started first
+            away = partial(away, patience_s=AWAY_S + options.sync_timeout)
+            away("opens the camera, in step with others")
+        return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, away)
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing), pixels)
-        return _lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop)
+        return _lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, away)
     return None
 
 
@@ -124,8 +131,9 @@ def _lasting(
     camera: CameraCalibration,
     clock: Clock,
     stop: threading.Event | None,
+    away: Away,
 ) -> FrameSource:
-    return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop)
+    return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop, away)
 
 
 def _index(place: str) -> int:

@@ -17,6 +17,7 @@ from common.clock import Clock
 from common.errors import CameraError
 from slave.cameras.settings import Tunable
 from slave.cameras.source import Frame, FrameSource
+from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 2.0
@@ -37,6 +38,7 @@ class ReopeningCamera:
         camera: CameraCalibration,
         clock: Clock,
         stop: threading.Event,
+        away: Away = nobody,
     ) -> None:
         """Open the camera.
 
@@ -45,6 +47,7 @@ class ReopeningCamera:
             camera: Its settings at first. Its rate counts the frames of an absence.
             clock: The clock of the frames' times.
             stop: Set when the slave is to end; `read` then gives up waiting for a camera.
+            away: Told that it is lost, and of each try to open it again.
 
         Raises:
             CameraError: The camera is not there or refused a setting.
@@ -53,6 +56,7 @@ class ReopeningCamera:
         self._camera = camera
         self._clock = clock
         self._stop = stop
+        self._away = away
         self._closed = threading.Event()
         self._source: FrameSource | None = opener(camera)
         self._base = 0  # added to the camera's own numbers
@@ -73,6 +77,7 @@ class ReopeningCamera:
                 frame = source.read()
             except CameraError as error:
                 self.lost += 1
+                self._away(f"camera lost: {error}")
                 self._say(f"lost: {error}")
                 self._drop()
                 continue
@@ -126,6 +131,7 @@ class ReopeningCamera:
             try:
                 self._source, self._fresh = self._open(self._camera), True
             except CameraError as error:
+                self._away(f"camera away: {error}")
                 self._say(f"still away: {error}")
                 continue
             if self._closed.is_set():  # while it was being opened

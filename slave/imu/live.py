@@ -8,17 +8,22 @@ from msgspec.structs import replace
 
 from common.clock import Clock
 from common.zenoh_bus import ZenohBus
-from slave.app import Barrier, Sender
+from slave.app import Barrier, Sender, nothing
 from slave.imu.source import ImuSource
 from slave.imu.tally import Orientation, SampleTally
 from slave.report import Reporter
+from slave.service import Service
 from slave.uplink import Uplink
 
 LOOK_S = 0.5e-3  # between two samples it is looked whether the master has started
 
 
 def wait_for_start(
-    source: ImuSource, barrier: Barrier, stop: threading.Event, orientation: Orientation | None = None
+    source: ImuSource,
+    barrier: Barrier,
+    stop: threading.Event,
+    orientation: Orientation | None = None,
+    alive: Callable[[], None] = nothing,
 ) -> bool:
     """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
 
@@ -34,6 +39,7 @@ def wait_for_start(
             return False
         if orientation is not None:
             orientation.push(sample)
+        alive()
     return False
 
 
@@ -43,6 +49,7 @@ def run(
     tally: SampleTally,
     stop: threading.Event,
     orientation: Orientation | None = None,
+    alive: Callable[[], None] = nothing,
 ) -> None:
     """Send every sample until the source ends or `stop` is set.
 
@@ -56,6 +63,7 @@ def run(
             sample = orientation.push(sample)
         sender.send(replace(sample, session=sender.session))
         tally.sample(sample.seq)
+        alive()
 
 
 def run_live(
@@ -66,6 +74,7 @@ def run_live(
     clock: Clock,
     stop: threading.Event,
     say: Callable[[str], None],
+    service: Service,
 ) -> None:
     """Wait for the master, then send until `stop` is set or the source ends; closes source and uplink.
 
@@ -77,6 +86,7 @@ def run_live(
         clock: The slave's clock.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
+        service: Told what it does, for the system's service manager.
 
     Raises:
         ImuError: The IMU is gone.
@@ -87,9 +97,11 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
-        if wait_for_start(source, uplink, stop, orientation):
-            run(source, uplink, tally, stop, orientation)
+        service.ready(lambda: uplink.started)
+        if wait_for_start(source, uplink, stop, orientation, service.waiting):
+            run(source, uplink, tally, stop, orientation, service.working)
     finally:
+        service.stopping()
         reporter.close()
         uplink.close()
         source.close()

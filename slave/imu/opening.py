@@ -12,6 +12,7 @@ from common.errors import CalibrationError, ImuError
 from common.imu_fusion import OrientationFilter
 from slave.imu.reopening import ReopeningImu
 from slave.imu.source import ImuSource
+from slave.service import Away, nobody
 
 if TYPE_CHECKING:  # the drivers are imported where one is opened: other commands start without them
     from slave.imu.lsm6dsox import I2cPlace
@@ -54,7 +55,9 @@ def orientation_of(imu: ImuCalibration) -> OrientationFilter:
     return OrientationFilter(imu.rate_hz)
 
 
-def open_real(name: str, driver: str, rate_hz: float, clock: Clock, stop: threading.Event) -> ReopeningImu:
+def open_real(
+    name: str, driver: str, rate_hz: float, clock: Clock, stop: threading.Event, away: Away = nobody
+) -> ReopeningImu:
     """Open the IMU that `--imu DRIVER:PLACE` names; until `stop` is set, it is opened again when it was lost.
 
     Args:
@@ -63,6 +66,7 @@ def open_real(name: str, driver: str, rate_hz: float, clock: Clock, stop: thread
         rate_hz: Samples per second that the rig needs.
         clock: The slave's clock.
         stop: Set when the slave is to end.
+        away: Told when it is lost.
 
     Raises:
         ImuError: There is no such driver, or the IMU cannot be opened.
@@ -81,7 +85,7 @@ def open_real(name: str, driver: str, rate_hz: float, clock: Clock, stop: thread
         opener = lambda: lsm6dsox.Lsm6dsoxImu(name, wires, rate_hz, clock, stop)  # noqa: E731
     else:
         raise ImuError(f"--imu {driver}: no such driver; there are {IMUS}")
-    return ReopeningImu(opener, true_hz, clock, stop)
+    return ReopeningImu(opener, true_hz, clock, stop, away)
 
 
 def places() -> str:

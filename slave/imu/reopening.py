@@ -17,6 +17,7 @@ from common.clock import Clock
 from common.errors import ImuError
 from common.messages import ImuSample
 from slave.imu.source import ImuSource, Telling
+from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 2.0
@@ -31,7 +32,12 @@ class ReopeningImu:
     """
 
     def __init__(
-        self, opener: Callable[[], ImuSource], rate_hz: float, clock: Clock, stop: threading.Event
+        self,
+        opener: Callable[[], ImuSource],
+        rate_hz: float,
+        clock: Clock,
+        stop: threading.Event,
+        away: Away = nobody,
     ) -> None:
         """Open the IMU.
 
@@ -40,11 +46,13 @@ class ReopeningImu:
             rate_hz: Counts the samples of an absence.
             clock: The clock of the samples' times.
             stop: Set when the slave is to end; `read` then gives up waiting for the IMU.
+            away: Told that it is lost, and of each try to open it again.
 
         Raises:
             ImuError: It is not there, or refused a setting.
         """
         self._open, self._rate_hz, self._clock, self._stop = opener, rate_hz, clock, stop
+        self._away = away
         self._closed = threading.Event()
         self._source: ImuSource | None = opener()
         self._base: int | None = 0  # added to the own numbers of the IMU; None: of one that was just opened
@@ -92,6 +100,7 @@ class ReopeningImu:
         if self._away_ns is None:
             self._away_ns = self._clock.now_ns()
             self._counts["lost"] += 1
+        self._away(f"IMU lost: {error}")
         self._say(f"lost: {error}")
         self._drop()
 
@@ -110,6 +119,7 @@ class ReopeningImu:
             try:
                 self._source = self._open()
             except ImuError as error:
+                self._away(f"IMU away: {error}")
                 self._say(f"still away: {error}")
                 continue
             if self._closed.is_set():  # while it was being opened

@@ -8,17 +8,22 @@ from msgspec.structs import replace
 
 from common.clock import Clock
 from common.zenoh_bus import ZenohBus
-from slave.app import POLL_S, Barrier, Sender
+from slave.app import POLL_S, Barrier, Sender, nothing
 from slave.objects.source import TrackerSource
 from slave.objects.tally import PoseTally
 from slave.report import Reporter
+from slave.service import Service
 from slave.uplink import Uplink
 
 LOOK_S = 0.5e-3  # between two poses it is looked whether the master has started
 
 
 def wait_for_start(
-    source: TrackerSource, barrier: Barrier, stop: threading.Event, recorded: bool = False
+    source: TrackerSource,
+    barrier: Barrier,
+    stop: threading.Event,
+    recorded: bool = False,
+    alive: Callable[[], None] = nothing,
 ) -> bool:
     """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
 
@@ -32,10 +37,17 @@ def wait_for_start(
             return True
         if not recorded and source.read() is None:
             return False
+        alive()
     return False
 
 
-def run(source: TrackerSource, sender: Sender, tally: PoseTally, stop: threading.Event) -> None:
+def run(
+    source: TrackerSource,
+    sender: Sender,
+    tally: PoseTally,
+    stop: threading.Event,
+    alive: Callable[[], None] = nothing,
+) -> None:
     """Send every pose until the source ends or `stop` is set.
 
     Raises:
@@ -44,6 +56,7 @@ def run(source: TrackerSource, sender: Sender, tally: PoseTally, stop: threading
     while not stop.is_set() and (pose := source.read()) is not None:
         sender.send(replace(pose, session=sender.session))
         tally.pose(pose)
+        alive()
 
 
 def run_live(
@@ -53,6 +66,7 @@ def run_live(
     clock: Clock,
     stop: threading.Event,
     say: Callable[[str], None],
+    service: Service,
     recorded: bool = False,
 ) -> None:
     """Wait for the master, then send until `stop` is set or the source ends; closes source and uplink.
@@ -64,6 +78,7 @@ def run_live(
         clock: The slave's clock.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
+        service: Told what it does, for the system's service manager.
         recorded: The source is a recording, of which nothing is to be missed.
 
     Raises:
@@ -75,9 +90,11 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
-        if wait_for_start(source, uplink, stop, recorded):
-            run(source, uplink, tally, stop)
+        service.ready(lambda: uplink.started)
+        if wait_for_start(source, uplink, stop, recorded, service.waiting):
+            run(source, uplink, tally, stop, service.working)
     finally:
+        service.stopping()
         reporter.close()
         uplink.close()
         source.close()

@@ -11,6 +11,7 @@ from common.errors import CalibrationError, TrackerError
 from common.object_profile import ObjectProfile
 from slave.objects.reopening import ReopeningTracker
 from slave.objects.source import TrackerSource
+from slave.service import Away, nobody
 
 REAL = "openvr | survive | survive:FILE"
 DEVICES = f"{REAL} | synthetic"
@@ -48,7 +49,13 @@ def object_with(calibration: Path, rig: RigCalibration, name: str) -> ObjectProf
 
 
 def open_real(
-    name: str, device: str, serial: str | None, program: str, clock: Clock, stop: threading.Event
+    name: str,
+    device: str,
+    serial: str | None,
+    program: str,
+    clock: Clock,
+    stop: threading.Event,
+    away: Away = nobody,
 ) -> TrackerSource:
     """Open the tracker that `--device` names; one that is no recording is opened again when it was lost.
 
@@ -59,6 +66,7 @@ def open_real(
         program: survive-cli.
         clock: The slave's clock.
         stop: Set when the slave is to end.
+        away: Told when it is lost.
 
     Raises:
         TrackerError: There is no such system, or it cannot be opened.
@@ -79,4 +87,4 @@ def open_real(
         opener = lambda: OpenVrTracker(name, serial, clock, stop)  # noqa: E731
     else:
         raise TrackerError(f"--device {device}: no such system; there are {DEVICES}")
-    return ReopeningTracker(name, opener, clock, stop)
+    return ReopeningTracker(name, opener, clock, stop, away)

@@ -19,6 +19,7 @@ from common.errors import TrackerChoiceError, TrackerError
 from common.messages import TrackerPose
 from slave.imu.source import Telling
 from slave.objects.source import TrackerSource
+from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221)
@@ -34,7 +35,12 @@ class ReopeningTracker:
     """
 
     def __init__(
-        self, name: str, opener: Callable[[], TrackerSource], clock: Clock, stop: threading.Event
+        self,
+        name: str,
+        opener: Callable[[], TrackerSource],
+        clock: Clock,
+        stop: threading.Event,
+        away: Away = nobody,
     ) -> None:
         """Open it.
 
@@ -43,11 +49,13 @@ class ReopeningTracker:
             opener: Opens it; called again after each loss.
             clock: The clock of the poses' times.
             stop: Set when the slave is to end.
+            away: Told before it is given back, and of each try to open it again.
 
         Raises:
             TrackerError: It is not there.
         """
         self._name, self._open, self._clock, self._stop = name, opener, clock, stop
+        self._away = away
         self._closed = threading.Event()
         self._source: TrackerSource | None = opener()
         self._seq, self._last_ns = -1, -(2**62)
@@ -110,6 +118,7 @@ class ReopeningTracker:
         if self._away_ns is None:
             self._away_ns = now_ns
             self._counts["lost"] += 1
+        self._away(f"tracker lost: {error}")
         self._say(f"lost: {error}")
         self._drop()
         self._try_ns = now_ns + round(1e9 * self._wait_s)
@@ -127,6 +136,7 @@ class ReopeningTracker:
         now_ns = self._clock.now_ns()
         if now_ns < self._try_ns:
             return None
+        self._away("tracker lost: opens it again")
         self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a pose has come
         self._try_ns = now_ns + round(1e9 * self._wait_s)
         try:
