@@ -1,45 +1,175 @@
-"""The rig key: the one secret that the processes of a rig share, and where it comes from.
+"""What a process proves itself by: the rig key of the datagrams, and a certificate on the bus. Where they come from.
 
-It is 32 random bytes, written as 64 hexadecimal digits, in the environment variable
-PHALANX_RIG_KEY or in a file that only its owner can read. It is never on a command line, where
-every user of the machine could see it.
+The rig key is 32 random bytes that all processes of a rig share, written as 64 hexadecimal digits. It is in a file that
+only its owner can read, or in the environment variable PHALANX_RIG_KEY; never on a command line, where every user of
+the machine could see it.
+
+A *keys folder* has all that processes need; `--keys DIR` or the variable PHALANX_KEYS names it. `phalanx-master keys
+make` makes it (docs/keys.md):
+
+| file | what |
+|---|---|
+| `rig.key` | the rig key |
+| `ca.pem` | who signed the certificates of this rig; `ca.key`, which signs, stays on the PC |
+| `master.pem`, `.key`; `operator.pem`, `.key` | of the master, and of every other program of the PC |
+| `devices/NAME.pem`, `.key` | of each device; on the device itself `device-NAME.pem`, or `device.pem` if it is alone |
 """
 
 import secrets
 import stat
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
+from common.certificates import MASTER, OPERATOR, shown
 from common.datagram import KEY_BYTES
-from common.errors import PhalanxError
+from common.errors import BusError, PhalanxError
 
 ENVIRONMENT = "PHALANX_RIG_KEY"
+FOLDER = "PHALANX_KEYS"
+OPEN = "PHALANX_OPEN"
+RIG_KEY, AUTHORITY, DEVICES = "rig.key", "ca.pem", "devices"
+_CREDENTIALS = "CREDENTIALS_DIRECTORY"
 _ADVICE = f"write 64 hexadecimal digits, for example from: openssl rand -hex {KEY_BYTES}"
 
 
-def rig_key(environment: Mapping[str, str], key_file: Path | None = None) -> bytes:
-    """Return the 32 bytes of the rig key: from `key_file` if given, else from the environment.
+def rig_key(environment: Mapping[str, str], key_file: Path | None = None, keys: Path | None = None) -> bytes:
+    """Return the 32 bytes of the rig key.
+
+    Args:
+        environment: Of the process: PHALANX_RIG_KEY, else PHALANX_KEYS, where neither of the next two is given.
+        key_file: File that has it.
+        keys: Keys folder that has it.
 
     Raises:
         PhalanxError: No key, not 64 hexadecimal digits, or a file that others can read.
     """
-    if key_file is not None:
-        try:
-            mode = key_file.stat().st_mode
-            text = key_file.read_text(encoding="ascii")
-        except (OSError, UnicodeDecodeError) as error:
-            raise PhalanxError(f"{key_file}: cannot read the rig key ({error}); {_ADVICE}") from error
-        if mode & (stat.S_IRWXG | stat.S_IRWXO):
-            raise PhalanxError(f"{key_file}: others can read the rig key; run: chmod 600 {key_file}")
-        return _parse(text, str(key_file))
-    if ENVIRONMENT not in environment:
-        raise PhalanxError(f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}")
-    return _parse(environment[ENVIRONMENT], ENVIRONMENT)
+    if key_file is None and keys is None and ENVIRONMENT in environment:
+        return _parse(environment[ENVIRONMENT], ENVIRONMENT)
+    folder = keys or keys_folder(environment)
+    path = key_file or (folder / RIG_KEY if folder else None)
+    if path is None:
+        raise PhalanxError(
+            f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder, phalanx-master"
+            f" keys make DIR, and give --keys DIR (or set {FOLDER})"
+        )
+    try:
+        text = path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PhalanxError(f"{path}: cannot read the rig key ({error}); {_ADVICE}") from error
+    if (fault := others_read(path, environment)) is not None:
+        raise PhalanxError(fault)
+    return _parse(text, str(path))
 
 
 def new_key() -> str:
     """Return a fresh rig key as text, for the environment or a file."""
     return secrets.token_hex(KEY_BYTES)
+
+
+def keys_folder(environment: Mapping[str, str]) -> Path | None:
+    """The keys folder that the environment names, if it does."""
+    return Path(environment[FOLDER]) if environment.get(FOLDER) else None
+
+
+def others_read(path: Path, environment: Mapping[str, str]) -> str | None:
+    """Why a private file is none: others than its owner can read it; None: all is well.
+
+    In the folder of a service's credentials the mask of an access-control list stands where the group's bits are.
+    """
+    folder = environment.get(_CREDENTIALS)
+    handed = folder is not None and path.parent == Path(folder)
+    forbidden = stat.S_IRWXO if handed else stat.S_IRWXG | stat.S_IRWXO
+    if path.stat().st_mode & forbidden:
+        return f"{path}: others can read this secret; run: chmod 600 {path}"
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who a process is on an encrypted bus.
+
+    Attributes:
+        name: Common name of its certificate: `master`, `operator`, or a device.
+        authority: Certificate that signed those of the rig (PEM file).
+        certificate: Own certificate (PEM file).
+        key: Its private key (PEM file).
+        devices: Names of devices that the keys folder has certificates of.
+    """
+
+    name: str
+    authority: Path
+    certificate: Path
+    key: Path
+    devices: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Access:
+    """How a process comes to the bus.
+
+    Attributes:
+        role: `MASTER`, `OPERATOR`, or the name of a device.
+        folder: Keys folder; None: it has none, and can only use a bus that is not encrypted.
+        open: Whether a bus that is neither encrypted nor authenticated may leave this machine.
+        environment: Of the process.
+    """
+
+    role: str
+    folder: Path | None
+    open: bool
+    environment: Mapping[str, str]
+
+    def identity(self) -> Identity:
+        """Find the certificate of this role.
+
+        Raises:
+            BusError: There is no keys folder, a file is missing, of somebody else, or others can read it.
+        """
+        if self.folder is None:
+            raise BusError(
+                f"no keys: give --keys DIR or set {FOLDER}; phalanx-master keys make DIR makes them"
+            )
+        own = self._stem(self.folder)
+        found = tuple(sorted(path.stem for path in (self.folder / DEVICES).glob("*.pem")))
+        pem, key = (own.with_name(f"{own.name}.{ending}") for ending in ("pem", "key"))
+        identity = Identity(self.role, self.folder / AUTHORITY, pem, key, found)
+        try:
+            name = shown(identity.certificate.read_bytes()).name
+            shown(identity.authority.read_bytes())
+            fault = others_read(identity.key, self.environment)
+        except (OSError, ValueError) as error:
+            raise BusError(f"{self.folder}: keys of {self.role!r}: {error}") from error
+        if fault is not None:
+            raise BusError(fault)
+        if name != self.role:
+            raise BusError(f"{identity.certificate}: is the certificate of {name!r}, not of {self.role!r}")
+        return identity
+
+    def _stem(self, folder: Path) -> Path:
+        """Where its certificate and key are, without their endings."""
+        if self.role in (MASTER, OPERATOR):
+            places = [folder / self.role]
+        else:
+            places = [folder / DEVICES / self.role, folder / f"device-{self.role}", folder / "device"]
+        for place in places:
+            if place.with_name(f"{place.name}.pem").exists():
+                return place
+        where = ", ".join(f"{place.relative_to(folder)}.pem" for place in places)
+        make = "" if self.role in (MASTER, OPERATOR) else f" --device {self.role}"
+        raise BusError(
+            f"{folder}: no certificate of {self.role!r} ({where}); make it on the PC that has ca.key:"
+            f" phalanx-master keys make {folder}{make}"
+        )
+
+
+def access_of(
+    environment: Mapping[str, str], role: str, keys: Path | None = None, open_bus: bool = False
+) -> Access:
+    """How a process of `role` comes to the bus, from its options `--keys` and `--open` or its environment."""
+    return Access(
+        role, keys or keys_folder(environment), open_bus or environment.get(OPEN) == "1", environment
+    )
 
 
 def _parse(text: str, where: str) -> bytes:

@@ -16,31 +16,28 @@ import logging
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol
 
 import zenoh
 
 from common.bus import ANY, Handler, Inbox, Subscription, decoded, payload_of, stream_key
+from common.bus_refusal import why_refused
+from common.bus_settings import settings
+from common.endpoints import check, encrypted, loopback
 from common.errors import BusError, PhalanxError
+from common.keys import Access, access_of
 from common.messages import Command, Health, Message, encode
 from common.streams import ALIVE_KEY, key_of
 
-SCHEMES = ("tcp", "tls", "quic")
-LEASE_MS = 1000  # so soon a pulled cable is noticed
-RETRY = {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2}
-MAX_MESSAGE_BYTES = 1 << 20
-CLIENT_TIMEOUT_MS = 500  # a viewer tries a master that is not there for so long, then says that it waits
 ASK_AGAIN_S = 0.05  # a target that has just connected is not known everywhere yet
 JOIN_S = 1.0  # a thread that zenoh does not release is left to the end of the process
 LIVELINESS_TIMEOUT_S = 0.5
 FIFO_DEPTH = 64  # between zenoh and the thread that empties it at once
-# Batches that may wait for the link before a message is dropped. With zenoh's own 2, a busy machine that gives the link
-# no time for a millisecond loses messages; 16 is its most.
-LINK_QUEUE = {"data": 16, "data_low": 16}
-WAITING = frozenset(
-    {"taken"}
-)  # nothing of these is dropped: who publishes them does so on a thread of its own
+# Nothing of these is dropped: who publishes them does so on a thread of its own.
+WAITING = frozenset({"taken"})
+ALONE_S = 2.0  # without anybody for so long, a process says why
+LOOK_S = 0.25
 
 _LOG = logging.getLogger(__name__)
 
@@ -53,26 +50,59 @@ class ZenohBus:
     holds again once the peer is back.
     """
 
-    def __init__(self, listen: str | None, connect: str | None, *, beyond: bool = False) -> None:
-        """Listen on an endpoint, connect to one, or both; for example `tcp/127.0.0.1:47802`.
+    def __init__(
+        self,
+        listen: str | None,
+        connect: str | Sequence[str] | None,
+        access: Access | None = None,
+        *,
+        beyond: bool = False,
+        devices: Iterable[str] = (),
+        router: bool = False,
+        namespace: str | None = None,
+    ) -> None:
+        """Listen on an endpoint, connect to one, or both; for example `tls/127.0.0.1:47802`.
 
         With `beyond`, this process sees and asks also those that are connected to the one it connects to:
         a viewer at the master reaches the slaves. It is a client then, listens nowhere, and that one must be there.
 
+        Args:
+            listen: Endpoint where others connect to; needs the master's certificate if it is encrypted.
+            connect: Endpoint of who listens; of several only for a router.
+            access: Certificates, and whether plain text may leave the machine; None: neither.
+            beyond: See above.
+            devices: Names that may connect, beside those whose certificates are in the keys folder.
+            router: Pass everything on between all that are connected, in place of being one of them.
+            namespace: Site whose keys these are, at a router of several.
+
         Raises:
-            BusError: An endpoint is malformed or not tcp, tls or quic, or its address is taken; with `beyond`,
-                nobody listens there yet.
+            BusError: An endpoint is malformed, or not tcp, tls or quic; it would leave the machine as plain text; keys
+                are missing; the address is taken; with `beyond`, nobody listens there yet, or refused us.
         """
-        ends = (("listening on", listen), ("connecting to", connect))
+        targets = [connect] if isinstance(connect, str) else list(connect or ())
+        ends = [("listening on", listen), *(("connecting to", target) for target in targets)]
         self._where = ", ".join(f"{what} {endpoint}" for what, endpoint in ends if endpoint)
+        endpoints = [endpoint for _, endpoint in ends if endpoint]
+        for endpoint in endpoints:
+            check(endpoint, access is not None and access.open)
+            if not encrypted(endpoint) and not loopback(endpoint):
+                _LOG.warning("OPEN BUS: %s is not encrypted; whoever reaches it can watch, tune and stop this rig",
+                             endpoint)  # fmt: skip
+        self._identity = None
+        if any(encrypted(endpoint) for endpoint in endpoints):
+            if access is None:
+                access = access_of({}, "")
+            self._identity = access.identity()
+        self._sealed = [target for target in targets if encrypted(target)]
+        mode = "client" if beyond else "router" if router else "peer"
+        made = settings(listen, targets, mode, self._identity, devices, namespace)
         try:
-            self._session = zenoh.open(
-                zenoh.Config.from_json5(json.dumps(_settings(listen, connect, beyond)))
-            )
+            self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(made)))
         except zenoh.ZError as error:
+            reason = self._refusal()
+            hint = "Is the master running?" if beyond else "Is the address taken or mistyped?"
             raise BusError(
-                f"cannot open the bus ({self._where or 'no endpoint'}): {_plain(error)}. "
-                + ("Is the master running?" if beyond else "Is the address taken or mistyped?")
+                f"cannot open the bus ({self._where or 'no endpoint'}): {reason or _plain(error)}. {hint}"
             ) from error
         self._inboxes: list[Inbox] = []
         self._undeclare: list[Callable[[], None]] = []
@@ -82,11 +112,18 @@ class ZenohBus:
         # A thread that is still inside zenoh when the interpreter ends aborts the process, and with
         # it the report of whatever error ended the program before it could close this.
         atexit.register(self.close)
+        self._closing = threading.Event()
+        if self._sealed and not beyond:
+            thread = threading.Thread(target=self._watch, name="bus alone", daemon=True)
+            thread.start()
+            self._threads.append(thread)
 
     @property
     def peers(self) -> int:
         """Number of processes this one is connected to now."""
-        return 0 if self._closed else len(self._session.info.peers_zid())
+        if self._closed:
+            return 0
+        return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
     def publish(self, stream: str, name: str, message: Message) -> None:
         """Send to every matching subscription; dropped when the link is congested.
@@ -196,6 +233,7 @@ class ZenohBus:
             if self._closed:
                 return
             self._closed = True
+            self._closing.set()
             atexit.unregister(self.close)
             inboxes, undeclare, threads = list(self._inboxes), list(self._undeclare), list(self._threads)
         for inbox in inboxes:
@@ -214,12 +252,35 @@ class ZenohBus:
         if self._closed:
             raise BusError("the bus is closed")
 
+    def _watch(self) -> None:
+        """Say why nobody is connected, when it is so for a while, and again when the reason is another one."""
+        said, since = "", time.monotonic()
+        while not self._closing.wait(LOOK_S):
+            now = time.monotonic()
+            if self.peers:
+                said, since = "", now
+            elif now - since > ALONE_S:
+                since = now
+                reason = self._refusal()
+                if reason != said and not self._closing.is_set():
+                    _LOG.warning("bus (%s): %s", self._where, reason or "connecting")
+                said = reason
+
+    def _refusal(self) -> str:
+        """Why no encrypted endpoint takes us; empty: there is none, or nothing is wrong."""
+        if self._identity is None:
+            return ""
+        reasons = [why_refused(target, self._identity) for target in self._sealed]
+        return "; ".join(dict.fromkeys(reason for reason in reasons if reason))
+
     def _silence(self, command: Command, timeout_s: float) -> str:
         """Say why nobody may have answered."""
         text = (
             f"no answer from {command.target!r} to {command.verb!r} within {timeout_s:g} s ({self._where}): "
         )
         if self.peers == 0:
+            if reason := self._refusal():
+                return text + reason
             return text + "no process is connected. Is the master running, and is this its bus endpoint?"
         names = ", ".join(sorted(self.alive())) or "none announced"
         return text + f"{self.peers} connected, alive: {names}. Is the target running and named so?"
@@ -228,37 +289,6 @@ class ZenohBus:
 def _plain(error: zenoh.ZError) -> str:
     """What went wrong, without the places in zenoh's source that it names."""
     return re.sub(r" at /\S+:\d+\.?", "", str(error)).rstrip(".")
-
-
-def _settings(listen: str | None, connect: str | None, beyond: bool) -> dict[str, object]:
-    """Return zenoh's configuration: everything that is not safe or quick by default is set here."""
-    endpoints = [endpoint for endpoint in (listen, connect) if endpoint is not None]
-    for endpoint in endpoints:
-        if endpoint.split("/", 1)[0] not in SCHEMES:
-            raise BusError(
-                f"bus endpoint {endpoint!r}: must begin with {', '.join(s + '/' for s in SCHEMES)}"
-            )
-    return {
-        # A peer passes messages between its clients and its peers, never from one peer to another.
-        "mode": "client" if beyond else "peer",
-        "listen": {"endpoints": [listen] if listen else [], "exit_on_failure": True},
-        "connect": {
-            "endpoints": [connect] if connect else [],
-            # A client that has not found its peer is no session at all: zenoh gives up after this, or never returns.
-            # For a peer 0 would try once and give up for ever; `open` returns after 0.5 s in any case.
-            "timeout_ms": CLIENT_TIMEOUT_MS if beyond else -1,
-            "exit_on_failure": False,
-            "retry": RETRY,
-        },
-        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {
-            "link": {
-                "protocols": list(SCHEMES),
-                "tx": {"lease": LEASE_MS, "queue": {"size": LINK_QUEUE}},
-                "rx": {"max_message_size": MAX_MESSAGE_BYTES},
-            }
-        },
-    }
 
 
 def _start(name: str, step: Callable[[], None]) -> threading.Thread:

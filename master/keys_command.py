@@ -1,0 +1,109 @@
+"""`phalanx-master keys`: the rig key and the certificates of a rig, made and kept on the PC."""
+
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from master.keys_folder import certificates_of, make, renew, renew_device
+
+Folder = Annotated[Path, typer.Argument(help="Keys folder; keep it private, and out of calib_json.")]
+Devices = Annotated[
+    list[str] | None,
+    typer.Option("--device", help="Name of a camera, IMU or tracker as the rig has it; once for each."),
+]
+
+
+def keys_app() -> typer.Typer:
+    """The command `keys`."""
+    app = typer.Typer(no_args_is_help=True)
+
+    @app.callback()
+    def about() -> None:
+        """The secrets of a rig: one key for its datagrams, certificates for its bus. docs/keys.md says who has which.
+
+        `phalanx deploy` makes the folder and brings each device its part.
+        """
+
+    app.command(name="make")(make_command)
+    app.command(name="show")(show_command)
+    app.command(name="renew")(renew_command)
+    app.command(name="revoke")(revoke_command)
+    return app
+
+
+def make_command(folder: Folder, device: Devices = None) -> None:
+    """Make a keys folder, or add what is missing: what is there stays as it is.
+
+    Examples:
+
+      phalanx-master keys make ~/.config/phalanx/keys
+
+      phalanx-master keys make ~/.config/phalanx/keys --device left --device right
+    """
+    made = make(folder, device or (), _now())
+    typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")
+
+
+def show_command(folder: Folder) -> None:
+    """Say who has a certificate, what for, and until when.
+
+    Examples:
+
+      phalanx-master keys show ~/.config/phalanx/keys
+    """
+    told = certificates_of(folder)
+    wide = max(len(one.name) for one in told)
+    for one in told:
+        use = "listens" if one.listens else "connects"
+        late = "  ENDED: renew" if one.until < _now() else ""
+        typer.echo(f"{one.name:<{wide}}  {use:<8}  until {one.until:%Y-%m-%d}  {one.fingerprint}{late}")
+
+
+def renew_command(
+    folder: Folder,
+    device: Annotated[
+        str | None,
+        typer.Option(
+            help="Only a new certificate for this device; its old one stays valid, so not for a lost one."
+        ),
+    ] = None,
+) -> None:
+    """Make all keys anew, for everybody; then deploy again and restart the programs of the PC.
+
+    Examples:
+
+      phalanx-master keys renew ~/.config/phalanx/keys
+
+      phalanx-master keys renew ~/.config/phalanx/keys --device left
+    """
+    if device is not None:
+        renew_device(folder, device, _now())
+        typer.echo(f"{folder}: new certificate of {device}: deploy it again")
+        return
+    _tell(folder, renew(folder, _now()))
+
+
+def revoke_command(
+    folder: Folder,
+    device: Annotated[list[str], typer.Option(help="Device that was lost, sold or stolen; once for each.")],
+) -> None:
+    """Lock devices out: all keys are made anew, and these get none.
+
+    Every device has the rig key, so nothing less keeps a lost one out.
+
+    Examples:
+
+      phalanx-master keys revoke ~/.config/phalanx/keys --device left
+    """
+    _tell(folder, renew(folder, _now(), device))
+
+
+def _tell(folder: Path, left: list[str]) -> None:
+    names = ", ".join(left) or "no device"
+    typer.echo(f"{folder}: all keys are new. Deploy again to {names}; restart the master and what reads it")
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)
