@@ -23,6 +23,7 @@ from master.camera_command import camera
 from master.checklist.command import check
 from master.export.command import export
 from master.gestures.command import gestures_app
+from master.keys_command import keys_app
 from master.live import LiveSettings, run_live
 from master.master_bus import bus_of_master
 from master.options import (
@@ -304,6 +305,7 @@ def main() -> None:
     app.add_typer(calibrate_app(), name="calibrate")
     app.add_typer(evaluate_app(), name="evaluate")
     app.add_typer(gestures_app(), name="gestures")
+    app.add_typer(keys_app(), name="keys")
     app.command()(camera)
     app.command()(check)
     app.command()(export)
