@@ -15,6 +15,12 @@ _PRIMARY = "#1b6ac9"  # white on it, and itself on a dark panel, can be read
 _STYLE = Path(__file__).parent / "static" / "console.css"
 _THEMES: dict[str, bool | None] = {"auto": None, "light": False, "dark": True}
 _THEME_ICONS = {"auto": "brightness_auto", "light": "light_mode", "dark": "dark_mode"}
+# A page that is cut off because its session is over goes to the login instead of trying for ever.
+_SESSION_OVER = """<script>setInterval(async () => {
+  if (!window.socket || window.socket.connected) return;
+  const answer = await fetch(location.pathname, { redirect: "manual" }).catch(() => null);
+  if (answer?.type === "opaqueredirect") location.reload();
+}, 2000);</script>"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +102,7 @@ def _badge(state: ConsoleState) -> None:
 
 
 def _logout() -> None:
+    ui.add_head_html(_SESSION_OVER)
     with ui.element("form").props(f'method="post" action="{LOGOUT}"'):
         button = ui.button(icon="logout").props(
             'flat round dense color=inherit type="submit" aria-label="Log out"'

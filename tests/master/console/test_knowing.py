@@ -1,6 +1,7 @@
 """What the console knows and tells, without a browser: tuning, looking, figures, gestures, files, its guard."""
 
 import json
+import socket
 from pathlib import Path
 
 import pytest
@@ -188,9 +189,36 @@ def test_the_bus_cannot_fill_the_memory_with_names() -> None:
 )
 def test_only_own_pages_are_answered(host: str | None, origin: str | None, passes: bool) -> None:
     assert (refusal(host, origin, names_of("127.0.0.1")) is None) == passes
-    assert names_of("0.0.0.0") == frozenset(), (
-        "served everywhere: by any name, but still only to its own pages"
-    )
+
+
+@pytest.mark.parametrize(
+    ("host", "passes"),
+    [
+        ("192.168.1.2:8080", True),
+        ("[2001:db8::1]:8080", True),
+        ("localhost:8080", True),
+        (f"{socket.gethostname()}:8080", True),
+        ("evil.example:8080", False),
+    ],
+)
+def test_a_console_that_listens_everywhere_has_its_addresses_and_its_own_name(
+    host: str, passes: bool
+) -> None:
+    assert (refusal(host, None, names_of("0.0.0.0")) is None) == passes
+
+
+@pytest.mark.parametrize(
+    ("site", "mode", "passes"),
+    [
+        ("same-origin", "cors", True),
+        ("none", "navigate", True),
+        ("cross-site", "navigate", True),  # a link on somebody's page
+        ("cross-site", "no-cors", False),
+        ("same-site", "no-cors", False),  # another port of this machine
+    ],
+)
+def test_pages_of_other_servers_may_link_here_and_no_more(site: str, mode: str, passes: bool) -> None:
+    assert (refusal("127.0.0.1:8080", None, names_of("127.0.0.1"), site, mode) is None) == passes
 
 
 def test_a_hand_is_told_in_words() -> None:
