@@ -20,8 +20,8 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from common.errors import PhalanxError
+from common.keys import OPEN
 
-OPEN = "PHALANX_OPEN"
 LIFE = timedelta(days=397)  # browsers refuse a longer life
 _RENEW_BEFORE = timedelta(days=14)
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
@@ -54,7 +54,7 @@ def is_loopback(host: str) -> bool:
 
 
 def is_open(environment: Mapping[str, str]) -> bool:
-    """Whether PHALANX_OPEN=1 says that links may be plain."""
+    """Whether links may be plain: PHALANX_OPEN=1, which the option --open sets."""
     return environment.get(OPEN, "") == "1"
 
 
