@@ -1,9 +1,10 @@
-"""What the count needs, made once under out/aarch64: Debian's aarch64 Python, the pinned wheels, QEMU and its plugin.
+"""What emulation needs, made once under out/aarch64: Debian's aarch64 Python, the pinned wheels, QEMU and its plugin.
 
 Nothing is installed and nothing needs root: Debian's packages are unpacked, not set up. QEMU comes from the same
 suite, whatever the machine has: one version counts for all, and since Debian 13 qemu-user loads no plugins.
 """
 
+import fcntl
 import gzip
 import hashlib
 import importlib.util
@@ -22,8 +23,19 @@ CACHE = ROOT / "out" / "aarch64"
 PLUGIN = Path(__file__).with_name("count.c")
 SUITE, MIRROR, PYTHON = "bookworm", "http://deb.debian.org/debian", "3.11"  # Raspberry Pi OS 12
 PACKAGES = ("python3", "libgomp1", "libstdc++6")
-WHEELS = ("numpy", "opencv-python-headless", "msgspec", "cryptography")
+# What the slave needs: `dependencies` of pyproject.toml, and what those need.
+WHEELS = (
+    "cryptography",
+    "eclipse-zenoh",
+    "imufusion",
+    "msgspec",
+    "numpy",
+    "opencv-python-headless",
+    "pyserial",
+    "smbus2",
+)
 WHEELS_OF_WHEELS = ("cffi", "pycparser")
+UNREACHABLE = ("resolve", "connect", "unreachable", "NewConnectionError", "timed out")
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 TOOLS = {"mmdebstrap": "mmdebstrap", "gcc": "gcc libc6-dev", "tar": "tar"}
 # Of this machine: Debian's name of the architecture, and the loader of programs.
@@ -31,7 +43,11 @@ HOSTS = {"x86_64": ("amd64", "ld-linux-x86-64.so.2"), "aarch64": ("arm64", "ld-l
 
 
 class NotPossibleError(Exception):
-    """The count cannot be made here; the message says what is missing and how to get it."""
+    """Nothing can be emulated here; the message says what is missing and how to get it."""
+
+
+class NoNetworkError(NotPossibleError):
+    """What has to be downloaded cannot be reached."""
 
 
 class Sysroot(NamedTuple):
@@ -53,9 +69,10 @@ def missing() -> list[str]:
 
 
 def prepare(say: Callable[[str], None]) -> Sysroot:
-    """Make what is not there yet.
+    """Make what is not there yet; of several that call at once, one makes it and the others wait.
 
     Raises:
+        NoNetworkError: Debian's mirror or the registry of wheels cannot be reached.
         NotPossibleError: A tool is missing, or fails.
     """
     if absent := missing():
@@ -66,6 +83,13 @@ def prepare(say: Callable[[str], None]) -> Sysroot:
         raise NotPossibleError(
             f"Debian has no QEMU for {platform.machine()}; there is one for {', '.join(HOSTS)}"
         )
+    CACHE.mkdir(parents=True, exist_ok=True)
+    with (CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _prepared(say)
+
+
+def _prepared(say: Callable[[str], None]) -> Sysroot:
     architecture, loader = HOSTS[platform.machine()]
     root = _debian("arm64", PACKAGES, say)
     tools = _debian(architecture, ("qemu-user",), say)
@@ -163,4 +187,5 @@ def _run(command: Sequence[str]) -> None:
     result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode != 0:
         tail = "\n".join((result.stderr or result.stdout).strip().splitlines()[-8:])
-        raise NotPossibleError(f"{' '.join(command)} failed:\n{tail}")
+        error = NoNetworkError if any(sign in tail for sign in UNREACHABLE) else NotPossibleError
+        raise error(f"{' '.join(command)} failed:\n{tail}")

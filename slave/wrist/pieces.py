@@ -60,7 +60,8 @@ def measure(runs: Runs, finger: Int, width_px: int) -> Pieces:
         piece[k] = 0.0
     last = np.concatenate([left, right])
     to_end = outer - points[inner]
-    piece = np.concatenate([piece, np.hypot(to_end[:, 0], to_end[:, 1])])
+    # No hypot, no products of matrices: this way the bits are the same on every processor.
+    piece = np.concatenate([piece, np.sqrt((to_end * to_end).sum(axis=1))])
     middle_u = np.concatenate([u[:-1] + 0.5, (outer[:, 0] + u[inner]) / 2.0])
     middle_v = np.concatenate([(v[1:] + v[:-1]) / 2.0, (outer[:, 1] + v[inner]) / 2.0])
     of = np.concatenate([finger[:-1], finger[last]]) + 1
@@ -98,7 +99,7 @@ def _apart(points: Float, finger: Int, left: Int, right: Int) -> Float:
             [points[a : b + 1].mean(axis=0) for a, b in zip(left[parts], right[parts], strict=True)]
         )
         columns = right[parts] - left[parts] + 1
-        whole = columns @ middles / columns.sum()
+        whole = (columns[:, None] * middles).sum(axis=0) / columns.sum()
         out[of] = 0.5 * float(np.hypot(*(whole - middles[int(columns.argmax())])))
     return out
 

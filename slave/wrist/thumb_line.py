@@ -40,16 +40,18 @@ def beyond_ball(runs: Runs, of_thumb: Int, beyond_m: Float) -> tuple[Float, floa
     points: Float = np.stack([runs.column[of_thumb], runs.row[of_thumb]], axis=-1, dtype=np.float64)
     length = np.ones(len(points))
     if len(points) > 2:
-        step = np.hypot(1.0, np.minimum(np.abs(np.diff(points[:, 1])), _LEAST_PX))
+        down = np.minimum(np.abs(np.diff(points[:, 1])), _LEAST_PX)
+        step = np.sqrt(1.0 + down * down)
         length[1:-1] = 0.5 * (step[1:] + step[:-1])
     weights = (beyond_m > _BORDERS_M[:, None]) * length
     total = weights.sum(axis=1)
     seen = total >= _LEAST_PX
-    whole = length @ points / length.sum()
+    # Sums, not products of matrices, and no hypot: they are the same bits on every processor.
+    whole = (length[:, None] * points).sum(axis=0) / length.sum()
     if (
         not seen.any()
     ):  # all of it on the ball: nearest to the thumb is where it is seen farthest from the root
         return points[int(beyond_m.argmax())] - whole, float(np.ptp(points[:, 0]))
-    off = weights[seen] @ points / total[seen, None] - whole
+    off = (weights[seen, :, None] * points).sum(axis=1) / total[seen, None] - whole
     mean = off.mean(axis=0)
     return mean, _TAILS * float(np.sqrt(((off - mean) ** 2).mean(axis=0).max()))

@@ -1,6 +1,6 @@
 """Instructions per frame: the arithmetic of the marks, the gate, the frames, what is said where a tool is missing.
 
-What needs emulation runs where `make instructions` has been run before, and says so where not.
+What needs emulation is skipped, with the reason, where a tool or the network is missing.
 """
 
 import struct
@@ -16,12 +16,13 @@ import pytest
 from bench.aarch64 import baseline, scene, sysroot
 from bench.aarch64.__main__ import CASES, main
 from bench.aarch64.baseline import Baseline, BaselineError
-from bench.aarch64.count import FIRST, LAST, counted, native, slope, spans
+from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
 from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, write
 from bench.aarch64.guest import Digest, Marks, run_case
 from bench.aarch64.parts import counted_parts
-from bench.aarch64.sysroot import NotPossibleError, Sysroot, prepare
+from bench.aarch64.sysroot import NotPossibleError, Sysroot
 from slave.markers import detector
+from tests.aarch64.machine import sysroot_or_skip
 
 RECORD = Baseline("cortex-a53", {"six": 4_000_000}, {"numpy": "2.4.6", "qemu": "7.2"})
 
@@ -269,11 +270,7 @@ def test_what_failed_to_be_made_leaves_nothing(tmp_path: Path, monkeypatch: pyte
 
 @pytest.fixture(scope="module")
 def emulated() -> Sysroot:
-    if absent := sysroot.missing():
-        pytest.skip(f"missing here: {', '.join(absent)}")
-    if not list(sysroot.CACHE.glob("wheels-*")):
-        pytest.skip("nothing to emulate with: run `make instructions` once")
-    return prepare(lambda line: None)
+    return sysroot_or_skip()
 
 
 LOOPS = 1000
@@ -321,9 +318,21 @@ def test_the_plugin_says_what_it_needs(emulated: Sysroot, tmp_path: Path) -> Non
     assert "to=FILE" in said.stderr
 
 
-def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(emulated: Sysroot, folder: Path) -> None:
+@pytest.fixture(scope="module")
+def six(emulated: Sysroot, folder: Path) -> Counted:
+    return counted(emulated, folder, ["six"])
+
+
+def test_a_frame_of_six_markers_takes_the_instructions_of_the_record(six: Counted, emulated: Sysroot) -> None:
+    record = baseline.read()
+    assert record is not None
+    assert six.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
+    told = baseline.compared(six.per_frame["six"], record.instructions["six"])
+    others = baseline.other_versions(emulated.versions, record.versions)
+    assert baseline.within(six.per_frame["six"], record.instructions["six"]), (told, others)
+
+
+def test_detections_on_aarch64_are_those_of_this_machine_bit_by_bit(six: Counted, folder: Path) -> None:
     if sys.version_info[:2] != (3, 11):
         pytest.skip("Python 3.12 and later add floats otherwise than the emulated 3.11")
-    found = counted(emulated, folder, ["six"])
-    assert found.hashes == native(folder, ["six"])
-    assert found.per_frame["six"] > 640 * 480 / 4  # a scan of a quarter of the pixels cannot take fewer
+    assert six.hashes == native(folder, ["six"])

@@ -1,0 +1,67 @@
+"""The real slave program, emulated, and a master of this machine: datagrams, reports, commands cross architectures."""
+
+import socket
+from pathlib import Path
+
+import numpy as np
+
+from bench.local_rig import free_port
+from common.clock import SystemClock
+from common.messages import Command, Health, MarkerDetections
+from common.zenoh_bus import ZenohBus
+from master.ingest import Ingest
+from tests.aarch64.machine import guest_or_skip
+from tests.network_helpers import until
+
+KEY = bytes(range(32))
+WANTED = 12  # frames
+PATIENCE_S = 120.0  # an emulated start takes ten seconds on an idle machine
+
+
+def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
+    guest = guest_or_skip()
+    endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    beacon = free_port(socket.SOCK_DGRAM)
+    key = tmp_path / "rig.key"
+    key.write_text(KEY.hex())
+    key.chmod(0o600)
+    bus = ZenohBus(endpoint, None)
+    health = bus.subscribe("health", "left")
+    place = ("127.255.255.255", beacon)
+    ingest = Ingest(("left",), KEY, SystemClock(), place, ("127.0.0.1", 0), endpoint)
+    options = ["--name", "left", "--rig", "desk", "--camera", "synthetic", "--colours", "fixed"]
+    link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon), "--key-file", str(key)]
+    slave = guest.start(["-m", "slave", "run", *options, *link])
+    try:
+        seen = _frames(ingest)
+        reports = [report for _ in range(3) if (report := health.get(20.0)) is not None]
+        answer = bus.ask(Command("left", "stop"), 20.0)
+        said, errors = slave.communicate(timeout=60)
+    finally:
+        slave.kill()
+        slave.wait()
+        ingest.close()
+        bus.close()
+    assert len(seen) == WANTED, errors
+    assert all(np.isfinite(one.uv).any() for one in seen[2:])
+    assert [one.seq for one in seen] == sorted(one.seq for one in seen)
+    assert ingest.counts_of("left").received >= WANTED
+    assert not ingest.refused
+    assert all(isinstance(report, Health) and report.counts["frames"] > 0 for report in reports)
+    assert len(reports) == 3
+    assert answer.source == "left"
+    assert slave.returncode == 0, errors
+    assert "frames, sent" in said
+
+
+def _frames(ingest: Ingest) -> list[MarkerDetections]:
+    """The first frames that come."""
+    seen: list[MarkerDetections] = []
+
+    def enough() -> bool:
+        if isinstance(message := ingest.get(0.1), MarkerDetections):
+            seen.append(message)
+        return len(seen) == WANTED
+
+    until(enough, PATIENCE_S)
+    return seen
