@@ -451,6 +451,17 @@ def _detect_wrist(options: argparse.Namespace, progress: Callable[[int, int], No
     return 0
 
 
+def _doctor(options: argparse.Namespace) -> int:
+    from common.machine import program
+    from slave.doctor.command import examine
+    from slave.doctor.finding import as_json, as_text, exit_code
+    from slave.doctor.system import System
+
+    findings = list(examine(options, System.here()))
+    print(as_json(findings, program()) if options.json else as_text(findings))
+    return exit_code(findings)
+
+
 def _colours(options: argparse.Namespace) -> int:
     from slave.markers.colours import report
     from slave.offline import calibrate_colours
@@ -476,6 +487,7 @@ COMMANDS = {
     "record": _record,
     "join": _join,
     "detect": _detect,
+    "doctor": _doctor,
     "colours": _colours,
 }
 

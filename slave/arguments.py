@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slave.cameras import real
+from slave.doctor import command as doctor
 from slave.imu import opening
 from slave.lights.opening import CHOICES, SWITCHED
 from slave.objects import opening as trackers
@@ -104,6 +105,18 @@ HELP = {
         of a wrist device: laser points and fingertips of every strobed triple; the hand is DIR/hands/RIG'S HAND.json
 """,
     ),
+    "doctor": (
+        "what of this device is well, and what is not",
+        """\
+  sudo phalanx-slave doctor
+        on a device with a service: machine, clock, libraries, keys, devices, camera, service, and whether its master
+        is heard; each line ok, warn or fail, with what mends it; exit 1 where something fails
+  phalanx-slave doctor --name left --rig desk --camera v4l2 --calibration calib_json --keys keys --master pc.local
+        before it is installed; as root it sees the keys, as another user the rest
+  phalanx-slave doctor --json
+        the same for programs; docs/doctor.md
+""",
+    ),
     "colours": (
         "colours of the markers",
         """\
@@ -137,6 +150,7 @@ def parser() -> argparse.ArgumentParser:
         "record": _record,
         "join": _join,
         "detect": _detect,
+        "doctor": _doctor,
         "colours": _colours,
     }
     for name, add_options in fill.items():
@@ -273,6 +287,10 @@ def _detect(detect: argparse.ArgumentParser) -> None:
     detect.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
     )
+
+
+def _doctor(command: argparse.ArgumentParser) -> None:
+    doctor.add_options(command, BEACON_PORT)
 
 
 def _colours(colours: argparse.ArgumentParser) -> None:

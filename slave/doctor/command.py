@@ -1,0 +1,135 @@
+"""`phalanx-slave doctor`: which slaves this machine has, and every check of each."""
+
+import argparse
+import shlex
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from slave.doctor.camera import check_camera
+from slave.doctor.clock import check_clock
+from slave.doctor.devices import cameras_of, check_devices, check_groups
+from slave.doctor.finding import Finding, fail, unseen
+from slave.doctor.host import check_host
+from slave.doctor.identity import check_keys, folder_of
+from slave.doctor.master import check_master
+from slave.doctor.programs import check_programs
+from slave.doctor.system import System, pairs
+from slave.doctor.unit import check_unit
+
+ETC = "/etc/phalanx"
+PARSER_EXIT = 2
+
+
+def examine(options: argparse.Namespace, system: System) -> Iterator[Finding]:
+    """All findings: the machine, then each slave.
+
+    Args:
+        options: Those of `add_options`.
+        system: The computer.
+    """
+    yield from check_host(system)
+    yield from check_clock(system, options.master)
+    yield check_groups(system)
+    names = [options.name] if options.name else sorted(path.stem for path in system.path(ETC).glob("*.env"))
+    slaves = [_slave(options, system, name) for name in names]
+    told = [one for one in slaves if isinstance(one, argparse.Namespace)]
+    yield from check_programs(system, sorted({extra for one in told for extra in _extras(one)}))
+    yield cameras_of(system)
+    folder = folder_of(system, options.keys)
+    if not names:
+        yield unseen("slave", f"none in {ETC}: give --name, --rig, --camera, or install it first")
+        yield from check_keys(system, folder, None)
+    for name, slave in zip(names, slaves, strict=True):
+        yield from _of(f"{name}: " if len(names) > 1 else "", _look(system, folder, name, slave))
+    port = next((one.beacon_port for one in told), options.beacon_port)
+    yield from check_master(system, folder, options.master, port)
+
+
+def _look(
+    system: System, folder: Path, name: str, slave: "argparse.Namespace | Finding"
+) -> Iterator[Finding]:
+    """The checks of one slave."""
+    unit = check_unit(system, name)
+    yield unit.finding
+    yield from check_keys(system, folder, name)
+    if isinstance(slave, Finding):
+        yield slave
+        return
+    yield from check_devices(system, slave)
+    if slave.command == "run":
+        yield from check_camera(slave, unit.runs)
+    else:
+        yield unseen("device", f"{slave.command}: whether it answers, the service says")
+
+
+def _slave(options: argparse.Namespace, system: System, name: str) -> "argparse.Namespace | Finding":
+    """Options of a slave: those of its service, each replaced by what the doctor was told."""
+    told = [
+        word
+        for option in ("rig", "camera", "calibration")
+        if (value := getattr(options, option)) is not None
+        for word in (f"--{option}", str(value))
+    ]
+    text = system.text(f"{ETC}/{name}.env")
+    if text is None:
+        if options.camera is None:
+            return unseen("camera", f"no {ETC}/{name}.env: give --camera, and --rig, --calibration")
+        return _parsed(["run", "--name", name, *told], name)
+    said = pairs(text)
+    try:
+        words = shlex.split(said.get("PHALANX_OPTIONS", ""))
+    except ValueError as error:
+        return fail(
+            "options", f"{ETC}/{name}.env: PHALANX_OPTIONS: {error}", "phalanx deploy writes it again"
+        )
+    if said.get("PHALANX_COMMAND") != "run":
+        told = []
+    return _parsed([said.get("PHALANX_COMMAND", ""), *words, *told], name)
+
+
+def _parsed(words: Sequence[str], name: str) -> "argparse.Namespace | Finding":
+    from slave.arguments import parser  # which knows the doctor's own options
+
+    try:
+        return parser().parse_args(words)
+    except SystemExit as error:
+        if error.code == PARSER_EXIT:
+            return fail(
+                "options", f"of {name}: see the line above", f"{ETC}/{name}.env: phalanx-slave COMMAND --help"
+            )
+        raise
+
+
+def _extras(slave: argparse.Namespace) -> Iterator[str]:
+    """Libraries that only this slave needs."""
+    if str(getattr(slave, "camera", "")).partition(":")[0] == "picamera2":
+        yield "picamera2"
+    if str(getattr(slave, "lights", "")).startswith("gpio:"):
+        yield "gpiod"
+    if "i2c:" in str(getattr(slave, "lights", "")) or "lsm6dsox" in str(getattr(slave, "imu", "")):
+        yield "smbus2"
+    if "ximu3" in str(getattr(slave, "imu", "")):
+        yield "serial"
+    if getattr(slave, "engine", "") == "numba":
+        yield "numba"
+
+
+def _of(prefix: str, findings: Iterator[Finding]) -> Iterator[Finding]:
+    for one in findings:
+        yield Finding(prefix + one.check, one.verdict, one.text, one.fix)
+
+
+def add_options(parser: argparse.ArgumentParser, beacon_port: int) -> None:
+    """What the doctor can be told; what it is not, the files in /etc/phalanx say."""
+    parser.add_argument("--name", help="slave to look at (default: all that are installed here)")
+    parser.add_argument("--rig", help="its rig (default: as installed)")
+    parser.add_argument(
+        "--camera", metavar="DRIVER", help="its camera, as `run` has it (default: as installed)"
+    )
+    parser.add_argument("--calibration", type=Path, metavar="DIR", help="calib_json (default: as installed)")
+    parser.add_argument("--keys", type=Path, metavar="DIR", help="keys folder (default: /etc/phalanx/keys)")
+    parser.add_argument("--master", metavar="HOST", help="the PC whose beacon and clock are expected")
+    parser.add_argument(
+        "--beacon-port", type=int, default=beacon_port, metavar="PORT", help="default: %(default)s"
+    )
+    parser.add_argument("--json", action="store_true", help="for programs")

@@ -1,0 +1,112 @@
+"""The machine itself: 64 bit, which system on which board, Python, room, heat, supply."""
+
+import platform
+import re
+import struct
+import sys
+from collections.abc import Iterator
+
+from common.machine import Machine
+from slave.doctor.finding import Finding, fail, ok, unseen, warn
+from slave.doctor.system import System
+
+RELEASES = {"trixie": "13", "bookworm": "12"}  # of Debian, and of the Raspberry Pi OS made from it
+PYTHONS = ((3, 11), (3, 13))
+STATE = "/var/lib/phalanx"
+FEW_MB, NO_MB = 500.0, 100.0
+# Raspberry Pi documentation, "vcgencmd get_throttled": bit -> what it says; the same 16 bits higher: since the start.
+BITS = {
+    0: "under-voltage",
+    1: "processor frequency capped",
+    2: "throttled",
+    3: "soft temperature limit",
+}
+SINCE = 16
+COOL = "better cooling: a heat sink, a fan, air around it"
+SUPPLY = "a stronger power supply, a shorter or thicker cable"
+
+
+def check_host(system: System) -> Iterator[Finding]:
+    """Everything that is neither a device nor a program of ours."""
+    yield _bits()
+    yield _release(system)
+    yield _board(system)
+    yield _python()
+    yield from _gauges(system)
+    yield _throttled(system)
+
+
+def _bits() -> Finding:
+    machine, bits = platform.machine(), struct.calcsize("P") * 8
+    if bits != 64:
+        return fail(
+            "64 bit", f"{machine}, this Python has {bits} bit", "install the 64-bit Raspberry Pi OS (Lite)"
+        )
+    return ok("64 bit", machine)
+
+
+def _release(system: System) -> Finding:
+    text = system.text("/etc/os-release") or ""
+    said = dict(re.findall(r'^(\w+)="?([^"\n]*)"?$', text, re.MULTILINE))
+    name = said.get("PRETTY_NAME", "unknown")
+    if said.get("VERSION_CODENAME") in RELEASES:
+        return ok("system", name)
+    return warn(
+        "system", f"{name}: not tried with it", f"Raspberry Pi OS or Debian {' or '.join(sorted(RELEASES))}"
+    )
+
+
+def _board(system: System) -> Finding:
+    model = system.text("/sys/firmware/devicetree/base/model")
+    return unseen("board", "no device tree: not a Raspberry Pi") if model is None else ok("board", model)
+
+
+def _python() -> Finding:
+    version = platform.python_version()
+    if not PYTHONS[0] <= sys.version_info[:2] <= PYTHONS[1]:
+        return fail("Python", version, "Python 3.11 to 3.13")
+    return ok("Python", f"{version} in {sys.prefix}")
+
+
+def _gauges(system: System) -> Iterator[Finding]:
+    folder = system.path(STATE) if system.path(STATE).is_dir() else system.root
+    gauges = Machine(folder, system.environment).gauges()
+    free_mb = gauges.get("disk_free_mb")
+    if free_mb is None:
+        yield unseen("disk", f"{folder}: not known")
+    elif free_mb < FEW_MB:
+        say = fail if free_mb < NO_MB else warn
+        yield say(
+            "disk", f"{free_mb:.0f} MB free", "delete recordings or old releases in /opt/phalanx/releases"
+        )
+    else:
+        yield ok("disk", f"{free_mb / 1000.0:.1f} GB free")
+    now, limit = gauges.get("temperature_c"), gauges.get("temperature_limit_c")
+    if now is None or limit is None:
+        yield unseen("temperature", "no sensor with a limit")
+    elif now >= limit:
+        yield warn("temperature", f"{now:.0f} °C, it slows down from {limit:.0f} °C on", COOL)
+    else:
+        yield ok("temperature", f"{now:.0f} °C, limit {limit:.0f} °C")
+
+
+def _throttled(system: System) -> Finding:
+    flags = _flags(system)
+    if flags is None:
+        return unseen("throttling", "no firmware of a Raspberry Pi that tells, no vcgencmd")
+    now = [text for bit, text in BITS.items() if flags >> bit & 1]
+    before = [text for bit, text in BITS.items() if flags >> (bit + SINCE) & 1 and text not in now]
+    if not now and not before:
+        return ok("throttling", "none since the start")
+    said = [*(f"{text} now" for text in now), *(f"{text} since the start" for text in before)]
+    fix = SUPPLY if flags & (1 | 1 << SINCE) else COOL
+    return warn("throttling", ", ".join(said), fix)
+
+
+def _flags(system: System) -> int | None:
+    """Those of the firmware: asked by vcgencmd, which knows all of them on every board; else those of sysfs."""
+    asked = system.run(("vcgencmd", "get_throttled"), 5.0)
+    if asked.code == 0 and (found := re.search(r"throttled=(0x[0-9a-fA-F]+)", asked.out)):
+        return int(found[1], 16)
+    told = Machine(system.root, system.environment).gauges().get("throttled")
+    return None if told is None else int(told)

@@ -1,0 +1,83 @@
+"""The keys of a device: all there, of each other, for this name, valid, and nobody else's to read."""
+
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives import serialization
+
+from common.certificates import shown
+from common.errors import PhalanxError
+from common.keys import RIG_KEY, access_of, rig_key
+from slave.doctor.finding import Finding, fail, ok, unseen, warn
+from slave.doctor.system import System
+
+FOLDER = "/etc/phalanx/keys"
+SOON = timedelta(days=90)
+MAKE = "on the PC: phalanx-master keys make DIR --device {}, then phalanx deploy"
+_PUBLIC = (serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+
+
+def folder_of(system: System, told: Path | None) -> Path:
+    """Where the keys are: as told, as the environment says, or where an installer puts them."""
+    if told is not None:
+        return told
+    named = system.environment.get("PHALANX_KEYS")
+    return Path(named) if named else system.path(FOLDER)
+
+
+def check_keys(
+    system: System, folder: Path, name: str | None, now: datetime | None = None
+) -> Iterator[Finding]:
+    """The keys folder, as the device `name` uses it."""
+    try:
+        next(folder.iterdir(), None)
+    except FileNotFoundError:
+        yield fail("keys", f"{folder}: no such folder", MAKE.format(name or "NAME"))
+        return
+    except PermissionError:
+        yield unseen("keys", f"{folder}: only root may look: sudo phalanx-slave doctor")
+        return
+    if folder.stat().st_mode & 0o077:
+        yield warn("keys", f"{folder}: others may look into it", f"sudo chmod 700 {folder}")
+    try:
+        rig_key({}, folder / RIG_KEY)
+    except (PhalanxError, OSError) as error:
+        yield fail("rig key", str(error), MAKE.format(name or "NAME"))
+    else:
+        yield ok("rig key", str(folder / RIG_KEY))
+    if name is None:
+        yield unseen("certificate", "of whom? give --name")
+        return
+    yield _certificate(system, folder, name, now or datetime.now(UTC))
+
+
+def _certificate(system: System, folder: Path, name: str, now: datetime) -> Finding:
+    try:
+        identity = access_of(system.environment, name, folder).identity()
+        own = x509.load_pem_x509_certificate(identity.certificate.read_bytes())
+        authority = x509.load_pem_x509_certificate(identity.authority.read_bytes())
+        key = serialization.load_pem_private_key(identity.key.read_bytes(), None)
+        until = shown(identity.certificate.read_bytes()).until
+    except (PhalanxError, OSError, ValueError) as error:
+        return fail("certificate", str(error), MAKE.format(name))
+    if key.public_key().public_bytes(*_PUBLIC) != own.public_key().public_bytes(*_PUBLIC):
+        return fail("certificate", f"{identity.key}: the key of another certificate", MAKE.format(name))
+    try:
+        own.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):
+        return fail(
+            "certificate", f"{identity.certificate}: not signed by {identity.authority}", MAKE.format(name)
+        )
+    days = (until - now).days
+    if until <= now or authority.not_valid_after_utc <= now:
+        return fail(
+            "certificate", f"ended {-days} days ago, or the clock is wrong", "phalanx-master keys renew DIR"
+        )
+    if until - now < SOON:
+        return warn(
+            "certificate", f"ends in {days} days", "phalanx-master keys renew DIR, then phalanx deploy"
+        )
+    return ok("certificate", f"of {name}, signed by the rig's authority, until {until:%Y-%m-%d}")

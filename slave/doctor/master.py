@@ -1,0 +1,77 @@
+"""Whether the master is heard: does a beacon of this rig arrive within a second, and from where. Nothing is sent."""
+
+import os
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from common.clock import SystemClock
+from common.errors import PhalanxError
+from common.keys import RIG_KEY, rig_key
+from common.udp import UdpSocket
+from slave.doctor.finding import Finding, fail, ok, unseen, warn
+from slave.doctor.system import System
+from slave.link import SlaveLink
+
+LISTEN_S = 1.0  # the beacon comes four times a second and more
+NOT_HEARD = (
+    "is phalanx-master running, with --beacon of this network? Are both in one network, and does its wireless router "
+    "let clients talk to each other? UDP port {} must pass"
+)
+
+
+def check_master(
+    system: System, keys: Path, master: str | None, port: int, bind: str = "0.0.0.0"
+) -> Iterator[Finding]:
+    """Listen for a beacon, as a slave with the same key does."""
+    addresses: set[str] = set()
+    if master is not None:
+        try:
+            addresses = {str(one[4][0]) for one in socket.getaddrinfo(master, None, socket.AF_INET)}
+            yield ok("master's name", f"{master} is {', '.join(sorted(addresses))}")
+        except OSError as error:
+            yield fail(
+                "master's name", f"{master}: {error.strerror}", "give its address, or NAME.local (mDNS)"
+            )
+    try:
+        file = keys / RIG_KEY
+        key = rig_key(system.environment, file if file.exists() else None)
+    except (PhalanxError, OSError) as error:
+        yield unseen("beacon", f"without a rig key no beacon can be told from a foreign one: {error}")
+        return
+    yield _listen(SlaveLink("doctor", key, SystemClock(), os.urandom), port, bind, addresses)
+
+
+def _listen(link: SlaveLink, port: int, bind: str, addresses: set[str]) -> Finding:
+    try:
+        beacons = UdpSocket((bind, port), shared=True, timeout_s=0.1)
+    except PhalanxError as error:
+        return fail("beacon", str(error), "stop what has the port, or use --beacon-port on both sides")
+    end_s = time.monotonic() + LISTEN_S
+    try:
+        while time.monotonic() < end_s:
+            if (arrived := beacons.receive()) is None:
+                continue
+            datagram, address = arrived
+            before = link.refused.total()
+            link.hear_beacon(datagram, address, time.monotonic_ns())
+            if link.refused.total() == before:
+                return _heard(address[0], addresses)
+    finally:
+        beacons.close()
+    refused = {str(reason.value): count for reason, count in link.refused.items()}
+    if "version" in refused:
+        return fail(
+            "beacon", "a master of another version of the wire", "install the same version on both sides"
+        )
+    if refused:
+        said = ", ".join(f"{reason} {count}" for reason, count in refused.items())
+        return fail("beacon", f"heard, but not of this rig: {said}", "compare rig.key of both sides")
+    return fail("beacon", f"none in {LISTEN_S:g} s on UDP port {port}", NOT_HEARD.format(port))
+
+
+def _heard(address: str, expected: set[str]) -> Finding:
+    if expected and address not in expected:
+        return warn("beacon", f"from {address}, which is not the master named", "is a second master running?")
+    return ok("beacon", f"from {address}, of this rig")
