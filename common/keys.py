@@ -57,7 +57,7 @@ def rig_key(environment: Mapping[str, str], key_file: Path | None = None, keys: 
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise PhalanxError(f"{path}: cannot read the rig key ({error}); {_ADVICE}") from error
-    if (fault := others_read(path, environment)) is not None:
+    if (fault := others_read(path, "the rig key", environment)) is not None:
         raise PhalanxError(fault)
     return _parse(text, str(path))
 
@@ -72,8 +72,8 @@ def keys_folder(environment: Mapping[str, str]) -> Path | None:
     return Path(environment[FOLDER]) if environment.get(FOLDER) else None
 
 
-def others_read(path: Path, environment: Mapping[str, str]) -> str | None:
-    """Why a private file is none: others than its owner can read it; None: all is well.
+def others_read(path: Path, what: str, environment: Mapping[str, str]) -> str | None:
+    """Why a private file, which has `what`, is none: others than its owner can read it; None: all is well.
 
     In the folder of a service's credentials the mask of an access-control list stands where the group's bits are.
     """
@@ -81,7 +81,7 @@ def others_read(path: Path, environment: Mapping[str, str]) -> str | None:
     handed = folder is not None and path.parent == Path(folder)
     forbidden = stat.S_IRWXO if handed else stat.S_IRWXG | stat.S_IRWXO
     if path.stat().st_mode & forbidden:
-        return f"{path}: others can read this secret; run: chmod 600 {path}"
+        return f"{path}: others can read {what}; run: chmod 600 {path}"
     return None
 
 
@@ -137,7 +137,7 @@ class Access:
         try:
             name = shown(identity.certificate.read_bytes()).name
             shown(identity.authority.read_bytes())
-            fault = others_read(identity.key, self.environment)
+            fault = others_read(identity.key, f"the key of {self.role!r}", self.environment)
         except (OSError, ValueError) as error:
             raise BusError(f"{self.folder}: keys of {self.role!r}: {error}") from error
         if fault is not None:

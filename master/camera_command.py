@@ -13,7 +13,7 @@ from common.camera_settings import ROI_LEAST, ROI_MOST, WANTED, CameraSettings, 
 from common.errors import BusError, CalibrationError, PhalanxError
 from common.messages import Command, Health
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from master.master_bus import join_bus
 from master.options import HERE_BUS, BusEnd
 
 ANSWER_S = (
@@ -73,7 +73,7 @@ def camera(
     """
     wanted = settings(exposure_us, gain, colour_gains, rate_hz, roi_margin)
     steps = commands(name, wanted, pick, load_file, save)
-    connection = ZenohBus(None, bus, beyond=True)
+    connection = join_bus(bus)
     try:
         health = tell(connection, steps)
     finally:

@@ -12,11 +12,11 @@ from common.bus import Bus
 from common.clock import Clock, SystemClock
 from common.messages import Command, Health
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
 from master.ingest import Ingest
+from master.master_bus import carry_bus
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
 from master.outputs.devices import DevicePoses
@@ -42,7 +42,7 @@ class LiveSettings:
     Attributes:
         beacon: Broadcast address and port where slaves listen.
         bind: Own UDP address and port for data (0: any).
-        bus: Endpoint on which the zenoh bus listens, for example tcp/127.0.0.1:47802.
+        bus: Endpoint on which the zenoh bus listens, for example tls/0.0.0.0:47802.
         start_timeout_s: How long the first slave waits for the others.
         poses: Where to write poses.npz, or None; those of a second hand stand beside it under its name, and objects,
             contact and gestures in its folder.
@@ -95,7 +95,7 @@ def run_live(
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
     with ExitStack() as stack:
-        bus = ZenohBus(settings.bus, None)
+        bus = carry_bus(settings.bus, devices_of(setups))
         stack.callback(bus.close)
         tap = Tap(bus, clock, always=settings.record is not None)
         stack.callback(tap.close)
@@ -178,6 +178,12 @@ def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
 def trackers_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
     """All trackers that sit on objects."""
     return tuple(name for setup in setups for name in setup.trackers)
+
+
+def devices_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
+    """All that may connect: cameras, IMUs and trackers."""
+    imus = tuple(name for setup in setups for name in setup.imus)
+    return tuple(dict.fromkeys((*cameras_of(setups), *imus, *trackers_of(setups))))
 
 
 def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: LiveSettings) -> Ingest:

@@ -1,12 +1,37 @@
-"""The bus as the master sees it, for programs beside a master: they wait until one is there."""
+"""How programs of the PC come to the bus: a master listens, all others join it, each with its own certificate."""
 
+import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+from common.certificates import MASTER, OPERATOR
 from common.errors import BusError
+from common.keys import access_of
 from common.zenoh_bus import ZenohBus
 
 _TRY_AGAIN_S = 0.3
+
+
+def join_bus(endpoint: str) -> ZenohBus:
+    """The bus as the master at `endpoint` sees it.
+
+    Raises:
+        BusError: Nobody listens there, or refuses this program's certificate; the endpoint is malformed.
+    """
+    return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True)
+
+
+def carry_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
+    """The bus of a master, which listens at `endpoint`.
+
+    Args:
+        endpoint: As `tls/0.0.0.0:47802`.
+        devices: Names of cameras, IMUs and trackers that may connect, beside those whose keys are in the keys folder.
+
+    Raises:
+        BusError: The address is taken; keys are missing; the endpoint is malformed.
+    """
+    return ZenohBus(endpoint, None, access_of(os.environ, MASTER), devices=devices)
 
 
 def bus_of_master(
@@ -15,14 +40,14 @@ def bus_of_master(
     """The bus, once a master listens at `endpoint`; None when stopped before. `waiting` is told once why not yet.
 
     Raises:
-        BusError: The endpoint is malformed.
+        BusError: The endpoint is malformed, or keys are missing.
     """
     said = False
     while not stop.is_set():
         try:
-            return ZenohBus(None, endpoint, beyond=True)
+            return join_bus(endpoint)
         except BusError as error:
-            if error.__cause__ is None:  # refused by us, not by the network: the endpoint is malformed
+            if error.__cause__ is None:  # refused by us, not by the network: endpoint or keys
                 raise
             if not said:
                 waiting(error)

@@ -1,13 +1,16 @@
 """Options that several commands of the master share, and what the texts behind them mean."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from common.datagram import Address
+from common.endpoints import default_bus
 from common.errors import PhalanxError
 
+HERE_BUS = "here"  # of this machine; encrypted where there are keys
 Rig = Annotated[str, typer.Option(help="Rig: a file of CALIBRATION/rigs, without .json.")]
 Rigs = Annotated[
     list[str],
@@ -19,8 +22,26 @@ Rigs = Annotated[
     ),
 ]
 Calibration = Annotated[Path, typer.Option(help="Folder with rigs/, cameras/ and hands/.")]
-KeyFile = Annotated[Path | None, typer.Option(help="Rig key; default: the variable PHALANX_RIG_KEY.")]
-BusEnd = Annotated[str, typer.Option("--bus", help="Endpoint of the bus.")]
+KeyFile = Annotated[
+    Path | None,
+    typer.Option(help="File of the rig key alone; default: PHALANX_RIG_KEY, then --keys."),
+]
+
+
+def _bus(text: str) -> str:
+    """What `--bus` says; said nothing, the bus of this machine."""
+    return default_bus(os.environ) if text == HERE_BUS else text
+
+
+BusEnd = Annotated[
+    str,
+    typer.Option(
+        "--bus",
+        help="Endpoint of the bus; tls/ needs keys, docs/keys.md.",
+        show_default="tls/127.0.0.1:47802 where there are keys, else tcp/127.0.0.1:47802",
+        callback=_bus,
+    ),
+]
 Beacon = Annotated[str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")]
 RecordingRig = Annotated[
     str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")
@@ -32,7 +53,7 @@ JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers
 Bind = Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")]
 
 CALIB_JSON = Path("calib_json")
-HERE_BEACON, HERE_BIND, HERE_BUS = "127.255.255.255:47800", "127.0.0.1:47801", "tcp/127.0.0.1:47802"
+HERE_BEACON, HERE_BIND = "127.255.255.255:47800", "127.0.0.1:47801"
 
 
 def address(text: str, option: str) -> Address:

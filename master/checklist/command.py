@@ -9,7 +9,7 @@ from common.bus import Subscription
 from common.errors import BusError
 from common.messages import CheckItem, Checklist
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
+from master.master_bus import join_bus
 from master.options import HERE_BUS, BusEnd
 
 ANSWER_S = 3.0  # a master tells once a second
@@ -31,10 +31,10 @@ def check(
 
       phalanx-master check --watch
 
-      phalanx-master check --bus tcp/192.168.1.2:47802 && echo ready
+      phalanx-master check --keys DIR --bus tls/192.168.1.2:47802 && echo ready
     """
     items: tuple[CheckItem, ...] = ()
-    connection = ZenohBus(None, bus, beyond=True)
+    connection = join_bus(bus)
     try:
         lists = connection.subscribe("checklist", MASTER)
         items = newest(lists, bus)

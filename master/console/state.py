@@ -22,13 +22,13 @@ from common.messages import (
     Preview,
 )
 from common.streams import MASTER
-from common.zenoh_bus import ZenohBus
 from master.console.gestures_heard import GesturesHeard
 from master.console.history import STEP_S, History
 from master.console.link import Link
 from master.console.local import LocalProcesses
 from master.console.looking import Looking
 from master.console.tuner import Tuner
+from master.master_bus import join_bus
 from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
 
 STALE_S = 3.0  # what was not told again for so long is no longer shown as present
@@ -107,7 +107,7 @@ class ConsoleState:
         self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._closing = threading.Event()
-        self.link = Link(open_bus or (lambda: ZenohBus(None, settings.bus, beyond=True)), _takers(self))
+        self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))
         self._looking = Looking(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
         self._sampler = threading.Thread(target=self._sample, name="console history", daemon=True)

@@ -12,11 +12,11 @@ from common.errors import CalibrationError, FitError, PhalanxError
 from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
-from common.zenoh_bus import ZenohBus
 from master.calibrate.tree_files import provenance
 from master.gestures.lesson import held, lesson, what_lacks
 from master.gestures.reading import lines_of, read_gestures, spans_of
 from master.gestures.teach import FEWEST, MOST, Example, Taught, learn
+from master.master_bus import join_bus
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration
 from master.outputs.files import load_poses
 
@@ -204,7 +204,7 @@ def _live(
     name: str, examples: int, bus: str, hand: Path | None, hand_name: str | None, calibration: Path
 ) -> list[Example]:
     """Examples that are shown before a running master."""
-    link = ZenohBus(None, bus, beyond=True)
+    link = join_bus(bus)
     try:
         queue = (
             link.subscribe("hand", depth=_DEPTH)

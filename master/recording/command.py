@@ -10,8 +10,7 @@ import typer
 from common.bus import Bus
 from common.errors import PhalanxError
 from common.recording import open_messages
-from common.zenoh_bus import ZenohBus
-from master.master_bus import bus_of_master
+from master.master_bus import bus_of_master, carry_bus
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, Rigs
 from master.recording.lines import ProgressLine, bar, events_of, progress_text, table
 from master.recording.play import PlaySettings, run_play
@@ -141,7 +140,7 @@ def play(
         done = position_s / length_s if length_s > 0.0 else 1.0
         line.show(f"{bar(done)} {position_s:.1f} of {length_s:.1f} s")
 
-    connection = None if no_bus else ZenohBus(bus, None)
+    connection = None if no_bus else carry_bus(bus)
     try:
         passed = run_play(settings, connection, stop, _player_says, show)
     finally:

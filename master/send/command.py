@@ -31,7 +31,7 @@ def send(
 
       phalanx-master send --only osc,vmc
 
-      phalanx-master send --outputs stage --bus tcp/192.168.1.2:47802
+      phalanx-master send --outputs stage --keys DIR --bus tls/192.168.1.2:47802
     """
     path = calibration / "outputs" / f"{outputs}.json"
     settings = settings_of(path)

@@ -12,11 +12,11 @@ from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.keys import rig_key
-from common.zenoh_bus import ZenohBus
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of, options_of
 from master.ingest import Ingest
+from master.master_bus import carry_bus
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -70,7 +70,7 @@ def capture_views(
     new_folder(out)
     stop = stop_on_signals()
     with ExitStack() as stack:
-        link = ZenohBus(bus, None)
+        link = carry_bus(bus, live.cameras)
         stack.callback(link.close)
         ingest = Ingest(live.cameras, key, clock, *ends, bus, _START_S)
         stack.callback(ingest.close)

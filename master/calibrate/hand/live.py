@@ -6,9 +6,9 @@ from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.hand_model import HandModel
 from common.messages import HandPose
-from common.zenoh_bus import ZenohBus
 from master.calibrate.hand.observed import Observed, marker_rows
 from master.calibrate.hand.session import lead
+from master.master_bus import join_bus
 
 _DEPTH = 256  # poses that may wait while a line is printed
 
@@ -27,7 +27,7 @@ def observe_live(bus: str, names: tuple[str, ...], model: HandModel) -> Observed
         FitError: The routine was not seen.
     """
     tips = marker_rows(names, model)[:5]
-    link = ZenohBus(None, bus, beyond=True)
+    link = join_bus(bus)
     try:
         poses = link.subscribe("hand", depth=_DEPTH)
 

@@ -5,9 +5,9 @@ from collections.abc import Callable, Sequence
 from common.calibration import RigCalibration
 from common.clock import SystemClock
 from common.messages import HandPose
-from common.zenoh_bus import ZenohBus
 from master.calibrate.object.seen import Seen
 from master.calibrate.object.session import lead
+from master.master_bus import join_bus
 
 _DEPTH = 512  # poses that may wait while a line is printed
 
@@ -29,7 +29,7 @@ def observe_live(
         CalibrationError: The master runs another rig.
         FitError: No pose came.
     """
-    link = ZenohBus(None, bus, beyond=True)
+    link = join_bus(bus)
     try:
         poses = link.subscribe("hand", depth=_DEPTH)
 

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from common.clock import SystemClock
 from common.messages import ObjectPose, TrackerPose
 from common.object_profile import ObjectProfile
-from common.zenoh_bus import ZenohBus
 from master.calibrate.tracker.session import Session, lead
+from master.master_bus import join_bus
 
 _DEPTH = 1024  # poses that may wait while a line is printed
 
@@ -24,7 +24,7 @@ def observe_live(bus: str, profile: ObjectProfile, longest_s: float, say: Callab
         BusError: Nobody listens there.
         FitError: Cameras or tracker said nothing.
     """
-    link = ZenohBus(None, bus, beyond=True)
+    link = join_bus(bus)
     try:
         objects = link.subscribe("object", profile.name, _DEPTH)
         devices = link.subscribe("device", profile.tracker or profile.name, _DEPTH)

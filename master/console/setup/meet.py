@@ -10,9 +10,9 @@ import typer
 from common.clock import SystemClock
 from common.errors import PhalanxError
 from common.keys import rig_key
-from common.zenoh_bus import ZenohBus
 from master.calibrate.cameras.capture_command import cameras_of
 from master.ingest import Ingest
+from master.master_bus import carry_bus
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -45,7 +45,7 @@ def meet(
     ends = address(beacon, "--beacon"), address(bind, "--bind")
     stop = stop_on_signals()
     with ExitStack() as stack:
-        link = ZenohBus(bus, None)
+        link = carry_bus(bus, cameras)
         stack.callback(link.close)
         ingest = Ingest(cameras, rig_key(os.environ, key_file), SystemClock(), *ends, bus, _START_S)
         stack.callback(ingest.close)
