@@ -15,7 +15,7 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
 
 from common.errors import PhalanxError
 from common.frame_recording import open_recording
-from common.keys import ENVIRONMENT, rig_key
+from common.keys import ENVIRONMENT, keys_folder, rig_key
 from common.sim.scenes import NAMES
 from common.sim.wrist.scene import WRIST_NAMES
 from master.calibrate.cli import calibrate_app
@@ -24,6 +24,7 @@ from master.checklist.command import check
 from master.export.command import export
 from master.gestures.command import gestures_app
 from master.keys_command import keys_app
+from master.key_options import program
 from master.live import LiveSettings, run_live
 from master.master_bus import bus_of_master
 from master.options import (
@@ -111,7 +112,7 @@ def run(
 
       phalanx-master run --rig desk --record out/wave.mcap
 
-      phalanx-master run --rig desk --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tcp/192.168.1.2:47802
+      phalanx-master run --rig desk --keys DIR --beacon 192.168.1.255:47800 --bind 0.0.0.0:47801 --bus tls/0.0.0.0:47802
     """
     setups = load_setups(calibration, rig, hand)
     settings = LiveSettings(
@@ -200,7 +201,7 @@ def view(
 
       phalanx-master view --rig desk --rig wrist
 
-      phalanx-master view --rig desk --bus tcp/192.168.1.2:47802 --web
+      phalanx-master view --rig desk --keys DIR --bus tls/192.168.1.2:47802 --web
     """
     from master.outputs.rerun import run_viewer
 
@@ -237,10 +238,19 @@ def console(
     key_file: KeyFile = None,
     port: Annotated[int, typer.Option(min=0, max=65535, help="TCP port of the page; 0: a free one.")] = 8080,
     host: Annotated[
-        str, typer.Option(help="Address to serve on. Whoever reaches it can tune and stop the rig.")
+        str,
+        typer.Option(
+            help="Address to serve on. Elsewhere than on this machine the page asks for a password."
+        ),
     ] = "127.0.0.1",
 ) -> None:
     """Serve the console: watch, tune, record and set up in a browser. A process of its own, which may come and go.
+    password_file: Annotated[
+        Path | None,
+        typer.Option(
+            help="Ask for the password in the first line of this file; default: one is made and said once."
+        ),
+    ] = None,
 
     Needs no master and no file: the page sets a rig up from nothing. BEACON, BIND and the key are those of the
     processes that the page starts.
@@ -251,16 +261,30 @@ def console(
 
       phalanx-master console --rig desk --rig wrist --port 8081
 
-      phalanx-master console --bus tcp/192.168.1.2:47802
+      phalanx-master console --keys DIR --bus tls/192.168.1.2:47802
+
+      phalanx-master console --host 0.0.0.0
     """
     from master.console.app import run_console
     from master.console.state import ConsoleSettings
 
     address(beacon, "--beacon")
+    from master.listening import is_open
     address(bind, "--bind")
-    known = key_file is not None or ENVIRONMENT in os.environ
+    known = key_file is not None or ENVIRONMENT in os.environ or keys_folder(os.environ) is not None
     key = rig_key(os.environ, key_file) if known else None
-    settings = ConsoleSettings(calibration, tuple(rig or ()), bus, beacon, bind, key, port, host)
+    settings = ConsoleSettings(
+        calibration,
+        tuple(rig or ()),
+        bus,
+        beacon,
+        bind,
+        key,
+        port,
+        host,
+        password_file,
+        is_open(os.environ),
+    )
     run_console(settings, stop_on_signals(), _say)
 
 
@@ -313,7 +337,7 @@ def main() -> None:
         app.command()(command)
     app.command()(send)
     try:
-        app()
+        program(app)()
     except PhalanxError as error:
         print(f"phalanx-master: {error}", file=sys.stderr)
         sys.exit(1)
