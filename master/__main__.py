@@ -23,8 +23,8 @@ from master.camera_command import camera
 from master.checklist.command import check
 from master.export.command import export
 from master.gestures.command import gestures_app
-from master.keys_command import keys_app
 from master.key_options import program
+from master.keys_command import keys_app
 from master.live import LiveSettings, run_live
 from master.master_bus import bus_of_master
 from master.options import (
@@ -243,14 +243,14 @@ def console(
             help="Address to serve on. Elsewhere than on this machine the page asks for a password."
         ),
     ] = "127.0.0.1",
-) -> None:
-    """Serve the console: watch, tune, record and set up in a browser. A process of its own, which may come and go.
     password_file: Annotated[
         Path | None,
         typer.Option(
             help="Ask for the password in the first line of this file; default: one is made and said once."
         ),
     ] = None,
+) -> None:
+    """Serve the console: watch, tune, record and set up in a browser. A process of its own, which may come and go.
 
     Needs no master and no file: the page sets a rig up from nothing. BEACON, BIND and the key are those of the
     processes that the page starts.
@@ -267,9 +267,9 @@ def console(
     """
     from master.console.app import run_console
     from master.console.state import ConsoleSettings
+    from master.listening import is_open
 
     address(beacon, "--beacon")
-    from master.listening import is_open
     address(bind, "--bind")
     known = key_file is not None or ENVIRONMENT in os.environ or keys_folder(os.environ) is not None
     key = rig_key(os.environ, key_file) if known else None
