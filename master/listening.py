@@ -8,6 +8,7 @@ The browser asks once; what it shows is compared with the fingerprint that is pr
 import os
 import socket
 import ssl
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -19,11 +20,13 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
+from common.endpoints import loopback
 from common.errors import PhalanxError
 from common.keys import OPEN
 
 LIFE = timedelta(days=397)  # browsers refuse a longer life
 _RENEW_BEFORE = timedelta(days=14)
+_MOST_BYTES = 65536
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
 
 
@@ -41,16 +44,8 @@ class PageCertificate:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address to listen on is reached from this machine alone; a name is, where all it means is."""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        pass
-    try:
-        found = {str(one[4][0]) for one in socket.getaddrinfo(host, None)}
-    except OSError:
-        return False
-    return bool(found) and all(ip_address(one.split("%", 1)[0]).is_loopback for one in found)
+    """Whether an address is reached from this machine alone. Of names only localhost is: the others may change."""
+    return loopback(f"tcp/[{host}]:0")
 
 
 def is_open(environment: Mapping[str, str]) -> bool:
@@ -78,18 +73,50 @@ def page_certificate(folder: Path, host: str, now: datetime | None = None) -> Pa
     path = folder / "page.pem"
     now = now or datetime.now(UTC)
     try:
-        if not path.exists() or not _fits(path.read_bytes(), host, now):
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _write(path, _made(host, now))
-        if path.stat().st_mode & 0o077:
-            raise PhalanxError(f"{path}: others can read the key of the page; run: chmod 600 {path}")
+        if not path.exists() or not _fits(read_private(path), host, now):
+            write_private(path, _made(host, now))
+        pem = read_private(path)
         context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
         context.minimum_version = ssl.TLSVersion.TLSv1_2
         context.load_cert_chain(path)
-        digest = x509.load_pem_x509_certificate(path.read_bytes()).fingerprint(hashes.SHA256()).hex().upper()
-    except (OSError, ValueError) as error:  # ssl.SSLError is an OSError
+        digest = x509.load_pem_x509_certificate(pem).fingerprint(hashes.SHA256()).hex().upper()
+    except (ssl.SSLError, x509.ExtensionNotFound, ValueError) as error:
         raise PhalanxError(f"{path}: cannot use the certificate of the page ({error}); delete it") from error
     return PageCertificate(context, ":".join(digest[i : i + 2] for i in range(0, len(digest), 2)))
+
+
+def read_private(path: Path) -> bytes:
+    """What is in a file of secrets, at most 64 KiB of it.
+
+    Raises:
+        PhalanxError: It cannot be read, or others can read it.
+    """
+    try:
+        mode = path.stat().st_mode
+        with path.open("rb") as file:
+            data = file.read(_MOST_BYTES)
+    except OSError as error:
+        raise PhalanxError(f"{path}: cannot be read: {error.strerror}") from error
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PhalanxError(f"{path}: others can read it; run: chmod 600 {path}")
+    return data
+
+
+def write_private(path: Path, data: bytes) -> None:
+    """Write a file that its owner alone can read, at once; its folder is made, for him alone, where it is missing.
+
+    Raises:
+        PhalanxError: It cannot be written.
+    """
+    half = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        half.unlink(missing_ok=True)
+        with os.fdopen(os.open(half, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(data)
+        half.replace(path)
+    except OSError as error:
+        raise PhalanxError(f"{path}: cannot be written: {error.strerror}") from error
 
 
 def machine_names() -> frozenset[str]:
@@ -136,12 +163,3 @@ def _made(host: str, now: datetime) -> bytes:
     return certificate.public_bytes(serialization.Encoding.PEM) + private.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-
-
-def _write(path: Path, pem: bytes) -> None:
-    """Under its name only when it is whole, and never readable by others."""
-    half = path.with_suffix(f".{os.getpid()}")
-    half.unlink(missing_ok=True)
-    with os.fdopen(os.open(half, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-        file.write(pem)
-    half.replace(path)

@@ -6,14 +6,13 @@ on purpose: who steals the file of the hash tries a dozen passwords a second, no
 
 import hashlib
 import hmac
-import os
 import secrets
-import stat
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from common.errors import PhalanxError
+from master.listening import read_private, write_private
 
 HASH_FILE = "console.password"
 LEAST_CHARACTERS = 12
@@ -22,7 +21,6 @@ _ALPHABET = "abcdefghijkmnpqrstuvwxyz23456789"  # 32 that are not taken for one 
 _GROUPS, _GROUP = 4, 5  # 100 bits
 _N, _R, _P, _BYTES = 2**15, 8, 1, 32  # 32 MiB and about 0.1 s
 _MOST_N = 2**20
-_OWNER_ONLY = 0o600
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,7 @@ def password_from(file: Path) -> PasswordHash:
     Raises:
         PhalanxError: It cannot be read, others can read it, or the password is too short.
     """
-    text = _private_text(file)
+    text = _text(file)
     password = text.splitlines()[0].strip() if text.strip() else ""
     if len(password) < LEAST_CHARACTERS:
         raise PhalanxError(
@@ -99,31 +97,19 @@ def kept_password(folder: Path, say: Callable[[str], None]) -> PasswordHash:
         say(
             f"console: the password is the one that was said when {path} was made; forgotten: delete that file"
         )
-        return PasswordHash.parse(_private_text(path), str(path))
+        return PasswordHash.parse(_text(path), str(path))
     password = new_password()
     kept = PasswordHash.of(password)
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _OWNER_ONLY)
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.write(kept.text())
-    except OSError as error:
-        raise PhalanxError(f"{path}: cannot keep the password: {error.strerror}") from error
+    write_private(path, kept.text().encode())
     say(f"console: the password is {password}   (said only now; its hash is kept in {path})")
     return kept
 
 
-def _private_text(path: Path) -> str:
+def _text(path: Path) -> str:
     try:
-        mode = path.stat().st_mode
-        with path.open("rb") as file:
-            data = file.read(MOST_BYTES)
-        text = data.decode()
-    except (OSError, UnicodeDecodeError) as error:
-        raise PhalanxError(f"{path}: cannot read the password: {error}") from error
-    if mode & (stat.S_IRWXG | stat.S_IRWXO):
-        raise PhalanxError(f"{path}: others can read the password; run: chmod 600 {path}")
-    return text
+        return read_private(path).decode()
+    except UnicodeDecodeError as error:
+        raise PhalanxError(f"{path}: not a text") from error
 
 
 def _scrypt(password: str, salt: bytes, n: int, r: int, p: int) -> bytes:

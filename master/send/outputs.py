@@ -3,11 +3,14 @@
 An output is a `Sink`. Its file is imported when it is switched on: what its library is, nobody else needs.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from common.endpoints import loopback
 from common.messages import Contact, Gesture, HandPose, ObjectPose, Told
 from common.output_settings import OutputPart, OutputSettings
+from master.listening import is_loopback, is_open
 from master.outputs.sink import Sink
 from master.send.times import Times
 
@@ -59,6 +62,12 @@ def _web(settings: OutputSettings, times: Times) -> Sink:
     return WebSink(settings.web)
 
 
+def _where_web(settings: OutputSettings) -> str:
+    from master.send.web import address_of
+
+    return address_of(settings.web, os.environ)
+
+
 EVERYTHING: tuple[type[Told], ...] = (HandPose, ObjectPose, Contact, Gesture)
 OUTPUTS: dict[str, Output] = {
     "osc": Output(EVERYTHING, lambda s: s.osc, lambda s: f"udp {s.osc.host}:{s.osc.port}", _osc),
@@ -70,10 +79,32 @@ OUTPUTS: dict[str, Output] = {
         _ros2,
     ),
     "lsl": Output((HandPose,), lambda s: s.lsl, lambda s: f"streams {s.lsl.name}-HAND ({s.lsl.scope})", _lsl),
-    "web": Output(
-        (HandPose, ObjectPose), lambda s: s.web, lambda s: f"http://{s.web.host}:{s.web.port}/", _web
-    ),
+    "web": Output((HandPose, ObjectPose), lambda s: s.web, _where_web, _web),
 }
+
+
+def who_reads(name: str, settings: OutputSettings) -> str | None:
+    """Who else can read an output that leaves this machine, and what he can do; None where it does not leave it.
+
+    These protocols have no encryption and no login: that they leave the machine is the choice of who wrote the file.
+    """
+    match name:
+        case "osc" | "vmc":
+            part = settings.osc if name == "osc" else settings.vmc
+            leaves = not is_loopback(part.host)
+        case "ros2":
+            leaves = not loopback(settings.ros2.router)
+        case "lsl":
+            leaves = settings.lsl.scope == "network"
+        case _:
+            if is_loopback(settings.web.host):
+                return None
+            if is_open(os.environ):
+                return "plain (--open): whoever listens to the network reads the hands and the key"
+            return "encrypted, by a certificate of this machine; whoever has the key of the address reads the hands"
+    if not leaves:
+        return None
+    return "leaves this machine unencrypted: whoever is in that network reads it, and can send such messages himself"
 
 
 def switched_on(settings: OutputSettings) -> dict[str, bool]:

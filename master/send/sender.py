@@ -21,7 +21,7 @@ from common.output_settings import OutputSettings, default_outputs
 from common.streams import MASTER
 from common.watching import WatchedFiles
 from master.send.line import OutputLine, Tally
-from master.send.outputs import OUTPUTS, switched_on
+from master.send.outputs import OUTPUTS, switched_on, who_reads
 from master.send.times import MasterTimes
 
 NAME = "outputs"
@@ -84,8 +84,13 @@ class Sender:
             return tuple(name for name in OUTPUTS if name in self._lines)
 
     def where(self, name: str) -> str:
-        """Where an output sends to, for a person."""
-        return OUTPUTS[name].where(self._settings)
+        """Where an output sends to, and who else can read it there, for a person."""
+        try:
+            where = OUTPUTS[name].where(self._settings)
+        except PhalanxError as error:
+            return str(error)  # it is not opened either
+        reader = who_reads(name, self._settings)
+        return where if reader is None else f"{where}; {reader}"
 
     def switch(self, name: str, *, on: bool) -> None:
         """Switch one output.

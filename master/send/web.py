@@ -1,9 +1,55 @@
-"""Hands and objects for web pages: JSON by WebSocket in the joint order of WebXR, and the page that shows them."""
+"""Hands and objects for web pages: JSON by WebSocket in the joint order of WebXR, and the page that shows them.
 
+On this machine it is plain, for whoever is on it. Where other machines reach it, it is encrypted by the certificate of
+this machine's pages and wants to be shown a key (docs/security.md); with --open it is plain there, but wants the key.
+"""
+
+import os
+import secrets
+from collections.abc import Mapping
+
+from common.errors import PhalanxError
 from common.messages import HandPose, ObjectPose, Told
 from common.output_settings import WebOutput
+from master.listening import (
+    is_loopback,
+    is_open,
+    page_certificate,
+    private_folder,
+    read_private,
+    write_private,
+)
 from master.web import object_json, webxr_json
-from master.web.server import WebServer
+from master.web.server import Guard, WebServer
+
+KEY_FILE = "web.key"
+_KEY_BYTES = 10  # 80 bits: who guesses has to ask us each time
+
+
+def guard_of(settings: WebOutput, environment: Mapping[str, str]) -> Guard:
+    """What stands before the page: nothing on this machine, key and TLS elsewhere.
+
+    Raises:
+        PhalanxError: Key or certificate cannot be read or written.
+    """
+    if is_loopback(settings.host):
+        return Guard()
+    folder = private_folder(environment)
+    if not (folder / KEY_FILE).exists():
+        write_private(folder / KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())
+    key = read_private(folder / KEY_FILE).decode("ascii", "replace").strip()
+    if len(key) < 2 * _KEY_BYTES or not key.isalnum():
+        raise PhalanxError(f"{folder / KEY_FILE}: not a key; delete it, and a new one is made")
+    tls = None if is_open(environment) else page_certificate(folder, settings.host).context
+    return Guard(key, tls)
+
+
+def address_of(settings: WebOutput, environment: Mapping[str, str]) -> str:
+    """What to open in a browser: with the key, where one is needed."""
+    guard = guard_of(settings, environment)
+    place = f"[{settings.host}]" if ":" in settings.host else settings.host
+    asked = "" if guard.key is None else f"?key={guard.key}"
+    return f"{'http' if guard.tls is None else 'https'}://{place}:{settings.port}/{asked}"
 
 
 class WebSink:
@@ -13,13 +59,14 @@ class WebSink:
         server: Who is connected, and how much slow clients skipped.
     """
 
-    def __init__(self, settings: WebOutput) -> None:
+    def __init__(self, settings: WebOutput, environment: Mapping[str, str] | None = None) -> None:
         """Listen at the address of the settings.
 
         Raises:
-            PhalanxError: The address cannot be had, or three.js is not installed.
+            PhalanxError: The address cannot be had, three.js is not installed, or key or certificate cannot be used.
         """
-        self.server = WebServer(settings.host, settings.port)
+        guard = guard_of(settings, os.environ if environment is None else environment)
+        self.server = WebServer(settings.host, settings.port, guard=guard)
 
     def write(self, message: Told) -> None:
         """Offer a hand or an object to every client; costs nothing while there is none. Others are left alone.

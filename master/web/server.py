@@ -5,16 +5,20 @@ hand, an object) and no more: who reads too slowly skips, delays nobody, and cos
 
 A browser lets any page of any site open a WebSocket to this machine, so a request whose `Origin` is not this very
 server is refused, and so is one that calls this server by a foreign name (a site may point its own name at 127.0.0.1).
+Where other machines reach it, it wants to be shown a key, and is encrypted (`Guard`, docs/security.md).
 """
 
 import asyncio
+import hmac
 import logging
 import socket
+import ssl
 import threading
+from dataclasses import dataclass
 from http import HTTPStatus
 from ipaddress import ip_address
 from typing import Final
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 
 import msgspec
 from websockets.asyncio.server import ServerConnection, serve
@@ -31,6 +35,7 @@ ECHO_BYTES = 256  # the longest text of a client; one that begins with "ping" co
 SEND_BUFFER_BYTES = 32 * 1024  # about five poses: what lies in the system's buffer is old when it is read
 PING_S, SILENT_S = 10.0, 20.0
 _JOIN_S = 3.0
+_COOKIE_S = 30 * 24 * 3600
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",
@@ -44,6 +49,19 @@ _HEADERS = {
     # The browser itself refuses whatever would leave this server.
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data:; object-src 'none'; base-uri 'none'",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """What stands before a server that other machines reach.
+
+    Attributes:
+        key: Has to be shown, as `?key=…` or by the cookie that the page then has; None: nobody is asked.
+        tls: Encrypts; None: plain.
+    """
+
+    key: str | None = None
+    tls: ssl.SSLContext | None = None
 
 
 class Mailbox:
@@ -78,14 +96,14 @@ class WebServer:
     Holds the listening socket, the thread with its loop, the newest texts on their way to it, and a mailbox per client.
     """
 
-    def __init__(self, host: str, port: int, *, clients: int = CLIENTS) -> None:
-        """Listen at once; `port` 0 takes any that is free.
+    def __init__(self, host: str, port: int, *, clients: int = CLIENTS, guard: Guard | None = None) -> None:
+        """Listen at once, behind the guard; `port` 0 takes any that is free.
 
         Raises:
             PhalanxError: The address cannot be had, or three.js is not installed.
         """
         self._files = _files()
-        self._clients = clients
+        self._clients, self._guard = clients, guard or Guard()
         self._mailboxes: dict[ServerConnection, Mailbox] = {}
         self._names = _own_names(host)
         self._lock = threading.Lock()
@@ -147,6 +165,7 @@ class WebServer:
         async with serve(
             self._client,
             sock=self._socket,
+            ssl=self._guard.tls,
             process_request=self._answer,
             compression=None,  # it costs more than it saves on the machine itself
             max_size=ECHO_BYTES,
@@ -186,14 +205,39 @@ class WebServer:
         path = urlsplit(request.path).path
         if (trouble := foreign(request.headers, self._names)) is not None:
             return _refusal(HTTPStatus.FORBIDDEN, trouble)
+        if not self._knows(request):
+            return _refusal(
+                HTTPStatus.UNAUTHORIZED, "open the address with ?key= that `phalanx-master send` said"
+            )
         if path in self._files:
             kind, body = self._files[path]
-            return _response(HTTPStatus.OK, kind, body)
+            answer = _response(HTTPStatus.OK, kind, body)
+            if self._guard.key is not None:
+                answer.headers["Set-Cookie"] = self._cookie(self._guard.key)
+            return answer
         if path != PATH:
             return _refusal(HTTPStatus.NOT_FOUND, f"{path}: there are {', '.join([*self._files, PATH])}")
         if len(self._mailboxes) >= self._clients:
             return _refusal(HTTPStatus.SERVICE_UNAVAILABLE, f"{self._clients} clients are connected already")
         return None
+
+    def _knows(self, request: Request) -> bool:
+        """Whether the request shows the key, where there is one."""
+        if self._guard.key is None:
+            return True
+        shown = parse_qs(urlsplit(request.path).query).get("key", [])
+        for value in request.headers.get_all("Cookie"):
+            shown += [
+                one.partition("=")[2] for one in value.split("; ") if one.startswith(f"{self._name()}=")
+            ]
+        return any(hmac.compare_digest(one.encode(), self._guard.key.encode()) for one in shown)
+
+    def _name(self) -> str:
+        return f"phalanx-hands-{self.port}"  # cookies know no port
+
+    def _cookie(self, key: str) -> str:
+        secure = "; Secure" if self._guard.tls is not None else ""
+        return f"{self._name()}={key}; Path=/; Max-Age={_COOKIE_S}; HttpOnly; SameSite=Strict{secure}"
 
 
 async def _send(connection: ServerConnection, mailbox: Mailbox) -> None:
