@@ -7,9 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from deploy.demo import DemoSettings, run_demo, stop_on_signals
+from deploy.deployment import Lines, deploy, make_keys, uninstall
+from deploy.fleet import fleet_once, table, watch_fleet
+from deploy.host_options import add_commands, ears_of, reached_of, rig_of, wish_of
 from deploy.replay import ReplayError, ReplaySettings, run_replay
 from deploy.sensors import DemoError, best_rigs
 from deploy.summary import summary_lines
+from deploy.targets import DeployError, Target, targets_of
 
 _EXAMPLES = {
     "demo": """examples:
@@ -38,8 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage, 130 interrupted."""
     options = _parser().parse_args(arguments)
     try:
-        return _demo(options) if options.command == "demo" else _replay(options)
-    except (DemoError, ReplayError) as error:
+        return _COMMANDS[options.command](options)
+    except (DemoError, DeployError, ReplayError) as error:
         print(f"phalanx: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:  # of a replay, or the second of a demo
@@ -75,6 +79,36 @@ def _replay(options: argparse.Namespace) -> int:
     )
     _finish(run_replay(settings, _say), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")
+    return 0
+
+
+def _deploy(options: argparse.Namespace) -> int:
+    rig = rig_of(options)
+    targets = targets_of(options.hosts, rig)
+    wish, ears, say = wish_of(options, rig), ears_of(options), Lines(_say)
+    if not options.dry_run:
+        make_keys(options.keys, [name for target in targets for name in target.names], say)
+    return _told(deploy(targets, wish, reached_of(options), ears, say))
+
+
+def _uninstall(options: argparse.Namespace) -> int:
+    targets = [Target(host, ()) for host in dict.fromkeys(options.hosts)]
+    return _told(uninstall(targets, reached_of(options), options.dry_run, Lines(_say)))
+
+
+def _told(results: dict[str, str | None]) -> int:
+    """Say which machines failed; the exit code."""
+    failed = {host: why for host, why in results.items() if why is not None}
+    for host, why in failed.items():
+        print(f"{host}: FAILED: {why}", file=sys.stderr)
+    return 1 if failed else 0
+
+
+def _fleet(options: argparse.Namespace) -> int:
+    if options.watch:
+        return watch_fleet(options.keys, options.bus, _say)
+    devices = fleet_once(options.keys, options.bus)
+    _say(json.dumps(devices) if options.json else "\n".join(table(devices)))
     return 0
 
 
@@ -185,6 +219,7 @@ def _parser() -> argparse.ArgumentParser:
         help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
         "there is (auto); default: what its rig says",
     )
+    add_commands(commands.add_parser, _calibration())
     return parser
 
 
@@ -202,6 +237,9 @@ def _calibration() -> Path:
     """The calib_json of the working directory, else the one beside the source."""
     here = Path("calib_json")
     return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
+
+
+_COMMANDS = {"demo": _demo, "replay": _replay, "deploy": _deploy, "uninstall": _uninstall, "fleet": _fleet}
 
 
 if __name__ == "__main__":

@@ -22,7 +22,9 @@ from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
 from master.checklist.command import check
 from master.export.command import export
+from master.fleet import fleet
 from master.gestures.command import gestures_app
+from master.hear import hear
 from master.key_options import program
 from master.keys_command import keys_app
 from master.live import LiveSettings, run_live
@@ -333,6 +335,8 @@ def main() -> None:
     app.command()(camera)
     app.command()(check)
     app.command()(export)
+    app.command()(fleet)
+    app.command()(hear)
     for command in (record, play, info):
         app.command()(command)
     app.command()(send)

@@ -1,0 +1,188 @@
+"""What is done on one machine: look at it, bring packages, wheels and files, install; or take back, or remove."""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+from deploy.bundle import BUNDLE, bundle, command
+from deploy.remote import Remote
+from deploy.targets import DeployError, RigFile, Target
+from deploy.wheelhouse import Kind, wheelhouse
+
+STAGE = "/opt/phalanx/wheels"  # of root; the installer removes it
+_CLOCK_S = 0.5  # from here on it is said
+_PROBE_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the user wants on all machines.
+
+    Attributes:
+        master: Host name or address of the PC.
+        rig: The rig's file.
+        calibration: calib_json tree of the PC.
+        keys: Keys folder of the PC.
+        options: Of the installer, handed on.
+        camera: Driver of the cameras, which decides what the system has to have.
+        wheels: Folder of wheels; None: they are downloaded.
+        apt: Whether packages of the system are installed.
+        dry_run: Write nothing.
+        ready_s: How long slaves may take until they are ready.
+    """
+
+    master: str
+    rig: RigFile
+    calibration: Path
+    keys: Path | None
+    options: tuple[str, ...]
+    camera: str
+    wheels: Path | None
+    apt: bool
+    dry_run: bool
+    ready_s: float
+
+
+@dataclass(slots=True)
+class Host:
+    """One machine while it is deployed to.
+
+    Attributes:
+        target: Which, and for what.
+        remote: How it is reached.
+        say: Told one line a step.
+        sudo: Whether root is reached by sudo.
+        changed: Whether something was changed, which can be taken back.
+        reboot: Whether it runs only after it was restarted.
+    """
+
+    target: Target
+    remote: Remote
+    say: Callable[[str], None]
+    sudo: bool = False
+    changed: bool = False
+    reboot: bool = False
+
+    def deploy(self, wish: Wish) -> None:
+        """Bring it to what is wanted.
+
+        Raises:
+            DeployError: It failed; the machine is as before.
+        """
+        facts = self.look(wish.camera)
+        self._packages(facts, wish)
+        picamera2 = wish.camera.startswith("picamera2")
+        old = facts["codename"] == "bookworm"  # whose simplejpeg was built for numpy 1
+        kind = Kind(
+            str(facts["machine"]),
+            ".".join(str(part) for part in cast(list[int], facts["python"])),
+            ("simplejpeg",) if picamera2 and old else (),
+            ("wrist",) if wish.rig.kind == "wrist" else (),
+        )
+        wheels, release = wheelhouse(kind, wish.wheels, self.say)
+        there = release in cast(list[str], facts["releases"])
+        if not there and not wish.dry_run:
+            size_mb = sum(file.stat().st_size for file in wheels.glob("*.whl")) * 1e-6
+            self.say(f"sending {size_mb:.0f} MB of wheels")
+            self.remote.send_folder(wheels, STAGE, self.sudo)
+        words = ["install", "--json", "--bundle", BUNDLE, "--master", wish.master, "--rig", wish.rig.name]
+        words += ["--release", release, "--wheelhouse", STAGE, "--ready-s", str(wish.ready_s), *wish.options]
+        words += [word for name in self.target.names for word in ("--name", name)]
+        words += ["--dry-run"] if wish.dry_run else []
+        packed = bundle(wish.keys, self.target.names, wish.calibration, wish.rig)
+        done = self._act(words, packed)
+        self.changed = bool(done.get("changed")) or bool(done.get("restarted"))
+        self.reboot = bool(done.get("reboot"))
+        self.say(str(done["text"]))
+
+    def look(self, camera: str = "") -> dict[str, object]:
+        """What it is like.
+
+        Raises:
+            DeployError: It is not reached, or nothing can be installed there.
+        """
+        lines: list[tuple[float, str]] = []
+        code = self.remote.run(
+            command(["probe", *([camera] if camera else [])], sudo=False),
+            _plain_bundle(),
+            lambda line: lines.append((time.time(), line)),
+            _PROBE_S,
+        )
+        results = [(at, line) for at, line in lines if line.startswith('{"result"')]
+        if code != 0 or not results:
+            raise DeployError(f"cannot look at it: {lines[-1][1] if lines else f'python3 ended with {code}'}")
+        arrived, text = results[-1]
+        facts = cast(dict[str, object], json.loads(text)["result"])
+        if facts["why_not"] is not None:
+            raise DeployError(str(facts["why_not"]))
+        self.sudo = facts["user"] != "root"
+        python = ".".join(str(part) for part in cast(list[int], facts["python"]))
+        self.say(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
+        ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
+        if abs(ahead_s) > _CLOCK_S:
+            self.say(
+                f"its clock is {ahead_s:+.1f} s from this one; chrony brings it here, if this machine answers"
+            )
+        return facts
+
+    def roll_back(self) -> str:
+        """Let it go back to what was before; the text of what is there now."""
+        return str(self._act(["install", "--json", "--roll-back"], _plain_bundle())["text"])
+
+    def uninstall(self, dry_run: bool) -> None:
+        """Take everything of ours away.
+
+        Raises:
+            DeployError: It failed.
+        """
+        self.look()
+        words = ["install", "--json", "--uninstall", *(["--dry-run"] if dry_run else [])]
+        self.say(str(self._act(words, _plain_bundle())["text"]))
+
+    def _packages(self, facts: dict[str, object], wish: Wish) -> None:
+        """Bring what the system lacks, or say what it lacks.
+
+        Raises:
+            DeployError: apt failed, or it cannot be done without.
+        """
+        there = cast(list[str], facts["packages"])
+        wanted = ["rsync", "chrony", *(["python3-picamera2"] if wish.camera.startswith("picamera2") else [])]
+        missing = [name for name in wanted if name not in there]
+        if not missing:
+            return
+        if wish.apt and not wish.dry_run:
+            self._act(["packages", *missing], _plain_bundle())
+            return
+        self.say(f"{'would install' if wish.apt else 'not installed'}: {' '.join(missing)}")
+
+    def _act(self, words: Sequence[str], packed: bytes) -> dict[str, object]:
+        """Run the installer there; its result.
+
+        Raises:
+            DeployError: It failed; its own line says why.
+        """
+        result: dict[str, object] = {}
+        last = ""
+
+        def hear(line: str) -> None:
+            nonlocal last
+            if line.startswith('{"result"'):
+                result.update(json.loads(line)["result"])
+            else:
+                last = line
+                self.say(line)
+
+        code = self.remote.run(command(words, self.sudo), packed, hear)
+        if "error" in result:
+            raise DeployError(str(result["error"]))
+        if code != 0 or not result:
+            raise DeployError(last.removeprefix("! ") or f"the installer ended with {code}")
+        return result
+
+
+def _plain_bundle() -> bytes:
+    """The installer alone."""
+    return bundle(None, (), None, None)

@@ -1,0 +1,189 @@
+"""Commands on another machine by ssh, folders by rsync: both come to an end, also when the network goes meanwhile."""
+
+import contextlib
+import os
+import shlex
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+from deploy.targets import DeployError
+
+CONNECT_S = 10
+ALIVE_S, ALIVE_TIMES = 3, 3  # a link that is gone shows after nine seconds
+STALLED_S = 15
+_SETTINGS = (
+    "BatchMode=yes",
+    f"ConnectTimeout={CONNECT_S}",
+    f"ServerAliveInterval={ALIVE_S}",
+    f"ServerAliveCountMax={ALIVE_TIMES}",
+)
+_NOT_REACHED = 255  # ssh's own exit code
+_HINTS = (
+    ("Permission denied", "its key is not known there: ssh-copy-id HOST"),
+    ("Host key verification failed", "its host key is not known here: ssh HOST once, and look at it"),
+    (
+        "REMOTE HOST IDENTIFICATION",
+        "another machine answers than before: ssh-keygen -R HOST, if that is meant",
+    ),
+)
+
+
+class Deadline:
+    """A moment by which all must be done. Holds that moment."""
+
+    def __init__(self, seconds: float) -> None:
+        """So many seconds from now."""
+        self._end, self._seconds = time.monotonic() + seconds, seconds
+
+    def left_s(self) -> float:
+        """What is left of it.
+
+        Raises:
+            DeployError: Nothing.
+        """
+        left = self._end - time.monotonic()
+        if left <= 0.0:
+            raise DeployError(f"not done within {self._seconds:.0f} s (--deadline)")
+        return left
+
+
+@dataclass(frozen=True, slots=True)
+class Remote:
+    """How one machine is reached.
+
+    Attributes:
+        host: HOST or USER@HOST.
+        options: Of ssh, as it takes them.
+        deadline: Of all that is done there.
+    """
+
+    host: str
+    options: tuple[str, ...]
+    deadline: Deadline
+
+    def run(
+        self, command: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float = 1e9
+    ) -> int:
+        """Run a command there, give it `send` as its input, and hand on each line it says; its exit code.
+
+        Raises:
+            DeployError: The machine is not reached, the link broke, or the time is over.
+        """
+        words = [*self._ssh(), "--", self.host, shlex.join(command)]
+        code, errors = run_bounded(words, send, on_line, min(limit_s, self.deadline.left_s()))
+        if code is None:
+            self.deadline.left_s()
+            raise DeployError(f"no answer within {limit_s:.0f} s")
+        if code == _NOT_REACHED:
+            raise DeployError(_plain(errors, self.host))
+        if code != 0 and errors:
+            on_line(f"! {errors[-1]}")
+        return code
+
+    def send_folder(self, folder: Path, to: str, sudo: bool) -> None:
+        """Make the folder `to` there the same as `folder`.
+
+        Raises:
+            DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
+        """
+        words = [
+            "rsync",
+            "-r",
+            "--times",
+            "--delete",
+            "--mkpath",
+            f"--timeout={STALLED_S}",
+        ]
+        if sudo:
+            words += ["--rsync-path", "sudo -n rsync"]
+        words += ["-e", shlex.join(self._ssh()), "--", f"{folder}/", f"{_bracketed(self.host)}:{to}/"]
+        code, errors = run_bounded(words, b"", lambda _line: None, self.deadline.left_s())
+        if code is None:
+            self.deadline.left_s()
+        if code != 0:
+            raise DeployError(f"rsync: {_plain(errors, self.host)}")
+
+    def _ssh(self) -> list[str]:
+        return ["ssh", *(word for setting in _SETTINGS for word in ("-o", setting)), *self.options]
+
+
+def run_bounded(
+    words: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float
+) -> tuple[int | None, list[str]]:
+    """Run a command of this machine; its exit code and the lines of its errors. None: it was ended, the time was over.
+
+    Raises:
+        DeployError: There is no such command.
+    """
+    try:
+        child = subprocess.Popen(
+            list(words),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            start_new_session=True,  # so that what it starts ends with it
+        )
+    except FileNotFoundError as error:
+        raise DeployError(
+            f"{words[0]}: not found on this machine; install it (Debian: apt install {words[0]})"
+        ) from error
+    assert child.stdin is not None
+    assert child.stdout is not None
+    assert child.stderr is not None
+    errors: list[str] = []
+    threads = [
+        threading.Thread(target=_feed, args=(child.stdin, send), daemon=True),
+        threading.Thread(target=_lines, args=(child.stdout, on_line), daemon=True),
+        threading.Thread(target=_lines, args=(child.stderr, errors.append), daemon=True),
+    ]
+    for thread in threads:
+        thread.start()
+    code: int | None = None
+    try:
+        code = child.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        code = None
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(child.pid, signal.SIGKILL)
+        child.wait()
+    for thread in threads[1:]:
+        thread.join(2.0)
+    return code, [line for line in errors if line.strip()]
+
+
+def _feed(pipe: IO[bytes], content: bytes) -> None:
+    with contextlib.suppress(BrokenPipeError), pipe:
+        pipe.write(content)
+
+
+def _lines(pipe: IO[bytes], on_line: Callable[[str], None]) -> None:
+    with pipe:
+        for line in pipe:
+            on_line(line.decode(errors="replace").rstrip("\r\n"))
+
+
+def _plain(errors: Sequence[str], host: str) -> str:
+    """The line that says why, with what to do about it."""
+    text = "\n".join(errors)
+    for sign, hint in _HINTS:
+        if sign in text:
+            return f"{sign}: {hint.replace('HOST', host)}"
+    own = [
+        line
+        for line in errors
+        if not line.startswith(("Warning:", "** ", "rsync error: error in rsync protocol"))
+    ]
+    return (own or ["the connection broke"])[0].removeprefix("ssh: ")
+
+
+def _bracketed(host: str) -> str:
+    """As rsync wants an IPv6 address."""
+    user, at, address = host.rpartition("@")
+    return f"{user}{at}[{address}]" if ":" in address else host

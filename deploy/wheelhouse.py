@@ -1,0 +1,211 @@
+"""Wheels for another machine, gathered on this one: what a slave needs, for its Python and processor, and our own.
+
+Downloaded once for each kind of machine, and kept below ~/.cache/phalanx.
+"""
+
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import zipfile
+from base64 import urlsafe_b64encode
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+from deploy.bundle import ROOT
+from deploy.targets import DeployError
+
+NAME = "phalanx-hand"
+PACKAGES = ("slave", "common", "master", "deploy")
+_GLIBC = ("2_17", "2_24", "2_26", "2_27", "2_28", "2_31", "2_34", "2_35")  # Bookworm has 2.36
+_DOWNLOAD_S = 600.0
+_WHEN = (1980, 1, 1, 0, 0, 0)  # a wheel of the same content is the same file
+_LOCK = threading.Lock()
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """What wheels have to fit to.
+
+    Attributes:
+        machine: aarch64 or x86_64.
+        python: Version, as 3.13.
+        more: Requirements besides ours.
+        extras: Of ours.
+    """
+
+    machine: str
+    python: str
+    more: tuple[str, ...] = ()
+    extras: tuple[str, ...] = ()
+
+
+def cache() -> Path:
+    """Where wheels are kept."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "phalanx"
+
+
+def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> tuple[Path, str]:
+    """The folder of wheels for machines of this kind, and the name of the release that they make.
+
+    Args:
+        kind: Of machine.
+        given: Folder that the user made; ours is added if it is missing there. None: it is downloaded.
+        say: Told when something is downloaded.
+
+    Raises:
+        DeployError: A wheel cannot be had.
+    """
+    with _LOCK:  # the second machine of a kind waits for the first
+        wheels = _downloaded(kind, say) if given is None else _taken(given)
+        digest = hashlib.sha256()
+        files = sorted(wheels.glob("*.whl"))
+        for file in files:
+            digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
+        versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
+        return wheels, f"{versions[-1]}-{digest.hexdigest()[:8]}"
+
+
+def own_wheel(folder: Path) -> Path:
+    """Write our own wheel as this program is, installed or in a source tree; without a network or a build.
+
+    Raises:
+        DeployError: It was never installed, so that nobody knows what it needs.
+    """
+    ours = _ours()
+    stem = f"{NAME.replace('-', '_')}-{ours.version}"
+    wheel = folder / f"{stem}-py3-none-any.whl"
+    info = f"{stem}.dist-info"
+    files = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in _sources()}
+    files |= {
+        f"{info}/{name}": (ours.read_text(name) or "").encode() for name in ("METADATA", "entry_points.txt")
+    }
+    files[f"{info}/WHEEL"] = (
+        b"Wheel-Version: 1.0\nGenerator: phalanx\nRoot-Is-Purelib: true\nTag: py3-none-any\n"
+    )
+    rows = [f"{name},sha256={_digest(content)},{len(content)}" for name, content in files.items()]
+    files[f"{info}/RECORD"] = "\n".join([*rows, f"{info}/RECORD,,", ""]).encode()
+    fresh = wheel.with_suffix(".new")
+    with zipfile.ZipFile(fresh, "w") as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _WHEN), content, zipfile.ZIP_DEFLATED)
+    fresh.replace(wheel)
+    return wheel
+
+
+def _sources() -> Iterable[Path]:
+    for package in PACKAGES:
+        for path in sorted((ROOT / package).rglob("*")):
+            if path.is_file() and "__pycache__" not in path.parts:
+                yield path
+
+
+def _ours() -> Distribution:
+    try:
+        return distribution(NAME)
+    except PackageNotFoundError as error:
+        raise DeployError(
+            f"{NAME} is not installed here (pip install .), so what it needs is not known"
+        ) from error
+
+
+def _digest(content: bytes) -> str:
+    return urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+
+
+def _taken(given: Path) -> Path:
+    """The user's folder, or a copy of it with our wheel where that is missing.
+
+    Raises:
+        DeployError: There are no wheels in it.
+    """
+    files = sorted(given.glob("*.whl"))
+    if not files:
+        raise DeployError(f"--wheelhouse {given}: no wheels in it")
+    if any(file.name.startswith("phalanx_hand-") for file in files):
+        return given
+    folder = cache() / f"given-{hashlib.sha256(str(given.resolve()).encode()).hexdigest()[:12]}"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    for file in files:
+        shutil.copy2(file, folder)
+    own_wheel(folder)
+    return folder
+
+
+def _downloaded(kind: Kind, say: Callable[[str], None]) -> Path:
+    requirements = [*_requirements(kind.extras), *kind.more, "pip"]
+    limits = _limits()
+    key = "\n".join([*requirements, *([] if limits is None else [limits.read_text()])])
+    digest = hashlib.sha256(key.encode()).hexdigest()[:12]
+    folder = cache() / f"{kind.machine}-{kind.python}-{digest}"
+    if not folder.is_dir():
+        say(f"downloading wheels for {kind.machine}, Python {kind.python}")
+        fresh = folder.with_name(f".{folder.name}.{os.getpid()}")
+        shutil.rmtree(fresh, ignore_errors=True)
+        fresh.mkdir(parents=True)
+        try:
+            _download(kind, requirements, limits, fresh)
+            fresh.rename(folder)
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+    for old in folder.glob("phalanx_hand-*.whl"):
+        old.unlink()
+    own_wheel(folder)
+    return folder
+
+
+def _download(kind: Kind, requirements: list[str], limits: Path | None, folder: Path) -> None:
+    platforms = [f"manylinux_{glibc}_{kind.machine}" for glibc in reversed(_GLIBC)] + [
+        f"manylinux2014_{kind.machine}"
+    ]
+    words = [
+        sys.executable,
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--dest",
+        str(folder),
+    ]
+    words += ["--only-binary=:all:", "--implementation", "cp", "--python-version", kind.python]
+    words += [word for platform in platforms for word in ("--platform", platform)]
+    words += ["-c", str(limits)] if limits is not None else []
+    try:
+        done = subprocess.run(
+            [*words, *requirements], capture_output=True, text=True, timeout=_DOWNLOAD_S, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise DeployError(f"pip download: no end after {_DOWNLOAD_S:.0f} s; is there a network?") from error
+    if done.returncode != 0:
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
+            done.stderr[-300:].strip()
+        ]
+        raise DeployError(
+            f"pip download: {errors[-1].removeprefix('ERROR: ')}; --wheelhouse DIR takes wheels you have"
+        )
+
+
+def _requirements(extras: tuple[str, ...]) -> list[str]:
+    """What a slave needs, by our own metadata, and by those extras."""
+    found: list[str] = []
+    for line in _ours().requires or []:
+        requirement, _, marker = (part.strip() for part in line.partition(";"))
+        extra = re.search(r"extra == ['\"]([^'\"]+)", marker)
+        if extra is None or extra.group(1) in extras:
+            found.append(requirement)
+    return found
+
+
+def _limits() -> Path | None:
+    """The tested versions, where they are known."""
+    for path in (ROOT / "deploy" / "constraints.txt", ROOT / "constraints.txt"):
+        if path.is_file():
+            return path
+    return None

@@ -1,0 +1,45 @@
+"""Our lines in a Raspberry Pi's config.txt: a marked block, only of what the file does not say already."""
+
+from collections.abc import Sequence
+
+BEGIN, END = "# --- Phalanx: begin ---", "# --- Phalanx: end ---"
+_ALL = "[all]"  # lines before may be for one model only
+
+
+def with_block(text: str, lines: Sequence[str]) -> str:
+    """`text` with a block of those `lines` that it does not say itself; without a block if it says all of them."""
+    plain = without_block(text)
+    own = _said_to_all(plain)
+    missing = [line for line in lines if line not in own]
+    if not missing:
+        return plain
+    if plain and not plain.endswith("\n"):
+        plain += "\n"
+    return plain + "\n".join([BEGIN, _ALL, *missing, END]) + "\n"
+
+
+def without_block(text: str) -> str:
+    """`text` as it was before we came."""
+    kept: list[str] = []
+    ours = False
+    for line in text.splitlines(keepends=True):
+        if line.strip() == BEGIN:
+            ours = True
+        elif line.strip() == END and ours:
+            ours = False
+        elif not ours:
+            kept.append(line)
+    return "".join(kept)
+
+
+def _said_to_all(text: str) -> set[str]:
+    """Lines that hold on every model; of a setting that is said twice, the last one."""
+    said: dict[str, str] = {}
+    everyone = True
+    for line in (line.strip() for line in text.splitlines()):
+        if line.startswith("["):
+            everyone = line == _ALL
+        elif everyone and line and not line.startswith("#"):
+            key = line if line.startswith(("dtoverlay=", "dtparam=")) else line.partition("=")[0]
+            said[key] = line
+    return set(said.values())

@@ -1,0 +1,184 @@
+"""`phalanx-slave install`, and what the PC runs on a machine by ssh: the same installer, its options and its words."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+from slave.install import bundle, steps
+from slave.install.errors import InstallError
+from slave.install.options import READY_S, SETTLE_S, add_options, plan_of
+from slave.install.probe import judge, probe
+from slave.install.release import Source
+from slave.install.removal import packages, uninstall
+from slave.install.systemd import Systemd
+
+PURPOSE = "install it as a service of this machine"
+EXAMPLES = """\
+  sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --keys keys --calibration calib_json
+        on the Raspberry Pi itself, after `pipx install --global --system-site-packages`; keys and calib_json are
+        copied from the PC. From the PC, for all machines at once: phalanx deploy
+  sudo phalanx-slave install --master 192.168.1.2 --rig wrist --imu lsm6dsox:1:0x6a --lights gpio:0:17,27 --keys keys
+        a wrist device: its camera and its IMU, each a service
+  sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run
+        only say what would be changed; the keys that are there stay
+  sudo phalanx-slave install --uninstall
+        take everything away again but the packages of apt
+"""
+Say = Callable[[str], None]
+
+
+def add_install(parser: argparse.ArgumentParser) -> None:
+    """All options of `phalanx-slave install`."""
+    add_options(parser)
+    parser.add_argument(
+        "--keys", type=Path, metavar="DIR", help="keys folder of the PC; default: those that are there stay"
+    )
+    parser.add_argument(
+        "--calibration", type=Path, default=Path("calib_json"), metavar="DIR", help="default: %(default)s"
+    )
+    parser.add_argument(
+        "--wheelhouse",
+        type=Path,
+        metavar="DIR",
+        help="install these wheels (default: what this command runs from)",
+    )
+    parser.add_argument("--no-apt", action="store_true", help="install no packages of the system")
+    parser.add_argument("--dry-run", action="store_true", help="write nothing; say what would be changed")
+    parser.add_argument("--uninstall", action="store_true", help="take everything away again")
+    parser.add_argument(
+        "--ready-s",
+        type=float,
+        default=READY_S,
+        metavar="S",
+        help="until slaves are ready (default: %(default)g)",
+    )
+    parser.add_argument("--settle-s", type=float, default=SETTLE_S, help=argparse.SUPPRESS)
+    parser.add_argument("--root", type=Path, default=Path("/"), help=argparse.SUPPRESS)
+    parser.add_argument("--bundle", type=Path, help=argparse.SUPPRESS)  # keys and calibration, from the PC
+    parser.add_argument("--release", help=argparse.SUPPRESS)
+    parser.add_argument("--roll-back", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--json", action="store_true", help=argparse.SUPPRESS)
+
+
+def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -> int:
+    """Install, take back, or remove; the exit code: 0 done, 1 something the user can mend.
+
+    Args:
+        options: Of `add_install`.
+        say: Told one line a step.
+        systemd: The machine's services; None: those of this machine.
+    """
+    machine = steps.Machine(options.root, systemd or Systemd(), say, options.ready_s, options.settle_s)
+    try:
+        if os.geteuid() != 0 and options.root == Path("/") and not options.dry_run:
+            raise InstallError("only root can install a service: sudo phalanx-slave install ...")
+        done = _act(options, machine)
+    except InstallError as error:
+        return _end(options, say, {"error": str(error)}, f"phalanx-slave: {error}", 1)
+    except OSError as error:
+        text = f"{error.filename or options.root}: {error.strerror or error}"
+        return _end(options, say, {"error": text}, f"phalanx-slave: {text}", 1)
+    return _end(options, say, done, str(done.pop("text", "done")), 0)
+
+
+def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, object]:
+    if options.uninstall:
+        gone = uninstall(machine, options.dry_run)
+        would = "would remove" if options.dry_run else "removed"
+        text = (
+            f"{would} {', '.join('/' + path for path in gone)}; packages of apt stay"
+            if gone
+            else "nothing of ours is there"
+        )
+        return {"removed": gone, "text": text}
+    if options.roll_back:
+        current = steps.roll_back(machine)
+        return {"release": current, "text": f"back at release {current}"}
+    if options.bundle is not None:
+        keys, calibration = bundle.from_archive(options.bundle)
+    else:
+        keys, calibration = bundle.keys_of(options.keys), bundle.calibration_of(options.calibration)
+    plan = plan_of(options, calibration, keys)
+    source = Source.here() if options.wheelhouse is None else Source(options.wheelhouse)
+    if options.bundle is None:
+        _prepare(options, plan.picamera2, machine)
+    name = options.release or source.name()
+    try:
+        outcome = steps.install(plan, source, name, machine, options.dry_run)
+    finally:
+        if options.bundle is not None and options.wheelhouse is not None and not options.dry_run:
+            shutil.rmtree(options.wheelhouse, ignore_errors=True)  # sent by the PC for this alone
+    return {**asdict(outcome), "text": told(outcome, options.dry_run)}
+
+
+def told(outcome: steps.Outcome, dry_run: bool) -> str:
+    """What was done, or would be, in one line."""
+    if not outcome.changed and not outcome.restarted:
+        return f"unchanged: release {outcome.release}"
+    would = "would " if dry_run else ""
+    parts = [f"{would}change {'/' + path}" if dry_run else f"/{path}" for path in outcome.changed]
+    parts += [f"{would}restart {unit}" if dry_run else f"restarted {unit}" for unit in outcome.restarted]
+    text = f"release {outcome.release}: {', '.join(parts)}"
+    return text + "; config.txt has changed: restart the machine" if outcome.reboot else text
+
+
+def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machine) -> None:
+    """Look at this machine, and bring what it lacks by apt.
+
+    Raises:
+        InstallError: It cannot be installed on.
+    """
+    if options.root != Path("/"):
+        return
+    facts = probe(options.root)
+    if (why := judge(facts)) is not None:
+        raise InstallError(why)
+    wanted = missing_packages(facts["packages"], picamera2)
+    if options.no_apt or options.dry_run:
+        for name in wanted:
+            machine.say(f"not installed: {name}")
+        return
+    packages(wanted, machine)
+
+
+def missing_packages(there: list[str], picamera2: bool) -> list[str]:
+    """What apt has to bring."""
+    return [name for name in ("chrony", *(["python3-picamera2"] if picamera2 else [])) if name not in there]
+
+
+def _end(options: argparse.Namespace, say: Say, result: dict[str, object], text: str, code: int) -> int:
+    say(json.dumps({"result": result}) if options.json else text)
+    return code
+
+
+def main(arguments: list[str], say: Say, systemd: Systemd | None = None) -> int:
+    """`python3 -m slave.install ACTION ...`: what the PC runs before a slave is installed.
+
+    `install` is `phalanx-slave install`; `probe [CAMERA]` says what the machine is like; `packages NAME...` calls apt.
+    """
+    action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
+    if action == "probe":
+        facts = probe(camera=rest[0] if rest else "")
+        say(json.dumps({"result": facts | {"why_not": judge(facts, rest[0] if rest else "")}}))
+        return 0
+    if action == "packages":
+        try:
+            packages(rest, steps.Machine(Path("/"), Systemd(), say, READY_S, SETTLE_S))
+        except InstallError as error:
+            say(json.dumps({"result": {"error": str(error)}}))
+            return 1
+        say(json.dumps({"result": {}}))
+        return 0
+    if action != "install":
+        sys.stderr.write("python3 -m slave.install install|probe|packages ...\n")
+        return 2
+    parser = argparse.ArgumentParser("slave.install", description=PURPOSE)
+    add_install(parser)
+    return run(parser.parse_args(rest), say, systemd)

@@ -1,0 +1,136 @@
+"""What the machine is like, before anything is installed on it: facts for `judge`. Writes nothing.
+
+An old Python runs this too, so that it is told and not a syntax error.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import platform
+import pwd
+import shutil
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("chrony", "python3-picamera2", "rsync")
+OLDEST, NEWEST = (3, 11), (3, 13)
+MACHINES = ("aarch64", "x86_64")
+LEAST_FREE_MB = 700.0  # wheels, what they unpack to, and the release before it
+RELEASES = "opt/phalanx"
+_QUICK_S = 20.0
+_FIND_CAMERAS = (
+    "import json,sys; from picamera2 import Picamera2; "
+    "print('CAMERAS', json.dumps([c.get('Model', '?') for c in Picamera2.global_camera_info()]))"
+)
+
+
+def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
+    """The facts, as JSON has them.
+
+    Args:
+        root: Where the machine's files are.
+        camera: Driver that will be used; picamera2 is asked for its cameras, where it is there already.
+    """
+    release = _os_release(root)
+    found: dict[str, Any] = {
+        "machine": platform.machine(),
+        "bits": struct.calcsize("P") * 8,
+        "python": list(sys.version_info[:2]),
+        "venv": importlib.util.find_spec("venv") is not None,
+        "systemd": (root / "run/systemd/system").is_dir(),
+        "free_mb": _free_mb(root / RELEASES),
+        "model": _text(root / "proc/device-tree/model").strip("\0\n ") or platform.node(),
+        "os": release.get("PRETTY_NAME", "unknown"),
+        "codename": release.get("VERSION_CODENAME", ""),
+        "user": pwd.getpwuid(os.geteuid()).pw_name,
+        "root": os.geteuid() == 0 or _says(["sudo", "-n", "true"]) is not None,
+        "packages": [name for name in PACKAGES if _has_package(name)],
+        "video": sorted({_text(path).strip() for path in (root / "sys/class/video4linux").glob("*/name")}),
+        "cameras": _cameras() if camera.startswith("picamera2") else None,
+        "releases": sorted(path.name for path in (root / RELEASES / "releases").glob("[!.]*")),
+        "hostname": platform.node(),
+    }
+    found["t_unix_ns"] = time.time_ns()  # last: the asker compares it with the moment at which it arrives
+    return found
+
+
+def judge(facts: dict[str, Any], camera: str = "") -> str | None:
+    """One line why nothing can be installed there, with what to do; None: it can."""
+    python = tuple(facts["python"])
+    if facts["bits"] != 64 or facts["machine"] not in MACHINES:
+        return (
+            f"{facts['machine']} with {facts['bits']}-bit programs: needs a 64-bit system; "
+            "write Raspberry Pi OS (64-bit) to its card"
+        )
+    if python < OLDEST:
+        have = ".".join(map(str, python))
+        return f"its Python is {have}, needs 3.11 or newer: Raspberry Pi OS Bookworm or Trixie has that"
+    if python > NEWEST:
+        return f"its Python is {'.'.join(map(str, python))}, for which not all wheels are there; needs 3.11 to 3.13"
+    if not facts["venv"]:
+        return "its Python cannot make virtual environments: apt install python3-venv"
+    if not facts["systemd"]:
+        return "systemd does not run there, which keeps the slave running"
+    if not facts["root"]:
+        return (
+            f"user {facts['user']} may not become root without a password: log in as root, or give "
+            f"{facts['user']} passwordless sudo (Raspberry Pi OS does)"
+        )
+    if facts["free_mb"] < LEAST_FREE_MB and not facts["releases"]:
+        return f"{facts['free_mb']:.0f} MB free below /opt, needs {LEAST_FREE_MB:.0f} MB"
+    if facts["cameras"] == []:
+        return "libcamera finds no camera: look at its cable, then at `rpicam-hello --list-cameras`"
+    driver, _, device = camera.partition(":")
+    if driver == "v4l2" and not facts["video"]:
+        return f"--camera {camera}: no V4L2 camera is there ({device or '/dev/video0'}); is it plugged in?"
+    return None
+
+
+def _free_mb(folder: Path) -> float:
+    while not folder.exists():
+        folder = folder.parent
+    return shutil.disk_usage(folder).free * 1e-6
+
+
+def _os_release(root: Path) -> dict[str, str]:
+    lines = _text(root / "etc/os-release").splitlines()
+    pairs = (line.partition("=") for line in lines if "=" in line)
+    return {key: value.strip().strip('"') for key, _, value in pairs}
+
+
+def _has_package(name: str) -> bool:
+    said = _says(["dpkg-query", "-W", "-f=${db:Status-Status}", name])
+    return said is not None and said.strip() == "installed"
+
+
+def _cameras() -> list[str] | None:
+    """What libcamera finds; None where picamera2 is not installed, so that nobody knows."""
+    said = _says(["/usr/bin/python3", "-c", _FIND_CAMERAS])
+    for line in (said or "").splitlines():
+        if line.startswith("CAMERAS "):
+            return [str(model) for model in json.loads(line.removeprefix("CAMERAS "))]
+    return None
+
+
+def _says(command: list[str]) -> str | None:
+    """What a command says; None: it is not there, failed, or takes too long."""
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_QUICK_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""

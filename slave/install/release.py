@@ -1,0 +1,224 @@
+"""Releases below /opt/phalanx: each a virtual environment, made under another name and renamed when it is whole.
+
+It sees the system's packages (picamera2 and libcamera come by apt); what it has itself goes before them. That comes
+from a folder of wheels, without a network, or from the environment that the installer runs in.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib.metadata import distributions
+from pathlib import Path
+
+from slave.install.errors import InstallError
+from slave.install.systemd import run_command
+from slave.install.wanted import OPT
+
+RELEASES = f"{OPT}/releases"
+KEPT = 2
+OURS = "phalanx-hand"
+_PACKAGES = ("slave", "common", "master", "deploy")
+_UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
+_SPARE_MB = 50.0
+_PIP_S = 1500.0  # under emulation, too
+_SCRIPT = """\
+#!{python}
+import sys
+
+from slave.__main__ import main
+
+sys.exit(main())
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a release's packages come from.
+
+    Attributes:
+        wheels: Folder of wheels; None: `site` is copied.
+        site: site-packages of the environment that the installer runs from.
+    """
+
+    wheels: Path | None
+    site: Path | None = None
+
+    @staticmethod
+    def here() -> Source:
+        """The environment that this runs in."""
+        return Source(None, Path(sysconfig.get_path("purelib")))
+
+    def name(self) -> str:
+        """Version and a hash of all that is in it: other content is another release.
+
+        Raises:
+            InstallError: There is no Phalanx in it.
+        """
+        digest = hashlib.sha256()
+        if self.wheels is not None:
+            wheels = sorted(self.wheels.glob("*.whl"))
+            for wheel in wheels:
+                digest.update(wheel.name.encode() + hashlib.sha256(wheel.read_bytes()).digest())
+            versions = [w.name.split("-")[1] for w in wheels if w.name.startswith("phalanx_hand-")]
+            where = self.wheels
+        else:
+            assert self.site is not None
+            for package in distributions(path=[str(self.site)]):
+                digest.update((package.read_text("RECORD") or package.name).encode())
+            for file in sorted(_own_packages(self.site).rglob("*.py")):
+                if file.relative_to(_own_packages(self.site)).parts[0] in _PACKAGES:
+                    digest.update(file.read_bytes())
+            versions = [one.version for one in distributions(path=[str(self.site)]) if one.name == OURS]
+            where = self.site
+        if not versions:
+            raise InstallError(f"{where}: no {OURS} in it")
+        return f"{versions[-1]}-{digest.hexdigest()[:8]}"
+
+
+def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> bool:
+    """Make the release `name` if it is not there whole; whether it had to be made.
+
+    Raises:
+        InstallError: No room, or a wheel is missing or of another machine. Nothing of it stays.
+    """
+    releases = root / RELEASES
+    if (releases / name).is_dir():
+        return False
+    releases.mkdir(parents=True, exist_ok=True)
+    for left in releases.glob(".new-*"):
+        shutil.rmtree(left, ignore_errors=True)
+    _check_room(releases, source)
+    fresh = releases / f".new-{name}"
+    say(f"making release {name}")
+    try:
+        venv.EnvBuilder(system_site_packages=True, symlinks=True, with_pip=False).create(fresh)
+        if source.wheels is not None:
+            _install_wheels(fresh, source.wheels)
+        else:
+            assert source.site is not None
+            _copy_site(fresh, source.site)
+        _settle(fresh, releases / name, root)
+        os.sync()
+        fresh.rename(releases / name)
+    except OSError as error:
+        raise InstallError(f"release {name}: {error.strerror or error}: {error.filename or fresh}") from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return True
+
+
+def prune(root: Path, current: str, before: str | None) -> list[str]:
+    """Remove all but the current release and the one before it; their names."""
+    keep = {current, before} - {None}
+    folders = sorted((root / RELEASES).glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
+    keep |= {path.name for path in folders if path.name not in keep and len(keep) < KEPT}
+    gone = [path for path in folders if path.name not in keep]
+    for path in gone:
+        shutil.rmtree(path)
+    return [path.name for path in gone]
+
+
+def _check_room(releases: Path, source: Source) -> None:
+    """Raises InstallError: there is too little."""
+    if source.wheels is not None:
+        sizes = [zipfile.ZipFile(wheel).infolist() for wheel in source.wheels.glob("*.whl")]
+        size = sum(item.file_size for items in sizes for item in items)
+    else:
+        assert source.site is not None
+        size = sum(file.stat().st_size for file in source.site.rglob("*") if file.is_file())
+    needed_mb = size * 1e-6 * _UNPACKED + _SPARE_MB
+    free_mb = shutil.disk_usage(releases).free * 1e-6
+    if free_mb < needed_mb:
+        raise InstallError(
+            f"{releases}: {free_mb:.0f} MB free, a release needs {needed_mb:.0f} MB; make room there"
+        )
+
+
+def _install_wheels(fresh: Path, wheels: Path) -> None:
+    """Install one of each package of the folder; pip itself comes out of it, too."""
+    found = sorted(wheels.glob("*.whl"))
+    names = sorted({wheel.name.split("-")[0] for wheel in found} - {"pip"})
+    pips = [wheel for wheel in found if wheel.name.startswith("pip-")]
+    pip = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
+    python = str(fresh / "bin/python")
+    command = [
+        *pip,
+        "--python",
+        python,
+        "install",
+        "--no-index",
+        "--find-links",
+        str(wheels),
+        *_QUIET,
+        *names,
+    ]
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=_PIP_S, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InstallError(f"pip: no end after {_PIP_S:.0f} s") from error
+    if done.returncode != 0:
+        errors = [line for line in done.stderr.splitlines() if line.startswith("ERROR:")] or [
+            done.stderr[-300:]
+        ]
+        raise InstallError(f"{wheels}: {errors[-1].removeprefix('ERROR: ').strip()}")
+
+
+_QUIET = (
+    "--ignore-installed",
+    "--disable-pip-version-check",
+    "--no-input",
+    "--quiet",
+    "--root-user-action=ignore",
+)
+
+
+def _copy_site(fresh: Path, site: Path) -> None:
+    """Copy what is installed beside us, and our packages if they are elsewhere (an editable installation)."""
+    there = next((fresh / "lib").glob("python3*/site-packages"))
+    shutil.copytree(site, there, dirs_exist_ok=True, symlinks=True, ignore=shutil.ignore_patterns("*.pth"))
+    own = _own_packages(site)
+    for package in _PACKAGES if own != site else ():
+        if (own / package).is_dir():
+            shutil.copytree(own / package, there / package, ignore=shutil.ignore_patterns("__pycache__"))
+    script = fresh / "bin/phalanx-slave"
+    script.write_text(_SCRIPT.format(python=fresh / "bin/python"))
+    script.chmod(0o755)
+
+
+def _own_packages(site: Path) -> Path:
+    """The folder that has our packages: `site`, or where they are developed."""
+    return site if (site / "slave").is_dir() else Path(__file__).resolve().parents[2]
+
+
+def _settle(fresh: Path, final: Path, root: Path) -> None:
+    """Let its scripts name the place that it is going to have, and see that the slave starts there."""
+    old, new = str(fresh).encode(), str(Path("/") / final.relative_to(root)).encode()
+    if not (fresh / "bin/phalanx-slave").is_file():
+        raise InstallError(f"release {final.name}: has no phalanx-slave; is its wheel whole?")
+    for script in (fresh / "bin").iterdir():
+        if script.is_file() and not script.is_symlink():
+            content = script.read_bytes()
+            if content.startswith(b"#!") and old in content:
+                script.write_bytes(content.replace(old, new))
+    for script in (fresh / "bin").glob("[aA]ctivate*"):
+        script.unlink()
+
+
+def runs(root: Path, name: str, check: Sequence[str]) -> None:
+    """See that a release can be run at all.
+
+    Raises:
+        InstallError: Its last line is the reason.
+    """
+    run_command([str(root / RELEASES / name / "bin/python"), *check])

@@ -1,0 +1,278 @@
+"""The installation, step by step: release, files, switch, restart, wait; taken back if it does not run then."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import shutil
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from slave.install import release
+from slave.install.errors import InstallError, NotReadyError
+from slave.install.options import Plan, Sender
+from slave.install.release import RELEASES, Source
+from slave.install.systemd import Systemd
+from slave.install.transaction import CURRENT, Transaction, changed, point, write
+from slave.install.wanted import (
+    BOOT,
+    CHRONY,
+    ETC,
+    KEYS,
+    RECORD,
+    SYSUSERS,
+    UNIT,
+    File,
+    Record,
+    own_groups,
+    recorded,
+    wanted_files,
+)
+
+LOCK = "run/phalanx-install.lock"
+_UNITS = "phalanx-slave@{}.service"
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The machine that is installed on.
+
+    Attributes:
+        root: Where its files are.
+        systemd: Its services.
+        say: Told one line a step.
+        ready_s: How long its slaves may take until they are ready.
+        settle_s: How long they then have to stay so.
+    """
+
+    root: Path
+    systemd: Systemd
+    say: Callable[[str], None]
+    ready_s: float
+    settle_s: float
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What an installation did.
+
+    Attributes:
+        release: Which one is current now.
+        changed: Paths that were written or removed, and `current` if another release is.
+        restarted: Services.
+        reboot: Whether config.txt has changed, which the next start reads.
+    """
+
+    release: str
+    changed: list[str] = field(default_factory=list[str])
+    restarted: list[str] = field(default_factory=list[str])
+    reboot: bool = False
+
+
+def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bool = False) -> Outcome:
+    """Bring the machine to the plan; a machine that is there already is left alone.
+
+    Args:
+        plan: What is to be.
+        source: Packages of the release.
+        name: Of the release.
+        machine: Where.
+        dry_run: Only say what would change.
+
+    Raises:
+        InstallError: It failed, and the machine is as before.
+    """
+    with _alone(machine.root, dry_run):
+        notes = Transaction(machine.root)
+        if notes.is_open and not dry_run:
+            machine.say("an installation before was cut off: taking it back")
+            _take_back(machine)
+        record = Record.read(machine.root)
+        files = wanted_files(plan, machine.root, record)
+        groups = record.groups + tuple(g for g in own_groups() if not _has_group(machine.root, g))
+        files[RECORD] = recorded(plan, tuple(dict.fromkeys(groups))).file()
+        outcome = _difference(plan, files, name, machine)
+        if dry_run:
+            return outcome
+        if not outcome.changed and not outcome.restarted:
+            _enable(plan.senders, machine)
+            return outcome
+        made = release.make(machine.root, name, source, machine.say)
+        before = _current(machine.root)
+        notes.begin([path for path in outcome.changed if path != CURRENT], outcome.restarted)
+        try:
+            _apply(plan, files, name, outcome, machine)
+        except (InstallError, OSError) as error:
+            machine.say("taking it back")
+            _undo(machine, plan.senders, name if made else None)
+            raise InstallError(f"{error}; everything is as before") from error
+        notes.end()
+        _finish(machine, name, before)
+        return outcome
+
+
+def roll_back(machine: Machine, gone: bool = True) -> str:
+    """Go back to what was before the last installation; the release that is current then.
+
+    Raises:
+        InstallError: There was none before, or what was before does not run either.
+    """
+    with _alone(machine.root, False):
+        left = _current(machine.root)
+        senders = _senders(machine.root)
+        _take_back(machine, senders)
+        now = _current(machine.root)
+        if gone and left is not None and left != now:
+            shutil.rmtree(machine.root / RELEASES / left, ignore_errors=True)
+        return now or "none"
+
+
+def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: Machine) -> Outcome:
+    """What is not as it is to be, and which services have to be restarted for it."""
+    outcome = Outcome(name, changed(machine.root, files))
+    if _current(machine.root) != name:
+        outcome.changed.append(CURRENT)
+    everybodys = {UNIT, SYSUSERS, CURRENT, f"{KEYS}/rig.key", f"{KEYS}/ca.pem"} & set(outcome.changed)
+    for sender in plan.senders:
+        own = {
+            f"{ETC}/{sender.name}.env",
+            *(f"{KEYS}/device-{sender.name}.{kind}" for kind in ("pem", "key")),
+        }
+        if everybodys or own & set(outcome.changed) or not machine.systemd.state(sender.unit).active:
+            outcome.restarted.append(sender.unit)
+    outcome.reboot = BOOT in outcome.changed
+    return outcome
+
+
+def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcome, machine: Machine) -> None:
+    """Write, switch, restart, wait.
+
+    Raises:
+        InstallError: What was installed does not run.
+        OSError: A file cannot be written.
+    """
+    run, root = machine.systemd.run, machine.root
+    for path in outcome.changed:
+        if path == CURRENT:
+            continue
+        machine.say(f"{'writing' if files[path] is not None else 'removing'} /{path}")
+        file = files[path]
+        if file is None:
+            if path.endswith(".env"):
+                run(["systemctl", "disable", "--now", _UNITS.format(Path(path).stem)])
+            (root / path).unlink(missing_ok=True)
+        else:
+            write(root, path, file)
+    if SYSUSERS in outcome.changed:
+        run(["systemd-sysusers", str(root / SYSUSERS)])
+    if CURRENT in outcome.changed:
+        point(root / CURRENT, f"releases/{name}")
+    if UNIT in outcome.changed or any(path.endswith(".env") for path in outcome.changed):
+        run(["systemctl", "daemon-reload"])
+    if CHRONY in outcome.changed:
+        _follow_clock(machine)
+    _enable(plan.senders, machine)
+    if outcome.restarted:
+        machine.say(f"starting {', '.join(outcome.restarted)}")
+        run(["systemctl", "restart", "--no-block", *outcome.restarted])
+    try:
+        machine.systemd.wait_ready([s.unit for s in plan.senders], machine.ready_s, machine.settle_s)
+    except NotReadyError as error:
+        if not outcome.reboot:
+            raise
+        machine.say(f"not ready before the machine is restarted, for config.txt has changed: {error}")
+
+
+def _finish(machine: Machine, name: str, before: str | None) -> None:
+    for gone in release.prune(machine.root, name, before):
+        machine.say(f"removed release {gone}")
+
+
+def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> None:
+    """Take back; what then fails is said, for the first cause matters more.
+
+    Args:
+        machine: Where.
+        senders: Whose services may have been started.
+        fresh: Release that was made for this; None: it was there before.
+    """
+    try:
+        _take_back(machine, {sender.name for sender in senders})
+    except (InstallError, OSError) as error:
+        machine.say(f"what was before does not run either: {error}")
+    if fresh is not None and _current(machine.root) != fresh:
+        shutil.rmtree(machine.root / RELEASES / fresh, ignore_errors=True)
+
+
+def _take_back(machine: Machine, started: set[str] | None = None) -> None:
+    """Put files and release back, and restart what runs by them.
+
+    Raises:
+        InstallError: There is nothing to take back, or it does not run.
+    """
+    run = machine.systemd.run
+    units = Transaction(machine.root).take_back()
+    there = _senders(machine.root)
+    for name in sorted((started or set()) - there):
+        with contextlib.suppress(InstallError):  # it may never have been there
+            run(["systemctl", "disable", "--now", _UNITS.format(name)])
+    run(["systemctl", "daemon-reload"])
+    again = sorted({unit for unit in units if unit in {_UNITS.format(n) for n in there}})
+    for name in sorted(there):
+        run(["systemctl", "enable", "--quiet", _UNITS.format(name)])
+    if again and _current(machine.root) is not None:
+        run(["systemctl", "restart", "--no-block", *again])
+        machine.systemd.wait_ready(again, machine.ready_s, machine.settle_s)
+
+
+def _enable(senders: tuple[Sender, ...], machine: Machine) -> None:
+    for sender in senders:
+        if not machine.systemd.state(sender.unit).enabled:
+            machine.systemd.run(["systemctl", "enable", "--quiet", sender.unit])
+
+
+def _follow_clock(machine: Machine) -> None:
+    try:
+        machine.systemd.run(["systemctl", "try-reload-or-restart", "chrony.service"])
+    except InstallError as error:
+        machine.say(f"the clock does not follow the master yet: {error}")
+
+
+def _current(root: Path) -> str | None:
+    link = root / CURRENT
+    return link.readlink().name if link.is_symlink() else None
+
+
+def _senders(root: Path) -> set[str]:
+    return {path.stem for path in (root / ETC).glob("*.env")}
+
+
+def _has_group(root: Path, group: str) -> bool:
+    try:
+        return any(line.startswith(f"{group}:") for line in (root / "etc/group").read_text().splitlines())
+    except FileNotFoundError:
+        return False
+
+
+@contextlib.contextmanager
+def _alone(root: Path, dry_run: bool) -> Generator[None]:
+    """One installation at a time.
+
+    Raises:
+        InstallError: Another one runs.
+    """
+    if dry_run:
+        yield
+        return
+    file = root / LOCK
+    file.parent.mkdir(parents=True, exist_ok=True)
+    with file.open("w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InstallError("another installation runs on this machine; wait for its end") from error
+        try:
+            yield
+        finally:
+            file.unlink(missing_ok=True)

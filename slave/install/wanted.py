@@ -1,0 +1,181 @@
+"""Which files a plan puts where, with which content. Keys and calibration are looked at before anything is written."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pkgutil
+import re
+import ssl
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from slave.install.boot_config import with_block
+from slave.install.errors import InstallError
+from slave.install.options import Plan
+
+OPT, ETC, KEYS, CALIB = "opt/phalanx", "etc/phalanx", "etc/phalanx/keys", "var/lib/phalanx/calib_json"
+UNIT, SYSUSERS = "etc/systemd/system/phalanx-slave@.service", "etc/sysusers.d/phalanx.conf"
+CHRONY, BOOT, RECORD = "etc/chrony/conf.d/phalanx.conf", "boot/firmware/config.txt", f"{OPT}/installed.json"
+_CHRONY = """\
+# Written by the installer of Phalanx: the clock of the master's machine first, so that cameras agree with each other.
+# That machine answers with `local stratum 8` and `allow` in its own chrony.conf.
+server {master} iburst minpoll 0 maxpoll 4 prefer
+makestep 0.1 3
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class File:
+    """Content and mode of a file."""
+
+    content: bytes
+    mode: int = 0o644
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """What the last installation left behind for the next one.
+
+    Attributes:
+        calibration: Path below calib_json -> SHA-256 of what the PC had then.
+        groups: Groups of the system that we made.
+    """
+
+    calibration: Mapping[str, str]
+    groups: tuple[str, ...] = ()
+
+    @staticmethod
+    def read(root: Path) -> Record:
+        """That of this machine; empty before the first installation."""
+        try:
+            found = json.loads((root / RECORD).read_text())
+            return Record(dict(found["calibration"]), tuple(found["groups"]))
+        except FileNotFoundError:
+            return Record({})
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InstallError(
+                f"{root / RECORD}: cannot read it ({error}); remove it, and install again"
+            ) from error
+
+    def file(self) -> File:
+        """As it is kept."""
+        found = {"calibration": dict(sorted(self.calibration.items())), "groups": sorted(self.groups)}
+        return File((json.dumps(found, indent=1) + "\n").encode())
+
+
+def wanted_files(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
+    """Path below `root` -> what it is to be; None: gone.
+
+    Raises:
+        InstallError: Keys are none, or there are none at all.
+    """
+    files: dict[str, File | None] = {
+        UNIT: File(_own("phalanx-slave@.service")),
+        SYSUSERS: File(_own("phalanx.sysusers.conf")),
+    }
+    for sender in plan.senders:
+        files[f"{ETC}/{sender.name}.env"] = File(sender.environment.encode())
+    if (root / CHRONY).parent.is_dir():
+        files[CHRONY] = File(_CHRONY.format(master=plan.master).encode())
+    if (root / BOOT).is_file():
+        text = (root / BOOT).read_text(errors="surrogateescape")
+        files[BOOT] = File(with_block(text, plan.boot).encode(errors="surrogateescape"), 0o755)
+    files |= _keys(plan, root)
+    files |= _gone(plan, root)
+    return files | _calibration(plan, root, record)
+
+
+def recorded(plan: Plan, groups: tuple[str, ...]) -> Record:
+    """What is to be remembered of this installation."""
+    return Record({path: _hash(content) for path, content in plan.calibration.items()}, groups)
+
+
+def own_groups() -> list[str]:
+    """The groups that our sysusers file asks for."""
+    lines = _own("phalanx.sysusers.conf").decode().splitlines()
+    return [line.split()[1] for line in lines if line.startswith("g ")]
+
+
+def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
+    """Refuse what is no rig key, no certificate, or a key of another certificate.
+
+    Raises:
+        InstallError: Names the file.
+    """
+    if not re.fullmatch(rb"[0-9a-fA-F]{64}\s*", keys["rig.key"]):
+        raise InstallError(
+            "keys: rig.key is not 64 hexadecimal digits; phalanx-master keys make DIR makes one"
+        )
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        context.load_verify_locations(cadata=keys["ca.pem"].decode("ascii"))
+    except (ssl.SSLError, ValueError) as error:
+        raise InstallError(f"keys: ca.pem is not a certificate ({error})") from error
+    for name in names:
+        with _in_memory(keys[f"device-{name}.pem"]) as pem, _in_memory(keys[f"device-{name}.key"]) as key:
+            try:
+                context.load_cert_chain(pem.path, key.path, password=lambda: b"")
+            except (ssl.SSLError, OSError, ValueError) as error:
+                raise InstallError(
+                    f"keys: device-{name}.pem and device-{name}.key are no certificate and its key ({error})"
+                ) from error
+
+
+class _in_memory:  # noqa: N801 - reads as a function
+    """A file that is on no disk, for libraries that only open paths."""
+
+    def __init__(self, content: bytes) -> None:
+        self._descriptor = os.memfd_create("phalanx")
+        with open(self._descriptor, "wb", closefd=False) as file:
+            file.write(content)
+        self.path = f"/proc/self/fd/{self._descriptor}"
+
+    def __enter__(self) -> _in_memory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._descriptor)
+
+
+def _keys(plan: Plan, root: Path) -> dict[str, File | None]:
+    names = tuple(sender.name for sender in plan.senders)
+    if plan.keys:
+        check_keys(plan.keys, names)
+        return {f"{KEYS}/{name}": File(content, 0o600) for name, content in plan.keys.items()}
+    wanted = ["rig.key", "ca.pem", *(f"device-{name}.{kind}" for name in names for kind in ("pem", "key"))]
+    if missing := [one for one in wanted if not (root / KEYS / one).is_file()]:
+        raise InstallError(
+            f"/{KEYS}/{missing[0]}: missing; give --keys DIR, made by: phalanx-master keys make DIR"
+        )
+    return {}
+
+
+def _gone(plan: Plan, root: Path) -> dict[str, File | None]:
+    """What belongs to senders that this machine served before and does not now."""
+    names = {sender.name for sender in plan.senders}
+    gone = [path for path in (root / ETC).glob("*.env") if path.stem not in names]
+    gone += [p for p in (root / KEYS).glob("device-*") if p.stem.removeprefix("device-") not in names]
+    return {str(path.relative_to(root)): None for path in sorted(gone)}
+
+
+def _calibration(plan: Plan, root: Path, record: Record) -> dict[str, File | None]:
+    """The PC's files where they are new or changed since the last installation; else what the slave saved stays."""
+    files: dict[str, File | None] = {}
+    for path, content in plan.calibration.items():
+        there = (root / CALIB / path).exists()
+        if not there or _hash(content) != record.calibration.get(path):
+            files[f"{CALIB}/{path}"] = File(content)
+    return files
+
+
+def _own(name: str) -> bytes:
+    content = pkgutil.get_data("slave.install", f"files/{name}")  # out of a zip, too
+    assert content is not None
+    return content
+
+
+def _hash(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
