@@ -26,6 +26,7 @@ from slave.lights.opening import SWITCHED, SYNTHETIC, choose, limits_for, open_g
 from slave.service import COMPILE_S, Away, Service, nobody
 
 if TYPE_CHECKING:
+    from common.keys import Access
     from slave.cameras.synthetic import LitBy
     from slave.imu.recording import ImuRecorder
     from slave.imu.source import ImuSource
@@ -52,7 +53,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     # Imported here: `detect` and `colours` need neither sockets nor zenoh, and start twice as fast.
-    from common.keys import rig_key
     from slave.live import run_live
     from slave.markers import engine as marker_engine
     from slave.tuning import CameraFiles
@@ -71,7 +71,7 @@ def _run(options: argparse.Namespace) -> int:
         files = replace(files, hand_path=hand_path, hand=load(hand_path, HandProfile))
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
-    key = rig_key(os.environ, options.key_file)
+    key, access = _secrets(options)
     raw = _raw_settings(options, true_clock)
     engine = (wrist_engine if rig.kind == "wrist" else marker_engine).engine_named(options.engine)
     source = _lit_source(options, rig, camera, clock, true_clock, stop, service.away)
@@ -80,7 +80,9 @@ def _run(options: argparse.Namespace) -> int:
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
 
-    run_live(options.name, files, source, uplink, clock, options.colours, engine, stop, say, service, raw)
+    run_live(
+        options.name, files, source, uplink, clock, options.colours, engine, stop, say, service, access, raw
+    )
     return 0
 
 
@@ -98,6 +100,20 @@ def _raw_settings(options: argparse.Namespace, true_clock: Clock) -> "RawSetting
     return RawSettings(folder, round(options.raw_reserve_mb * 1e6), _skewed(options, true_clock))
 
 
+def _secrets(options: argparse.Namespace) -> "tuple[bytes, Access]":
+    """The rig key, and how this device comes to the bus.
+
+    Raises:
+        PhalanxError: There is no rig key, or the keys folder has no certificate of this device.
+    """
+    from common.keys import access_of, rig_key
+
+    access = access_of(os.environ, options.name, options.keys, options.open)
+    if access.folder is not None:
+        access.identity()  # said now, not when a master is heard
+    return rig_key(os.environ, options.key_file, options.keys), access
+
+
 def _skewed(options: argparse.Namespace, true_clock: Clock) -> str:
     """How the slave's clock differs from the machine's, for whoever compares two recordings; empty: not at all."""
     skewed = f" {options.clock_offset_ms:+g} ms" if options.clock_offset_ms else ""
@@ -105,7 +121,6 @@ def _skewed(options: argparse.Namespace, true_clock: Clock) -> str:
 
 
 def _imu(options: argparse.Namespace) -> int:
-    from common.keys import rig_key
     from slave.imu.live import run_live
     from slave.imu.opening import open_real, orientation_of
     from slave.imu.synthetic import SyntheticImu
@@ -119,7 +134,7 @@ def _imu(options: argparse.Namespace) -> int:
     orientation = orientation_of(rig.imu)
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
-    key = rig_key(os.environ, options.key_file)
+    key, access = _secrets(options)
 
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
@@ -133,12 +148,11 @@ def _imu(options: argparse.Namespace) -> int:
         else:
             source = open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
         uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
-        run_live(options.name, source, orientation, uplink, clock, stop, say, service)
+        run_live(options.name, source, orientation, uplink, clock, stop, say, service, access)
     return 0
 
 
 def _tracker(options: argparse.Namespace) -> int:
-    from common.keys import rig_key
     from slave.objects.live import run_live
     from slave.objects.opening import object_with, open_real
     from slave.uplink import Uplink
@@ -147,7 +161,7 @@ def _tracker(options: argparse.Namespace) -> int:
     profile = object_with(options.calibration, rig, options.name)
     true_clock = SystemClock()
     clock = SkewedClock(round(options.clock_offset_ms * 1e6), options.clock_ppm, true_clock)
-    key = rig_key(os.environ, options.key_file)
+    key, access = _secrets(options)
 
     def say(line: str) -> None:
         print(f"{options.name}: {line}", flush=True)
@@ -169,9 +183,8 @@ def _tracker(options: argparse.Namespace) -> int:
         except PhalanxError:
             source.close()
             raise
-        run_live(
-            options.name, source, uplink, clock, stop, say, service, options.device.startswith("survive:")
-        )
+        recorded = options.device.startswith("survive:")
+        run_live(options.name, source, uplink, clock, stop, say, service, access, recorded)
     return 0
 
 

@@ -358,7 +358,18 @@ def _link(command: argparse.ArgumentParser) -> None:
         "--bind", default="0.0.0.0", metavar="ADDRESS", help="own address (default: every network)"
     )
     command.add_argument(
-        "--key-file", type=Path, metavar="FILE", help="rig key; default: environment PHALANX_RIG_KEY"
+        "--keys",
+        type=Path,
+        metavar="DIR",
+        help="keys folder of this device: rig key and certificate (docs/keys.md); default: environment PHALANX_KEYS",
+    )
+    command.add_argument(
+        "--key-file", type=Path, metavar="FILE", help="rig key alone; default: environment PHALANX_RIG_KEY"
+    )
+    command.add_argument(
+        "--open",
+        action="store_true",
+        help="join the bus of a master that is not encrypted: only in a closed laboratory; also PHALANX_OPEN=1",
     )
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from common.clock import Clock
 from common.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
+from common.endpoints import reached_at
 from common.messages import WIRE_VERSION, Message, encode
 from common.session import (
     NONCE_BYTES,
@@ -122,7 +123,10 @@ class SlaveLink:
 
     @property
     def zenoh_endpoint(self) -> str | None:
-        """Where the bus of the session's master listens; None without session or bus."""
+        """Where the bus of the session's master listens; None without session or bus.
+
+        Of a master that listens everywhere it is the address that its beacon came from.
+        """
         return None if self._session is None else self._session.zenoh_endpoint
 
     def hear_beacon(self, datagram: bytes, address: Address, t_ns: int) -> None:
@@ -197,7 +201,11 @@ class SlaveLink:
 
     def _answer(self, beacon: Beacon, counter: int, address: Address, t_ns: int) -> None:
         old, since_ns = self._offer, t_ns
-        if old is not None and old.beacon.master_nonce == beacon.master_nonce and t_ns - old.heard_ns < OFFER_NS:
+        if (
+            old is not None
+            and old.beacon.master_nonce == beacon.master_nonce
+            and t_ns - old.heard_ns < OFFER_NS
+        ):
             since_ns = old.since_ns
         nonce = self._random(NONCE_BYTES) if old is None else old.slave_nonce
         self._offer = _Offer(nonce, beacon, counter, address, heard_ns=t_ns, next_ns=t_ns, since_ns=since_ns)
@@ -251,7 +259,7 @@ class SlaveLink:
             offer.beacon_counter,
             keys.key_id,
             address,
-            offer.beacon.zenoh_endpoint or None,
+            reached_at(offer.beacon.zenoh_endpoint, offer.address[0]) or None,
             self._keys.session_sealer(keys.to_master, keys.key_id),
             Opener(keys.to_slave),
             since_ns=t_ns,

@@ -11,6 +11,7 @@ from typing import Literal
 from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
 from common.hand_model import FINGERS
+from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import run, run_wrist, wait_for_start
 from slave.cameras.source import FrameSource
@@ -60,6 +61,7 @@ def run_live(
     stop: threading.Event,
     say: Callable[[str], None],
     service: Service,
+    access: Access,
     raw_frames: RawSettings | None = None,
 ) -> None:
     """Wait for the master, then detect and send until `stop` is set or the source ends; closes source and uplink.
@@ -75,6 +77,7 @@ def run_live(
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
         service: Told what it does, for the system's service manager.
+        access: How it comes to the master's bus.
         raw_frames: Where raw frames go when somebody asks for them; None: nowhere.
 
     Raises:
@@ -96,7 +99,7 @@ def run_live(
         uplink,
         line.numbers,
         clock,
-        lambda endpoint: ZenohBus(None, endpoint),
+        lambda endpoint: ZenohBus(None, endpoint, access),
         stop.set,
         shown=line.previews,
         camera=tuning,

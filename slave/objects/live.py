@@ -7,6 +7,7 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from common.clock import Clock
+from common.keys import Access
 from common.zenoh_bus import ZenohBus
 from slave.app import POLL_S, Barrier, Sender, nothing
 from slave.objects.source import TrackerSource
@@ -67,6 +68,7 @@ def run_live(
     stop: threading.Event,
     say: Callable[[str], None],
     service: Service,
+    access: Access,
     recorded: bool = False,
 ) -> None:
     """Wait for the master, then send until `stop` is set or the source ends; closes source and uplink.
@@ -79,13 +81,16 @@ def run_live(
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
         service: Told what it does, for the system's service manager.
+        access: How it comes to the master's bus.
         recorded: The source is a recording, of which nothing is to be missed.
 
     Raises:
         TrackerError: The tracking system is gone.
     """
     tally = PoseTally(source)
-    reporter = Reporter(name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint), stop.set)
+    reporter = Reporter(
+        name, uplink, tally, clock, lambda endpoint: ZenohBus(None, endpoint, access), stop.set
+    )
     try:
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
