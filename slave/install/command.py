@@ -85,7 +85,7 @@ def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -
     except OSError as error:
         text = f"{error.filename or options.root}: {error.strerror or error}"
         return _end(options, say, {"error": text}, f"phalanx-slave: {text}", 1)
-    return _end(options, say, done, str(done.pop("text", "done")), 0)
+    return _end(options, say, done, str(done.get("text", "done")), 0)
 
 
 def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, object]:

@@ -1,7 +1,6 @@
 """Two hosts on one bridge, and the machine that runs the tests as the PC beside them."""
 
 import os
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
@@ -68,16 +67,13 @@ class Fleet:
             f"IdentityFile {key}\nIdentitiesOnly yes\nUserKnownHostsFile {self.folder}/known_hosts\n"
             "StrictHostKeyChecking yes\nBatchMode yes\nConnectTimeout 5\nLogLevel ERROR\n"
         )
-        self.path = self.folder / "bin"
-        self.path.mkdir()
-        real = shutil.which("ssh")
-        (self.path / "ssh").write_text(f'#!/bin/sh\nexec {real} -F {self.folder}/ssh_config "$@"\n')
-        (self.path / "ssh").chmod(0o755)
         return key.with_suffix(".pub").read_text()
 
-    def environment(self) -> dict[str, str]:
-        """Of a command in which `ssh` knows the hosts of this run, as a user's ~/.ssh/config would say."""
-        return os.environ | {"PATH": f"{self.path}:{os.environ['PATH']}"}
+    @property
+    def ssh_options(self) -> tuple[str, ...]:
+        """With which `phalanx deploy` reaches the hosts."""
+        known = f"UserKnownHostsFile={self.folder}/known_hosts"
+        return ("--identity", str(self.folder / "id"), *_each("--ssh-option", known, "IdentitiesOnly=yes"))
 
     def set_link(self, host: Host, up: bool) -> None:
         """Pull or plug the cable of a host."""
@@ -100,3 +96,7 @@ def _ip(arguments: str) -> None:
     done = subprocess.run(["ip", *arguments.split()], capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(f"ip {arguments}: {done.stderr.strip()}")
+
+
+def _each(option: str, *values: str) -> tuple[str, ...]:
+    return tuple(word for value in values for word in (option, value))

@@ -189,6 +189,23 @@ class Host:
         line = ["ssh", *self.ssh, self.login, as_root]
         return subprocess.run(line, capture_output=True, text=True, timeout=timeout_s, check=False)
 
+    @property
+    def unit(self) -> str:
+        """The slave that it runs."""
+        return f"phalanx-slave@{self.name}.service"
+
+    def main_pid(self) -> int:
+        """Of the slave, as the host numbers it; 0: it does not run."""
+        return int(self.run(f"systemctl show -p MainPID --value {self.unit}"))
+
+    def restarts(self) -> int:
+        """How often systemd has started the slave again."""
+        return int(self.run(f"systemctl show -p NRestarts --value {self.unit}"))
+
+    def journal(self, lines: int = 25) -> str:
+        """What the slave, and systemd of it, said last."""
+        return self.try_run(f"journalctl -u {self.unit} -n {lines} -o cat --no-pager").stdout
+
     def files(self) -> dict[str, str]:
         """Each file, folder and link of its disk: owner, mode and content; without what the system itself writes."""
         return {

@@ -6,9 +6,12 @@ import socket
 import struct
 import threading
 import time
+from pathlib import Path
+from typing import NamedTuple
 
 ETH_P_ALL = 3
-ETHERNET, UDP_HEADER, UDP = 14, 8, 17
+ETHERNET, UDP_HEADER, UDP, TCP = 14, 8, 17, 6
+PCAP_HEADER, PCAP_RECORD = 24, 16
 MAGIC, DATA = b"PHLX", 8  # docs/wire.md, sections 1 and 3
 
 
@@ -74,14 +77,44 @@ class Tap:
                 self._times.setdefault(source, []).append(arrived)
 
 
+class Packet(NamedTuple):
+    """A UDP datagram or a segment of TCP."""
+
+    protocol: int
+    source: str
+    ports: tuple[int, int]
+    payload: bytes
+
+
+def packet_of(frame: bytes) -> Packet | None:
+    """What an Ethernet frame brings; None if it is neither UDP nor TCP over IPv4."""
+    if len(frame) < ETHERNET + 20 or frame[12:14] != b"\x08\x00" or frame[ETHERNET + 9] not in (UDP, TCP):
+        return None
+    protocol, length = frame[ETHERNET + 9], struct.unpack_from("!H", frame, ETHERNET + 2)[0]
+    begin, end = ETHERNET + 4 * (frame[ETHERNET] & 0x0F), ETHERNET + length
+    if len(frame) < begin + UDP_HEADER:
+        return None
+    header = UDP_HEADER if protocol == UDP else 4 * (frame[begin + 12] >> 4)
+    source = socket.inet_ntoa(frame[ETHERNET + 12 : ETHERNET + 16])
+    return Packet(protocol, source, struct.unpack_from("!HH", frame, begin), frame[begin + header : end])
+
+
+def captured(file: Path) -> list[Packet]:
+    """The UDP and TCP of a capture of tcpdump (pcap, Ethernet, as this machine's byte order has it)."""
+    content, packets, at = file.read_bytes(), list[Packet](), PCAP_HEADER
+    assert struct.unpack_from("=I", content)[0] in (0xA1B2C3D4, 0xA1B23C4D), f"{file}: no pcap"
+    while at + PCAP_RECORD <= len(content):
+        length = struct.unpack_from("=I", content, at + 8)[0]
+        frame = content[at + PCAP_RECORD : at + PCAP_RECORD + length]
+        if (packet := packet_of(frame)) is not None:
+            packets.append(packet)
+        at += PCAP_RECORD + length
+    return packets
+
+
 def data_source(frame: bytes, port: int) -> str | None:
     """Address that sent this Ethernet frame if it is a data datagram to UDP `port`, else None."""
-    if len(frame) < ETHERNET + 20 or frame[12:14] != b"\x08\x00" or frame[ETHERNET + 9] != UDP:
+    packet = packet_of(frame)
+    if packet is None or packet.protocol != UDP or packet.ports[1] != port:
         return None
-    udp = ETHERNET + 4 * (frame[ETHERNET] & 0x0F)
-    body = udp + UDP_HEADER
-    if len(frame) < body + 6 or struct.unpack_from("!H", frame, udp + 2)[0] != port:
-        return None
-    if frame[body : body + 4] != MAGIC or frame[body + 5] != DATA:
-        return None
-    return socket.inet_ntoa(frame[ETHERNET + 12 : ETHERNET + 16])
+    return packet.source if packet.payload[:4] == MAGIC and packet.payload[5:6] == bytes([DATA]) else None

@@ -1,0 +1,129 @@
+"""A version that does not run, one that runs and says nothing, a good one, a host that is off, a disk that is full."""
+
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.hosts.conftest import Measured
+from tests.hosts.deployment import Deployment, differences, streams
+from tests.hosts.host import Host
+from tests.hosts.rig import Ran, Rig, changed_wheels
+
+CANNOT_START = """import sys
+
+
+def main(arguments=None):
+    print("phalanx-slave: planted: this version cannot start", file=sys.stderr)
+    return 1
+"""
+SAYS_NOTHING = """import os
+import socket
+import time
+
+
+def main(arguments=None):
+    manager, address = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM), os.environ["NOTIFY_SOCKET"]
+    told = "READY=1"
+    while True:
+        manager.sendto(told.encode(), address)
+        told = "WATCHDOG=1"
+        time.sleep(1.0)
+"""
+DEADLINE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def wheels(deployed: Deployment, rig: Rig) -> Path:
+    """What the first deployment gathered."""
+    (ours,) = rig.cache.glob("phalanx/*/phalanx_hand-*.whl")
+    return ours.parent
+
+
+def release(host: Host) -> str:
+    return host.run("readlink /opt/phalanx/current")
+
+
+def last_line(ran: Ran) -> str:
+    return ran.err.strip().splitlines()[-1]
+
+
+def refused(rig: Rig, name: str, wheelhouse: Path, measured: Measured) -> Ran:
+    """Deploy to one host a version that is no good; everything on it has to be as before."""
+    host, tap = rig.fleet.hosts[name], rig.fleet.tap
+    streams(rig, name)
+    before, files, begin = release(host), host.files(), time.monotonic()
+    ran = rig.deploy("--wheelhouse", str(wheelhouse), targets=(f"{name}={host.login}",))
+    assert ran.code == 1, str(ran)
+    assert release(host) == before, str(ran)
+    assert differences(files, host.files()) == [], str(ran)
+    streams(rig, name)
+    measured(f"... refused after, of {wheelhouse.name}", ran.seconds)
+    measured(f"... longest gap, of {wheelhouse.name}", tap.longest_gap_s(host.address, begin))
+    return ran
+
+
+def test_a_version_that_cannot_start_is_taken_back(wheels: Path, rig: Rig, measured: Measured) -> None:
+    bad = changed_wheels(wheels, rig.folder / "cannot start", "90.0", {"slave/__main__.py": CANNOT_START})
+    ran = refused(rig, "left", bad, measured)
+    assert "planted: this version cannot start" in last_line(ran), str(ran)
+
+
+def test_a_version_that_sends_nothing_is_taken_back(wheels: Path, rig: Rig, measured: Measured) -> None:
+    bad = changed_wheels(wheels, rig.folder / "sends nothing", "91.0", {"slave/__main__.py": SAYS_NOTHING})
+    ran = refused(rig, "right", bad, measured)
+    assert "no datagram of right" in last_line(ran), str(ran)
+
+
+def test_a_full_disk_is_told_and_nothing_stops(wheels: Path, rig: Rig, measured: Measured) -> None:
+    host, tap = rig.fleet.hosts["left"], rig.fleet.tap
+    good = changed_wheels(wheels, rig.folder / "disk full", "92.0", {})
+    streams(rig, "left")
+    before, begin, pid = release(host), time.monotonic(), host.main_pid()
+    host.run("fallocate -l $(($(df --output=avail -B1 / | tail -1) - 20000000)) /var/filler")
+    try:
+        ran = rig.deploy("--wheelhouse", str(good), targets=(f"left={host.login}",))
+    finally:
+        host.run("rm /var/filler")
+    assert ran.code == 1, str(ran)
+    assert "No space left on device" in last_line(ran) or "MB free" in last_line(ran), str(ran)
+    assert (release(host), host.main_pid()) == (before, pid)
+    gap = tap.longest_gap_s(host.address, begin)
+    measured("longest gap while the disk is full and a version refused", gap)
+    assert gap < 1.0
+
+
+def test_a_host_that_is_off_does_not_keep_the_other_from_a_new_version(
+    wheels: Path, rig: Rig, measured: Measured
+) -> None:
+    left, right = rig.fleet.hosts["left"], rig.fleet.hosts["right"]
+    good = changed_wheels(wheels, rig.folder / "good", "93.0", {})
+    left.cut_power()
+    try:
+        ran = rig.deploy("--wheelhouse", str(good), "--deadline", str(DEADLINE_S))
+    finally:
+        left.boot()
+    measured("a deployment, one of two hosts off", ran.seconds, limit=DEADLINE_S)
+    assert ran.code == 1, str(ran)
+    assert ran.seconds <= DEADLINE_S
+    assert left.address in last_line(ran), str(ran)
+    assert right.address not in last_line(ran), str(ran)
+    assert release(right).startswith("releases/93.0-")
+    assert release(left).startswith(f"releases/{rig.version}-")
+    streams(rig)
+
+
+def test_a_good_version_comes_and_goes_back(wheels: Path, rig: Rig, measured: Measured) -> None:
+    before = {name: release(rig.fleet.hosts["left"]) for name in rig.fleet.hosts}
+    begin = time.monotonic()
+    ran = rig.deploy("--wheelhouse", str(rig.folder / "good"))
+    assert ran.code == 0, str(ran)
+    gap = max(rig.fleet.tap.longest_gap_s(host.address, begin) for host in rig.fleet.hosts.values())
+    measured("longest gap of a good new version", gap)
+    assert all(release(host).startswith("releases/93.0-") for host in rig.fleet.hosts.values())
+    streams(rig)
+    back = rig.deploy("--wheelhouse", str(wheels))  # its release is still there
+    assert back.code == 0, str(back)
+    measured("going back to the version before", back.seconds)
+    assert {name: release(host) for name, host in rig.fleet.hosts.items()} == before, str(back)
+    streams(rig)

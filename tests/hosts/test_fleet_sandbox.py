@@ -1,0 +1,110 @@
+"""What the running service may not do, tried from inside its own sandbox; and what can be read on the network."""
+
+import subprocess
+import time
+import zlib
+
+import pytest
+
+from tests.hosts.conftest import Measured
+from tests.hosts.deployment import Deployment, streams
+from tests.hosts.fleet import MASTER_PORT
+from tests.hosts.host import Host
+from tests.hosts.rig import BUS_PORT, Rig
+from tests.hosts.tap import MAGIC, TCP, UDP, captured
+
+CAPTURE_S = 5.0
+FIRST_DYNAMIC, LAST_DYNAMIC = 61184, 65519  # users of DynamicUser=, systemd's UIDS-GIDS.md
+READABLE = (
+    b"thumb",
+    b"middle",
+    b"little",
+    b"markers",
+    b"quality",
+    b"session",
+    b"phalanx/",
+    b"camera",
+    b"health",
+)
+
+
+@pytest.fixture
+def host(deployed: Deployment, rig: Rig) -> Host:
+    return rig.fleet.hosts["left"]
+
+
+def inside(host: Host, command: str) -> subprocess.CompletedProcess[str]:
+    """Run a shell command as the slave's user, before the files that the slave sees."""
+    pid = host.main_pid()
+    user = host.run(f"awk '/^Uid:/ {{print $2}}' /proc/{pid}/status")
+    return host.try_run(f"nsenter -t {pid} -m -S {user} -G {user} -- sh -c '{command}'")
+
+
+def test_it_is_nobody_and_can_become_nobody(host: Host) -> None:
+    lines = host.run(f"cat /proc/{host.main_pid()}/status").splitlines()
+    status = {key: value.split() for key, _, value in (line.partition(":") for line in lines)}
+    assert FIRST_DYNAMIC <= int(status["Uid"][0]) <= LAST_DYNAMIC
+    assert len(set(status["Uid"])) == 1
+    assert {status[name][0] for name in ("CapInh", "CapPrm", "CapEff", "CapBnd", "CapAmb")} == {"0" * 16}
+    assert status["NoNewPrivs"] == ["1"]
+    assert status["Seccomp"] == ["2"]
+
+
+@pytest.mark.parametrize(
+    "place",
+    ["/opt/phalanx", "/opt/phalanx/current/bin", "/etc/phalanx", "/usr/bin", "/var/lib", "/root", "/home"],
+)
+def test_it_writes_nowhere(host: Host, place: str) -> None:
+    assert inside(host, f"touch {place}/planted").returncode != 0
+    assert host.try_run(f"test -e {place}/planted").returncode != 0
+
+
+def test_it_writes_to_its_state_alone(host: Host) -> None:
+    assert inside(host, "touch /var/lib/phalanx/planted && rm /var/lib/phalanx/planted").returncode == 0
+
+
+def test_it_reads_its_own_keys_and_not_those_of_the_machine(host: Host) -> None:
+    folder = f"/run/credentials/{host.unit}"
+    assert "PRIVATE KEY" in inside(host, f"cat {folder}/device.key").stdout
+    for file in ("rig.key", f"device-{host.name}.key"):
+        assert host.run(f"test -f /etc/phalanx/keys/{file} && echo there") == "there"
+        denied = inside(host, f"cat /etc/phalanx/keys/{file}")
+        assert denied.returncode != 0
+        assert "Permission denied" in denied.stderr
+    others = host.try_run(f"nsenter -t {host.main_pid()} -m -S 65534 -G 65534 -- cat {folder}/rig.key")
+    assert others.returncode != 0
+
+
+def test_a_service_like_it_is_exposed_little(host: Host, measured: Measured) -> None:
+    said = host.run(f"systemd-analyze security {host.unit} --no-pager | tail -1")
+    exposure = float(said.split(":")[1].split()[0])
+    measured("exposure of the running unit, systemd-analyze security", exposure, unit="", limit=2.5)
+    assert exposure <= 2.5
+
+
+def test_a_capture_shows_nothing_that_can_be_read(host: Host, rig: Rig, measured: Measured) -> None:
+    streams(rig)
+    file = rig.folder / "capture.pcap"
+    watch = ["tcpdump", "-i", rig.fleet.bridge, "-w", str(file), "-U", "--immediate-mode", "-s", "0"]
+    with subprocess.Popen(
+        [*watch, f"net {rig.fleet.network}.0/24 and not port 22"], stderr=subprocess.DEVNULL
+    ) as dump:
+        time.sleep(1.0)
+        host.run(f"systemctl restart {host.unit}")  # its handshakes, too
+        streams(rig)
+        time.sleep(CAPTURE_S)
+        dump.terminate()
+    content = file.read_bytes()
+    assert {word for word in READABLE if word in content} == set()
+    packets = captured(file)
+    datagrams = [one.payload for one in packets if one.protocol == UDP and one.ports[1] == MASTER_PORT]
+    bus = [one.payload for one in packets if one.protocol == TCP and BUS_PORT in one.ports and one.payload]
+    measured("captured datagrams of the slaves", len(datagrams), unit="")
+    assert len(datagrams) > 30 * CAPTURE_S
+    assert {one[:4] for one in datagrams} == {MAGIC}
+    sealed = b"".join(one[28:] for one in datagrams)  # behind the header of docs/wire.md
+    assert len(zlib.compress(sealed, 9)) > 0.99 * len(sealed), "it has a pattern, so it is not encrypted"
+    # RFC 8446, 5.1: the first byte of a TLS record is its kind; 22: handshake, 23: encrypted.
+    kinds = {one[:3] for one in bus}
+    assert b"\x16\x03\x01" in kinds, "nobody began a TLS session on the bus"
+    assert b"\x17\x03\x03" in kinds, "nothing is encrypted on the bus"
