@@ -1,0 +1,161 @@
+"""The unit and what stands beside it, as far as they can be tried without a device: systemd's own checks, and whether
+all that a slave needs has wheels for the Raspberry Pi."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from importlib import resources
+from pathlib import Path
+
+import pytest
+
+from slave.doctor.devices import GROUPS
+
+ROOT = Path(__file__).resolve().parents[3]
+FILES = resources.files("slave.install") / "files"
+UNIT = FILES / "phalanx-slave@.service"
+MOST_EXPOSED = 25  # of 250; systemd-analyze counts in tenths
+NEEDS_SYSTEMD = pytest.mark.skipif(
+    shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing: apt install systemd"
+)
+# What the unit mentions, so that nothing of this machine's own systemd takes part.
+TARGETS = ("sysinit", "basic", "shutdown", "multi-user", "network")
+PROGRAMS = ("opt/phalanx/current/bin/phalanx-slave", "bin/sh")
+PIP_S = 60.0
+PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
+
+
+def settings(text: str) -> list[tuple[str, str]]:
+    return [(key, value) for key, value in re.findall(r"^(\w+)=(.*)$", text, re.MULTILINE)]
+
+
+def verified(tmp_path: Path, text: str) -> str:
+    """What systemd says about this text as our unit: nothing, or what is wrong."""
+    units = tmp_path / "etc/systemd/system"
+    units.mkdir(parents=True)
+    for name in TARGETS:
+        (units / f"{name}.target").write_text("[Unit]\nDescription=of the test\n")
+    (units / "system.slice").write_text("[Slice]\n")
+    for program in PROGRAMS:
+        path = tmp_path / program
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("#!/bin/sh\n")
+        path.chmod(0o755)
+    (units / "phalanx-slave@.service").write_text(text)
+    command = ["systemd-analyze", "verify", "--man=no", f"--root={tmp_path}", "phalanx-slave@left.service"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    return done.stderr + done.stdout + ("" if done.returncode == 0 else f"exit {done.returncode}")
+
+
+@NEEDS_SYSTEMD
+def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
+    assert verified(tmp_path, UNIT.read_text()) == ""
+
+
+@NEEDS_SYSTEMD
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
+        ("char-i2c", "chor-i2c", "chor-i2c"),
+        ("current/bin/phalanx-slave $PHALANX_COMMAND", "current/bin/phalanx", "not executable"),
+    ],
+)
+def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+    text = UNIT.read_text()
+    assert old in text
+    assert said in verified(tmp_path, text.replace(old, new, 1))
+
+
+@NEEDS_SYSTEMD
+@pytest.mark.parametrize(("drop", "passes"), [(None, True), ("SystemCallFilter", False)])
+def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) -> None:
+    text = UNIT.read_text()
+    unit = tmp_path / "phalanx-slave@.service"
+    unit.write_text(text if drop is None else re.sub(rf"^{drop}=.*$", "", text, flags=re.MULTILINE))
+    done = subprocess.run(
+        [
+            "systemd-analyze",
+            "security",
+            "--no-pager",
+            "--offline=true",
+            f"--threshold={MOST_EXPOSED}",
+            str(unit),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode == 0) is passes, done.stdout[-200:] + done.stderr
+
+
+def test_every_group_of_the_unit_is_made_and_known_to_the_doctor() -> None:
+    (asked,) = [value for key, value in settings(UNIT.read_text()) if key == "SupplementaryGroups"]
+    sysusers = (FILES / "phalanx.sysusers.conf").read_text()
+    made = re.findall(r"^g (\w+) - -$", sysusers, re.MULTILINE)
+    assert sorted(asked.split()) == sorted(made) == sorted(GROUPS)
+
+
+def test_the_unit_waits_for_the_slave_and_watches_its_loop() -> None:
+    said = dict(settings(UNIT.read_text()))
+    assert (said["Type"], said["Restart"], said["StartLimitIntervalSec"]) == ("notify", "always", "0")
+    # A hang is found after at most a watchdog's period, ended within the abort's, and the slave is up a second later.
+    assert int(said["WatchdogSec"]) + int(said["TimeoutAbortSec"]) + int(said["RestartSec"]) <= 8
+    assert "MemoryDenyWriteExecute" not in said  # numba
+    credentials = [value.split(":") for key, value in settings(UNIT.read_text()) if key == "LoadCredential"]
+    assert [name for name, _ in credentials] == ["rig.key", "ca.pem", "device.pem", "device.key"]
+    assert all(path.startswith("/etc/phalanx/keys/") for _, path in credentials)
+
+
+def test_the_files_of_the_unit_are_in_the_wheel(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(command, cwd=ROOT, check=True, capture_output=True, timeout=120)
+    (wheel,) = tmp_path.glob("*.whl")
+    listed = subprocess.run(
+        [sys.executable, "-m", "zipfile", "-l", str(wheel)],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    ).stdout
+    assert "slave/install/files/phalanx-slave@.service" in listed
+    assert "slave/install/files/phalanx.sysusers.conf" in listed
+
+
+@pytest.mark.parametrize("python", ["3.11", "3.13"])  # of Debian 12 and 13
+def test_all_that_a_slave_needs_has_wheels_for_the_pi(tmp_path: Path, python: str) -> None:
+    needed: list[str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    report = tmp_path / "report.json"
+    tag = python.replace(".", "")
+    where = [f"--platform={one}" for one in PLATFORMS] + [
+        f"--abi={one}" for one in (f"cp{tag}", "abi3", "none")
+    ]
+    resolve = [
+        "install",
+        "--dry-run",
+        "--ignore-installed",
+        "--quiet",
+        "--no-input",
+        "--retries=1",
+        "--timeout=5",
+    ]
+    which = ["--only-binary=:all:", f"--python-version={python}", "--implementation=cp", *where]
+    place = [f"--target={tmp_path / 'nothing'}", f"--report={report}", "-c", str(ROOT / "constraints.txt")]
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *resolve, *which, *place, *needed]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PIP_S, check=False)
+    if "No module named pip" in done.stderr:
+        pytest.skip("no pip in this environment: python -m ensurepip")
+    if re.search(r"connection|name resolution|unreachable|ProxyError", done.stderr, re.IGNORECASE):
+        pytest.skip("no package registry can be reached")
+    assert done.returncode == 0, done.stderr
+    found = [
+        one["download_info"]["url"].rsplit("/", 1)[1] for one in json.loads(report.read_text())["install"]
+    ]
+    assert {re.split(r"[-.]", name.lower())[0] for name in found} >= {
+        re.split(r"[<>=\[; ]", name)[0].lower().replace("-", "_") for name in needed
+    }
+    assert all("aarch64" in name or name.endswith("-none-any.whl") for name in found), found
