@@ -1,0 +1,164 @@
+"""`make audit`: known vulnerabilities of everything that is locked, as the Python registry or osv.dev knows them.
+
+Exit 0: all were asked about, and nothing is known. 1: something is known. 2: they could not be asked, or not about all;
+that is no pass. `--sbom FILE` also writes what is locked as a bill of materials (CycloneDX 1.6), which asks nobody.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+from uuid import uuid4
+
+import msgspec
+
+from bench.locked import locked, scopes
+from common.errors import PhalanxError
+
+ROOT = Path(__file__).resolve().parents[1]
+SERVICES = ("pypi", "osv")
+NONE_KNOWN, KNOWN, NOT_ASKED = 0, 1, 2
+_PATIENCE_S = 600.0
+
+
+class Vulnerability(msgspec.Struct):
+    """One that is known: its name, other names, the versions that mend it, and what it is."""
+
+    id: str
+    fix_versions: list[str]
+    aliases: list[str] = []
+    description: str = ""
+
+
+class Package(msgspec.Struct):
+    """What is known of one package; `skip_reason`: nobody could be asked."""
+
+    name: str
+    version: str = ""
+    skip_reason: str = ""
+    vulns: list[Vulnerability] = []
+
+
+class _Answer(msgspec.Struct):
+    dependencies: list[Package]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What an audit came to: exit code, and lines for a person."""
+
+    code: int
+    lines: tuple[str, ...]
+
+
+def asked(constraints: Path, service: str) -> list[Package]:
+    """What a service answers about every line.
+
+    Raises:
+        PhalanxError: It does not answer.
+    """
+    command = [
+        sys.executable,
+        "-m",
+        "pip_audit",
+        "--requirement",
+        str(constraints),
+        "--disable-pip",
+        "--no-deps",
+    ]
+    command += ["--progress-spinner", "off", "--format", "json", "--vulnerability-service", service]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise PhalanxError(f"{service}: no answer within {_PATIENCE_S:g} s") from error
+    try:
+        return msgspec.json.decode(done.stdout, type=_Answer).dependencies
+    except msgspec.MsgspecError as error:
+        last = (done.stderr.strip().splitlines() or [f"exit {done.returncode}"])[-1]
+        raise PhalanxError(f"{service}: {last[:300]}") from error
+
+
+def judge(versions: dict[str, str], told: Sequence[Package], who: dict[str, str]) -> Verdict:
+    """What the answers come to.
+
+    Args:
+        versions: What is locked: name -> version.
+        told: What was answered.
+        who: Name -> who needs it.
+    """
+    answers = {one.name: one for one in told if not one.skip_reason and one.version == versions.get(one.name)}
+    lines: list[str] = []
+    for name in sorted(answers):
+        for one in answers[name].vulns:
+            names, fix = " ".join([one.id, *one.aliases]), ", ".join(one.fix_versions) or "no version yet"
+            lines.append(f"{name} {versions[name]} (for {who.get(name, '?')}): {names}; mended by {fix}")
+    missing = sorted(set(versions) - set(answers))
+    if lines:
+        return Verdict(
+            KNOWN, (*lines, f"{len(lines)} known; raise the lines of constraints.txt, then `make test`")
+        )
+    if missing:
+        few = ", ".join(missing[:5]) + (" ..." if len(missing) > 5 else "")
+        return Verdict(NOT_ASKED, (f"nothing is known of {len(missing)} of {len(versions)} packages: {few}",))
+    return Verdict(NONE_KNOWN, (f"none known in {len(versions)} packages",))
+
+
+def bill_of_materials(versions: dict[str, str], who: dict[str, str]) -> str:
+    """CycloneDX JSON of what is locked; the property `phalanx:for` says who needs it."""
+    scope = {"slave": "required", "master": "required", "extra": "optional", "tests": "excluded"}
+    components = [
+        {
+            "type": "library",
+            "bom-ref": f"{name}=={version}",
+            "name": name,
+            "version": version,
+            "scope": scope[who[name]],
+            "purl": f"pkg:pypi/{name}@{quote(version)}",
+            "properties": [{"name": "phalanx:for", "value": who[name]}],
+        }
+        for name, version in sorted(versions.items())
+    ]
+    head = {
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.6",
+        "serialNumber": f"urn:uuid:{uuid4()}",
+        "version": 1,
+    }
+    return json.dumps({**head, "components": components}, indent=1) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Ask the services one after the other, until one knows of all; print, and return the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m bench.audit", description=__doc__)
+    parser.add_argument("--constraints", type=Path, default=ROOT / "constraints.txt", help="what is locked")
+    parser.add_argument(
+        "--sbom", type=Path, metavar="FILE", help="also write the bill of materials, CycloneDX JSON"
+    )
+    given = parser.parse_args(arguments)
+    versions = locked(given.constraints)
+    who = scopes(ROOT / "pyproject.toml", versions)
+    if given.sbom is not None:
+        given.sbom.write_text(bill_of_materials(versions, who), encoding="utf-8")
+        print(f"wrote {given.sbom}: {len(versions)} packages")
+    verdict = Verdict(NOT_ASKED, ())
+    for service in SERVICES:
+        try:
+            verdict = judge(versions, asked(given.constraints, service), who)
+        except PhalanxError as error:
+            verdict = Verdict(NOT_ASKED, (str(error),))
+        for line in verdict.lines:
+            print(f"audit ({service}): {line}")
+        if verdict.code != NOT_ASKED:
+            return verdict.code
+    print(
+        "audit: could not be done, which is no pass: it needs a network that reaches pypi.org or api.osv.dev"
+    )
+    return verdict.code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
