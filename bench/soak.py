@@ -62,7 +62,7 @@ def _settings(arguments: Sequence[str] | None) -> SoakSettings:
     parser.add_argument("--minutes", type=float, default=60.0, help="length (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("out/soak"), help="folder (default: %(default)s)")
     parser.add_argument(
-        "--marker-hz", type=float, default=12.0, help="of each marker camera (default: %(default)s)"
+        "--marker-hz", type=float, default=10.0, help="of each marker camera (default: %(default)s)"
     )
     parser.add_argument(
         "--wrist-hz", type=float, default=12.0, help="frames; three a triple (default: %(default)s)"
@@ -71,7 +71,7 @@ def _settings(arguments: Sequence[str] | None) -> SoakSettings:
         "--every-s", type=float, default=5.0, help="memory is read so often (default: %(default)s)"
     )
     parser.add_argument(
-        "--nice", type=int, default=0, help="give way to others, 0..19 (default: %(default)s)"
+        "--nice", type=int, default=0, help="give way to others so far; below 0, as root: go before them"
     )
     given = parser.parse_args(arguments)
     return SoakSettings(given.minutes, given.out, given.marker_hz, given.wrist_hz, given.every_s, given.nice)

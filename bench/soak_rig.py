@@ -1,12 +1,15 @@
 """The rig of the soak: a master, two marker cameras, a wrist camera and an IMU, each a real process of this machine.
 
 All that a real rig runs is run: drawn frames are detected, sealed and sent by UDP, clocks differ and drift, the wrist
-device strobes, one master makes one hand of both. Only the rate is chosen, so that a small machine keeps up.
+device strobes, one master makes one hand of both, the bus is encrypted by keys of this run. Only the rate is chosen, so
+that a small machine keeps up.
 """
 
 import json
+import os
 import shutil
 import socket
+import subprocess
 import sys
 import time
 from collections.abc import Generator
@@ -15,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.local_rig import free_port
-from common.keys import ENVIRONMENT, new_key
+from common.keys import FOLDER
 from deploy.process import Process
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
@@ -37,7 +40,7 @@ class SoakSettings:
         marker_hz: Rate of both marker cameras.
         wrist_hz: Frames of the wrist camera in a second; three make a triple.
         every_s: How often the memory of the processes is read.
-        nice: By how many steps of the scheduler's all of it gives way to others, 0..19.
+        nice: By how many steps of the scheduler it gives way to others; below 0 it goes before them.
     """
 
     minutes: float
@@ -62,6 +65,7 @@ def running(settings: SoakSettings) -> Generator[SoakRig]:
 
     Raises:
         OSError: The folder cannot be written.
+        subprocess.CalledProcessError: No keys can be made; why has been printed.
     """
     settings.out.mkdir(parents=True, exist_ok=True)
     tree = settings.out / "calib_json"
@@ -71,9 +75,12 @@ def running(settings: SoakSettings) -> Generator[SoakRig]:
         _set_rate(
             tree / "cameras" / f"{name}.json", settings.wrist_hz if name == "wrist" else settings.marker_hz
         )
-    bus = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+    os.environ[FOLDER] = str(
+        _keys(settings.out / "keys")
+    )  # for this process, which joins the bus, and all it starts
+    bus = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     beacon, data = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
-    environment = {ENVIRONMENT: new_key(), "PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = {"PYTHONUNBUFFERED": "1", "OPENBLAS_NUM_THREADS": "1"}
     place = ["--calibration", str(tree)]
     link = ["--bind", "127.0.0.1", "--beacon-port", str(beacon)]
     rigs = [word for rig in RIGS for word in ("--rig", rig)]
@@ -106,6 +113,19 @@ def running(settings: SoakSettings) -> Generator[SoakRig]:
             stack.callback(process.stop)
             processes.append(process)
         yield SoakRig(tuple(processes), bus)
+
+
+def _keys(folder: Path) -> Path:
+    """A keys folder of this run.
+
+    Raises:
+        subprocess.CalledProcessError: It cannot be made; why has been printed.
+    """
+    shutil.rmtree(folder, ignore_errors=True)
+    devices = [word for name in (*CAMERAS, "imu") for word in ("--device", name)]
+    make = [sys.executable, "-m", "master", "keys", "make", str(folder), *devices]
+    subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
+    return folder
 
 
 def _set_rate(camera: Path, rate_hz: float) -> None:

@@ -22,6 +22,7 @@ GROWS_MS, GROWS_SHARE = (
 )  # latency that grew by less over the run, or by less of itself, did not grow
 WARM_UP_S, WARM_UP_SHARE = 300.0, 1.0 / 6.0
 BLOCK_S, QUIET_MINUTES = 60.0, 5
+LEAST_S = 600.0  # after the warm-up; a shorter run cannot tell 1 MB/h from the last arenas that are filled
 _Z95 = 1.96
 _FEWEST = 4
 
@@ -74,7 +75,7 @@ def warm_up_s(length_s: float) -> float:
 def memory_slope(course: Course, process: str, quantity: str = "rss_mb") -> Slope:
     """Of a process, by medians of minutes, after the warm-up [MB/h]."""
     times, values = np.array(course.times_s), np.array(course.series(process, quantity))
-    if not len(times):
+    if not len(times) or times[-1] - warm_up_s(times[-1]) < LEAST_S:
         return Slope(nan, nan, nan)
     block = (times // BLOCK_S).astype(np.int64)
     late = times >= warm_up_s(times[-1])
@@ -88,7 +89,7 @@ def memory_slope(course: Course, process: str, quantity: str = "rss_mb") -> Slop
 
 def latency_slope(minutes: Sequence[Minute], quantity: str) -> Slope:
     """Of `p50_ms` or `p99_ms`, by the quietest minute of every five, after the warm-up [ms/h]."""
-    if not minutes:
+    if not minutes or minutes[-1].t_s - warm_up_s(minutes[-1].t_s) < LEAST_S:
         return Slope(nan, nan, nan)
     late = [one for one in minutes if one.t_s > warm_up_s(minutes[-1].t_s)]
     size = QUIET_MINUTES if len(late) >= _FEWEST * QUIET_MINUTES else 1
@@ -105,7 +106,9 @@ def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
         findings.append(
             Finding(
                 f"memory of {process}",
-                f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})",
+                "too short to say"
+                if np.isnan(found.per_h)
+                else f"{found.per_h:+.2f} MB/h ({found.low:+.2f} ... {found.high:+.2f})",
                 f"{MB_PER_H:g} MB/h",
                 None if np.isnan(found.per_h) else found.per_h <= MB_PER_H,
             )
