@@ -10,7 +10,7 @@ import time
 from pathlib import Path
 
 from bench.row import Row
-from deploy.demo import DemoSettings, play, run_demo
+from deploy.demo import DemoSettings, demo_keys, play, run_demo
 from master.summary import read_summary
 
 _CALIBRATION = Path(__file__).parent.parent / "calib_json"
@@ -53,7 +53,8 @@ _FIGURES = (
 def _relay(out: Path) -> tuple[float, float]:
     """Median and 99 % of the relay's latency [ms]."""
     settings = _settings(out, _RELAY_SECONDS, "bench.idle_master")
-    play(settings, time.monotonic_ns() + 4_000_000_000, threading.Event(), _quiet)
+    with demo_keys(settings) as keys:
+        play(settings, keys, time.monotonic_ns() + 4_000_000_000, threading.Event(), _quiet)
     found = read_summary(out / "live.json")
     p50, p99 = (found[f"latency_{name}_ms"] for name in ("p50", "p99"))
     assert isinstance(p50, float)

@@ -181,7 +181,8 @@ def _parser() -> argparse.ArgumentParser:
     demo.add_argument(
         "--bus",
         metavar="ENDPOINT",
-        help="where other programs can read along, as tcp/127.0.0.1:47802 (default: any free port)",
+        help="where other programs of this machine can read along, as tcp/127.0.0.1:47802 (default: any free port, "
+        "encrypted)",
     )
     demo.add_argument("--seed", type=int, default=7, help="of the scene (default: %(default)s)")
     demo.add_argument(

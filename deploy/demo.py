@@ -1,21 +1,22 @@
 """The demo: a slave for each camera, IMU and tracker of its rigs, all synthetic, the master and the viewer, as
 processes of this machine.
 
-Real sealed UDP on 127.0.0.1, real zenoh, one ephemeral rig key passed by the environment. The slaves' clocks
-have different zeros and rates, and each camera runs 5 ms after the one before.
+Real sealed UDP on 127.0.0.1, real zenoh over TLS, with keys that are made for this run and gone after it. The slaves'
+clocks have different zeros and rates, and each camera runs 5 ms after the one before.
 """
 
 import json
 import os
 import re
-import secrets
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
@@ -55,7 +56,7 @@ class DemoSettings:
         web: The viewer is a page on 127.0.0.1 instead of a window.
         console: The console, a page as well, takes the viewer's place.
         master: Module that is run as the master.
-        bus: Endpoint of the master's bus; None: a port that is free.
+        bus: Endpoint of the master's bus; None: encrypted, on a port that is free.
     """
 
     seconds: float
@@ -97,13 +98,31 @@ def run_demo(settings: DemoSettings, stop: threading.Event, say: Callable[[str],
     Raises:
         DemoError: A process does not come up, or the results cannot be made.
     """
-    epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(settings.sensors()) + 1, os.getloadavg()[0]))
-    restarts = play(settings, epoch_ns, stop, say)
+    with demo_keys(settings) as keys:
+        epoch_ns = time.monotonic_ns() + round(1e9 * lead_s(len(settings.sensors()) + 1, os.getloadavg()[0]))
+        restarts = play(settings, keys, epoch_ns, stop, say)
     summary = _report(settings, epoch_ns, say)
     if restarts:
         summary["restarts"] = restarts
         (settings.out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     return summary
+
+
+@contextmanager
+def demo_keys(settings: DemoSettings) -> Generator[Path, None, None]:
+    """A keys folder for one run, in a place that only this user can enter; gone at the end of the block.
+
+    Raises:
+        DemoError: It cannot be made.
+    """
+    with tempfile.TemporaryDirectory(prefix="phalanx-demo-") as private:
+        folder = Path(private) / "keys"
+        names = [word for sensor in settings.sensors() for word in ("--device", sensor.name)]
+        command = [sys.executable, "-m", "master.keys_command", "make", str(folder), *names]
+        made = subprocess.run(command, capture_output=True, text=True, check=False)
+        if made.returncode != 0:
+            raise DemoError(f"cannot make keys: {made.stderr.strip()}")
+        yield folder
 
 
 def lead_s(processes: int, load: float) -> float:
@@ -113,12 +132,13 @@ def lead_s(processes: int, load: float) -> float:
 
 
 def play(
-    settings: DemoSettings, epoch_ns: int, stop: threading.Event, say: Callable[[str], None]
+    settings: DemoSettings, keys: Path, epoch_ns: int, stop: threading.Event, say: Callable[[str], None]
 ) -> dict[str, int]:
     """Run the processes for as long as wanted; the master leaves live.json and poses.npz. Who was restarted how often.
 
     Args:
         settings: What the user chose.
+        keys: Keys folder of all processes.
         epoch_ns: When the scene begins, on this machine's monotonic clock.
         stop: Ends the run early.
         say: Told one line of progress at a time.
@@ -138,9 +158,11 @@ def play(
     processes: list[Process] = []
     try:
         drawn = {sensor.name for sensor in settings.sensors() if sensor.kind == "camera"}
-        for name, command, environment in _table(settings, epoch_ns):
+        for name, command, environment in _table(settings, keys, epoch_ns):
             nice = _GIVES_WAY if name in drawn else 0
             processes.append(Process(name, command, environment, out / f"{name}.log", _listener(state), nice))
+        if settings.bus is not None and not settings.bus.startswith("tcp/"):
+            say(f"programs that read along at {settings.bus} need PHALANX_KEYS={keys}")
         say(f"started {', '.join(f'{p.name} (pid {p.pid})' for p in processes)}; logs in {out}")
         _wait_until_tracking(state, processes, stop, say)
         _until_end(settings, state, processes, epoch_ns, stop, say)
@@ -161,11 +183,11 @@ def _stop(processes: list[Process]) -> None:
         raise
 
 
-def _table(settings: DemoSettings, epoch_ns: int) -> list[tuple[str, list[str], dict[str, str]]]:
+def _table(settings: DemoSettings, keys: Path, epoch_ns: int) -> list[tuple[str, list[str], dict[str, str]]]:
     """The process table: name, command line, environment."""
-    key = {"PHALANX_RIG_KEY": secrets.token_hex(32), "PYTHONUNBUFFERED": "1"}
+    key = {"PHALANX_KEYS": str(keys), "PYTHONUNBUFFERED": "1"}
     beacon, data = _free_port(socket.SOCK_DGRAM), _free_port(socket.SOCK_DGRAM)
-    bus = settings.bus or f"tcp/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
+    bus = settings.bus or f"tls/127.0.0.1:{_free_port(socket.SOCK_STREAM)}"
     tree = ["--calibration", str(settings.calibration)]
     place = [*rig_options(settings.rigs), *tree]
     rows: list[tuple[str, list[str], dict[str, str]]] = []

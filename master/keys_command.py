@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from common.errors import PhalanxError
 from master.keys_folder import certificates_of, make, renew, renew_device
 
 Folder = Annotated[Path, typer.Argument(help="Keys folder; keep it private, and out of calib_json.")]
@@ -107,3 +108,15 @@ def _tell(folder: Path, left: list[str]) -> None:
 
 def _now() -> datetime:
     return datetime.now(UTC)
+
+
+def main() -> None:
+    """`python -m master.keys_command`: the same without the rest of the master, which takes seconds to load."""
+    try:
+        keys_app()()
+    except PhalanxError as error:
+        raise SystemExit(f"keys: {error}") from error
+
+
+if __name__ == "__main__":
+    main()
