@@ -32,6 +32,8 @@ def check(endpoint: str, open_bus: bool) -> None:
     """
     if endpoint.split("/", 1)[0] not in SCHEMES:
         raise BusError(f"bus endpoint {endpoint!r}: must begin with {', '.join(s + '/' for s in SCHEMES)}")
+    if "#" in endpoint:  # zenoh would take other certificates from there, or do without
+        raise BusError(f"bus endpoint {endpoint!r}: must have no settings of its own behind #")
     if encrypted(endpoint) or open_bus or loopback(endpoint):
         return
     raise BusError(

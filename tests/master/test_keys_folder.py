@@ -1,0 +1,115 @@
+"""The keys folder: made once, added to, renewed, a device taken out; private from the first moment on."""
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from common.certificates import shown
+from common.errors import PhalanxError
+from master.keys_folder import certificates_of, devices_of, make, renew, renew_device
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+ALL = {"rig.key", "ca.pem", "ca.key", "master.pem", "master.key", "operator.pem", "operator.key"}
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """All files below a folder."""
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def keys(tmp_path: Path) -> Path:
+    """A keys folder of two devices."""
+    before = os.umask(0)  # who cares least about his files
+    try:
+        make(tmp_path / "of" / "rig", ["left", "pi.right-2_x"], NOW)
+    finally:
+        os.umask(before)
+    return tmp_path / "of" / "rig"
+
+
+def test_it_has_everything_and_nobody_else_can_read_a_secret(keys: Path) -> None:
+    devices = {f"devices/{name}.{ending}" for name in ("left", "pi.right-2_x") for ending in ("pem", "key")}
+    assert set(files(keys)) == ALL | devices
+    for path in [keys, keys / "devices"]:
+        assert path.stat().st_mode & 0o777 == 0o700
+    for path in keys.rglob("*.key"):
+        assert path.stat().st_mode & 0o777 == 0o600
+    assert {one.name: one.listens for one in certificates_of(keys)} == {
+        "master": True,
+        "operator": False,
+        "left": False,
+        "pi.right-2_x": False,
+    }
+
+
+def test_made_again_it_stays_as_it_is_and_only_what_is_missing_is_added(keys: Path) -> None:
+    before = files(keys)
+    assert make(keys, ["left"], NOW) == []
+    assert files(keys) == before
+    assert make(keys, ["left", "imu"], NOW) == ["devices/imu.key", "devices/imu.pem"]
+    assert {name: content for name, content in files(keys).items() if "imu" not in name} == before
+    (keys / "devices" / "left.key").unlink()
+    assert make(keys, ["left"], NOW) == ["devices/left.key", "devices/left.pem"]
+
+
+def test_a_rig_key_that_is_there_stays(tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    (tmp_path / "rig.key").write_text("ab" * 32)
+    make(tmp_path, [], NOW)
+    assert (tmp_path / "rig.key").read_text() == "ab" * 32
+
+
+def test_renewed_everything_is_another_and_other_files_stay(keys: Path) -> None:
+    before = files(keys)
+    (keys / "note.txt").write_text("mine")
+    assert renew(keys, NOW) == ["left", "pi.right-2_x"]
+    after = files(keys)
+    assert after.pop("note.txt") == b"mine"
+    assert set(after) == set(before)
+    assert not [name for name in after if after[name] == before[name]]
+
+
+def test_a_device_that_is_taken_out_has_nothing_that_is_still_worth_anything(keys: Path) -> None:
+    before = files(keys)
+    assert renew(keys, NOW, ["left"]) == ["pi.right-2_x"]
+    assert devices_of(keys) == ["pi.right-2_x"]
+    after = files(keys)
+    assert after["rig.key"] != before["rig.key"]
+    assert after["ca.pem"] != before["ca.pem"]
+    with pytest.raises(PhalanxError, match="no device 'left'; there are: pi.right-2_x"):
+        renew(keys, NOW, ["left"])
+
+
+def test_one_device_is_renewed_without_the_others(keys: Path) -> None:
+    before = files(keys)
+    renew_device(keys, "left", NOW)
+    changed = {name for name, content in files(keys).items() if content != before[name]}
+    assert changed == {"devices/left.pem", "devices/left.key"}
+    assert shown((keys / "devices" / "left.pem").read_bytes()).name == "left"
+
+
+@pytest.mark.parametrize(
+    "name", ["master", "operator", "", ".", "..", "a/b", "../left", "a b", "x" * 65, "naïve", "a\n"]
+)
+def test_a_name_that_no_device_can_have_is_refused_before_anything_is_made(tmp_path: Path, name: str) -> None:
+    with pytest.raises(PhalanxError, match="--device"):
+        make(tmp_path / "keys", [name], NOW)
+    assert not (tmp_path / "keys").exists()
+
+
+def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path, keys: Path) -> None:
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    shared.chmod(0o755)
+    with pytest.raises(PhalanxError, match="others can enter it"):
+        make(shared, [], NOW)
+    assert not list(shared.iterdir())
+    for use in (devices_of, certificates_of, lambda folder: renew(folder, NOW)):
+        with pytest.raises(PhalanxError, match="no keys folder"):
+            use(shared)
+    (keys / "ca.key").unlink()  # as on a device
+    with pytest.raises(PhalanxError, match=r"has ca\.pem but not ca\.key"):
+        make(keys, ["late"], NOW)
