@@ -23,7 +23,10 @@ HOT_C = 80.0  # from here on a Raspberry Pi lowers its clock (its documentation,
 BELOW_TRIP_C = 5.0
 LEAST_TRIP_C = 50.0  # a lower one switches a fan, or is a dummy of the firmware
 _ZONES = "sys/class/thermal"
-_THROTTLED = "sys/devices/platform/soc/soc:firmware/get_throttled"
+# Below soc or, on a Pi 5 with newer kernels, soc@107c000000. The file is deprecated, and some kernels have none: these
+# tell of a weak supply alone, as an alarm of the sensor rpi_volt (Linux, drivers/hwmon/raspberrypi-hwmon.c).
+_THROTTLED = "sys/devices/platform/soc*/soc*:firmware/get_throttled"
+_SENSORS, _SUPPLY, _WEAK = "sys/class/hwmon/hwmon*", "rpi_volt", "in0_lcrit_alarm"
 _TRIPS = ("passive", "hot", "critical")
 _NOW = 0xF  # bits of what holds now; those above are of what has been since the start
 
@@ -53,6 +56,9 @@ class Machine:
         self._root = Path(environment.get(ROOT, "/"))
         self._folder = folder
         self._rehearsed = ROOT in environment
+        self._flags = next(iter(sorted(self._root.glob(_THROTTLED))), None)
+        sensors = (path / _WEAK for path in self._root.glob(_SENSORS) if _text(path / "name") == _SUPPLY)
+        self._weak = next(sensors, None) if self._flags is None else None
 
     def gauges(self) -> dict[str, float]:
         """temperature_c and temperature_limit_c of the zone nearest to its limit, throttled (flags), disk_free_mb."""
@@ -63,7 +69,7 @@ class Machine:
         if zones:
             now, limit = max(zones, key=lambda zone: zone[0] - zone[1])
             found |= {"temperature_c": round(now, 1), "temperature_limit_c": limit}
-        if (flags := _text(self._root / _THROTTLED)) is not None:
+        if (told := self._flags or self._weak) is not None and (flags := _text(told)) is not None:
             with contextlib.suppress(ValueError):  # of another firmware: nothing is known
                 found["throttled"] = float(int(flags, 16) & _NOW)
         if (free := self.disk_free_mb()) is not None:

@@ -6,7 +6,7 @@
 It inherits the slave's request of the lines: while it lives the kernel does not give them back. It sets both lines
 inactive where a light is on for `LONGEST_S` (the slave was stopped, or something in it holds up all its threads), and
 when the pipe ends, because the slave closed it or has died of whatever; then it ends, too. It imports nothing that
-could hold it up, and no signal of a terminal or of a service's stop ends it earlier: the slave ends first, in order.
+could hold it up, and no signal of a terminal, a service's stop or its watchdog ends it earlier: the slave ends first.
 """
 
 import fcntl
@@ -24,7 +24,7 @@ INACTIVE = 0
 
 def main() -> int:
     """Watch until standard input ends; 0: the lines are dark, 1: they are not there any more."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGABRT):
         signal.signal(number, signal.SIG_IGN)
     lines, longest_s = int(sys.argv[1]), float(sys.argv[2])
     said = DARK

@@ -50,3 +50,19 @@ def test_what_is_not_there_is_not_told(tmp_path: Path) -> None:
     (tmp_path / "disk_free_mb").write_text("")  # as it is while somebody writes it
     assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["disk_free_mb"] > 0.0
     assert Machine(tmp_path / "gone", {ROOT: str(tmp_path)}).disk_free_mb() is None
+
+
+def test_a_pi_5_has_the_flags_of_its_firmware_elsewhere(tmp_path: Path) -> None:
+    flags = tmp_path / "sys/devices/platform/soc@107c000000/soc@107c000000:firmware/get_throttled"
+    flags.parent.mkdir(parents=True)
+    flags.write_text("80008\n")
+    assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["throttled"] == 8.0
+
+
+def test_a_kernel_without_these_flags_tells_of_a_weak_supply_alone(tmp_path: Path) -> None:
+    for number, (name, alarm) in enumerate([("cpu_thermal", "0"), ("rpi_volt", "1")]):
+        sensor = tmp_path / f"sys/class/hwmon/hwmon{number}"
+        sensor.mkdir(parents=True)
+        (sensor / "name").write_text(name + "\n")
+        (sensor / "in0_lcrit_alarm").write_text(alarm + "\n")
+    assert Machine(tmp_path, {ROOT: str(tmp_path)}).gauges()["throttled"] == 1.0

@@ -305,6 +305,7 @@ def test_the_heir_of_a_killed_slave_darkens_both_lines() -> None:
     heir = int(slave.stdout.readline())
     assert ignores_stops(heir)
     os.kill(heir, signal.SIGTERM)  # a service's stop reaches both: the slave is to end first
+    os.kill(heir, signal.SIGABRT)  # as does that of its watchdog
     slave.kill()
     said = slave.stdout.read()  # ends when the heir has ended, too
     slave.wait()
