@@ -24,7 +24,7 @@ INACTIVE = 0
 
 def main() -> int:
     """Watch until standard input ends; 0: the lines are dark, 1: they are not there any more."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGABRT):
+    for number in (signal.SIGABRT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     lines, longest_s = int(sys.argv[1]), float(sys.argv[2])
     said = DARK
