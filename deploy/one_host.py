@@ -82,14 +82,23 @@ class Host:
             ("simplejpeg",) if picamera2 and old else (),
             ("wrist",) if wish.rig.kind == "wrist" else (),
         )
-        wheels, release = wheelhouse(kind, wish.wheels, self.say)
-        there = release in cast(list[str], facts["releases"])
+        wheels = wheelhouse(kind, wish.wheels, self.say)
+        there = wheels.release in cast(list[str], facts["releases"])
+        stage = f"{STAGE}/{wheels.release}"
+        if not there:
+            self.say(f"{'would send' if wish.dry_run else 'sending'} {wheels.size_mb:.0f} MB of wheels")
         if not there and not wish.dry_run:
-            size_mb = sum(file.stat().st_size for file in wheels.glob("*.whl")) * 1e-6
-            self.say(f"sending {size_mb:.0f} MB of wheels")
-            self.remote.send_folder(wheels, STAGE, self.sudo)
+            self.remote.send(wheels.files, stage, self.sudo)
         words = ["install", "--json", "--bundle", BUNDLE, "--master", wish.master, "--rig", wish.rig.name]
-        words += ["--release", release, "--wheelhouse", STAGE, "--ready-s", str(wish.ready_s), *wish.options]
+        words += [
+            "--release",
+            wheels.release,
+            "--wheelhouse",
+            stage,
+            "--ready-s",
+            str(wish.ready_s),
+            *wish.options,
+        ]
         words += [word for name in self.target.names for word in ("--name", name)]
         words += ["--dry-run"] if wish.dry_run else []
         packed = bundle(wish.keys, self.target.names, wish.calibration, wish.rig)

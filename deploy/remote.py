@@ -86,23 +86,22 @@ class Remote:
             on_line(f"! {errors[-1]}")
         return code
 
-    def send_folder(self, folder: Path, to: str, sudo: bool) -> None:
-        """Make the folder `to` there the same as `folder`.
+    def send(self, files: Sequence[Path], to: str, sudo: bool) -> None:
+        """Send files to the folder `to` there; what is there of them already, whole or in part, is not sent again.
 
         Raises:
             DeployError: The machine is not reached, its disk is full, the link broke, or the time is over.
         """
         words = [
             "rsync",
-            "-r",
+            "--partial",
             "--times",
-            "--delete",
             "--mkpath",
             f"--timeout={STALLED_S}",
         ]
         if sudo:
             words += ["--rsync-path", "sudo -n rsync"]
-        words += ["-e", shlex.join(self._ssh()), "--", f"{folder}/", f"{_bracketed(self.host)}:{to}/"]
+        words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{_bracketed(self.host)}:{to}/"]
         code, errors = run_bounded(words, b"", lambda _line: None, self.deadline.left_s())
         if code is None:
             self.deadline.left_s()

@@ -4,6 +4,7 @@ Downloaded once for each kind of machine, and kept below ~/.cache/phalanx.
 """
 
 import hashlib
+import io
 import os
 import re
 import shutil
@@ -50,36 +51,57 @@ def cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "phalanx"
 
 
-def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> tuple[Path, str]:
-    """The folder of wheels for machines of this kind, and the name of the release that they make.
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """What a release is made of.
+
+    Attributes:
+        files: Wheels, ours among them.
+        release: Its name: our version and a hash of all of them, so that other content is another release.
+    """
+
+    files: tuple[Path, ...]
+    release: str
+
+    @property
+    def size_mb(self) -> float:
+        """How much has to be sent."""
+        return sum(file.stat().st_size for file in self.files) * 1e-6
+
+
+def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wheels:
+    """The wheels for machines of this kind.
 
     Args:
         kind: Of machine.
-        given: Folder that the user made; ours is added if it is missing there. None: it is downloaded.
+        given: Folder that the user made; ours is added if it is missing there. None: they are downloaded.
         say: Told when something is downloaded.
 
     Raises:
         DeployError: A wheel cannot be had.
     """
     with _LOCK:  # the second machine of a kind waits for the first
-        wheels = _downloaded(kind, say) if given is None else _taken(given)
+        folder = _downloaded(kind, say) if given is None else given
+        files = sorted(folder.glob("*.whl"))
+        if not files:
+            raise DeployError(f"--wheelhouse {given}: no wheels in it")
+        if not any(file.name.startswith("phalanx_hand-") for file in files):
+            files.append(own_wheel())
         digest = hashlib.sha256()
-        files = sorted(wheels.glob("*.whl"))
         for file in files:
             digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
         versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
-        return wheels, f"{versions[-1]}-{digest.hexdigest()[:8]}"
+        return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
 
 
-def own_wheel(folder: Path) -> Path:
-    """Write our own wheel as this program is, installed or in a source tree; without a network or a build.
+def own_wheel() -> Path:
+    """Our own wheel as this program is, installed or in a source tree; made without a network or a build.
 
     Raises:
         DeployError: It was never installed, so that nobody knows what it needs.
     """
     ours = _ours()
     stem = f"{NAME.replace('-', '_')}-{ours.version}"
-    wheel = folder / f"{stem}-py3-none-any.whl"
     info = f"{stem}.dist-info"
     files = {path.relative_to(ROOT).as_posix(): path.read_bytes() for path in _sources()}
     files |= {
@@ -90,11 +112,17 @@ def own_wheel(folder: Path) -> Path:
     )
     rows = [f"{name},sha256={_digest(content)},{len(content)}" for name, content in files.items()]
     files[f"{info}/RECORD"] = "\n".join([*rows, f"{info}/RECORD,,", ""]).encode()
-    fresh = wheel.with_suffix(".new")
-    with zipfile.ZipFile(fresh, "w") as archive:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
         for name, content in files.items():
             archive.writestr(zipfile.ZipInfo(name, _WHEN), content, zipfile.ZIP_DEFLATED)
-    fresh.replace(wheel)
+    # In a folder of its hash: another program of another state does not change it while it is sent.
+    wheel = cache() / "own" / hashlib.sha256(packed.getvalue()).hexdigest()[:12] / f"{stem}-py3-none-any.whl"
+    if not wheel.is_file():
+        wheel.parent.mkdir(parents=True, exist_ok=True)
+        fresh = wheel.with_name(f".{os.getpid()}.new")
+        fresh.write_bytes(packed.getvalue())
+        fresh.replace(wheel)
     return wheel
 
 
@@ -118,26 +146,6 @@ def _digest(content: bytes) -> str:
     return urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
 
 
-def _taken(given: Path) -> Path:
-    """The user's folder, or a copy of it with our wheel where that is missing.
-
-    Raises:
-        DeployError: There are no wheels in it.
-    """
-    files = sorted(given.glob("*.whl"))
-    if not files:
-        raise DeployError(f"--wheelhouse {given}: no wheels in it")
-    if any(file.name.startswith("phalanx_hand-") for file in files):
-        return given
-    folder = cache() / f"given-{hashlib.sha256(str(given.resolve()).encode()).hexdigest()[:12]}"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for file in files:
-        shutil.copy2(file, folder)
-    own_wheel(folder)
-    return folder
-
-
 def _downloaded(kind: Kind, say: Callable[[str], None]) -> Path:
     requirements = [*_requirements(kind.extras), *kind.more, "pip"]
     limits = _limits()
@@ -154,9 +162,6 @@ def _downloaded(kind: Kind, say: Callable[[str], None]) -> Path:
             fresh.rename(folder)
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
-    for old in folder.glob("phalanx_hand-*.whl"):
-        old.unlink()
-    own_wheel(folder)
     return folder
 
 

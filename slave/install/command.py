@@ -114,7 +114,7 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
         outcome = steps.install(plan, source, name, machine, options.dry_run)
     finally:
         if options.bundle is not None and options.wheelhouse is not None and not options.dry_run:
-            shutil.rmtree(options.wheelhouse, ignore_errors=True)  # sent by the PC for this alone
+            shutil.rmtree(options.wheelhouse.parent, ignore_errors=True)  # sent by the PC for this alone
     return {**asdict(outcome), "text": told(outcome, options.dry_run)}
 
 
@@ -122,11 +122,11 @@ def told(outcome: steps.Outcome, dry_run: bool) -> str:
     """What was done, or would be, in one line."""
     if not outcome.changed and not outcome.restarted:
         return f"unchanged: release {outcome.release}"
-    would = "would " if dry_run else ""
-    parts = [f"{would}change {'/' + path}" if dry_run else f"/{path}" for path in outcome.changed]
-    parts += [f"{would}restart {unit}" if dry_run else f"restarted {unit}" for unit in outcome.restarted]
-    text = f"release {outcome.release}: {', '.join(parts)}"
-    return text + "; config.txt has changed: restart the machine" if outcome.reboot else text
+    units = ", ".join(outcome.restarted) or "nothing"
+    if dry_run:
+        return f"would have release {outcome.release}, and restart {units}"
+    text = f"has release {outcome.release}, restarted {units}"
+    return f"{text}; config.txt has changed: restart the machine" if outcome.reboot else text
 
 
 def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machine) -> None:

@@ -14,7 +14,7 @@ import sys
 import sysconfig
 import venv
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import distributions
 from pathlib import Path
@@ -30,6 +30,9 @@ _PACKAGES = ("slave", "common", "master", "deploy")
 _UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
 _SPARE_MB = 50.0
 _PIP_S = 1500.0  # under emulation, too
+# What a slave loads; its service may not write, so what is not compiled now is compiled at each start.
+_LOADS = "import slave.__main__, slave.live, slave.uplink, slave.imu.live, slave.imu.opening, slave.simulated"
+_LOADS_S = 300.0
 _SCRIPT = """\
 #!{python}
 import sys
@@ -176,6 +179,7 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
 
 _QUIET = (
     "--ignore-installed",
+    "--no-compile",
     "--disable-pip-version-check",
     "--no-input",
     "--quiet",
@@ -206,6 +210,10 @@ def _settle(fresh: Path, final: Path, root: Path) -> None:
     old, new = str(fresh).encode(), str(Path("/") / final.relative_to(root)).encode()
     if not (fresh / "bin/phalanx-slave").is_file():
         raise InstallError(f"release {final.name}: has no phalanx-slave; is its wheel whole?")
+    try:
+        run_command([str(fresh / "bin/python"), "-I", "-c", _LOADS], _LOADS_S)
+    except InstallError as error:
+        raise InstallError(f"release {final.name} does not load: {str(error).partition(': ')[2]}") from error
     for script in (fresh / "bin").iterdir():
         if script.is_file() and not script.is_symlink():
             content = script.read_bytes()
@@ -213,12 +221,3 @@ def _settle(fresh: Path, final: Path, root: Path) -> None:
                 script.write_bytes(content.replace(old, new))
     for script in (fresh / "bin").glob("[aA]ctivate*"):
         script.unlink()
-
-
-def runs(root: Path, name: str, check: Sequence[str]) -> None:
-    """See that a release can be run at all.
-
-    Raises:
-        InstallError: Its last line is the reason.
-    """
-    run_command([str(root / RELEASES / name / "bin/python"), *check])

@@ -94,6 +94,8 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
         files[RECORD] = recorded(plan, tuple(dict.fromkeys(groups))).file()
         outcome = _difference(plan, files, name, machine)
         if dry_run:
+            for path in outcome.changed:
+                machine.say(f"would {'remove' if files.get(path, path) is None else 'write'} /{path}")
             return outcome
         if not outcome.changed and not outcome.restarted:
             _enable(plan.senders, machine)
