@@ -464,6 +464,12 @@ def _detect_wrist(options: argparse.Namespace, progress: Callable[[int, int], No
     return 0
 
 
+def _install(options: argparse.Namespace) -> int:
+    from slave.install.command import run
+
+    return run(options, lambda line: print(line, flush=True))
+
+
 def _doctor(options: argparse.Namespace) -> int:
     from common.machine import program
     from slave.doctor.command import examine
@@ -500,6 +506,7 @@ COMMANDS = {
     "record": _record,
     "join": _join,
     "detect": _detect,
+    "install": _install,
     "doctor": _doctor,
     "colours": _colours,
 }

@@ -8,6 +8,7 @@ from pathlib import Path
 from slave.cameras import real
 from slave.doctor import command as doctor
 from slave.imu import opening
+from slave.install import command as install
 from slave.lights.opening import CHOICES, SWITCHED
 from slave.objects import opening as trackers
 
@@ -105,6 +106,7 @@ HELP = {
         of a wrist device: laser points and fingertips of every strobed triple; the hand is DIR/hands/RIG'S HAND.json
 """,
     ),
+    "install": (install.PURPOSE, install.EXAMPLES),
     "doctor": (
         "what of this device is well, and what is not",
         """\
@@ -150,6 +152,7 @@ def parser() -> argparse.ArgumentParser:
         "record": _record,
         "join": _join,
         "detect": _detect,
+        "install": install.add_install,
         "doctor": _doctor,
         "colours": _colours,
     }
