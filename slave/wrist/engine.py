@@ -39,11 +39,12 @@ NUMPY = Engine(energy, least_paths, lines, measure)
 
 
 def engine_named(name: str) -> Engine:
-    """The engine of a name; raises what `engine_of` raises."""
+    """The engine of a name, ready to go; raises what `engine_of` raises."""
     return engine_of(name, NUMPY, _numba)
 
 
 def _numba() -> Engine:
-    from slave.wrist.fast import NUMBA
+    from slave.wrist.fast import NUMBA, prepare
 
+    prepare()
     return NUMBA

@@ -92,4 +92,17 @@ def _energy(
             out[s, k] = found + prior[k]
 
 
+def prepare() -> None:
+    """Compile everything, on a drawn line: a first hand must not find a slave that compiles.
+
+    Some ten seconds on a desktop processor the first time a version runs; half a second later, from the cache.
+    """
+    drawn = np.zeros((64, 640), np.uint8)
+    drawn[40:43, 100:400] = 200
+    runs, _ = lines(drawn, 0)
+    measure(runs, np.zeros(len(runs.column), np.int64), drawn.shape[1])
+    strips = np.zeros((2, len(valleys.PRIOR)), np.uint8)
+    least_paths(energy(strips, 0), (len(valleys.PRIOR),))
+
+
 NUMBA = Engine(energy, least_paths, lines, measure)

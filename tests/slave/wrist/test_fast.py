@@ -8,6 +8,7 @@ import pytest
 from common.arrays import Image
 from common.errors import PhalanxError
 from slave.wrist.background import lit
+from slave.wrist.detector import WristDetector
 from slave.wrist.engine import NUMPY, Engine, engine_named
 from slave.wrist.fingers import separate
 from slave.wrist.laser import laser_lines
@@ -114,6 +115,19 @@ def test_a_hand_is_seen_alike(fast: Engine) -> None:
         np.testing.assert_allclose(there.uv, here.uv, atol=0.2)
         np.testing.assert_allclose(there.length_px, here.length_px, atol=0.5)
         np.testing.assert_allclose(there.sigma_px, here.sigma_px, rtol=0.1)
+
+
+def test_a_first_hand_finds_everything_compiled(fast: Engine) -> None:
+    from slave.wrist import fast as seams
+    from slave.wrist import fast_lines
+
+    functions = (seams._least_paths, seams._energy, fast_lines._scan, fast_lines._link, fast_lines._measure)
+    before = [len(one.signatures) for one in functions]  # pyright: ignore[reportFunctionMemberAccess]
+    assert all(before)
+    detector = WristDetector(VIEW, 90.0, engine=fast)
+    assert sum(detector.push(frame) is not None for frame in strobed("curl", 8)) == 8
+    after = [len(one.signatures) for one in functions]  # pyright: ignore[reportFunctionMemberAccess]
+    assert after == before
 
 
 def test_engines_are_chosen_by_name_and_numba_must_be_there(monkeypatch: pytest.MonkeyPatch) -> None:
