@@ -1,0 +1,356 @@
+"""The doctor on machines laid out in files: what it says is well, or wrong, and what it did not look at."""
+
+import argparse
+import json
+import os
+import socket
+import threading
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from common.certificates import issue, new_authority
+from common.clock import SystemClock
+from common.keys import new_key
+from common.machine import ROOT, Program
+from master.link import MasterLink
+from slave.__main__ import main
+from slave.arguments import parser
+from slave.doctor.clock import check_clock
+from slave.doctor.command import examine
+from slave.doctor.devices import check_devices, check_groups
+from slave.doctor.finding import Finding, Verdict, as_json, as_text, exit_code, fail, ok, unseen, warn
+from slave.doctor.host import check_host
+from slave.doctor.identity import check_keys
+from slave.doctor.master import check_master
+from slave.doctor.programs import check_programs
+from slave.doctor.system import Ran, System, run
+from slave.doctor.unit import check_unit
+
+CALIBRATION = Path(__file__).resolve().parents[3] / "calib_json"
+NOW = datetime(2026, 11, 22, tzinfo=UTC)
+GROUP_LINES = "root:x:0:\nvideo:x:44:\ndialout:x:20:\ni2c:x:994:\ngpio:x:993:\n"
+
+
+class Answers:
+    """Programs that answer as told; of others there are none."""
+
+    def __init__(self, said: Mapping[str, Ran]) -> None:
+        self._said = said
+        self.asked: list[Sequence[str]] = []
+
+    def __call__(self, command: Sequence[str], timeout_s: float) -> Ran:
+        self.asked.append(command)
+        return self._said.get(Path(command[0]).name, Ran(None, "", f"there is no {command[0]}"))
+
+
+def machine(
+    root: Path, said: Mapping[str, Ran] | None = None, files: Mapping[str, str] | None = None
+) -> System:
+    for place, text in (files or {}).items():
+        path = root / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return System(root, {ROOT: str(root)}, Answers(said or {}))
+
+
+def pi(root: Path, said: Mapping[str, Ran] | None = None) -> System:
+    files = {
+        "etc/os-release": 'PRETTY_NAME="Debian GNU/Linux 13 (trixie)"\nVERSION_CODENAME=trixie\n',
+        "etc/group": GROUP_LINES,
+        "sys/firmware/devicetree/base/model": "Raspberry Pi 5 Model B Rev 1.0\0",
+        "sys/class/thermal/thermal_zone0/type": "cpu-thermal\n",
+        "sys/class/thermal/thermal_zone0/temp": "51200\n",
+        "disk_free_mb": "20000\n",
+    }
+    return machine(root, said, files)
+
+
+def by_check(findings: Sequence[Finding]) -> dict[str, Finding]:
+    return {one.check: one for one in findings}
+
+
+def test_a_pi_that_is_well(tmp_path: Path) -> None:
+    said = by_check(list(check_host(pi(tmp_path, {"vcgencmd": Ran(0, "throttled=0x0\n", "")}))))
+    assert {one.verdict for one in said.values()} == {Verdict.OK}
+    assert said["board"].text == "Raspberry Pi 5 Model B Rev 1.0"
+    assert said["temperature"].text == "51 °C, limit 80 °C"
+
+
+@pytest.mark.parametrize(
+    ("flags", "text", "fix"),
+    [
+        ("0x50005", "under-voltage now, throttled now", "power supply"),
+        ("0x50000", "under-voltage since the start, throttled since the start", "power supply"),
+        ("0x80008", "soft temperature limit now", "cooling"),
+    ],
+)
+def test_what_the_firmware_says_of_supply_and_heat(tmp_path: Path, flags: str, text: str, fix: str) -> None:
+    system = pi(tmp_path, {"vcgencmd": Ran(0, f"throttled={flags}\n", "")})
+    found = by_check(list(check_host(system)))["throttling"]
+    assert (found.verdict, found.text) == (Verdict.WARN, text)
+    assert fix in found.fix
+
+
+def test_a_pi_in_trouble(tmp_path: Path) -> None:
+    system = pi(tmp_path)
+    (tmp_path / "disk_free_mb").write_text("60\n")
+    (tmp_path / "sys/class/thermal/thermal_zone0/temp").write_text("83000\n")
+    (tmp_path / "etc/os-release").write_text("PRETTY_NAME=Elsewhere\n")
+    said = by_check(list(check_host(system)))
+    assert said["disk"].verdict is Verdict.FAIL
+    assert said["temperature"].verdict is Verdict.WARN
+    assert said["system"].verdict is Verdict.WARN
+    assert said["throttling"].verdict is Verdict.UNSEEN  # neither the firmware's file nor vcgencmd
+
+
+def test_a_missing_group_would_keep_systemd_from_starting_it(tmp_path: Path) -> None:
+    assert check_groups(machine(tmp_path / "a", None, {"etc/group": GROUP_LINES})).verdict is Verdict.OK
+    found = check_groups(machine(tmp_path / "b", None, {"etc/group": "video:x:44:\ndialout:x:20:\n"}))
+    assert found.verdict is Verdict.FAIL
+    assert "i2c, gpio" in found.text
+
+
+def test_devices_must_be_there_and_open_to_a_group_of_the_service(tmp_path: Path) -> None:
+    slave = argparse.Namespace(camera="picamera2", imu=None, lights="gpio:0:17,27")
+    system = machine(tmp_path, None, {"etc/group": GROUP_LINES})
+    missing = by_check(list(check_devices(system, slave)))
+    assert missing["lights"].verdict is missing["dma_heap"].verdict is Verdict.FAIL
+    assert "No such file" in missing["lights"].text
+    for place, mode in (("dev/gpiochip0", 0o600), ("dev/dma_heap/linux,cma", 0o666)):
+        path = tmp_path / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        path.chmod(mode)
+    found = by_check(list(check_devices(system, slave)))
+    assert found["lights"].verdict is Verdict.FAIL  # there, but root's alone
+    assert "-rw-------" in found["lights"].text
+    assert found["dma_heap"].verdict is Verdict.OK
+
+
+TRACKING = "C0A80005,pc.local,9,1763800000.1,{},0.000002,0.000031,-3.1,0.0,0.05,0.0002,0.0001,16.1,{}\n"
+
+
+@pytest.mark.parametrize(
+    ("said", "verdict", "text"),
+    [
+        (Ran(0, TRACKING.format("0.000012", "Normal"), ""), Verdict.OK, "+12 µs off pc.local (stratum 9)"),
+        (Ran(0, TRACKING.format("-0.004", "Normal"), ""), Verdict.WARN, "-4000 µs off"),
+        (Ran(0, TRACKING.format("0", "Not synchronised"), ""), Verdict.WARN, "no time yet"),
+        (Ran(0, TRACKING.format("junk", "Normal"), ""), Verdict.WARN, "junk"),
+        (Ran(1, "506 Cannot talk to daemon\n", ""), Verdict.WARN, "506 Cannot talk to daemon"),
+        (Ran(0, "", ""), Verdict.WARN, "no answer"),
+    ],
+)
+def test_the_clock_as_chrony_tells_it(tmp_path: Path, said: Ran, verdict: Verdict, text: str) -> None:
+    (found,) = check_clock(machine(tmp_path, {"chronyc": said}), None)
+    assert found.verdict is verdict
+    assert text in found.text
+
+
+def test_another_source_than_the_master_and_no_chrony_at_all(tmp_path: Path) -> None:
+    said = Ran(0, TRACKING.format("0.00001", "Normal"), "")
+    (found,) = check_clock(machine(tmp_path, {"chronyc": said}), "other.local")
+    assert found.verdict is Verdict.WARN
+    assert "not by other.local" in found.text
+    told = {"timedatectl": Ran(0, "NTP=yes\nNTPSynchronized=yes\n", "")}
+    (found,) = check_clock(machine(tmp_path, told), None)
+    assert found.verdict is Verdict.WARN
+    (found,) = check_clock(machine(tmp_path), None)
+    assert found.verdict is Verdict.UNSEEN
+
+
+def test_libraries_are_asked_of_the_services_python(tmp_path: Path) -> None:
+    python = tmp_path / "opt/phalanx/current/bin/python"
+    python.parent.mkdir(parents=True)
+    python.touch()
+    lines = "libstdc++ yes\nnumpy yes 2.4.6\ncv2 yes 5.0\nzenoh no ImportError: GLIBC_2.38 not found\n"
+    said = Answers({"python": Ran(-11, lines, "")})
+    findings = list(check_programs(System(tmp_path, {}, said), ["picamera2"]))
+    assert str(said.asked[0][0]) == str(python)
+    found = by_check(findings)
+    assert found["numpy"] == ok("numpy", "2.4.6")
+    assert found["zenoh"].verdict is Verdict.FAIL
+    assert "GLIBC_2.38" in found["zenoh"].text
+    assert "crashed" in findings[-1].text  # and what comes behind is not claimed
+    assert [one.check for one in findings][-1] == "cryptography"
+
+
+def test_libraries_of_this_environment_are_really_imported(tmp_path: Path) -> None:
+    findings = list(check_programs(System(tmp_path, {}, run), ["no_such_library"]))
+    found = by_check(findings)
+    assert found["installed"].verdict is Verdict.WARN
+    assert found["numpy"].verdict is found["cv2"].verdict is found["zenoh"].verdict is Verdict.OK
+    assert found["no_such_library"].verdict is Verdict.FAIL
+
+
+def keys_of(folder: Path, name: str, now: datetime = NOW) -> Path:
+    folder.mkdir(mode=0o700)
+    authority = new_authority(now)
+    pair = issue(authority, name, now)
+    content = {"ca.pem": authority.certificate, "device.pem": pair.certificate, "device.key": pair.key}
+    for file, text in (content | {"rig.key": new_key().encode()}).items():
+        (folder / file).write_bytes(text)
+        (folder / file).chmod(0o600)
+    return folder
+
+
+def verdicts(folder: Path, name: str | None, now: datetime = NOW) -> dict[str, Finding]:
+    return by_check(list(check_keys(System(Path("/"), {}), folder, name, now)))
+
+
+def test_keys_that_are_well(tmp_path: Path) -> None:
+    found = verdicts(keys_of(tmp_path / "keys", "left"), "left")
+    assert {one.verdict for one in found.values()} == {Verdict.OK}
+    assert found["certificate"].text.startswith("of left, signed by the rig's authority, until 2036-")
+
+
+def test_keys_that_are_not(tmp_path: Path) -> None:
+    keys = keys_of(tmp_path / "keys", "left")
+    assert "certificate of 'left', not of 'right'" in verdicts(keys, "right")["certificate"].text
+    assert "ends in 38 days" in verdicts(keys, "left", NOW + timedelta(days=3614))["certificate"].text
+    assert verdicts(keys, "left", NOW + timedelta(days=3700))["certificate"].verdict is Verdict.FAIL
+    assert verdicts(keys, None)["certificate"].verdict is Verdict.UNSEEN
+    other = keys_of(tmp_path / "other", "left")
+    (keys / "ca.pem").write_bytes((other / "ca.pem").read_bytes())
+    assert "not signed by" in verdicts(keys, "left")["certificate"].text
+    (keys / "device.key").write_bytes((other / "device.key").read_bytes())
+    assert "key of another certificate" in verdicts(keys, "left")["certificate"].text
+    (keys / "rig.key").chmod(0o644)
+    assert "others can read" in verdicts(keys, "left")["rig key"].text
+    keys.chmod(0o755)
+    assert verdicts(keys, "left")["keys"].verdict is Verdict.WARN
+    assert verdicts(tmp_path / "nowhere", "left")["keys"].verdict is Verdict.FAIL
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asked:
+        asked.bind(("127.0.0.1", 0))
+        return int(asked.getsockname()[1])
+
+
+def test_no_beacon_and_no_key(tmp_path: Path) -> None:
+    system, port = System(tmp_path, {}), free_port()
+    keys = keys_of(tmp_path / "keys", "left")
+    (found,) = check_master(system, keys, None, port, "127.0.0.1")
+    assert found.verdict is Verdict.FAIL
+    assert f"UDP port {port}" in found.text
+    (found,) = check_master(system, tmp_path / "nowhere", None, port, "127.0.0.1")
+    assert found.verdict is Verdict.UNSEEN
+
+
+def beacon(key: bytes, port: int) -> bytes:
+    """The first word of a master."""
+    link = MasterLink(
+        ("left",), key, SystemClock(), ("127.0.0.1", port), "tcp/127.0.0.1:1", 10**9, os.urandom
+    )
+    return link.due()[0][0]
+
+
+@pytest.mark.parametrize(
+    ("own", "master", "verdict", "text"),
+    [
+        (True, None, Verdict.OK, "from 127.0.0.1, of this rig"),
+        (True, "127.0.0.2", Verdict.WARN, "which is not the master named"),
+        (False, None, Verdict.FAIL, "not of this rig: foreign"),
+    ],
+)
+def test_a_beacon_is_heard(
+    tmp_path: Path, own: bool, master: str | None, verdict: Verdict, text: str
+) -> None:
+    keys, port = keys_of(tmp_path / "keys", "left"), free_port()
+    key = bytes.fromhex((keys / "rig.key").read_text()) if own else bytes(32)
+    said, over = beacon(key, port), threading.Event()
+
+    def speak() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as to:
+            while not over.wait(0.05):
+                to.sendto(said, ("127.0.0.1", port))
+
+    speaker = threading.Thread(target=speak)
+    speaker.start()
+    try:
+        *_, found = check_master(System(tmp_path, {}), keys, master, port, "127.0.0.1")
+    finally:
+        over.set()
+        speaker.join()
+    assert found.verdict is verdict
+    assert text in found.text
+
+
+UNIT = (
+    "LoadState=loaded\nActiveState={}\nSubState={}\nUnitFileState=enabled\nNRestarts={}\nExecMainStatus={}\n"
+    "StatusText={}\n"
+)
+
+
+@pytest.mark.parametrize(
+    ("said", "verdict", "runs", "text"),
+    [
+        (UNIT.format("active", "running", 0, 0, "90 frames/s"), Verdict.OK, True, "90 frames/s"),
+        (UNIT.format("active", "running", 3, 0, "90 frames/s"), Verdict.WARN, True, "restarted 3 times"),
+        (
+            UNIT.format("activating", "auto-restart", 9, 1, "failed: no such camera"),
+            Verdict.FAIL,
+            False,
+            "no such camera",
+        ),
+        (
+            UNIT.format("activating", "auto-restart", 9, 216, ""),
+            Verdict.FAIL,
+            False,
+            "a group of the unit is missing",
+        ),
+        (UNIT.format("inactive", "dead", 0, 0, ""), Verdict.FAIL, False, "stopped"),
+        ("LoadState=not-found\nActiveState=inactive\n", Verdict.WARN, False, "not installed"),
+    ],
+)
+def test_the_service_as_systemd_tells_it(
+    tmp_path: Path, said: str, verdict: Verdict, runs: bool, text: str
+) -> None:
+    unit = check_unit(machine(tmp_path, {"systemctl": Ran(0, said, "")}), "left")
+    assert (unit.finding.verdict, unit.runs) == (verdict, runs)
+    assert text in unit.finding.text
+
+
+def test_what_is_installed_is_looked_at_by_itself(tmp_path: Path) -> None:
+    system = pi(tmp_path, {"systemctl": Ran(0, UNIT.format("active", "running", 0, 0, "60 frames/s"), "")})
+    etc = tmp_path / "etc/phalanx"
+    etc.mkdir()
+    (etc / "left.env").write_text(
+        "# Written by the installer\nPHALANX_COMMAND=run\n"
+        f"PHALANX_OPTIONS=--name left --rig desk --camera picamera2 --calibration {CALIBRATION}\n"
+    )
+    (etc / "imu.env").write_text("PHALANX_COMMAND=imu\nPHALANX_OPTIONS=--name imu --imu lsm6dsox:1\n")
+    found = by_check(list(examine(parser().parse_args(["doctor"]), system)))
+    assert found["left: service"].text == "60 frames/s"
+    assert found["left: camera file"].verdict is Verdict.OK
+    assert found["left: camera"].verdict is Verdict.UNSEEN  # the running service has it
+    assert found["imu: IMU bus"].verdict is Verdict.FAIL  # /dev/i2c-1 is not there
+    assert "picamera2" not in found  # for the Python before it crashed: nothing answers here
+    assert found["libstdc++"].verdict is Verdict.FAIL
+
+
+def test_the_report(capsys: pytest.CaptureFixture[str]) -> None:
+    findings = [ok("disk", "9 GB free"), warn("clock", "far", "wait"), unseen("board", "no device tree")]
+    assert exit_code(findings) == 0
+    assert exit_code([*findings, fail("keys", "none", "make them")]) == 1
+    text = as_text(findings)
+    assert text.splitlines()[-1] == "1 ok, 1 to look at, 0 wrong"
+    assert "not looked at:\n     board" in text
+    told = json.loads(as_json(findings, Program("pi-left", "1.2")))
+    assert (told["host"], told["ok"]) == ("pi-left", True)
+    assert told["findings"][1] == {"check": "clock", "verdict": "warn", "text": "far", "fix": "wait"}
+
+
+def test_it_runs_without_any_hardware(capsys: pytest.CaptureFixture[str]) -> None:
+    files = ["--rig", "desk", "--calibration", str(CALIBRATION)]
+    code = main(
+        ["doctor", "--name", "left", "--camera", "v4l2:/dev/none", *files, "--beacon-port", str(free_port())]
+    )
+    said = capsys.readouterr().out
+    assert code == 1  # there is no such camera
+    assert "/dev/none" in said
+    assert "not looked at:" in said
