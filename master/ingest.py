@@ -139,6 +139,7 @@ class Ingest:
             counts |= {f"{sender}.{event}": number for event, number in of.items()}
             with self._lock:
                 counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
+                counts[f"{sender}.restarts"] = self._link.restarts_of(sender)
                 tags = self._link.tag_counts_of(sender)
             if tags is not None and tags.received:
                 counts |= {f"{sender}.tags_received": tags.received, f"{sender}.tags_late": tags.late}

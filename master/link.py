@@ -99,6 +99,7 @@ class _Sender:
     pending: _Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
     steps_before: int = 0  # of the clock in sessions that are over
+    restarts: int = 0
 
     @property
     def main(self) -> Counted:
@@ -240,6 +241,10 @@ class MasterLink:
         of = self._senders[sender]
         return of.steps_before + (0 if of.live is None else of.live.clock.steps)
 
+    def restarts_of(self, sender: str) -> int:
+        """Return how often another process took over as `sender` since this master began."""
+        return self._senders[sender].restarts
+
     def counts_of(self, sender: str) -> CameraCounts:
         """Return what was counted of `sender` since this master began."""
         kind = self._senders[sender].main
@@ -326,6 +331,7 @@ class MasterLink:
 
     def _confirm(self, sender: _Sender, session: _Session, t_ns: int) -> None:
         if sender.live is not None:
+            sender.restarts += sender.live.hello.process != session.hello.process
             sender.steps_before += sender.live.clock.steps
             del self._sessions[sender.live.key_id]
         sender.live, sender.pending = session, None

@@ -28,6 +28,7 @@ from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw
+from master.stereo.drift import DepthDrift
 from master.stereo.locate import CapLocator, Located
 from master.stereo.pairing import Instant, Pairing
 from master.stereo.place import EXACT, CalibrationResidual, Placement, ray_covariance
@@ -113,6 +114,7 @@ class MarkerPipeline:
         self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
         self._located = CapLocator(self._cameras, self._caps, self._place)
+        self._drift = DepthDrift()
         self._stage, self._volume = stage, volume
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._others = others
@@ -194,6 +196,14 @@ class MarkerPipeline:
                 self._others.solved(instant.t_ns, hand, told)
             if self._steady is not None:
                 hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand], raw[self._on_hand])
+            on_hand = np.isfinite(instant.uv[:, self._on_hand, 0])
+            hand = self._drift.push(
+                instant.t_ns,
+                hand,
+                placed=bool(measured.any()),
+                seen=bool(on_hand.any()),
+                sight=self._sight(hand, on_hand),
+            )
             pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
         if self._smooth is not None:
             self._past.saw(instant.t_ns, raw)
@@ -282,6 +292,14 @@ class MarkerPipeline:
         depth_m = _HAND_DEPTH_M if len(found) else _HELD_DEPTH_M
         cov[lone] = ray_covariance(sight, across, np.full(len(lone), depth_m))
         return points[self._on_hand], cov[self._on_hand]
+
+    def _sight(self, hand: TrackedHand, on_hand: Bool) -> Float:
+        """Unit vector (3,) from the camera that sees most of the hand's markers (C, M) to the hand."""
+        centre = self._centres[int(on_hand.sum(axis=1).argmax())]
+        if hand.solution is None:
+            return np.array([0.0, 0.0, 1.0])
+        sight = hand.solution.T_rig_palm[:3, 3] - centre
+        return sight / np.linalg.norm(sight)
 
     def _caps_of(self, hand: HandSolution) -> Float:
         """Where a hand has its markers (M, 3) [m]; NaN: those on no hand."""

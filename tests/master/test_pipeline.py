@@ -12,6 +12,7 @@ from common.hand_model import CHAINS
 from common.messages import HandPose, MarkerDetections, Source
 from master.rig import RigSetup, build_pipeline
 from master.stages import StageTimes
+from master.stereo.drift import SPEED_M_S
 from master.stereo.pipeline import MarkerPipeline
 from tests.hand_helpers import MARKERS, RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, hand_at, synthetic_run
@@ -274,3 +275,33 @@ def test_stamps_that_lie_are_corrected_by_the_rig_file(exact_run: SyntheticRun) 
     rig = msgspec.structs.replace(exact_run.setup.rig, stamp_offset_us={"right": 8000.0})
     assert error_mm(exact_run.setup) > 10.0
     assert error_mm(replace(exact_run.setup, rig=rig)) < 2.0
+
+
+def test_a_hand_that_one_camera_sees_is_sure_of_its_depth_for_as_long_as_it_was_placed(
+    exact_run: SyntheticRun,
+) -> None:
+    """Its depth is held, not seen: the covariance grows along the sight, and the joints are not tracked any more."""
+    pipeline = build_pipeline(exact_run.setup, StageTimes())
+    first = exact_run.messages[0].camera
+    both, alone = exact_run.messages[:20], [one for one in exact_run.messages[20:] if one.camera == first]
+    solve_all(pipeline, both)
+    last_ns = max(one.t_ns for one in both)
+    start = len(alone)
+    for k in range(1, 60):  # the camera goes on for as long again
+        shift = k * PERIOD_NS
+        alone.append(
+            msgspec.structs.replace(alone[start - 1], t_ns=alone[start - 1].t_ns + shift, seq=1000 + k)
+        )
+    poses = solve_all(pipeline, alone)
+    sigma_m = np.array([np.sqrt(np.linalg.eigvalsh(pose.cov_m2[1])[-1]) for pose in poses])
+    age_s = np.array([(pose.t_ns - last_ns) * 1e-9 for pose in poses])
+    late = age_s > 0.5
+    assert late.sum() > 10
+    assert np.all(sigma_m[late] >= 0.99 * SPEED_M_S * (age_s[late] - 0.05))
+    tracked = np.array([pose.tracked.any() for pose in poses])
+    assert tracked[age_s < 0.3].all()
+    assert not tracked[late].any()
+    assert all(pose.valid.all() for pose in poses)
+    axis = np.linalg.eigh(poses[-1].cov_m2[1])[1][:, -1]
+    sight = poses[-1].position_m[1] - exact_run.setup.models[first].centre
+    assert abs(axis @ sight) / np.linalg.norm(sight) > 0.99
