@@ -1,0 +1,106 @@
+"""What became of one fault: brought about, watched, taken away, and judged against what is expected."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bench.faults_links import Fault
+from bench.faults_rig import RATE_HZ, FaultRig, asked
+
+GOAL_S = 2.0
+SANE_MM, SANE_SIGMAS = 60.0, 6.0  # of a tracked joint; of a valid one, in its own standard deviations
+AFTER_S = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run of a fault.
+
+    Attributes:
+        lasted_s: From its beginning to the end of its cause [s].
+        recovery_s: From the end of its cause to steady, right poses [s]; None: never.
+        share: Poses during it, of the nominal number.
+        worst_mm: Worst error of a tracked joint from its beginning to a second after; NaN: none was tracked.
+        beyond: Worst error of a joint that is said to be valid, in its own standard deviations.
+        false: Poses with a tracked joint off by more than 60 mm, or a valid one by more than 6 of them.
+        oldest_s: The oldest pose that came, by its own time.
+        counts: What the master counted more than before, of those that tell it.
+        listed: Codes of the checklist meanwhile.
+        grown_mb: Memory of the master afterwards, against before.
+    """
+
+    lasted_s: float
+    recovery_s: float | None
+    share: float
+    worst_mm: float
+    beyond: float
+    false: int
+    oldest_s: float
+    counts: dict[str, int] = field(default_factory=dict[str, int])
+    listed: frozenset[str] = frozenset()
+    grown_mb: float = 0.0
+
+    def wrong(self, fault: Fault) -> list[str]:
+        """In what it is not as expected."""
+        out: list[str] = []
+        if self.recovery_s is None or self.recovery_s > GOAL_S:
+            out.append("recovery")
+        if self.false:
+            out.append("false poses")
+        if self.share < fault.tracks:
+            out.append("rate")
+        if fault.counts and not any(self.counts.values()):
+            out.append("not counted")
+        if not set(fault.listed) <= self.listed:
+            out.append("not listed")
+        return out
+
+
+class _Listed:
+    """All codes that are on the checklist while it looks. Holds them and a thread."""
+
+    def __init__(self, rig: FaultRig) -> None:
+        self.codes: set[str] = set()
+        self._rig, self._stop = rig, threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+
+    def close(self) -> frozenset[str]:
+        self._stop.set()
+        self._thread.join()
+        return frozenset(self.codes)
+
+    def _look(self) -> None:
+        while not self._stop.wait(0.05):
+            self.codes |= {code for code, _ in self._rig.listed()}
+
+
+def measure(rig: FaultRig, fault: Fault) -> Run:
+    """Bring it about and wait until all is well."""
+    rig.steady_after(time.monotonic())
+    before, memory = asked(rig), rig.anonymous_mb()
+    listed, began = _Listed(rig), time.monotonic()
+    ended = fault.bring(rig)
+    recovery_s = rig.steady_after(ended)
+    time.sleep(AFTER_S)
+    codes = listed.close()
+    told = rig.poses.since(began, ended + max(recovery_s or 0.0, AFTER_S))
+    during = [one for one in told if one.came_s < ended]
+    after = asked(rig)
+    base = {} if fault.restarts else before
+    grown_mb = 0.0 if fault.restarts else rig.anonymous_mb() - memory
+    seen = [one for one in told if np.isfinite(one.worst_mm)]
+    return Run(
+        lasted_s=ended - began,
+        recovery_s=recovery_s,
+        share=len(during) / max(RATE_HZ * (ended - began), 1.0),
+        worst_mm=max((one.worst_mm for one in seen), default=float("nan")),
+        beyond=max((one.beyond for one in told), default=0.0),
+        false=sum(one.worst_mm > SANE_MM or one.beyond > SANE_SIGMAS for one in told),
+        oldest_s=max((one.age_s for one in told), default=0.0),
+        counts={name: after.get(name, 0) - base.get(name, 0) for name in fault.counts},
+        listed=codes,
+        grown_mb=grown_mb,
+    )
