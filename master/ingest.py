@@ -23,7 +23,8 @@ from master.link import MasterLink, Taken
 from master.sequence import CameraCounts
 from master.turned_away import Away
 
-QUEUE = 64  # frames, or triples, that may wait
+QUEUE = 64  # frames, or triples, that may wait, of one or two cameras
+QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
 ROOM = {
     "frame": QUEUE,
     "tags": QUEUE,
@@ -82,6 +83,7 @@ class Ingest:
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
         self._queue: deque[Taken] = deque()
+        self._room = room(len(cameras))
         self._waiting = dict.fromkeys(ROOM, 0)
         self._changed = threading.Condition()
         self._overflowed = 0
@@ -115,6 +117,11 @@ class Ingest:
     def skipped(self) -> int:
         """Frames, or triples, of all cameras that were never sent: camera or slave had no time for them."""
         return sum(self.counts_of(camera).skipped for camera in self._cameras)
+
+    @property
+    def waiting(self) -> int:
+        """Frames, or triples, of all cameras that have come and were not taken yet."""
+        return self._waiting["frame"]
 
     @property
     def refused(self) -> dict[str, int]:
@@ -205,11 +212,17 @@ class Ingest:
         with self._changed:
             self._queue.append(message)
             self._waiting[kind] += 1
-            if self._waiting[kind] > ROOM[kind]:
+            if self._waiting[kind] > self._room[kind]:
                 self._overflowed += 1
                 self._waiting[kind] -= 1
                 del self._queue[next(k for k, one in enumerate(self._queue) if _kind(one) == kind)]
             self._changed.notify()
+
+
+def room(cameras: int) -> dict[str, int]:
+    """How many messages of each kind may wait."""
+    frames = max(QUEUE, QUEUE_PER_CAMERA * cameras)
+    return ROOM | {"frame": frames, "tags": frames}
 
 
 def _kind(message: Taken) -> str:

@@ -15,6 +15,7 @@ from common.streams import MASTER
 from master.app import RunFigures, health, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
+from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
 from master.master_bus import carry_bus
 from master.odd_watch import OddWatch
@@ -91,7 +92,8 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    pipelines = [LivePipeline(setup, stages) for setup in setups]
+    hurry = Hurry(len(cameras_of(setups)))
+    pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
     with ExitStack() as stack:
@@ -105,6 +107,7 @@ def run_live(
             recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
+        hurry.waiting = lambda: ingest.waiting
         sinks: list[Sink] = [BusSink(bus)]
         if settings.poses is not None:
             counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}

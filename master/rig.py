@@ -22,6 +22,7 @@ from common.messages import Detections, MarkerDetections
 from common.object_profile import ObjectProfile
 from master.filters import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
+from master.hurry import never
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.rig_merge import gestures_named, merged_rig, refuse_shared_senders, rigs_by_hand
@@ -401,6 +402,7 @@ def build_pipeline(
     tracker: HandTracker | None = None,
     others: OtherSensors | None = None,
     counts: Counter[str] | None = None,
+    shed: Callable[[], bool] = never,
 ) -> MarkerPipeline:
     """The pipeline this marker rig's file describes; of a wrist device beside it nothing is used but through `others`.
 
@@ -411,6 +413,7 @@ def build_pipeline(
         tracker: Tracks the hand; None: a new one, which takes most of the time.
         others: What else watches the hand; None: nothing does.
         counts: Counted into; None: counts of its own.
+        shed: Asked for each instant whether it is left out.
 
     Raises:
         CalibrationError: The depth model does not fit the rig, or it is no marker rig.
@@ -436,11 +439,17 @@ def build_pipeline(
         others=others,
         counts=counts,
         stage=stage,
+        shed=shed,
     )
 
 
 def pipeline_of(
-    setup: RigSetup, stage: Stage, *, continuous: bool = True, tracker: HandTracker | None = None
+    setup: RigSetup,
+    stage: Stage,
+    *,
+    continuous: bool = True,
+    tracker: HandTracker | None = None,
+    shed: Callable[[], bool] = never,
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
@@ -448,12 +457,12 @@ def pipeline_of(
     what those of the other kind do.
     """
     if setup.wrist is None:
-        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker))
+        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker, shed=shed))
     try:
         if setup.has_markers:
             side = WristSide.of(setup.wrist, counts := Counter[str](), stage, continuous=continuous)
             markers = build_pipeline(
-                setup, stage, continuous=continuous, tracker=tracker, others=side, counts=counts
+                setup, stage, continuous=continuous, tracker=tracker, others=side, counts=counts, shed=shed
             )
             return FusedPipeline(
                 markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)

@@ -23,6 +23,7 @@ from common.calibration_parts import Part
 from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
+from master.hurry import never
 from master.ik.tracker import HandTracker
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
@@ -103,16 +104,17 @@ class LivePipeline:
     Holds it, its setup, what it was told last, and the one that is to take over with the next message.
     """
 
-    def __init__(self, setup: RigSetup, stage: Stage) -> None:
-        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use.
+    def __init__(self, setup: RigSetup, stage: Stage, shed: Callable[[], bool] = never) -> None:
+        """Begin with the pipeline of `setup`; `stage` measures the stages of whichever is in use, `shed` is asked for
+        each of its instants whether it is left out.
 
         Raises:
             CalibrationError: The depth model does not fit the rig.
         """
-        self._stage = stage
+        self._stage, self._shed = stage, shed
         self._setup: RigSetup = setup
         self._tracker = _new_tracker(setup)
-        self._now = pipeline_of(setup, stage, tracker=self._tracker)
+        self._now = pipeline_of(setup, stage, tracker=self._tracker, shed=shed)
         per_frame = _told_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
         self._recent: deque[tuple[int, Detections | _Turn]] = deque(maxlen=_WARM_FRAMES * per_frame)
@@ -165,7 +167,8 @@ class LivePipeline:
             tracker = self._tracker.fresh()
         else:
             tracker = _new_tracker(setup)
-        new = pipeline_of(setup, stage, tracker=tracker)
+        # What it is shown to warm up has been solved by the other already: nothing of it is left out.
+        new = pipeline_of(setup, stage, tracker=tracker, shed=lambda: stage.open and self._shed())
 
         def take() -> None:
             shown = self._warm(new)

@@ -83,6 +83,7 @@ class MarkerPipeline:
         others: OtherSensors | None = None,
         counts: Counter[str] | None = None,
         stage: Stage = lambda name: nullcontext(),
+        shed: Callable[[], bool] = lambda: False,
     ) -> None:
         """Join the parts.
 
@@ -102,6 +103,7 @@ class MarkerPipeline:
             others: What else watches the hand; None: nothing does.
             counts: Counted into; None: counts of its own.
             stage: Opens a timer by stage name.
+            shed: Asked for each instant whether it is left out, for newer ones wait (`master.hurry`).
         """
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
@@ -115,7 +117,7 @@ class MarkerPipeline:
         self._caps = CapModel(model, markers)
         self._located = CapLocator(self._cameras, self._caps, self._place)
         self._drift = DepthDrift()
-        self._stage, self._volume = stage, volume
+        self._stage, self._volume, self._shed = stage, volume, shed
         self._orientation = None if imu is None or not imu.placed else OrientationTrack(imu, self.counts)
         self._others = others
         self._last_ns = -(2**63)
@@ -153,13 +155,16 @@ class MarkerPipeline:
         return self._solved(self._pairing.flush())
 
     def _solved(self, instants: list[Instant]) -> list[SolvedPose]:
-        """Poses of instants later than the last pose; others are counted: cameras came back with old frames."""
+        """Poses of instants later than the last one; others are counted: cameras came back with old frames."""
         poses: list[SolvedPose] = []
         for instant in instants:
             if instant.t_ns <= self._last_ns:
                 self.counts["instants_late"] += 1
                 continue
             self._last_ns = instant.t_ns
+            if self._shed():
+                self.counts["instants_shed"] += 1
+                continue
             poses.append(self._solve(instant))
         return poses
 

@@ -1,0 +1,118 @@
+"""Rigs to be scaled: N cameras round one hand (a room), or many desks of two cameras each (a building), and what their
+cameras say, without drawing it: exact projections of a simulated hand with noise.
+
+The cameras of a room stand on a dome of 0.62 m about the hand, within 60 degrees of where the first one stands, so that
+all see most of it; one marker in twenty is not seen. Their shutters are global, their phases random.
+"""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from common.arrays import Float
+from common.calibration import HandProfile, load
+from common.messages import MarkerDetections
+from common.sim.scene import HAND_DEPTH_M, Scene
+from master.rig import RigSetup, load_setup
+
+CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
+ROOM, DESK = "room", "desk"
+LOOP_S = 10.0  # of the scene, then the same again
+NOISE_PX, UNSEEN = 0.08, 0.05
+_RADIUS_M, _CONE_RAD, _GOLDEN_RAD = 0.62, np.radians(60.0), np.pi * (3.0 - np.sqrt(5.0))
+_CAP_M = 0.007
+_SEED = 12
+
+
+def room(folder: Path, cameras: int, rate_hz: float) -> Path:
+    """Write a calib_json tree with the rig `room` of so many cameras; return it.
+
+    Raises:
+        OSError: It cannot be written.
+        ValueError: Fewer than two cameras.
+    """
+    if cameras < 2:
+        raise ValueError(f"cameras={cameras}: two or more are needed")
+    tree = folder / f"room{cameras}"
+    shutil.copytree(CALIBRATION, tree)
+    names = [f"cam{k:02d}" for k in range(cameras)]
+    for name in names:
+        _write_camera(tree, "left", name, rate_hz)
+    rig = json.loads((tree / "rigs" / f"{DESK}.json").read_text())
+    rig |= {"name": ROOM, "cameras": names}
+    rig["T_rig_camera"] = {name: pose.tolist() for name, pose in zip(names, dome(cameras), strict=True)}
+    (tree / "rigs" / f"{ROOM}.json").write_text(json.dumps(rig, indent=1) + "\n")
+    return tree
+
+
+def desk(folder: Path, rate_hz: float) -> Path:
+    """Write a tree whose rig `desk` has cameras of that rate; return it."""
+    tree = folder / "desk"
+    shutil.copytree(CALIBRATION, tree)
+    for name in ("left", "right"):
+        _write_camera(tree, name, name, rate_hz)
+    return tree
+
+
+def dome(cameras: int) -> list[Float]:
+    """Poses (4, 4) camera -> rig of so many cameras that look at the hand, the first at the rig's origin."""
+    centre = np.array([0.0, 0.0, HAND_DEPTH_M])
+    out: list[Float] = []
+    for k in range(cameras):
+        height = 1.0 - (1.0 - np.cos(_CONE_RAD)) * k / max(cameras - 1, 1)
+        round_rad, ring = k * _GOLDEN_RAD, np.sqrt(1.0 - height * height)
+        back = np.array([ring * np.cos(round_rad), ring * np.sin(round_rad), -height])
+        ahead = -back
+        right = np.cross([0.0, 1.0, 0.0], ahead)
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], axis=1)
+        pose[:3, 3] = centre + _RADIUS_M * back
+        out.append(pose)
+    move = np.linalg.inv(out[0])
+    return [move @ pose for pose in out]
+
+
+def told(setup: RigSetup, rate_hz: float) -> dict[str, list[MarkerDetections]]:
+    """Of each camera what it tells of `LOOP_S` of the standard scene; times are since its beginning.
+
+    `session` is for the sender to set, `seq` counts, `t_ns` has the camera's phase.
+    """
+    reference = load_setup(CALIBRATION, DESK)
+    profile = load(CALIBRATION / "hands" / f"{setup.rig.hand}.json", HandProfile)
+    scene, rng = Scene.standard(reference.rig, reference.cameras, profile), np.random.default_rng(_SEED)
+    to_rig = np.eye(4)
+    if setup.rig.name == ROOM:  # the dome's centre is its first camera's distance ahead, the scene's another
+        to_rig[2, 3] = _RADIUS_M - HAND_DEPTH_M
+    count = len(setup.rig.markers)
+    sigma, nowhere = np.full(count, 0.1), np.full((count, 2), np.nan)
+    out: dict[str, list[MarkerDetections]] = {}
+    for name, model in setup.models.items():
+        phase_s = float(rng.uniform(0.0, 1.0 / rate_hz))
+        out[name] = []
+        for seq in range(round(LOOP_S * rate_hz)):
+            t_s = seq / rate_hz + phase_s
+            caps = scene.truth(t_s).markers_m + to_rig[:3, 3]
+            uv = model.project(caps) + rng.normal(size=(count, 2)) * NOISE_PX
+            uv[rng.uniform(size=count) < UNSEEN] = np.nan
+            away = np.linalg.norm(caps - model.centre, axis=1)
+            area = np.where(np.isfinite(uv[:, 0]), np.pi * (_CAP_M * model.matrix[0, 0] / away) ** 2, np.nan)
+            seen = np.where(np.isfinite(uv[:, 0]), 1.0, np.nan)
+            t_ns = round(1e9 * t_s)
+            out[name].append(
+                MarkerDetections(name, 0, seq, t_ns, t_ns, uv, area, seen, sigma * seen, nowhere)
+            )
+    return out
+
+
+def _write_camera(tree: Path, like: str, name: str, rate_hz: float) -> None:
+    camera = json.loads((CALIBRATION / "cameras" / f"{like}.json").read_text())
+    camera |= {"name": name, "frame_rate_hz": rate_hz, "row_time_us": 0.0}
+    (tree / "cameras" / f"{name}.json").write_text(json.dumps(camera, indent=1) + "\n")
+
+
+def in_order(frames: dict[str, list[MarkerDetections]]) -> list[MarkerDetections]:
+    """All of them, by time."""
+    return sorted((one for camera in frames.values() for one in camera), key=lambda one: one.t_ns)
