@@ -1,12 +1,19 @@
 """Say why an encrypted bus does not come about: zenoh keeps silent about a certificate that was refused."""
 
+import logging
 import socket
 import ssl
+import threading
+import time
+from collections.abc import Callable
 
 from common.endpoints import host_of, port_of
 from common.keys import Identity
 
 _PATIENCE_S = 0.5
+_ALONE_S = 2.0  # without anybody for so long, a process says why
+_LOOK_S = 0.25
+_LOG = logging.getLogger(__name__)
 
 
 def why_refused(endpoint: str, identity: Identity) -> str:
@@ -52,3 +59,32 @@ def why_refused(endpoint: str, identity: Identity) -> str:
     except OSError as error:
         return f"nobody listens there ({error.strerror or error})"
     return ""
+
+
+def say_why_alone(
+    peers: Callable[[], int], reason: Callable[[], str], where: str, closing: threading.Event
+) -> threading.Thread:
+    """Log, on a thread, why nobody is connected when it is so for two seconds, and again when the reason is another.
+
+    Args:
+        peers: How many are connected.
+        reason: Why nobody is, for a person; may take a second.
+        where: Whom the text is about.
+        closing: Ends the thread.
+    """
+
+    def watch() -> None:
+        said, since = "", time.monotonic()
+        while not closing.wait(_LOOK_S):
+            now = time.monotonic()
+            if peers():
+                said, since = "", now
+            elif now - since > _ALONE_S:
+                why, since = reason(), now
+                if why and why != said and not closing.is_set():
+                    _LOG.warning("bus (%s): %s", where, why)
+                said = why
+
+    thread = threading.Thread(target=watch, name="bus alone", daemon=True)
+    thread.start()
+    return thread

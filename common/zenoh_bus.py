@@ -13,6 +13,7 @@ zenoh's own threads.
 import atexit
 import json
 import logging
+import os
 import re
 import threading
 import time
@@ -22,8 +23,9 @@ from typing import Protocol
 import zenoh
 
 from common.bus import ANY, Handler, Inbox, Subscription, decoded, payload_of, stream_key
-from common.bus_refusal import why_refused
+from common.bus_refusal import say_why_alone, why_refused
 from common.bus_settings import settings
+from common.certificates import MASTER, OPERATOR
 from common.endpoints import check, encrypted, loopback
 from common.errors import BusError, PhalanxError
 from common.keys import Access, access_of
@@ -36,8 +38,6 @@ LIVELINESS_TIMEOUT_S = 0.5
 FIFO_DEPTH = 64  # between zenoh and the thread that empties it at once
 # Nothing of these is dropped: who publishes them does so on a thread of its own.
 WAITING = frozenset({"taken"})
-ALONE_S = 2.0  # without anybody for so long, a process says why
-LOOK_S = 0.25
 
 _LOG = logging.getLogger(__name__)
 
@@ -69,7 +69,8 @@ class ZenohBus:
         Args:
             listen: Endpoint where others connect to; needs the master's certificate if it is encrypted.
             connect: Endpoint of who listens; of several only for a router.
-            access: Certificates, and whether plain text may leave the machine; None: neither.
+            access: Certificates, and whether plain text may leave the machine; None: as the variables PHALANX_KEYS and
+                PHALANX_OPEN say, for a master if it listens, else for an operator.
             beyond: See above.
             devices: Names that may connect, beside those whose certificates are in the keys folder.
             router: Pass everything on between all that are connected, in place of being one of them.
@@ -83,16 +84,17 @@ class ZenohBus:
         ends = [("listening on", listen), *(("connecting to", target) for target in targets)]
         self._where = ", ".join(f"{what} {endpoint}" for what, endpoint in ends if endpoint)
         endpoints = [endpoint for _, endpoint in ends if endpoint]
+        if access is None:
+            access = access_of(os.environ, MASTER if listen else OPERATOR)
         for endpoint in endpoints:
-            check(endpoint, access is not None and access.open)
+            check(endpoint, access.open)
             if not encrypted(endpoint) and not loopback(endpoint):
-                _LOG.warning("OPEN BUS: %s is not encrypted; whoever reaches it can watch, tune and stop this rig",
-                             endpoint)  # fmt: skip
-        self._identity = None
-        if any(encrypted(endpoint) for endpoint in endpoints):
-            if access is None:
-                access = access_of({}, "")
-            self._identity = access.identity()
+                _LOG.warning(
+                    "OPEN BUS: %s is plain text: whoever reaches it can watch, tune and stop this rig",
+                    endpoint,
+                )
+        sealed = any(encrypted(endpoint) for endpoint in endpoints)
+        self._identity = access.identity() if sealed else None
         self._sealed = [target for target in targets if encrypted(target)]
         mode = "client" if beyond else "router" if router else "peer"
         made = settings(listen, targets, mode, self._identity, devices, namespace)
@@ -114,9 +116,7 @@ class ZenohBus:
         atexit.register(self.close)
         self._closing = threading.Event()
         if self._sealed and not beyond:
-            thread = threading.Thread(target=self._watch, name="bus alone", daemon=True)
-            thread.start()
-            self._threads.append(thread)
+            self._threads.append(say_why_alone(lambda: self.peers, self._refusal, self._where, self._closing))
 
     @property
     def peers(self) -> int:
@@ -251,20 +251,6 @@ class ZenohBus:
     def _check_open(self) -> None:
         if self._closed:
             raise BusError("the bus is closed")
-
-    def _watch(self) -> None:
-        """Say why nobody is connected, when it is so for a while, and again when the reason is another one."""
-        said, since = "", time.monotonic()
-        while not self._closing.wait(LOOK_S):
-            now = time.monotonic()
-            if self.peers:
-                said, since = "", now
-            elif now - since > ALONE_S:
-                since = now
-                reason = self._refusal()
-                if reason != said and not self._closing.is_set():
-                    _LOG.warning("bus (%s): %s", self._where, reason or "connecting")
-                said = reason
 
     def _refusal(self) -> str:
         """Why no encrypted endpoint takes us; empty: there is none, or nothing is wrong."""

@@ -133,6 +133,11 @@ def devices_of(folder: Path) -> list[str]:
     return sorted(path.stem for path in (folder / DEVICES).glob("*.pem"))
 
 
+def files_of_device(name: str) -> tuple[str, ...]:
+    """What of the folder belongs on a device, by their places in it."""
+    return RIG_KEY, AUTHORITY, f"{DEVICES}/{name}.pem", f"{DEVICES}/{name}.key"
+
+
 def certificates_of(folder: Path) -> list[Shown]:
     """What the certificates of master, operator and devices say.
 

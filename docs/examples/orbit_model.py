@@ -123,7 +123,7 @@ def run(bus: Bus, orbit: Orbit, show: rr.RecordingStream, go_on: Callable[[], bo
 def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--bus", default="tcp/127.0.0.1:47802", help="of the master (default: %(default)s)")
+    parser.add_argument("--bus", default="tcp/127.0.0.1:47802", help="tls/ with keys (default: %(default)s)")
     parser.add_argument("--model", type=Path, metavar="FILE.glb", help="what to show (default: a chair)")
     parser.add_argument("--mirror", action="store_true", help="the reference camera faces you")
     parser.add_argument("--radius", type=float, default=1.0, help="of the model (default: %(default)s)")

@@ -131,7 +131,7 @@ def main() -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--output", choices=(*PROGRAMS, "print"), required=True, help="what sets the volume")
-    parser.add_argument("--bus", default="tcp/127.0.0.1:47802", help="of the master (default: %(default)s)")
+    parser.add_argument("--bus", default="tcp/127.0.0.1:47802", help="tls/ with keys (default: %(default)s)")
     parser.add_argument("--detent-deg", type=float, default=6.0, help="its turn (default: %(default)s)")
     parser.add_argument("--percent", type=int, default=2, help="of each detent (default: %(default)s)")
     options = parser.parse_args()

@@ -191,12 +191,15 @@ def test_a_device_is_heard_once_the_master_knows_its_name(tmp_path: Path) -> Non
 
 
 def test_without_a_certificate_of_the_rig_nobody_comes_in_and_hears_why(
-    rig: Rig, foreign: Path, caplog: pytest.LogCaptureFixture
+    rig: Rig, foreign: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with pytest.raises(BusError, match="no certificate of this rig's master"):
         ZenohBus(None, rig.endpoint, access(OPERATOR, foreign), beyond=True)
+    monkeypatch.delenv("PHALANX_KEYS", raising=False)
     with pytest.raises(BusError, match="no keys: give --keys"):
         ZenohBus(None, rig.endpoint)
+    monkeypatch.setenv("PHALANX_KEYS", str(rig.keys))
+    assert until(lambda: "left" in rig.opened(lambda: ZenohBus(None, rig.endpoint, beyond=True)).alive())
     plain = rig.endpoint.replace("tls/", "tcp/")
     with pytest.raises(BusError, match="cannot open the bus"):
         ZenohBus(None, plain, beyond=True)

@@ -1,19 +1,22 @@
 """Command lines of the processes that the set-up starts or tells to start: cameras, masters, calibrations."""
 
+import os
 import shlex
 import sys
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
-from common.keys import ENVIRONMENT
+from common.keys import ENVIRONMENT, keys_folder
 from master.calibrate.cli import COMMANDS
 from master.console.setup.fields import Value, arguments_of, fields_of
 from master.console.setup.files import KEY_FILE, CameraPlan, Plan, key_of
 from master.console.state import ConsoleSettings
+from master.keys_folder import AUTHORITY_KEY, files_of_device, make
 
 # What simulated cameras can look at: scene -> text. "still" is the hand before its motion begins.
 VIEWS = {
@@ -43,11 +46,14 @@ class Commands:
         return self.settings.calibration.resolve()
 
     def environment(self) -> dict[str, str]:
-        """What they need and what may not stand on a command line: the rig key.
+        """What they need and what may not stand on a command line: the rig key; of a keys folder they inherit where it
+        is, and each camera has a certificate in it from here on.
 
         Raises:
             PhalanxError: There is no key.
         """
+        if (keys := keys_folder(os.environ)) is not None and (keys / AUTHORITY_KEY).exists():
+            make(keys, [camera.name for camera in self.plan.cameras], datetime.now(UTC))
         return {ENVIRONMENT: key_of(self.settings.calibration, self.settings.key)}
 
     def camera(self, camera: CameraPlan, view: str, epoch_ns: int) -> list[str]:
@@ -79,6 +85,11 @@ class Commands:
         host = camera.device or f"{camera.name}.local"
         there = "calib_json"
         copy = f"rsync -a {shlex.quote(f'{self.tree}/')} {shlex.quote(host)}:{there}/"
+        secrets = ["--key-file", f"{there}/{KEY_FILE}"]
+        if (keys := keys_folder(os.environ)) is not None:
+            own = [f"{keys}/./{file}" for file in files_of_device(camera.name)]
+            copy += f" && rsync -aR {shlex.join(own)} {shlex.quote(host)}:keys/"
+            secrets = ["--keys", "keys"]
         slave = [
             "phalanx-slave",
             "run",
@@ -89,7 +100,7 @@ class Commands:
             "--camera",
             "picamera2",
         ]
-        slave += ["--calibration", there, "--beacon-port", self._port, "--key-file", f"{there}/{KEY_FILE}"]
+        slave += ["--calibration", there, "--beacon-port", self._port, *secrets]
         return copy, shlex.join([*slave, *shlex.split(camera.options)])
 
     def meet(self) -> list[str]:

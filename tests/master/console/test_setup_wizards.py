@@ -2,6 +2,7 @@
 
 import sys
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from master.console.setup.panel_lens import judged
 from master.console.setup.progress import fault, progress, share_of
 from master.console.setup.wizards import FILLED, WIZARDS
 from master.console.state import ConsoleSettings
+from master.keys_folder import make
 
 WAIT_S = 60.0
 
@@ -213,6 +215,23 @@ def figures(rms: float, off_mm: float) -> dict[str, object]:
         "pairs": [{"edge_mean_mm": 25.0, "edge_sd_mm": off_mm}],
         "cameras": {"left": {"coverage": {"advice": ""}}},
     }
+
+
+def test_with_a_keys_folder_each_camera_gets_its_certificate_and_a_pi_its_part(
+    tree: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pi = replace(Plan(), cameras=_cameras("pi", device="pi@left.local"))
+    keys = tree.parent / "keys"
+    monkeypatch.setenv("PHALANX_KEYS", str(keys))
+    make(keys, [], datetime.now(UTC))
+    assert len(Commands(ConsoleSettings(tree, key=bytes(32)), pi).environment()["PHALANX_RIG_KEY"]) == 64
+    copy, run = Commands(ConsoleSettings(tree), pi).pi(pi.cameras[0])
+    files = ("rig.key", "ca.pem", "devices/left.pem", "devices/left.key")
+    assert copy.endswith(
+        f" && rsync -aR {' '.join(f'{keys}/./{file}' for file in files)} pi@left.local:keys/"
+    )
+    assert all((keys / file).exists() for file in files)
+    assert run.endswith("--keys keys")
 
 
 def test_residuals_in_words() -> None:
