@@ -1,6 +1,6 @@
 """Print where the tip of the index finger is, with nothing of Phalanx installed: pip install eclipse-zenoh msgspec.
 
-Beside a master: python docs/examples/subscriber.py [tcp/127.0.0.1:47802]. Fields: docs/wire.md; with keys: docs/keys.md.
+Beside a master: python docs/examples/subscriber.py [tcp/127.0.0.1:47802]. Fields: docs/wire.md, with keys: docs/keys.md
 """
 
 import json
