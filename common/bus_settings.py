@@ -52,7 +52,8 @@ def settings(
             "retry": RETRY,
         },
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
-        "transport": {"link": link},
+        # Without shared memory: in a service's sandbox it cannot be made, and then zenoh opens nothing at all.
+        "transport": {"link": link, "shared_memory": {"enabled": False}},
     }
     if namespace is not None:
         made["namespace"] = namespace
