@@ -47,7 +47,7 @@ class ZenohBus:
 
     Holds the zenoh session and everything declared on it. An unreachable peer does not delay the
     constructor by more than half a second; zenoh goes on trying, and everything declared here
-    holds again once the peer is back.
+    holds again once the peer is back. `open` says whether it leaves this machine as plain text.
     """
 
     def __init__(
@@ -86,9 +86,11 @@ class ZenohBus:
         endpoints = [endpoint for _, endpoint in ends if endpoint]
         if access is None:
             access = access_of(os.environ, MASTER if listen else OPERATOR)
+        self.open = False
         for endpoint in endpoints:
             check(endpoint, access.open)
             if not encrypted(endpoint) and not loopback(endpoint):
+                self.open = True
                 _LOG.warning(
                     "OPEN BUS: %s is plain text: whoever reaches it can watch, tune and stop this rig",
                     endpoint,

@@ -8,10 +8,10 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from common.bus import Bus
 from common.clock import Clock, SystemClock
 from common.messages import Command, Health
 from common.streams import MASTER
+from common.zenoh_bus import ZenohBus
 from master.app import RunFigures, health, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
@@ -220,7 +220,7 @@ class _Reporter:
         cameras: tuple[str, ...],
         trackers: tuple[str, ...],
         clock: Clock,
-        bus: Bus,
+        bus: ZenohBus,
         ingest: Ingest,
         world: World,
         odd: Sequence[tuple[OddWatch, LivePipeline]],
@@ -246,7 +246,9 @@ class _Reporter:
         told = {name: number for name, number in events if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
         counts = dict(self._world.counts) | told | changes | self._tap.counts
-        times = self._watch.gauges(self._ingest.clock_of)
+        times = dict(self._watch.gauges(self._ingest.clock_of)) | (
+            {"open_bus": 1.0} if self._bus.open else {}
+        )
         return health(self.session, self._clock, self._figures, counts, times)
 
     def answer(self, command: Command) -> Health:

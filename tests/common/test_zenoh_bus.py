@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from common.errors import BusError
+from common.keys import access_of
 from common.messages import Command, Health
 from common.zenoh_bus import ZenohBus
 from tests.network_helpers import free_endpoint, health, until
@@ -112,6 +113,24 @@ def test_a_killed_process_leaves_the_list_of_the_living() -> None:
 def test_a_wrong_endpoint_is_an_error_that_names_it(endpoint: str) -> None:
     with pytest.raises(BusError, match=endpoint):
         ZenohBus(endpoint, None)
+
+
+def test_a_bus_that_leaves_the_machine_as_plain_text_is_wished_for_and_said(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    here = free_endpoint()
+    everywhere = here.replace("127.0.0.1", "0.0.0.0")
+    with pytest.raises(BusError, match="--open"):
+        ZenohBus(everywhere, None)
+    master, slave = ZenohBus(everywhere, None, access_of({}, "master", open_bus=True)), ZenohBus(None, here)
+    try:
+        assert f"OPEN BUS: {everywhere}" in caplog.text
+        assert master.open
+        assert not slave.open
+        assert until(lambda: slave.peers == 1)
+    finally:
+        slave.close()
+        master.close()
 
 
 def test_a_taken_address_is_an_error() -> None:

@@ -4,19 +4,37 @@ import ast
 import subprocess
 import sys
 import threading
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from common.hand_model import JOINTS
+from common.keys import access_of
 from common.zenoh_bus import ZenohBus
+from master.keys_folder import make
 from tests.master.send.hands import hand_pose
 from tests.network_helpers import free_endpoint
 
+_OWN_KEYS = (
+    "#root_ca_certificate_file={K}/ca.pem;connect_certificate_file={K}/operator.pem;"
+    "connect_private_key_file={K}/operator.key;enable_mtls=true;verify_name_on_connect=false"
+)
 
-def test_it_prints_the_tip_of_the_index_finger(root: Path) -> None:
-    endpoint = free_endpoint()
-    bus = ZenohBus(endpoint, None)
+
+def test_the_page_of_keys_says_how(root: Path) -> None:
+    page = (root / "docs" / "keys.md").read_text().replace("\\\n", "")
+    assert _OWN_KEYS.format(K="$K") in page
+
+
+@pytest.mark.parametrize("scheme", ["tcp", "tls"])
+def test_it_prints_the_tip_of_the_index_finger(root: Path, tmp_path: Path, scheme: str) -> None:
+    endpoint, keys = free_endpoint().replace("tcp", scheme), tmp_path / "keys"
+    make(keys, [], datetime.now(UTC))
+    bus = ZenohBus(endpoint, None, access_of({}, "master", keys))
+    if scheme == "tls":  # as docs/keys.md says
+        endpoint += _OWN_KEYS.format(K=keys)
     pose = hand_pose("right", t_ns=12_345_000_000)
     program = subprocess.Popen(
         [sys.executable, str(root / "docs" / "examples" / "subscriber.py"), endpoint],
