@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from master.outputs.files import load_poses
+from tests.sockets import Listener, listeners, rows, undocumented
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,16 +29,21 @@ def test_the_grab_test_runs_scores_and_outlives_its_wrist_device(tmp_path: Path)
     )
     heard: list[str] = []
     pids: dict[str, int] = {}
+    listening: set[Listener] = set()
     killed_ns = 0
     assert demo.stdout is not None
     for line in demo.stdout:
         heard.append(line)
         pids = pids or {name: int(pid) for name, pid in re.findall(r"(\w+) \(pid (\d+)\)", line)}
         if re.search(r"(9|1[0-3]) of 14 s", line) and not killed_ns:
+            listening = listeners(demo.pid)
             killed_ns = time.monotonic_ns()
             os.kill(pids["wrist"], signal.SIGKILL)
     said = "".join(heard)
     assert demo.wait(60) == 0, said
+    assert {"master run", "slave run", "slave imu"} <= {one.program for one in listening}
+    assert undocumented(listening, rows()) == [], "what listens is in docs/security.md"
+    assert all(one.here for one in listening), "a demo is nobody else's business"
     assert list(pids) == ["left", "right", "wrist", "imu", "master"]
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
     summary = json.loads((tmp_path / "summary.json").read_text())

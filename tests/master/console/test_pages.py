@@ -18,6 +18,7 @@ from common.zenoh_bus import ZenohBus
 from tests.browser import chromium
 from tests.master.console.fakes import HEIGHT, WIDTH, FakeMaster, FakeSlave, tree
 from tests.network_helpers import free_endpoint, until
+from tests.sockets import listeners, rows, undocumented
 
 WAIT_MS = 30_000
 LAPTOP, TABLET, UPRIGHT = (1366, 800), (1024, 768), (768, 1024)
@@ -34,6 +35,7 @@ class Desk:
     left: FakeSlave
     right: FakeSlave
     browser: Browser
+    pid: int
     faults: list[str] = field(default_factory=list[str])
 
 
@@ -57,7 +59,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Generator[Desk]:
         found = re.search(r"http://127\.0\.0\.1:\d+/", console.stdout.readline())
         assert found is not None
         with chromium() as browser:
-            yield Desk(found[0], calibration, master, left, right, browser)
+            yield Desk(found[0], calibration, master, left, right, browser, console.pid)
     finally:
         console.terminate()
         assert console.wait(PATIENCE_S) == 0, "the console ends when it is told to"
@@ -249,6 +251,9 @@ def test_an_output_is_switched_on_in_its_file_and_a_process_sends(desk: Desk, pa
     path = desk.calibration / "outputs" / "default.json"
     assert until(lambda: path.exists() and load(path, OutputSettings).osc.on, PATIENCE_S)
     expect(page.get_by_text(re.compile(r"^open, \d+ sent"))).to_be_visible(timeout=3 * WAIT_MS)
+    listening = listeners(desk.pid)
+    assert {one.program for one in listening} == {"master console"}, "OSC is only sent"
+    assert undocumented(listening, rows()) == []
     switch.click()
     assert until(lambda: not load(path, OutputSettings).osc.on, PATIENCE_S)
 
