@@ -1,0 +1,264 @@
+"""`phalanx deploy` as far as it needs no other machine: names of hosts, wheels, what is sent, deadlines, going back."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+import zipfile
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from deploy import deployment
+from deploy import wheelhouse as wheels_module
+from deploy.__main__ import main
+from deploy.bundle import BUNDLE, bundle, command
+from deploy.deployment import Ears, make_keys
+from deploy.fleet import table
+from deploy.one_host import Host
+from deploy.remote import Deadline, Remote
+from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
+from deploy.wheelhouse import own_wheel, wheelhouse
+from master.keys_folder import make
+
+ROOT = Path(__file__).resolve().parents[2]
+DESK, WRIST = (read_rig(ROOT / "calib_json", name) for name in ("desk", "wrist"))
+
+
+@pytest.mark.parametrize(
+    ("hosts", "rig", "expected"),
+    [
+        (["a", "b"], DESK, [("a", "left"), ("b", "right")]),
+        (["right=pi@b", "a"], DESK, [("pi@b", "right"), ("a", "left")]),
+        (["left+right=a"], DESK, [("a", "left", "right")]),
+        (["b"], WRIST, [("b", "wrist", "imu")]),
+        (["wrist=a", "imu=b"], WRIST, [("a", "wrist"), ("b", "imu")]),
+    ],
+)
+def test_hosts_take_cameras_in_the_order_of_the_rig_or_by_name(
+    hosts: list[str], rig: RigFile, expected: list[tuple[str, ...]]
+) -> None:
+    assert [(t.host, *t.names) for t in targets_of(hosts, rig)] == expected
+
+
+@pytest.mark.parametrize(
+    ("hosts", "said"),
+    [
+        (["a", "b", "c"], "c: rig 'desk' has no camera left for it; it has left, right"),
+        (["up=a"], "rig 'desk' has no camera or IMU 'up'"),
+        (["left=a", "left=b"], "left: stands twice"),
+        (["left=a", "right=a"], "a host stands twice"),
+        (["left=-oProxyCommand"], "not a host"),
+        (["a b"], "not a host"),
+    ],
+)
+def test_hosts_that_do_not_fit_are_refused(hosts: list[str], said: str) -> None:
+    with pytest.raises(DeployError) as refused:
+        targets_of(hosts, DESK)
+    assert said in str(refused.value)
+
+
+def test_our_own_wheel_is_whole_and_always_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "a"))
+    wheel = own_wheel()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "b"))
+    assert own_wheel().read_bytes() == wheel.read_bytes()
+    target = tmp_path / "site"
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--no-compile"]
+    subprocess.run([*pip, "--target", str(target), str(wheel)], check=True)
+    assert (target / "slave/install/files/phalanx-slave@.service").is_file()
+    assert (target / "bin/phalanx-slave").is_file()
+    names = zipfile.ZipFile(wheel).namelist()
+    assert not [name for name in names if "__pycache__" in name]
+    assert {name.split("/")[0] for name in names if "." not in name.split("/")[0]} == set(
+        wheels_module.PACKAGES
+    )
+
+
+def test_a_given_wheelhouse_gets_ours_and_a_release_is_named_by_all_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    given, kind = tmp_path / "given", wheels_module.Kind("aarch64", "3.13")
+    given.mkdir()
+    with pytest.raises(DeployError, match="no wheels in it"):
+        wheelhouse(kind, given, print)
+    (given / "numpy-2.0-py3-none-any.whl").write_bytes(b"1")
+    one = wheelhouse(kind, given, print)
+    (given / "numpy-2.0-py3-none-any.whl").write_bytes(b"2")
+    two = wheelhouse(kind, given, print)
+    assert one.release != two.release
+    assert [file.name.split("-")[0] for file in one.files] == ["numpy", "phalanx_hand"]
+    assert list(given.iterdir()) == [given / "numpy-2.0-py3-none-any.whl"], "the user's folder stays as it is"
+
+
+def test_what_is_sent_has_the_keys_of_that_machine_alone_and_runs_from_memory(tmp_path: Path) -> None:
+    keys = tmp_path / "keys"
+    make(keys, ("left", "right"), datetime.now(UTC))
+    sent = bundle(keys, ["left"], ROOT / "calib_json", DESK)
+    names = zipfile.ZipFile(_file(tmp_path / "sent.zip", sent)).namelist()
+    assert sorted(name for name in names if "keys" in name) == [
+        f"payload/keys/{name}" for name in ("ca.pem", "devices/left.key", "devices/left.pem", "rig.key")
+    ]
+    words = ["install", "--json", "--dry-run", "--bundle", BUNDLE, "--master", "10.0.0.2", "--name", "left"]
+    words += [
+        "--release",
+        "1.0-0",
+        "--camera",
+        "synthetic",
+        "--root",
+        str(tmp_path / "root"),
+        "--wheelhouse",
+        "/none/x",
+    ]
+    (tmp_path / "root").mkdir()
+    systemctl = tmp_path / "bin/systemctl"
+    systemctl.parent.mkdir()
+    systemctl.write_text("#!/bin/sh\necho ActiveState=inactive\n")
+    systemctl.chmod(0o755)
+    environment = {"PATH": f"{systemctl.parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        command(words, sudo=False), input=sent, capture_output=True, cwd="/", env=environment, check=False
+    )
+    result = json.loads(done.stdout.splitlines()[-1])["result"]
+    assert done.returncode == 0, done.stderr.decode()
+    assert "etc/phalanx/keys/device-left.key" in result["changed"]
+    assert not list((tmp_path / "root").iterdir()), "a dry run writes nothing"
+
+
+@pytest.fixture
+def fake_ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Puts a script in the place of ssh."""
+
+    def put(text: str) -> None:
+        (tmp_path / "ssh").write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / "ssh").chmod(0o755)
+        monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    return put
+
+
+def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
+    fake_ssh: Callable[[str], None], tmp_path: Path
+) -> None:
+    fake_ssh(f"sleep 300 & echo $! > {tmp_path}/child; wait")
+    began = time.monotonic()
+    with pytest.raises(DeployError, match=r"not done within 1 s \(--deadline\)"):
+        Remote("host", (), Deadline(1.0)).run(["true"], b"", print)
+    with pytest.raises(DeployError, match="--deadline"):
+        Remote("host", (), Deadline(0.5)).send((tmp_path / "ssh",), "/tmp", sudo=False)
+    assert time.monotonic() - began < 60.0
+    child = Path(f"/proc/{(tmp_path / 'child').read_text().strip()}/stat")
+    assert not child.exists() or " Z " in child.read_text()
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        (
+            "ssh: Could not resolve hostname pi: Name or service not known",
+            "Could not resolve hostname pi: Name or",
+        ),
+        (
+            "pi@pi: Permission denied (publickey,password).",
+            "Permission denied: its key is not known there: ssh-copy-id pi",
+        ),
+        ("Host key verification failed.", "its host key is not known here: ssh pi once"),
+    ],
+)
+def test_a_host_that_is_not_reached_is_told_in_one_line_with_what_to_do(
+    fake_ssh: Callable[[str], None],
+    said: str,
+    expected: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    fake_ssh(f"echo '{said}' >&2; exit 255")
+    assert main(["uninstall", "pi"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("pi: FAILED: ")
+    assert expected in error
+    assert error.count("\n") == 1
+
+
+class Remembered(Host):
+    """A machine that only remembers that it was sent back."""
+
+    back = 0
+
+    def roll_back(self) -> str:
+        self.back += 1
+        return "back at release 1.0-0"
+
+
+def _hosts(said: list[str]) -> list[Remembered]:
+    remote = Remote("none", (), Deadline(9.0))
+    hosts = [
+        Remembered(Target(name, (name,)), remote, said.append, changed=True) for name in ("left", "right")
+    ]
+    hosts[1].changed = False
+    return hosts
+
+
+def _hear_only(monkeypatch: pytest.MonkeyPatch, heard: dict[str, float], cause: str | None = None) -> None:
+    def answer(_names: object, _ears: object) -> tuple[dict[str, float], str | None]:
+        return heard, cause
+
+    monkeypatch.setattr(deployment, "heard_of", answer)
+
+
+def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    hosts = _hosts(said)
+    _hear_only(monkeypatch, {"right": 30.0})
+    failed = deployment._hear(hosts, Ears((), 3.0))
+    assert failed == {
+        "left": "no datagram of left in 3 s at the master; back at release 1.0-0",
+        "right": None,
+    }
+    assert [host.back for host in hosts] == [1, 0]
+    assert "streams: right 30/s" in said
+
+
+def test_what_was_not_changed_stays_and_so_does_all_if_nobody_can_listen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    hosts = _hosts([])
+    _hear_only(monkeypatch, {"left": 30.0})
+    assert deployment._hear(hosts, Ears((), 3.0))["right"] == "no datagram of right in 3 s at the master"
+    _hear_only(monkeypatch, {}, "cannot listen for it: port taken")
+    assert set(deployment._hear(hosts, Ears((), 3.0)).values()) == {"cannot listen for it: port taken"}
+    assert [host.back for host in hosts] == [0, 0]
+
+
+def test_missing_keys_are_made_and_what_is_there_stays(tmp_path: Path) -> None:
+    keys, said = tmp_path / "keys", list[str]()
+    make_keys(keys, ["left"], said.append)
+    rig_key = (keys / "rig.key").read_text()
+    make_keys(keys, ["left"], said.append)
+    assert said == [f"making keys in {keys}"]
+    assert (keys / "rig.key").read_text() == rig_key
+    assert (keys / "devices/left.key").stat().st_mode & 0o777 == 0o600
+
+
+def test_a_table_has_a_dash_where_nothing_is_known() -> None:
+    lines = table(
+        [
+            {"name": "left", "state": "streaming", "host": "pi-left", "version": "0.1.0", "temperature_c": 51.2,
+             "throttled": False, "rate_hz": 89.96, "offset_us": -12.4, "sigma_us": 8.0},
+            {"name": "right", "state": "unknown"},
+        ]
+    )  # fmt: skip
+    assert lines[1].split("  ")[0] == "left"
+    assert "51 °C" in lines[1]
+    assert "90.0/s" in lines[1]
+    assert "-12 ± 8 µs" in lines[1]
+    assert lines[2].split() == ["right", *["-"] * 6, "unknown"]
+
+
+def _file(path: Path, content: bytes) -> Path:
+    path.write_bytes(content)
+    return path

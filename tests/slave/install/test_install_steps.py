@@ -1,0 +1,184 @@
+"""Installing on a machine that is a folder: twice, with other content, with what does not run, and gone again."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from slave.install import release, steps
+from slave.install.errors import InstallError
+from slave.install.release import Source
+from slave.install.removal import uninstall
+from slave.install.transaction import NOTES, Transaction
+from tests.slave.install.conftest import Board, site_of
+
+UNIT = "phalanx-slave@left.service"
+
+
+def test_a_clean_machine_gets_all_of_it(board: Board, site: Path) -> None:
+    outcome = board.install(site)
+    root = board.root
+    assert outcome.restarted == [UNIT]
+    assert (root / "opt/phalanx/current").readlink() == Path(f"releases/{outcome.release}")
+    assert outcome.release.startswith("1.0-")
+    lines = (root / "etc/phalanx/left.env").read_text().splitlines()
+    assert "PHALANX_COMMAND=run" in lines
+    assert (
+        "PHALANX_OPTIONS=--name left --rig desk --calibration /var/lib/phalanx/calib_json --camera synthetic"
+        in lines
+    )
+    modes = {p.name: p.stat().st_mode & 0o777 for p in (root / "etc/phalanx/keys").iterdir()}
+    assert modes == dict.fromkeys(("rig.key", "ca.pem", "device-left.pem", "device-left.key"), 0o600)
+    assert (root / "etc/phalanx/keys").stat().st_mode & 0o777 == 0o700
+    assert "server 10.0.0.2 " in (root / "etc/chrony/conf.d/phalanx.conf").read_text()
+    assert (root / "var/lib/phalanx/calib_json/cameras/left.json").is_file()
+    assert not list((root / "var/lib/phalanx/calib_json/hands").glob("*left*")), (
+        "hands of others stay at home"
+    )
+    assert UNIT in board.systemd.enabled
+    script = (root / "opt/phalanx/current/bin/phalanx-slave").read_text()
+    assert script.startswith(f"#!/opt/phalanx/releases/{outcome.release}/bin/python\n")
+
+
+def test_a_second_time_nothing_is_changed_or_restarted(board: Board, site: Path) -> None:
+    board.install(site)
+    before, pids, asked = board.files(), dict(board.systemd.pids), len(board.systemd.asked)
+    outcome = board.install(site)
+    assert (outcome.changed, outcome.restarted) == ([], [])
+    assert board.files() == before
+    assert board.systemd.pids == pids
+    assert all(line.startswith("systemctl show") for line in board.systemd.asked[asked:])
+
+
+def test_a_dry_run_writes_nothing_and_says_what_it_would(board: Board, site: Path) -> None:
+    before = board.files()
+    outcome = board.install(site, dry_run=True)
+    assert board.files() == before
+    assert outcome.restarted == [UNIT]
+    assert "would write /etc/phalanx/left.env" in board.said
+    assert all(line.startswith("systemctl show") for line in board.systemd.asked)
+
+
+def test_only_what_changed_is_restarted(board: Board, site: Path) -> None:
+    two = ("--name", "right")
+    board.install(site, *two)
+    pids = dict(board.systemd.pids)
+    outcome = board.install(site, *two, "--options", "right=--seed 8")
+    assert outcome.changed == ["etc/phalanx/right.env"]
+    assert outcome.restarted == ["phalanx-slave@right.service"]
+    assert board.systemd.pids[UNIT] == pids[UNIT]
+
+
+def test_a_sender_that_is_served_no_more_is_removed_with_its_keys(board: Board, site: Path) -> None:
+    board.install(site, "--name", "right")
+    outcome = board.install(site)
+    assert "etc/phalanx/right.env" in outcome.changed
+    assert not (board.root / "etc/phalanx/keys/device-right.key").exists()
+    assert set(board.systemd.pids) == {UNIT}
+
+
+def test_an_upgrade_keeps_the_release_before_and_no_other(board: Board, tmp_path: Path) -> None:
+    names = [board.install(site_of(tmp_path / f"site{n}", f"1.{n}")).release for n in range(3)]
+    assert sorted(p.name for p in (board.root / "opt/phalanx/releases").iterdir()) == sorted(names[1:])
+    assert steps.roll_back(board.machine) == names[1]
+
+
+def test_what_does_not_run_is_taken_back_and_says_why(board: Board, site: Path, tmp_path: Path) -> None:
+    good = board.install(site)
+    before = board.files()
+    with pytest.raises(InstallError, match=r"it is broken, as it was meant to be; everything is as before"):
+        board.install(site_of(tmp_path / "bad", "2.0", broken=True), "--options", "--seed 8")
+    after = board.files()
+    assert {p: v for p, v in after.items() if not p.startswith(NOTES)} == {
+        p: v for p, v in before.items() if not p.startswith(NOTES)
+    }
+    assert (board.root / "opt/phalanx/current").readlink().name == good.release
+    assert UNIT in board.systemd.pids
+    board.install(site)  # and the next installation finds nothing to do
+
+
+def test_a_first_installation_that_does_not_run_leaves_no_service(board: Board, tmp_path: Path) -> None:
+    with pytest.raises(InstallError, match="everything is as before"):
+        board.install(site_of(tmp_path / "bad", "2.0", broken=True))
+    assert not list((board.root / "etc/phalanx").glob("*.env"))
+    assert not list((board.root / "etc/phalanx/keys").iterdir())
+    assert not (board.root / "opt/phalanx/current").is_symlink()
+    assert not board.systemd.pids
+    assert not board.systemd.enabled
+
+
+def test_a_release_that_does_not_load_stops_nothing(board: Board, site: Path, tmp_path: Path) -> None:
+    board.install(site)
+    asked = len(board.systemd.asked)
+    bad = site_of(tmp_path / "bad", "2.0")
+    (bad / "slave/live.py").write_text("import no_such_thing\n")
+    with pytest.raises(
+        InstallError, match="does not load: ModuleNotFoundError: No module named 'no_such_thing'"
+    ):
+        board.install(bad)
+    assert not [line for line in board.systemd.asked[asked:] if "restart" in line]
+    assert len(list((board.root / "opt/phalanx/releases").iterdir())) == 1
+
+
+def test_an_installation_that_was_cut_off_is_taken_back_first(
+    board: Board, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    good = board.install(site)
+    with monkeypatch.context() as patch:
+        patch.setattr(Transaction, "end", _power_goes)
+        with pytest.raises(KeyboardInterrupt):  # as if the power went
+            board.install(site_of(tmp_path / "new", "2.0"), "--options", "--seed 8")
+    assert Transaction(board.root).is_open
+    outcome = board.install(site)
+    assert board.said.count("an installation before was cut off: taking it back") == 1
+    assert outcome.changed == []
+    assert outcome.release == good.release
+
+
+def _power_goes(_self: Transaction) -> None:
+    raise KeyboardInterrupt
+
+
+def test_uninstalling_leaves_nothing_of_ours(board: Board, site: Path) -> None:
+    before = board.files()
+    board.install(site, "--overlay", "imx296")
+    assert board.files() != before
+    uninstall(board.machine)
+    left = {
+        path: value
+        for path, value in board.files().items()
+        if path not in ("run", "boot/firmware/config.txt")
+    }
+    assert left == {path: value for path, value in before.items() if path != "boot/firmware/config.txt"}
+    assert (board.root / "boot/firmware/config.txt").read_text() == "# of the system\ndtparam=audio=on\n"
+    assert not board.systemd.pids
+    assert not board.systemd.enabled
+    assert uninstall(board.machine) == [], "a second time there is nothing"
+
+
+def test_a_full_disk_is_told_and_leaves_what_runs(
+    board: Board, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = board.root / "opt"
+    mount = ["mount", "-t", "tmpfs", "-o", "size=60m", "none", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(mount, check=False).returncode != 0:
+        pytest.skip("needs root, to mount a small disk")
+    try:
+        good = board.install(site)
+        big = site_of(tmp_path / "big", "2.0")
+        (big / "ballast").write_bytes(bytes(30_000_000))
+        with pytest.raises(InstallError, match=r"MB free, a release needs 92 MB; make room there"):
+            board.install(big)
+        monkeypatch.setattr(release, "_check_room", _enough)  # as if somebody else filled it meanwhile
+        (disk / "filler").write_bytes(bytes(40_000_000))
+        with pytest.raises(InstallError, match="No space left on device"):
+            board.install(big)
+        assert (board.root / "opt/phalanx/current").readlink().name == good.release
+        assert [p.name for p in (disk / "phalanx/releases").iterdir()] == [good.release]
+    finally:
+        subprocess.run(["umount", str(disk)], check=True)
+
+
+def _enough(_releases: Path, _source: Source) -> None:
+    """There is room."""
