@@ -95,7 +95,9 @@ def who_reads(name: str, settings: OutputSettings) -> str | None:
         case "ros2":
             leaves = not loopback(settings.ros2.router)
         case "lsl":
-            leaves = settings.lsl.scope == "network"
+            if settings.lsl.scope == "machine":
+                return "found on this machine alone; but liblsl listens on every network, TCP 16572 and up: firewall"
+            leaves = True
         case _:
             if is_loopback(settings.web.host):
                 return None
