@@ -40,11 +40,13 @@ from master.options import (
     Calibration,
     KeyFile,
     Rigs,
+    Site,
     address,
 )
 from master.outputs.files import path_of_hand
 from master.recording.command import info, play, record
 from master.rig import load_setups, setups_with_hands
+from master.router_command import relay, router
 from master.send.command import send
 from master.solve import rigs_to_solve, solve_hands
 from master.stopping import stop_on_signals
@@ -187,6 +189,7 @@ def view(
     calibration: Calibration = CALIB_JSON,
     hand: Hand = None,
     bus: BusEnd = HERE_BUS,
+    site: Site = None,
     web: Annotated[
         bool, typer.Option(help="Serve the viewer to a browser on 127.0.0.1 instead of a window.")
     ] = False,
@@ -204,12 +207,14 @@ def view(
       phalanx-master view --rig desk --rig wrist
 
       phalanx-master view --rig desk --keys DIR --bus tls/192.168.1.2:47802 --web
+
+      phalanx-master view --rig desk --keys DIR --bus tls/192.168.2.1:47810 --site room-a
     """
     from master.outputs.rerun import run_viewer
 
     setups = load_setups(calibration, rig, hand)
     stop = stop_on_signals()
-    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"))
+    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"), site)
     if connection is None:
         return
     try:
@@ -337,7 +342,7 @@ def main() -> None:
     app.command()(export)
     app.command()(fleet)
     app.command()(hear)
-    for command in (record, play, info):
+    for command in (record, play, info, router, relay):
         app.command()(command)
     app.command()(send)
     try:

@@ -12,13 +12,13 @@ from common.zenoh_bus import ZenohBus
 _TRY_AGAIN_S = 0.3
 
 
-def join_bus(endpoint: str) -> ZenohBus:
-    """The bus as the master at `endpoint` sees it.
+def join_bus(endpoint: str, site: str | None = None) -> ZenohBus:
+    """The bus as the master at `endpoint` sees it; or, of a router there, what is told of `site`.
 
     Raises:
         BusError: Nobody listens there, or refuses this program's certificate; the endpoint is malformed.
     """
-    return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True)
+    return ZenohBus(None, endpoint, access_of(os.environ, OPERATOR), beyond=True, namespace=site)
 
 
 def carry_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
@@ -35,9 +35,11 @@ def carry_bus(endpoint: str, devices: Iterable[str] = ()) -> ZenohBus:
 
 
 def bus_of_master(
-    endpoint: str, stop: threading.Event, waiting: Callable[[BusError], None]
+    endpoint: str, stop: threading.Event, waiting: Callable[[BusError], None], site: str | None = None
 ) -> ZenohBus | None:
-    """The bus, once a master listens at `endpoint`; None when stopped before. `waiting` is told once why not yet.
+    """The bus, once a master, or a router for `site`, listens at `endpoint`; None when stopped before.
+
+    `waiting` is told once why not yet.
 
     Raises:
         BusError: The endpoint is malformed, or keys are missing.
@@ -45,7 +47,7 @@ def bus_of_master(
     said = False
     while not stop.is_set():
         try:
-            return join_bus(endpoint)
+            return join_bus(endpoint, site)
         except BusError as error:
             if error.__cause__ is None:  # refused by us, not by the network: endpoint or keys
                 raise

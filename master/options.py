@@ -1,6 +1,7 @@
 """Options that several commands of the master share, and what the texts behind them mean."""
 
 import os
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -52,6 +53,26 @@ ResultTree = Annotated[
 JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the numbers to this file.")]
 Bind = Annotated[str, typer.Option(help="Own ADDRESS:PORT for the data datagrams.")]
 
+
+def site_name(text: str | None) -> str | None:
+    """What `--site` says: a name that can stand in a key of the bus.
+
+    Raises:
+        PhalanxError: It is none.
+    """
+    if text is not None and not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,62}", text):
+        raise PhalanxError(f"--site {text!r}: letters, digits, '_', '.' and '-', at most 63")
+    return text
+
+
+Site = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="Of which site, where --bus is a router of several (docs/scale.md).",
+        callback=site_name,
+    ),
+]
 CALIB_JSON = Path("calib_json")
 HERE_BEACON, HERE_BIND = "127.255.255.255:47800", "127.0.0.1:47801"
 

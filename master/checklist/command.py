@@ -10,13 +10,14 @@ from common.errors import BusError
 from common.messages import CheckItem, Checklist
 from common.streams import MASTER
 from master.master_bus import join_bus
-from master.options import HERE_BUS, BusEnd
+from master.options import HERE_BUS, BusEnd, Site
 
 ANSWER_S = 3.0  # a master tells once a second
 
 
 def check(
     bus: BusEnd = HERE_BUS,
+    site: Site = None,
     watch: Annotated[
         bool, typer.Option("--watch", help="Go on until Ctrl-C, and print the list whenever it changes.")
     ] = False,
@@ -34,7 +35,7 @@ def check(
       phalanx-master check --keys DIR --bus tls/192.168.1.2:47802 && echo ready
     """
     items: tuple[CheckItem, ...] = ()
-    connection = join_bus(bus)
+    connection = join_bus(bus, site)
     try:
         lists = connection.subscribe("checklist", MASTER)
         items = newest(lists, bus)

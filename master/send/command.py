@@ -7,7 +7,7 @@ import typer
 from common.errors import BusError
 from common.zenoh_bus import ZenohBus
 from master.master_bus import bus_of_master
-from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration
+from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, Site
 from master.send.sender import NAME, run_sender, settings_of
 from master.stopping import stop_on_signals
 
@@ -20,6 +20,7 @@ def send(
     ] = None,
     calibration: Calibration = CALIB_JSON,
     bus: BusEnd = HERE_BUS,
+    site: Site = None,
 ) -> None:
     """Send hands, objects, contact and gestures to other programs: OSC, VMC, ROS 2, LSL, WebSocket.
 
@@ -37,7 +38,7 @@ def send(
     settings = settings_of(path)
     names = [] if only is None else [name.strip() for name in only.split(",") if name.strip()]
     stop = stop_on_signals()
-    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"))
+    connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"), site)
     if connection is None:
         return
     try:
