@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from slave.cameras import real
-from slave.doctor import command as doctor
+from slave.doctor import options as doctor
 from slave.imu import opening
 from slave.install import command as install
 from slave.lights.opening import CHOICES, SWITCHED
