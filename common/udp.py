@@ -51,8 +51,15 @@ class UdpSocket:
 
         One that is too long comes cut to one byte more than allowed, so that it is seen to be.
         """
+        return self._receive(0)
+
+    def receive_waiting(self) -> tuple[bytes, Address] | None:
+        """As `receive`, of what has come already: None at once where nothing has."""
+        return self._receive(socket.MSG_DONTWAIT)
+
+    def _receive(self, flags: int) -> tuple[bytes, Address] | None:
         try:
-            return self._socket.recvfrom(MAX_DATAGRAM + 1)
+            return self._socket.recvfrom(MAX_DATAGRAM + 1, flags)
         except (BlockingIOError, InterruptedError):
             return None
         except OSError as error:
