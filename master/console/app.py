@@ -26,6 +26,7 @@ from master.listening import is_loopback, page_certificate, private_folder
 
 TITLE = "Phalanx"
 _AWAY_S = 30.0  # a page that was not heard for so long, as on a busy machine, goes on where it was
+_MOST_CONNECTIONS = 256  # a page has about ten; whoever opens more finds a 503, and takes no more of us
 _LEAVE_S = 2  # pages that are open do not keep the console from ending
 
 
@@ -174,6 +175,7 @@ def _server(app: FastAPI, door: Door) -> uvicorn.Server:
         timeout_graceful_shutdown=_LEAVE_S,
         access_log=False,
         lifespan="on",
+        limit_concurrency=_MOST_CONNECTIONS,
         proxy_headers=False,  # who asks is who is connected, whatever a header says
     )
     config.load()
