@@ -24,7 +24,7 @@ NEEDS_SYSTEMD = pytest.mark.skipif(
 # What the unit mentions, so that nothing of this machine's own systemd takes part.
 TARGETS = ("sysinit", "basic", "shutdown", "multi-user", "network")
 PROGRAMS = ("opt/phalanx/current/bin/phalanx-slave", "bin/sh")
-PIP_S = 60.0
+PIP_S = 180.0
 PLATFORMS = ("manylinux_2_28_aarch64", "manylinux_2_17_aarch64", "manylinux2014_aarch64")
 
 
