@@ -14,6 +14,7 @@ from deploy.replay import ReplayError, ReplaySettings, run_replay
 from deploy.sensors import DemoError, best_rigs
 from deploy.summary import summary_lines
 from deploy.targets import DeployError, Target, targets_of
+from deploy.wheelhouse import Kind, export
 
 _EXAMPLES = {
     "demo": """examples:
@@ -102,6 +103,13 @@ def _told(results: dict[str, str | None]) -> int:
     for host, why in failed.items():
         print(f"{host}: FAILED: {why}", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _wheels(options: argparse.Namespace) -> int:
+    kind = Kind(options.machine, options.python, tuple(options.more), ("wrist",))
+    made = export(kind, options.folder, _say)
+    _say(f"{options.folder}: {len(made.files)} wheels, {made.size_mb:.0f} MB, release {made.release}")
+    return 0
 
 
 def _fleet(options: argparse.Namespace) -> int:
@@ -240,7 +248,21 @@ def _calibration() -> Path:
     return here if here.is_dir() else Path(__file__).resolve().parent.parent / "calib_json"
 
 
-_COMMANDS = {"demo": _demo, "replay": _replay, "deploy": _deploy, "uninstall": _uninstall, "fleet": _fleet}
+_COMMANDS = {
+    "demo": _demo,
+    "replay": _replay,
+    "deploy": _deploy,
+    "uninstall": _uninstall,
+    "fleet": _fleet,
+    "wheels": _wheels,
+}
+    "demo": _demo,
+    "replay": _replay,
+    "deploy": _deploy,
+    "uninstall": _uninstall,
+    "fleet": _fleet,
+    "wheels": _wheels,
+}
 
 
 if __name__ == "__main__":

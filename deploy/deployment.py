@@ -37,10 +37,12 @@ class Ears:
 
     Attributes:
         options: Of `phalanx-master hear`.
+        keys: Keys folder.
         seconds: How long they are waited for.
     """
 
     options: tuple[str, ...]
+    keys: Path
     seconds: float = _HEAR_S
 
 
@@ -139,10 +141,12 @@ def heard_of(names: Sequence[str], ears: Ears) -> tuple[dict[str, float], str | 
     Returns:
         Name -> datagrams a second, of those that were heard; and why nobody could listen, if that is so.
     """
-    words = [sys.executable, "-m", "master", "hear", "--json", "--seconds", str(ears.seconds), *ears.options]
+    words = [sys.executable, "-m", "master.hear", "--json", "--seconds", str(ears.seconds), *ears.options]
     words += [word for name in names for word in ("--name", name)]
     lines: list[str] = []
-    code, errors = run_bounded(words, b"", lines.append, ears.seconds + 30.0)
+    code, errors = run_bounded(
+        words, b"", lines.append, ears.seconds + 60.0, {"PHALANX_KEYS": str(ears.keys)}
+    )
     results = [line for line in lines if line.startswith('{"heard"')]
     if not results:
         said = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]

@@ -1,6 +1,7 @@
 """The table of a fleet, from what `phalanx-master fleet` reads on the bus."""
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -22,7 +23,7 @@ def fleet_once(keys: Path, bus: str | None) -> list[dict[str, object]]:
         DeployError: No master answers.
     """
     lines: list[str] = []
-    code, errors = run_bounded(_words(keys, bus, False), b"", lines.append, _ONCE_S)
+    code, errors = run_bounded(_words(bus, False), b"", lines.append, _ONCE_S, _keys(keys))
     if code != 0 or not lines:
         raise DeployError(([*lines, *errors] or ["phalanx-master fleet says nothing"])[-1])
     return _devices(lines[-1])
@@ -30,7 +31,9 @@ def fleet_once(keys: Path, bus: str | None) -> list[dict[str, object]]:
 
 def watch_fleet(keys: Path, bus: str | None, show: Callable[[str], None]) -> int:
     """Show the table each second, until Ctrl-C or the master ends; the exit code."""
-    with subprocess.Popen(_words(keys, bus, True), stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        _words(bus, True), stdout=subprocess.PIPE, text=True, env={**os.environ, **_keys(keys)}
+    ) as child:
         assert child.stdout is not None
         try:
             for line in child.stdout:
@@ -68,11 +71,14 @@ def _number(value: object, form: str) -> str:
     return "-" if value is None else form.format(value)
 
 
-def _words(keys: Path, bus: str | None, watch: bool) -> list[str]:
-    words = [sys.executable, "-m", "master", "fleet"]
-    words += ["--keys", str(keys)] if keys.is_dir() else []
+def _words(bus: str | None, watch: bool) -> list[str]:
+    words = [sys.executable, "-m", "master.fleet"]
     words += ["--bus", bus] if bus is not None else []
     return words + (["--watch"] if watch else [])
+
+
+def _keys(folder: Path) -> dict[str, str]:
+    return {"PHALANX_KEYS": str(folder)} if folder.is_dir() else {}
 
 
 def _devices(line: str) -> list[dict[str, object]]:

@@ -34,6 +34,11 @@ UNINSTALL_EXAMPLES = """examples:
         services, programs, keys and calibration are gone; what apt brought stays
   phalanx uninstall pi-left.local --dry-run
 """
+WHEELS_EXAMPLES = """examples:
+  phalanx wheels wheels                   for Raspberry Pi OS Trixie; then phalanx-slave install --wheelhouse wheels
+  phalanx wheels wheels --python 3.11 --with simplejpeg           for Bookworm, whose own was built for numpy 1
+  phalanx deploy HOST --master HOST --wheelhouse wheels           on a PC that has no network then
+"""
 FLEET_EXAMPLES = """examples:
   phalanx fleet                           once, as a table
   phalanx fleet --watch                   again each second
@@ -115,7 +120,33 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
     _keys(fleet, "keys folder")
     fleet.add_argument("--bus", metavar="ENDPOINT", help="of the master (default: of this machine)")
     fleet.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
+    _add_wheels(add_parser)
     fleet.add_argument("--json", action="store_true", help="as JSON")
+
+
+def _add_wheels(add_parser: AddParser) -> None:
+    wheels = _command(
+        add_parser,
+        "wheels",
+        "all that a slave needs, as files, for machines without a network",
+        "Downloads for another machine what a slave needs, and adds Phalanx itself.",
+        WHEELS_EXAMPLES,
+    )
+    wheels.add_argument("folder", type=Path, metavar="DIR", help="new or empty")
+    wheels.add_argument(
+        "--machine", choices=("aarch64", "x86_64"), default="aarch64", help="default: %(default)s"
+    )
+    wheels.add_argument(
+        "--python", default="3.13", metavar="VERSION", help="of that machine (default: %(default)s)"
+    )
+    wheels.add_argument(
+        "--with",
+        dest="more",
+        action="append",
+        default=[],
+        metavar="REQUIREMENT",
+        help="one more; once for each",
+    )
 
 
 def rig_of(options: argparse.Namespace) -> RigFile:
@@ -169,12 +200,12 @@ def ears_of(options: argparse.Namespace) -> Ears | None:
         return None
     address = _here(options.master)
     bus_host = "127.0.0.1" if address else options.master
-    words = ["--rig", options.rig, "--calibration", str(options.calibration), "--keys", str(options.keys)]
+    words = ["--rig", options.rig, "--calibration", str(options.calibration)]
     words += ["--bus", options.bus or f"tls/{bus_host}:{BUS_PORT}"]
     words += ["--bind", options.bind or f"{address or '0.0.0.0'}:{DATA_PORT}"]
     default = "127.255.255.255" if (address or "").startswith("127.") else _EVERYWHERE
     words += ["--beacon", options.beacon or f"{default}:{BEACON_PORT}"]
-    return Ears(tuple(words), options.hear_s)
+    return Ears(tuple(words), options.keys, options.hear_s)
 
 
 def reached_of(options: argparse.Namespace) -> Reached:

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
@@ -113,7 +113,11 @@ class Remote:
 
 
 def run_bounded(
-    words: Sequence[str], send: bytes, on_line: Callable[[str], None], limit_s: float
+    words: Sequence[str],
+    send: bytes,
+    on_line: Callable[[str], None],
+    limit_s: float,
+    environment: Mapping[str, str] | None = None,
 ) -> tuple[int | None, list[str]]:
     """Run a command of this machine; its exit code and the lines of its errors. None: it was ended, the time was over.
 
@@ -126,6 +130,7 @@ def run_bounded(
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
+            env=None if environment is None else {**os.environ, **environment},
             start_new_session=True,  # so that what it starts ends with it
         )
     except FileNotFoundError as error:

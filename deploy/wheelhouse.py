@@ -87,11 +87,27 @@ def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wh
             raise DeployError(f"--wheelhouse {given}: no wheels in it")
         if not any(file.name.startswith("phalanx_hand-") for file in files):
             files.append(own_wheel())
+        files.sort(key=lambda file: file.name)  # as the installer there names it, too
         digest = hashlib.sha256()
         for file in files:
             digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
         versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
         return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
+
+
+def export(kind: Kind, folder: Path, say: Callable[[str], None]) -> Wheels:
+    """Put the wheels for machines of this kind into a folder, for a machine without a network.
+
+    Raises:
+        DeployError: A wheel cannot be had, or the folder has others already.
+    """
+    if folder.exists() and any(folder.iterdir()):
+        raise DeployError(f"{folder}: is not empty")
+    wheels = wheelhouse(kind, None, say)
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in wheels.files:
+        shutil.copy2(file, folder)
+    return wheels
 
 
 def own_wheel() -> Path:

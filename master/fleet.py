@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from common.bus import Bus
+from common.errors import PhalanxError
 from common.keys import keys_folder
 from common.messages import Health
 from common.streams import MASTER
@@ -139,6 +140,14 @@ def fleet(
         connection.close()
 
 
+def main() -> None:
+    """`python -m master.fleet`: the same, without loading what else the master's program can do."""
+    try:
+        typer.run(fleet)
+    except PhalanxError as error:
+        raise SystemExit(f"fleet: {error}") from error
+
+
 def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.Event) -> None:
     inbox = bus.subscribe("health", depth=256)
     told = time.monotonic() + period_s
@@ -151,3 +160,7 @@ def _listen(bus: Bus, roll: Roll, period_s: float, watch: bool, stop: threading.
             told += period_s
             if not watch:
                 return
+
+
+if __name__ == "__main__":
+    main()

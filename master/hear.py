@@ -9,7 +9,6 @@ import os
 import threading
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -77,7 +76,7 @@ def hear(
         finally:
             connection.close()
     else:
-        setup = load(_file(calibration, rig), RigCalibration)
+        setup = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
         heard = here(names, setup, rig_key(os.environ, key_file), address(beacon, "--beacon"),
                      address(bind, "--bind"), seconds, stop)  # fmt: skip
     if as_json:
@@ -183,5 +182,13 @@ def _running(endpoint: str) -> ZenohBus | None:
     return None
 
 
-def _file(calibration: Path, rig: str) -> Path:
-    return calibration / "rigs" / f"{rig}.json"
+def main() -> None:
+    """`python -m master.hear`: the same, without loading what else the master's program can do."""
+    try:
+        typer.run(hear)
+    except PhalanxError as error:
+        raise SystemExit(f"hear: {error}") from error
+
+
+if __name__ == "__main__":
+    main()

@@ -214,7 +214,7 @@ def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pyte
     said: list[str] = []
     hosts = _hosts(said)
     _hear_only(monkeypatch, {"right": 30.0})
-    failed = deployment._hear(hosts, Ears((), 3.0))
+    failed = deployment._hear(hosts, Ears((), Path("keys"), 3.0))
     assert failed == {
         "left": "no datagram of left in 3 s at the master; back at release 1.0-0",
         "right": None,
@@ -228,9 +228,14 @@ def test_what_was_not_changed_stays_and_so_does_all_if_nobody_can_listen(
 ) -> None:
     hosts = _hosts([])
     _hear_only(monkeypatch, {"left": 30.0})
-    assert deployment._hear(hosts, Ears((), 3.0))["right"] == "no datagram of right in 3 s at the master"
+    assert (
+        deployment._hear(hosts, Ears((), Path("keys"), 3.0))["right"]
+        == "no datagram of right in 3 s at the master"
+    )
     _hear_only(monkeypatch, {}, "cannot listen for it: port taken")
-    assert set(deployment._hear(hosts, Ears((), 3.0)).values()) == {"cannot listen for it: port taken"}
+    assert set(deployment._hear(hosts, Ears((), Path("keys"), 3.0)).values()) == {
+        "cannot listen for it: port taken"
+    }
     assert [host.back for host in hosts] == [0, 0]
 
 
