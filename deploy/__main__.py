@@ -256,13 +256,6 @@ _COMMANDS = {
     "fleet": _fleet,
     "wheels": _wheels,
 }
-    "demo": _demo,
-    "replay": _replay,
-    "deploy": _deploy,
-    "uninstall": _uninstall,
-    "fleet": _fleet,
-    "wheels": _wheels,
-}
 
 
 if __name__ == "__main__":
