@@ -1,37 +1,14 @@
 """The two hosts are started once for all tests of this folder; what is measured on them is kept in out/hosts.json."""
 
-import json
 from collections.abc import Iterator
-from datetime import UTC, datetime
-from pathlib import Path
 
 import pytest
 
 from tests.hosts.debian import why_not
 from tests.hosts.deployment import Deployment, first_deployment
 from tests.hosts.fleet import Fleet
+from tests.hosts.measured import Measured
 from tests.hosts.rig import ROOT, Rig
-
-
-class Measured:
-    """Numbers by name; each is written at once, so that a run that is cut short has told what it knew."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._numbers: dict[str, object] = {"date": datetime.now(UTC).isoformat(timespec="seconds")}
-        self.lines: list[str] = []
-
-    def __call__(self, name: str, value: float, unit: str = "s", limit: float | None = None) -> None:
-        """Keep a number; `limit` is what the test holds it to."""
-        self._numbers[name] = {"value": round(value, 3), "unit": unit} | (
-            {} if limit is None else {"limit": limit}
-        )
-        self._file.parent.mkdir(exist_ok=True)
-        self._file.write_text(json.dumps(self._numbers, indent=1) + "\n")
-        self.lines.append(
-            f"{name:<62} {value:8.2f} {unit:<3}" + ("" if limit is None else f"  (at most {limit:g})")
-        )
-
 
 MEASURED = pytest.StashKey[Measured]()
 

@@ -42,24 +42,41 @@ class Rig:
     def __init__(self, fleet: Fleet, folder: Path) -> None:
         """Write its calibration and keys; nothing is started."""
         self.fleet, self.folder = fleet, folder
+        self.source = copied_source(folder / "source")
         self.calibration = small_calibration(ROOT / "calib_json", folder / "calib_json")
         self.keys = folder / "keys"
         self.cache = folder / "cache"
         self.bus = f"tls/{fleet.address}:{BUS_PORT}"
         self.version = version("phalanx-hand")
         self._master: subprocess.Popen[str] | None = None
-        made = self.program("phalanx-master", "keys", "make", str(self.keys), *_each("--device", fleet.hosts))
+        made = self.program("master", "keys", "make", str(self.keys), *_each("--device", fleet.hosts))
         assert made.code == 0, f"no keys: {made}"
 
     def start_master(self) -> None:
         """Start the master; it waits for its cameras."""
         bind = f"{self.fleet.address}:{MASTER_PORT}"
         beacon = f"{self.fleet.broadcast}:{BEACON_PORT}"
-        command = [*_python("phalanx-master"), "run", "--rig", "desk", "--calibration", str(self.calibration)]
+        command = [
+            sys.executable,
+            "-m",
+            "master",
+            "run",
+            "--rig",
+            "desk",
+            "--calibration",
+            str(self.calibration),
+        ]
         where = ["--keys", str(self.keys), "--beacon", beacon, "--bind", bind, "--bus", self.bus]
         files = ["--summary", str(self.folder / "summary.json")]
         log = (self.folder / "master.log").open("a")
-        self._master = subprocess.Popen([*command, *where, *files], text=True, stdout=log, stderr=log)
+        self._master = subprocess.Popen(
+            [*command, *where, *files],
+            text=True,
+            stdout=log,
+            stderr=log,
+            cwd=self.source,
+            env=self._environment(),
+        )
         self.fleet.undo.later("kill process", str(self._master.pid))
 
     def stop_master(self) -> dict[str, object]:
@@ -88,26 +105,42 @@ class Rig:
         what = ["--keys", str(self.keys), "--bus", self.bus, "--camera", "synthetic", "--no-apt"]
         what += ["--beacon", f"{self.fleet.broadcast}:{BEACON_PORT}", *self.fleet.ssh_options]
         hosts = self.targets if targets is None else targets
-        return self.program("phalanx", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
+        return self.program("deploy", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
 
     def uninstall(self) -> Ran:
         """Run `phalanx uninstall` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]
-        return self.program("phalanx", "uninstall", *hosts, *self.fleet.ssh_options)
+        return self.program("deploy", "uninstall", *hosts, *self.fleet.ssh_options)
 
-    def program(self, name: str, *arguments: str, timeout_s: float = 180.0) -> Ran:
-        """Run one of the project's programs on this machine as a user would, and wait for its end.
+    def program(self, package: str, *arguments: str, timeout_s: float = 180.0) -> Ran:
+        """Run `phalanx` (package deploy) or `phalanx-master` (master) as a user would, and wait for its end.
 
         Raises:
             subprocess.TimeoutExpired: It was still running after `timeout_s`, so it has no deadline of its own.
         """
-        environment = os.environ | {"XDG_CACHE_HOME": str(self.cache)}
         begin = time.monotonic()
         ran = subprocess.run(
-            [*_python(name), *arguments],
-            capture_output=True, text=True, timeout=timeout_s, check=False, env=environment, stdin=subprocess.DEVNULL,
-        )  # fmt: skip
+            [sys.executable, "-m", package, *arguments],
+            capture_output=True,
+            text=True,
+            timeout=timeout_s,
+            check=False,
+            cwd=self.source,
+            env=self._environment(),
+            stdin=subprocess.DEVNULL,
+        )
         return Ran(ran.returncode, ran.stdout, ran.stderr, begin, time.monotonic() - begin)
+
+    def _environment(self) -> dict[str, str]:
+        return os.environ | {"XDG_CACHE_HOME": str(self.cache), "PYTHONPATH": str(self.source)}
+
+
+def copied_source(folder: Path) -> Path:
+    """The project's programs as they are now: whoever works on them meanwhile makes no other release of them."""
+    for package in ("common", "deploy", "master", "slave"):
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "constraints.txt", folder)
+    return folder
 
 
 def small_calibration(source: Path, folder: Path) -> Path:
@@ -127,20 +160,20 @@ def small_calibration(source: Path, folder: Path) -> Path:
     return folder
 
 
-def changed_wheels(wheels: Path, folder: Path, new: str, replaced: dict[str, str]) -> Path:
-    """A copy of a folder of wheels whose own wheel is another version, with other text in some of its files.
+def changed_wheels(cache: Path, folder: Path, new: str, replaced: dict[str, str]) -> Path:
+    """A folder with the wheels that were gathered, ours as another version and with other text in some of its files.
 
     Args:
-        wheels: What `phalanx deploy` gathered.
+        cache: Where `phalanx deploy` gathers them.
         folder: To be made.
-        new: Version of the wheel in it.
+        new: Version of our wheel in it.
         replaced: File of the wheel -> its whole new text.
     """
     folder.mkdir()
-    for wheel in wheels.glob("*.whl"):
-        if not wheel.name.startswith("phalanx_hand-"):
-            (folder / wheel.name).hardlink_to(wheel)
-    (ours,) = wheels.glob("phalanx_hand-*.whl")
+    gathered = list(cache.rglob("*.whl"))
+    (ours,) = (wheel for wheel in gathered if wheel.name.startswith("phalanx_hand-"))
+    for wheel in set(gathered) - {ours}:
+        (folder / wheel.name).hardlink_to(wheel)
     old = ours.name.split("-")[1]
     with (
         zipfile.ZipFile(ours) as read,
@@ -156,10 +189,6 @@ def changed_wheels(wheels: Path, folder: Path, new: str, replaced: dict[str, str
                 write.writestr(name.replace(f"-{old}.dist-info", f"-{new}.dist-info"), text)
         write.writestr(f"phalanx_hand-{new}.dist-info/RECORD", "")
     return folder
-
-
-def _python(name: str) -> list[str]:
-    return [sys.executable, str(Path(sys.executable).with_name(name))]
 
 
 def _each(option: str, values: object) -> list[str]:

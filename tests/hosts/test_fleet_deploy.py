@@ -2,14 +2,14 @@
 
 import time
 
-from tests.hosts.conftest import Measured
 from tests.hosts.deployment import FIRST_S, Deployment, streams
+from tests.hosts.measured import Measured, strain
 from tests.hosts.rig import RATE_HZ, Rig
 
 
 def test_a_dry_run_says_what_it_would_do_and_writes_nothing(deployed: Deployment) -> None:
     assert deployed.dry.code == 0, str(deployed.dry)
-    assert "phalanx-slave@left" in deployed.dry.out, str(deployed.dry)
+    assert "phalanx-slave@left.service" in deployed.dry.out, str(deployed.dry)
     assert deployed.dry_changed == {"left": [], "right": []}
 
 
@@ -17,8 +17,8 @@ def test_two_clean_hosts_send_after_one_command(deployed: Deployment, rig: Rig, 
     assert deployed.ran.code == 0, str(deployed.ran)
     measured("deploy to two clean hosts, nothing loaded before", deployed.ran.seconds)
     slowest = max(deployed.first_s.values())
-    measured("  ... to the first datagrams of both", slowest, limit=FIRST_S)
-    assert slowest <= FIRST_S, str(deployed.ran)
+    within = measured.at_most(FIRST_S, "  ... to the first datagrams of both", slowest)
+    assert within, str(deployed.ran)
     streams(rig)
 
 
@@ -26,7 +26,7 @@ def test_both_send_as_fast_as_their_cameras_see(deployed: Deployment, rig: Rig, 
     for name, host in rig.fleet.hosts.items():
         rate = rig.fleet.tap.rate_hz(host.address, 2.0)
         measured(f"datagrams of {name}", rate, "Hz")
-        assert rate > 0.5 * RATE_HZ
+        assert rate > 0.8 * RATE_HZ / strain()
 
 
 def test_the_same_command_again_changes_nothing(deployed: Deployment, rig: Rig, measured: Measured) -> None:
@@ -45,7 +45,7 @@ def test_the_same_command_again_changes_nothing(deployed: Deployment, rig: Rig, 
 
 
 def test_the_fleet_is_told_by_name_and_version(deployed: Deployment, rig: Rig) -> None:
-    told = rig.program("phalanx", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
+    told = rig.program("deploy", "fleet", "--bus", rig.bus, "--keys", str(rig.keys), timeout_s=20.0)
     assert told.code == 0, str(told)
     for name in rig.fleet.hosts:
         line = next((line for line in told.out.splitlines() if name in line), None)

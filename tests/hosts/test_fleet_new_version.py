@@ -3,11 +3,9 @@
 import time
 from pathlib import Path
 
-import pytest
-
-from tests.hosts.conftest import Measured
 from tests.hosts.deployment import Deployment, differences, streams
 from tests.hosts.host import Host
+from tests.hosts.measured import Measured
 from tests.hosts.rig import Ran, Rig, changed_wheels
 
 CANNOT_START = """import sys
@@ -17,6 +15,7 @@ def main(arguments=None):
     print("phalanx-slave: planted: this version cannot start", file=sys.stderr)
     return 1
 """
+DOES_NOT_LOAD = "import planted_and_missing\n"
 SAYS_NOTHING = """import os
 import socket
 import time
@@ -33,11 +32,7 @@ def main(arguments=None):
 DEADLINE_S = 60.0
 
 
-@pytest.fixture(scope="module")
-def wheels(deployed: Deployment, rig: Rig) -> Path:
-    """What the first deployment gathered."""
-    (ours,) = rig.cache.glob("phalanx/*/phalanx_hand-*.whl")
-    return ours.parent
+NOTES = "opt/phalanx/before"  # what can be taken back; it has been
 
 
 def release(host: Host) -> str:
@@ -56,28 +51,43 @@ def refused(rig: Rig, name: str, wheelhouse: Path, measured: Measured) -> Ran:
     ran = rig.deploy("--wheelhouse", str(wheelhouse), targets=(f"{name}={host.login}",))
     assert ran.code == 1, str(ran)
     assert release(host) == before, str(ran)
-    assert differences(files, host.files()) == [], str(ran)
+    changed = [line for line in differences(files, host.files()) if not line.startswith(NOTES)]
+    assert changed == [], "\n".join(changed)
     streams(rig, name)
     measured(f"... refused after, of {wheelhouse.name}", ran.seconds)
     measured(f"... longest gap, of {wheelhouse.name}", tap.longest_gap_s(host.address, begin))
     return ran
 
 
-def test_a_version_that_cannot_start_is_taken_back(wheels: Path, rig: Rig, measured: Measured) -> None:
-    bad = changed_wheels(wheels, rig.folder / "cannot start", "90.0", {"slave/__main__.py": CANNOT_START})
+def test_a_version_that_does_not_load_interrupts_nothing(
+    deployed: Deployment, rig: Rig, measured: Measured
+) -> None:
+    host, pid = rig.fleet.hosts["left"], rig.fleet.hosts["left"].main_pid()
+    bad = changed_wheels(rig.cache, rig.folder / "does not load", "89.0", {"slave/live.py": DOES_NOT_LOAD})
+    ran = refused(rig, "left", bad, measured)
+    assert "planted_and_missing" in last_line(ran), str(ran)
+    assert host.main_pid() == pid
+
+
+def test_a_version_that_cannot_start_is_taken_back(
+    deployed: Deployment, rig: Rig, measured: Measured
+) -> None:
+    bad = changed_wheels(rig.cache, rig.folder / "cannot start", "90.0", {"slave/__main__.py": CANNOT_START})
     ran = refused(rig, "left", bad, measured)
     assert "planted: this version cannot start" in last_line(ran), str(ran)
 
 
-def test_a_version_that_sends_nothing_is_taken_back(wheels: Path, rig: Rig, measured: Measured) -> None:
-    bad = changed_wheels(wheels, rig.folder / "sends nothing", "91.0", {"slave/__main__.py": SAYS_NOTHING})
+def test_a_version_that_sends_nothing_is_taken_back(
+    deployed: Deployment, rig: Rig, measured: Measured
+) -> None:
+    bad = changed_wheels(rig.cache, rig.folder / "sends nothing", "91.0", {"slave/__main__.py": SAYS_NOTHING})
     ran = refused(rig, "right", bad, measured)
     assert "no datagram of right" in last_line(ran), str(ran)
 
 
-def test_a_full_disk_is_told_and_nothing_stops(wheels: Path, rig: Rig, measured: Measured) -> None:
+def test_a_full_disk_is_told_and_nothing_stops(deployed: Deployment, rig: Rig, measured: Measured) -> None:
     host, tap = rig.fleet.hosts["left"], rig.fleet.tap
-    good = changed_wheels(wheels, rig.folder / "disk full", "92.0", {})
+    good = changed_wheels(rig.cache, rig.folder / "disk full", "92.0", {})
     streams(rig, "left")
     before, begin, pid = release(host), time.monotonic(), host.main_pid()
     host.run("fallocate -l $(($(df --output=avail -B1 / | tail -1) - 20000000)) /var/filler")
@@ -89,21 +99,20 @@ def test_a_full_disk_is_told_and_nothing_stops(wheels: Path, rig: Rig, measured:
     assert "No space left on device" in last_line(ran) or "MB free" in last_line(ran), str(ran)
     assert (release(host), host.main_pid()) == (before, pid)
     gap = tap.longest_gap_s(host.address, begin)
-    measured("longest gap while the disk is full and a version refused", gap)
-    assert gap < 1.0
+    assert measured.at_most(1.0, "longest gap while the disk is full and a version refused", gap)
 
 
 def test_a_host_that_is_off_does_not_keep_the_other_from_a_new_version(
-    wheels: Path, rig: Rig, measured: Measured
+    deployed: Deployment, rig: Rig, measured: Measured
 ) -> None:
     left, right = rig.fleet.hosts["left"], rig.fleet.hosts["right"]
-    good = changed_wheels(wheels, rig.folder / "good", "93.0", {})
+    good = changed_wheels(rig.cache, rig.folder / "good", "93.0", {})
     left.cut_power()
     try:
         ran = rig.deploy("--wheelhouse", str(good), "--deadline", str(DEADLINE_S))
     finally:
         left.boot()
-    measured("a deployment, one of two hosts off", ran.seconds, limit=DEADLINE_S)
+    measured("a deployment, one of two hosts off", ran.seconds)
     assert ran.code == 1, str(ran)
     assert ran.seconds <= DEADLINE_S
     assert left.address in last_line(ran), str(ran)
@@ -113,7 +122,7 @@ def test_a_host_that_is_off_does_not_keep_the_other_from_a_new_version(
     streams(rig)
 
 
-def test_a_good_version_comes_and_goes_back(wheels: Path, rig: Rig, measured: Measured) -> None:
+def test_a_good_version_comes_and_goes_back(deployed: Deployment, rig: Rig, measured: Measured) -> None:
     before = {name: release(rig.fleet.hosts["left"]) for name in rig.fleet.hosts}
     begin = time.monotonic()
     ran = rig.deploy("--wheelhouse", str(rig.folder / "good"))
@@ -122,7 +131,7 @@ def test_a_good_version_comes_and_goes_back(wheels: Path, rig: Rig, measured: Me
     measured("longest gap of a good new version", gap)
     assert all(release(host).startswith("releases/93.0-") for host in rig.fleet.hosts.values())
     streams(rig)
-    back = rig.deploy("--wheelhouse", str(wheels))  # its release is still there
+    back = rig.deploy()  # its release is still there
     assert back.code == 0, str(back)
     measured("going back to the version before", back.seconds)
     assert {name: release(host) for name, host in rig.fleet.hosts.items()} == before, str(back)

@@ -1,11 +1,12 @@
 """Removing leaves nothing; and the hosts begin again, with wheels that are here already."""
 
-from tests.hosts.conftest import Measured
 from tests.hosts.deployment import FIRST_S, Deployment, differences, first_data
+from tests.hosts.measured import Measured
 from tests.hosts.rig import Rig
 
 # What systemd makes for any service with DynamicUser= and a state or cache folder, and keeps.
-OF_SYSTEMD = ("var/cache/private", "var/lib/private", "var/log/private")
+OF_SYSTEMD = ("var/cache/private:", "var/lib/private:", "var/log/private:")
+BACKUPS = ("etc/group-:", "etc/gshadow-:")  # of groupdel
 
 
 def test_uninstall_leaves_nothing_behind(deployed: Deployment, rig: Rig, measured: Measured) -> None:
@@ -28,8 +29,10 @@ def test_with_wheels_that_are_here_it_goes_faster(deployed: Deployment, rig: Rig
     ran = rig.deploy()
     assert ran.code == 0, str(ran)
     slowest = max(first_data(rig, ran.began).values())
-    measured("deploy to two clean hosts, wheels here, to both first datagrams", slowest, limit=FIRST_S)
-    assert slowest <= FIRST_S, str(ran)
+    within = measured.at_most(
+        FIRST_S, "deploy to two clean hosts, wheels here, to both first datagrams", slowest
+    )
+    assert within, str(ran)
 
 
 def test_the_master_lost_little_meanwhile(deployed: Deployment, rig: Rig) -> None:
@@ -37,4 +40,4 @@ def test_the_master_lost_little_meanwhile(deployed: Deployment, rig: Rig) -> Non
     counts = summary["counts"]
     assert isinstance(counts, dict)
     assert counts["poses"] > 0
-    assert {name: count for name, count in counts.items() if "refused" in name} == {}
+    assert {name: count for name, count in counts.items() if "refused" in name and count > 0} == {}
