@@ -57,7 +57,7 @@ def why_refused(endpoint: str, identity: Identity) -> str:
             " another rig?"
         )
     except OSError as error:
-        return f"nobody listens there ({error.strerror or error})"
+        return f"nobody listens there ({error.strerror or error}). Is the master running?"
     return ""
 
 

@@ -103,11 +103,11 @@ class ZenohBus:
         try:
             self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(made)))
         except zenoh.ZError as error:
-            reason = self._refusal()
-            hint = "Is the master running?" if beyond else "Is the address taken or mistyped?"
-            raise BusError(
-                f"cannot open the bus ({self._where or 'no endpoint'}): {reason or _plain(error)}. {hint}"
-            ) from error
+            why = self._refusal() or (
+                f"{_plain(error)}. "
+                + ("Is the master running?" if beyond else "Is the address taken or mistyped?")
+            )
+            raise BusError(f"cannot open the bus ({self._where or 'no endpoint'}): {why}") from error
         self._inboxes: list[Inbox] = []
         self._undeclare: list[Callable[[], None]] = []
         self._threads: list[threading.Thread] = []

@@ -194,7 +194,7 @@ def rows(
     settings = demo.DemoSettings(
         1.0, True, out, calibration, (rigs,) if isinstance(rigs, str) else rigs, 7, scene
     )
-    return {name: command for name, command, _ in demo._table(settings, 10**12)}
+    return {name: command for name, command, _ in demo._table(settings, out / "keys", 10**12)}
 
 
 def test_the_demo_starts_a_slave_for_the_imu_of_a_rig_that_has_one(tmp_path: Path) -> None:
@@ -221,13 +221,13 @@ def test_others_read_along_at_the_bus_that_the_user_names(tmp_path: Path) -> Non
     settings = demo.DemoSettings(
         1.0, True, tmp_path, ROOT / "calib_json", ("desk",), 7, bus="tcp/127.0.0.1:47999"
     )
-    (master,) = (command for name, command, _ in demo._table(settings, 10**12) if name == "master")
+    (master,) = (command for name, command, _ in demo._table(settings, tmp_path / "keys", 10**12) if name == "master")
     assert master[master.index("--bus") + 1] == "tcp/127.0.0.1:47999"
 
 
 def test_the_console_takes_the_place_of_the_viewer(tmp_path: Path) -> None:
     settings = demo.DemoSettings(1.0, False, tmp_path, ROOT / "calib_json", ("desk",), 7, console=True)
-    table = {name: command for name, command, _ in demo._table(settings, 10**12)}
+    table = {name: command for name, command, _ in demo._table(settings, tmp_path / "keys", 10**12)}
     assert list(table) == ["left", "right", "master", "viewer"]
     viewer, master = table["viewer"], table["master"]
     assert viewer[1:4] == ["-m", "master", "console"]
