@@ -101,6 +101,8 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
         try:
             act(host)
         except DeployError as error:
+            if len(hosts) > 1:  # the others go on, which takes a while
+                host.say(f"failed: {error}")
             return str(error)
         return None
 

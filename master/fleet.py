@@ -64,6 +64,8 @@ class Roll:
         """Take a report."""
         if (last := self._last.get(health.source)) is not None and last.session == health.session:
             self._before[health.source] = last
+        else:  # it began anew
+            self._before.pop(health.source, None)
         self._last[health.source], self._at[health.source] = health, now_s
 
     def devices(self, now_s: float) -> list[Device]:

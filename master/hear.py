@@ -13,6 +13,7 @@ from typing import Annotated
 
 import typer
 
+from common.bus import Bus
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.datagram import Address
@@ -87,7 +88,7 @@ def hear(
         raise typer.Exit(1)
 
 
-def at_master(bus: ZenohBus, names: Sequence[str], seconds: float, stop: threading.Event) -> Heard:
+def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Event) -> Heard:
     """What the master that runs takes of them: name -> datagrams a second, of those whose count rises.
 
     Raises:

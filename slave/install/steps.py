@@ -31,6 +31,7 @@ from slave.install.wanted import (
 )
 
 LOCK = "run/phalanx-install.lock"
+_LOOKS, _LOOK_S = 300, 1.0
 _UNITS = "phalanx-slave@{}.service"
 
 
@@ -83,7 +84,7 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
     Raises:
         InstallError: It failed, and the machine is as before.
     """
-    with _alone(machine.root, dry_run):
+    with _alone(machine, dry_run):
         notes = Transaction(machine.root)
         if notes.is_open and not dry_run:
             machine.say("an installation before was cut off: taking it back")
@@ -120,7 +121,7 @@ def roll_back(machine: Machine, gone: bool = True) -> str:
     Raises:
         InstallError: There was none before, or what was before does not run either.
     """
-    with _alone(machine.root, False):
+    with _alone(machine, False):
         left = _current(machine.root)
         senders = _senders(machine.root)
         _take_back(machine, senders)
@@ -257,23 +258,33 @@ def _has_group(root: Path, group: str) -> bool:
         return False
 
 
+def _wait_for(lock: int, machine: Machine) -> None:
+    for look in range(_LOOKS):
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            if look == 0:
+                machine.say("another installation runs on this machine: waiting for its end")
+            machine.systemd.sleep(_LOOK_S)
+        else:
+            return
+    raise InstallError("another installation runs on this machine and has no end")
+
+
 @contextlib.contextmanager
-def _alone(root: Path, dry_run: bool) -> Generator[None]:
-    """One installation at a time.
+def _alone(machine: Machine, dry_run: bool) -> Generator[None]:
+    """One installation at a time: one whose PC went away goes on to its end, and is waited for.
 
     Raises:
-        InstallError: Another one runs.
+        InstallError: Another one has no end.
     """
     if dry_run:
         yield
         return
-    file = root / LOCK
+    file = machine.root / LOCK
     file.parent.mkdir(parents=True, exist_ok=True)
     with file.open("w") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InstallError("another installation runs on this machine; wait for its end") from error
+        _wait_for(lock.fileno(), machine)
         try:
             yield
         finally:

@@ -75,7 +75,7 @@ class Systemd:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         """Of this machine."""
-        self.run, self._now, self._sleep = run, now, sleep
+        self.run, self._now, self.sleep = run, now, sleep
 
     def state(self, unit: str) -> UnitState:
         """How it is now.
@@ -121,7 +121,7 @@ class Systemd:
                 raise NotReadyError(
                     f"{unit} is not ready after {deadline_s:.0f} s: {self._why(unit, self.state(unit))}"
                 )
-            self._sleep(_STEP_S)
+            self.sleep(_STEP_S)
 
     def _why(self, unit: str, state: UnitState) -> str:
         """Its last words, or how systemd ended it."""

@@ -1,5 +1,6 @@
 """Installing on a machine that is a folder: twice, with other content, with what does not run, and gone again."""
 
+import fcntl
 import os
 import subprocess
 from pathlib import Path
@@ -182,3 +183,14 @@ def test_a_full_disk_is_told_and_leaves_what_runs(
 
 def _enough(_releases: Path, _source: Source) -> None:
     """There is room."""
+
+
+def test_an_installation_waits_for_another_and_not_for_ever(board: Board, site: Path) -> None:
+    lock = board.root / steps.LOCK
+    lock.parent.mkdir()
+    with lock.open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with pytest.raises(InstallError, match="another installation runs on this machine and has no end"):
+            board.install(site)
+    assert board.said == ["another installation runs on this machine: waiting for its end"]
+    assert board.install(site).changed
