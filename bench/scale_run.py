@@ -21,7 +21,7 @@ import numpy as np
 from bench.local_rig import free_port, join_bus
 from bench.scale_rig import DESK, ROOM, desk, room
 from common.bus import Bus, Subscription
-from common.messages import Command, HandPose
+from common.messages import Command, HandPose, encode
 from common.streams import MASTER
 
 READY_S, SETTLE_S = 90.0, 3.0
@@ -46,6 +46,7 @@ class ScaleRun:
         latency_p50_ms, latency_p99_ms: From the sending of the last frame of a pose to its publication.
         cores: Processor time of all masters together, seconds a second.
         threads: The same by thread of a master: `solve`, `ingest`, `bus`, `others`.
+        pose_bytes: Of a pose on the bus, with what is told beside it.
         sender_late_p99_ms: By how much the simulated cameras were late themselves.
         load: Load average of the machine at the end.
     """
@@ -68,6 +69,7 @@ class ScaleRun:
     latency_p99_ms: float
     cores: float
     threads: dict[str, float]
+    pose_bytes: float
     sender_late_p99_ms: float
     load: float
 
@@ -81,11 +83,13 @@ class _Master:
     hands: Subscription
     group: list[str]
     latency_ms: list[float] = field(default_factory=list[float])
+    pose_bytes: int = 0
 
     def listen(self) -> None:
         """Take the poses that came."""
         while isinstance(pose := self.hands.get(0.0), HandPose):
             self.latency_ms.append(pose.latency_ns * 1e-6)
+            self.pose_bytes = self.pose_bytes or len(encode(pose))
 
     def counts(self) -> dict[str, int]:
         """What it counted since its start."""
@@ -155,6 +159,7 @@ def measure(folder: Path, layout: str, cameras: int, rate_hz: float, seconds: fl
         latency_p99_ms=float(np.median([one[1] for one in latencies])) if latencies else nan,
         cores=sum(threads.values()),
         threads=threads,
+        pose_bytes=median(one.pose_bytes for one in running),
         sender_late_p99_ms=said["late_p99_ms"],
         load=load,
     )
