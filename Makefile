@@ -10,6 +10,7 @@ TEST_ARGS ?=
 BENCH_ARGS ?=
 SOAK_ARGS ?=
 SCALE_ARGS ?=
+AUDIT_ARGS ?=
 INSTRUCTIONS_ARGS ?=
 
 BIN := .venv/bin
@@ -84,8 +85,8 @@ soak: $(STAMP) ## an hour with both sensors: memory, latency, loss; SOAK_ARGS='-
 scale: $(STAMP) ## 2, 4, 8, 16 simulated cameras: cost of each, loss, latency
 	@$(BIN)/python -m bench.scale $(SCALE_ARGS)
 
-audit: $(STAMP) ## known vulnerabilities of everything that is locked; asks the registry's advisories
-	@$(BIN)/python -m pip_audit --requirement constraints.txt --disable-pip --no-deps --progress-spinner off --strict
+audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
+	@$(BIN)/python -m bench.audit $(AUDIT_ARGS)
 
 instructions: $(STAMP) ## aarch64 instructions of the slave per frame, against the record; needs mmdebstrap and gcc
 	@$(BIN)/python -m bench.aarch64 count $(INSTRUCTIONS_ARGS)
