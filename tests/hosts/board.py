@@ -3,33 +3,88 @@ until it is switched off."""
 
 import base64
 import os
+import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
-from tests.hosts.board_image import NETWORK, Image, board_image, run
+from tests.hosts.board_image import NETWORK, Image, board_image, pc_image, run
+from tests.hosts.fleet import Fleet
+from tests.hosts.rig import Rig
 from tests.hosts.tap import Tap
 from tests.hosts.undo import Undo
 
 MASTER_PORT = 47801
-UP_S = 180.0  # an idle machine of two cores takes 20 s
-CPU, CORES, MEMORY_MB = "cortex-a72", 2, 1024  # Raspberry Pi 4
+UP_S = 600.0  # 25 s where nothing else runs; tests are not for the load of the machine
+CORES, MEMORY_MB = 2, 1024
+FASTER = (
+    "mitigations=off nokaslr apparmor=0 audit=0 systemd.show_status=0 loglevel=4"  # of start under emulation
+)
+
+
+TOOLS = {
+    "mmdebstrap": "mmdebstrap",
+    "qemu-system-aarch64": "qemu-system-arm",
+    "qemu-system-x86_64": "qemu-system-x86",
+    "mke2fs": "e2fsprogs",
+    "depmod": "kmod",
+    "systemd-sysusers": "systemd",
+    "ssh": "openssh-client",
+    "ssh-keygen": "openssh-client",
+    "rsync": "rsync",
+    "ip": "iproute2",
+}
+
+
+def why_not() -> str | None:
+    """What keeps this machine from running a board, and the way out of it; None: nothing."""
+    if os.geteuid() != 0:
+        return "needs root: the board is on a network of its own (sudo make test-deploy)"
+    if absent := sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None}):
+        return f"missing here: {', '.join(absent)} (Debian: apt install {' '.join(absent)})"
+    return None
+
+
+@dataclass(frozen=True)
+class Model:
+    """A kind of machine.
+
+    Attributes:
+        image: Makes its kernel and disk.
+        qemu: Begin of the command line.
+        console: Its serial line, as the kernel calls it.
+    """
+
+    image: Callable[[], Image]
+    qemu: tuple[str, ...]
+    console: str
+
+
+ARM64 = Model(
+    board_image, ("qemu-system-aarch64", "-machine", "virt", "-cpu", "cortex-a72"), "ttyAMA0"
+)  # as a Pi 4
+AMD64 = Model(pc_image, ("qemu-system-x86_64", "-machine", "q35", "-cpu", "max"), "ttyS0")
 
 
 @dataclass
 class Board:
-    """An arm64 board on a network of its own with this machine.
+    """An emulated machine on a network of its own with this one.
 
     Attributes:
+        model: Which kind.
         name: Its name, and that of the camera on it.
         address: Of the board; `master_address` and `broadcast`: this machine's end.
         folder: What a run writes.
         undo: Takes back links and processes, also when the run is killed.
-        boot_s: From power to sshd [s].
+        boot_s: From power to a command by ssh [s].
     """
 
+    model: Model = ARM64
     name: str = "left"
     folder: Path = field(default_factory=lambda: Path(tempfile.mkdtemp(prefix="phalanx-board-")))
     undo: Undo = field(default_factory=Undo)
@@ -41,6 +96,7 @@ class Board:
         number = os.getpid() % 250 + 1  # runs beside one another have networks of their own
         self.address, self.master_address = f"10.174.{number}.11", f"10.174.{number}.1"
         self.broadcast, self.link = f"10.174.{number}.255", f"phxb{number}"
+        self.login = f"root@{self.address}"
 
     def start(self) -> None:
         """Make the network, switch it on, and wait for sshd.
@@ -48,7 +104,7 @@ class Board:
         Raises:
             RuntimeError: It did not come up; the end of its console.
         """
-        image = board_image()
+        image = self.model.image()
         try:
             self._connect()
             self._settle_ssh(image)
@@ -82,12 +138,18 @@ class Board:
         given = " ".join(
             f"systemd.set_credential_binary={name}:{_base64(text)}" for name, text in told.items()
         )
-        kernel = f"root=/dev/nvme0n1 rw console=ttyAMA0 quiet systemd.show_status=1 {given}"
+        kernel = f"root=/dev/nvme0n1 rw console={self.model.console} {FASTER} {given}"
         self._process = subprocess.Popen(
             [
-                *("qemu-system-aarch64", "-machine", "virt", "-cpu", CPU, "-accel", "tcg,thread=multi"),
+                *(*self.model.qemu, "-accel", "tcg,thread=multi,tb-size=512"),
                 *("-smp", str(CORES), "-m", str(MEMORY_MB), "-display", "none", "-monitor", "none"),
-                *("-kernel", str(image.kernel), "-append", kernel),
+                *(
+                    "-kernel",
+                    str(image.kernel),
+                    "-append",
+                    kernel,
+                    *(("-initrd", str(image.initrd)) if image.initrd else ()),
+                ),
                 # Writes go to a file that nobody else sees and that ends with the process.
                 *("-drive", f"file={image.disk},format=raw,if=none,id=disk,snapshot=on"),
                 *("-device", "nvme,drive=disk,serial=board"),
@@ -136,7 +198,7 @@ class Board:
 
     def try_run(self, command: str, timeout_s: float = 120.0) -> subprocess.CompletedProcess[str]:
         """The same, whatever its exit code."""
-        line = ["ssh", "-F", str(self.folder / "ssh_config"), f"root@{self.address}", command]
+        line = ["ssh", "-F", str(self.folder / "ssh_config"), self.login, command]
         return subprocess.run(line, capture_output=True, text=True, timeout=timeout_s, check=False)
 
     @property
@@ -144,9 +206,30 @@ class Board:
         """The slave that it runs."""
         return f"phalanx-slave@{self.name}.service"
 
+    @property
+    def ssh_options(self) -> tuple[str, ...]:
+        """With which `phalanx deploy` reaches it."""
+        known = f"UserKnownHostsFile={self.folder}/known_hosts"
+        options = (known, "IdentitiesOnly=yes")
+        return (
+            "--identity",
+            str(self.folder / "id"),
+            *(word for one in options for word in ("--ssh-option", one)),
+        )
+
+    def main_pid(self) -> int:
+        """Of the slave; 0: it does not run."""
+        return int(self.run(f"systemctl show -p MainPID --value {self.unit}"))
+
     def journal(self, lines: int = 40) -> str:
         """What the slave, and systemd of it, said last."""
         return self.try_run(f"journalctl -u {self.unit} -n {lines} -o short-monotonic --no-pager").stdout
+
+    def processor_s(self) -> float:
+        """Processor time [s] of this machine that it has taken since power."""
+        assert self._process is not None
+        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def close(self) -> None:
         """Off, and everything as it was before. Safe to call twice."""
@@ -157,6 +240,24 @@ class Board:
         if hasattr(self, "tap"):
             self.tap.close()
         self.undo.now()
+
+
+class BoardRig(Rig):
+    """A rig of which one camera is on the board; the other is nowhere."""
+
+    def __init__(self, board: Board) -> None:
+        """Write calibration and keys; nothing is started."""
+        self.board = board
+        hosts = {board.name: board}
+        fleet = SimpleNamespace(
+            address=board.master_address,
+            broadcast=board.broadcast,
+            hosts=hosts,
+            undo=board.undo,
+            tap=board.tap,
+            ssh_options=board.ssh_options,
+        )
+        super().__init__(cast(Fleet, fleet), board.folder)
 
 
 def _base64(text: str) -> str:

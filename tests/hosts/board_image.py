@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,18 +48,40 @@ PACKAGES = (
 ENABLED = {
     "multi-user.target.wants": ("ssh.service", "systemd-networkd.service", "chrony.service"),
     "sockets.target.wants": ("systemd-networkd.socket",),
+    "sysinit.target.wants": (
+        "systemd-network-generator.service",
+    ),  # the address comes with the kernel's command line
 }
-TOOLS = {
-    "mmdebstrap": "mmdebstrap",
-    "qemu-system-aarch64": "qemu-system-arm",
-    "mke2fs": "e2fsprogs",
-    "depmod": "kmod",
-    "systemd-sysusers": "systemd",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "rsync": "rsync",
-    "ip": "iproute2",
-}
+# Of a first start, or for a screen and a keyboard: minutes under emulation, and nothing that is tested.
+MASKED = (
+    *(
+        "systemd-hwdb-update",
+        "ldconfig",
+        "systemd-journal-catalog-update",
+        "systemd-update-done",
+        "systemd-firstboot",
+    ),
+    *(
+        "serial-getty@ttyAMA0",
+        "getty@tty1",
+        "systemd-logind",
+        "systemd-networkd-wait-online",
+        "systemd-pstore",
+    ),
+    *(
+        "e2scrub_reap",
+        "systemd-binfmt",
+        "systemd-boot-random-seed",
+        "systemd-machine-id-commit",
+        "modprobe@drm",
+    ),
+)
+PC_PACKAGES = (
+    *("linux-image-amd64", "initramfs-tools", "systemd-sysv", "udev", "kmod", "dbus", "iproute2", "procps"),
+    *("openssh-server", "rsync", "chrony", "python3", "python3-venv", "libgomp1", "i2c-tools"),
+)
+# A processor twenty times slower starts twenty times slower.
+SLOWER = "[Service]\nTimeoutStartSec=10min\nWatchdogSec=2min\n"
 NETWORK = """[Match]
 Type=ether
 [Network]
@@ -72,20 +95,12 @@ Subsystem sftp /usr/lib/openssh/sftp-server
 
 
 class Image(NamedTuple):
-    """Kernel, disk (raw, ext4; never written to) and the public key by which the board's sshd is known."""
+    """Kernel, disk (raw, ext4; never written to), the public key of its sshd, and an initrd if it needs one."""
 
     kernel: Path
     disk: Path
     host_key: Path
-
-
-def why_not() -> str | None:
-    """What keeps this machine from running a board, and the way out of it; None: nothing."""
-    if os.geteuid() != 0:
-        return "needs root: the board is on a network of its own (sudo make test-deploy)"
-    if absent := sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None}):
-        return f"missing here: {', '.join(absent)} (Debian: apt install {' '.join(absent)})"
-    return None
+    initrd: Path | None = None
 
 
 def cache() -> Path:
@@ -95,24 +110,54 @@ def cache() -> Path:
 
 
 def board_image() -> Image:
-    """The image, made if it is not there (a minute, 120 MB to load).
+    """That of an arm64 board, made if it is not there (a minute, 120 MB to load).
 
     Raises:
         RuntimeError: A tool failed; its own words.
     """
+    place = _made("board", _make_board)
+    return Image(place / "kernel", place / "disk", place / "host_key.pub")
+
+
+def pc_image() -> Image:
+    """That of a PC with Debian's full kernel, made if it is not there (two minutes, 170 MB to load).
+
+    Raises:
+        RuntimeError: A tool failed; its own words.
+    """
+    place = _made("pc", _make_pc)
+    return Image(place / "kernel", place / "disk", place / "host_key.pub", place / "initrd")
+
+
+def _made(name: str, make: Callable[[Path, Path], None]) -> Path:
     recipe = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
-    place = cache() / f"board-{SUITE}-arm64-{recipe}"
+    place = cache() / f"{name}-{SUITE}-{recipe}"
     if not place.is_dir():
         cache().mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=cache(), prefix="unfinished-") as unfinished:
             made = Path(unfinished) / "made"
             made.mkdir()
-            _make(Path(unfinished), made)
+            make(Path(unfinished), made)
             made.rename(place)
-    return Image(place / "kernel", place / "disk", place / "host_key.pub")
+    return place
 
 
-def _make(work: Path, made: Path) -> None:
+def _make_pc(work: Path, made: Path) -> None:
+    tree = work / "root"
+    small = (
+        "mkdir -p $1/etc/initramfs-tools/conf.d && echo MODULES=list > $1/etc/initramfs-tools/conf.d/small"
+    )
+    modules = "printf 'nvme\\next4\\n' > $1/etc/initramfs-tools/modules"
+    hooks = [f"--essential-hook={small}", f"--essential-hook={modules}"]
+    what = ["--variant=minbase", "--format=directory", f"--include={','.join(PC_PACKAGES)}", *hooks]
+    run("mmdebstrap", "--quiet", *what, SUITE, str(tree), MIRROR)
+    _start_quickly(tree)
+    (tree / "etc/fstab").write_text("/dev/nvme0n1 / ext4 defaults,noatime 0 0\n")
+    _finish(tree, made)
+    shutil.copy(next((tree / "boot").glob("initrd.img-*")), made / "initrd")
+
+
+def _make_board(work: Path, made: Path) -> None:
     archive, tree = work / "packages.tar", work / "root"
     modes = ["--mode=chrootless", "--skip=check/chrootless,check/qemu", "--variant=extract", "--arch=arm64"]
     run("mmdebstrap", "--quiet", *modes, f"--include={','.join(PACKAGES)}", SUITE, str(archive), MIRROR)
@@ -131,7 +176,11 @@ def _make(work: Path, made: Path) -> None:
     _settle(tree)
     kernel = next((tree / "boot").glob("vmlinuz-*"))
     run("depmod", "-b", str(tree), kernel.name.removeprefix("vmlinuz-"))
-    shutil.copy(kernel, made / "kernel")
+    _finish(tree, made)
+
+
+def _finish(tree: Path, made: Path) -> None:
+    shutil.copy(next((tree / "boot").glob("vmlinuz-*")), made / "kernel")
     shutil.copy(tree / "etc/ssh/ssh_host_ed25519_key.pub", made / "host_key.pub")
     run("mke2fs", "-q", "-t", "ext4", "-d", str(tree), str(made / "disk"), f"{DISK_MB}M")
 
@@ -153,7 +202,6 @@ def _settle(tree: Path) -> None:
     (etc / "nsswitch.conf").write_text("passwd: files systemd\ngroup: files systemd\nhosts: files\n")
     shutil.copy(shared / "chrony/chrony.conf", etc / "chrony/chrony.conf")
     (etc / "fstab").write_text("/dev/nvme0n1 / ext4 defaults,noatime 0 0\n")
-    (etc / "machine-id").write_text("")
     (etc / "ssh/sshd_config").write_text(SSHD)
     run(
         "ssh-keygen",
@@ -168,11 +216,37 @@ def _settle(tree: Path) -> None:
         str(etc / "ssh/ssh_host_ed25519_key"),
     )
     run("systemd-sysusers", f"--root={tree}")
+    # chrony's own set-up makes its account by adduser.
+    run("systemd-sysusers", f"--root={tree}", "--inline", "u _chrony - chrony /var/lib/chrony")
+    chrony = next(
+        line.split(":") for line in (etc / "passwd").read_text().splitlines() if line.startswith("_chrony")
+    )
+    for folder in ("lib", "log"):
+        (tree / "var" / folder / "chrony").mkdir(exist_ok=True)
+        os.chown(tree / "var" / folder / "chrony", int(chrony[2]), int(chrony[3]))
+    for name, target in (("run", "/run"), ("lock", "/run/lock")):
+        if not (tree / "var" / name).exists():
+            (tree / "var" / name).symlink_to(target)
+    _start_quickly(tree)
+
+
+def _start_quickly(tree: Path) -> None:
+    """Which services start, and that the slave's may take the time that emulation takes."""
+    etc = tree / "etc"
+    (etc / "machine-id").write_text(f"{hashlib.md5(b'phalanx board', usedforsecurity=False).hexdigest()}\n")
+    slower = etc / "systemd/system/phalanx-slave@.service.d"
+    slower.mkdir(parents=True)
+    (slower / "emulated.conf").write_text(SLOWER)
     for wants, units in ENABLED.items():
         folder = etc / "systemd/system" / wants
         folder.mkdir(parents=True, exist_ok=True)
         for unit in units:
+            (folder / unit).unlink(missing_ok=True)
             (folder / unit).symlink_to(f"/usr/lib/systemd/system/{unit}")
+    for unit in MASKED:
+        place = etc / "systemd/system" / f"{unit}.service"
+        place.unlink(missing_ok=True)
+        place.symlink_to("/dev/null")
 
 
 def run(*command: str) -> None:

@@ -1,0 +1,48 @@
+"""One emulated PC with Debian's full kernel for all tests of drivers; what is measured is kept in out/nightly.json."""
+
+import json
+from collections.abc import Iterator
+
+import pytest
+
+from tests.hosts.board import AMD64, Board, BoardRig, why_not
+from tests.hosts.measured import Measured
+from tests.hosts.rig import ROOT
+
+RATE_HZ = 10.0  # what an emulated processor draws, copies and looks at
+SIZE_PX = (320, 240)
+PATIENCE_S = 900.0
+# A camera of vivid: it is asked for a gain and takes it; exposure and white balance it does not have.
+VIVID = "--control gain=100 --allow-missing exposure --allow-missing white_balance --colours fixed"
+LOAD = "modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0"
+
+
+@pytest.fixture(scope="session")
+def told() -> Measured:
+    """Where numbers go."""
+    return Measured(ROOT / "out" / "nightly.json")
+
+
+@pytest.fixture(scope="session")
+def rig(told: Measured) -> Iterator[BoardRig]:
+    """The machine, on, with a camera of the kernel and the slave that `phalanx deploy` put there, and a master."""
+    if (reason := why_not()) is not None:
+        pytest.skip(reason)
+    pc = Board(AMD64)
+    pc.start()
+    try:
+        told("PC up, from power to ssh", pc.boot_s)
+        pc.run(LOAD)
+        one = BoardRig(pc)
+        file = one.calibration / "cameras/left.json"
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"frame_rate_hz": RATE_HZ}, indent=1))
+        one.start_master()
+        slow = ("--ready-s", str(PATIENCE_S / 2), "--hear-s", str(PATIENCE_S / 4))
+        camera = ("--camera", "left=v4l2:/dev/video0", "--options", f"left={VIVID}")
+        ran = one.deploy(*camera, *slow, timeout_s=PATIENCE_S)
+        assert ran.code == 0, f"{ran}\n{pc.journal()}"
+        told("deploy to the PC", ran.seconds)
+        yield one
+        one.close()
+    finally:
+        pc.close()
