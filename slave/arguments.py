@@ -8,7 +8,7 @@ from pathlib import Path
 from slave.cameras import real
 from slave.doctor import options as doctor
 from slave.imu import opening
-from slave.install import command as install
+from slave.install import arguments as install
 from slave.lights.opening import CHOICES, SWITCHED
 from slave.objects import opening as trackers
 

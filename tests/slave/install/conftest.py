@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from master.keys_folder import make
-from slave.install import command, steps
+from slave.install import arguments, steps
 from slave.install.bundle import calibration_of, keys_of
 from slave.install.errors import InstallError
 from slave.install.options import plan_of
@@ -126,7 +126,7 @@ class Board:
     ) -> steps.Outcome:
         """Install what is in `site` with these options."""
         parser = argparse.ArgumentParser()
-        command.add_install(parser)
+        arguments.add_install(parser)
         options = parser.parse_args(
             ["--master", "10.0.0.2", "--name", "left", "--camera", "synthetic", *words]
         )

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from slave.install import command
+from slave.install import arguments
 from slave.install.boot_config import BEGIN, END, with_block, without_block
 from slave.install.bundle import calibration_of, keys_of
 from slave.install.errors import InstallError, NotReadyError
@@ -37,7 +37,7 @@ FACTS = {
 
 def plan(*words: str) -> Plan:
     parser = argparse.ArgumentParser()
-    command.add_install(parser)
+    arguments.add_install(parser)
     return plan_of(parser.parse_args(["--master", "10.0.0.2", *words]), FILES, {})
 
 
