@@ -10,7 +10,6 @@ import argparse
 import json
 import os
 import platform
-import re
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -21,6 +20,7 @@ from statistics import median
 import numpy as np
 
 from bench.scale_hop import hop_ms
+from bench.scale_page import into_page
 from bench.scale_rig import CALIBRATION, DESK, ROOM, told
 from bench.scale_run import ScaleRun, measure
 from bench.scale_solve import solve_us
@@ -36,7 +36,6 @@ _EXAMPLES = """examples:
   python -m bench.scale --repeat 3 --page docs/scale.html the medians of three runs, into the page
   python -m bench.scale --cameras 16 --only room         the one question that matters most
 """
-_DATA = re.compile(r'(<script type="application/json" id="measured">\n).*?(\n</script>)', re.DOTALL)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,29 +97,21 @@ def summary(runs: Sequence[ScaleRun], stages: dict[int, dict[str, float]]) -> di
     return {
         "machine": dict(machine),
         "model": model,
-        "runs": {f"{one.layout} {one.cameras}": asdict(one) for one in runs},
+        "runs": {f"{one.layout} {one.cameras}": _told(one, stages) for one in runs},
         "stages_us": {str(count): dict(us) for count, us in stages.items()},
     }
+
+
+def _told(run: ScaleRun, stages: dict[int, dict[str, float]]) -> dict[str, object]:
+    """A run as the pages want it; what a hand costs is taken from solving alone."""
+    told: dict[str, object] = asdict(run)
+    return told | {"without_hand": cost_per_camera(run, stages.get(run.cameras, {}))}
 
 
 def datagram_bytes() -> int:
     """Length of a sealed datagram of six markers, all of them seen."""
     frames = told(load_setup(CALIBRATION, DESK), 10.0)
     return OVERHEAD + max(len(encode(one)) for one in next(iter(frames.values())))
-
-
-def into_page(page: Path, found: dict[str, dict[str, object]]) -> None:
-    """Write what was measured into the page, in place of what it has.
-
-    Raises:
-        ValueError: The page has no place for it.
-    """
-    text, places = _DATA.subn(lambda m: m[1] + json.dumps(found, indent=1) + m[2], page.read_text())
-    if places != 1:
-        raise ValueError(
-            f'{page}: expected one <script type="application/json" id="measured">, found {places}'
-        )
-    page.write_text(text)
 
 
 def cost_per_camera(run: ScaleRun, stages: dict[str, float]) -> float:
