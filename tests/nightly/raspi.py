@@ -64,7 +64,8 @@ def started(
     kernel, tree = _kernel()
     memory, log = folder / "initrd", folder / "serial.log"
     _write_memory_disk(made, memory, console)
-    words = f"console={console},115200 rdinit=/init nokaslr loglevel=4 panic=-1 mitigations=off"
+    # Init's environment: at the first start there is no /dev yet, from which Python would take its random numbers.
+    words = f"console={console},115200 rdinit=/init nokaslr loglevel=4 mitigations=off PYTHONHASHSEED=0"
     begin = time.monotonic()
     with subprocess.Popen(
         [
@@ -86,7 +87,7 @@ def started(
     ) as board:
         try:
             while END not in (said := log.read_text(errors="replace") if log.exists() else ""):
-                if board.poll() is not None or time.monotonic() - begin > timeout_s:
+                if board.poll() is not None or "Kernel panic" in said or time.monotonic() - begin > timeout_s:
                     raise RuntimeError(f"the board's program did not end:\n{said[-3000:]}")
                 time.sleep(0.5)
         finally:
