@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo browser emulator hosts-tools api test test-deploy test-nightly check format audit bench soak scale instructions schema clean
+.PHONY: help install demo browser emulator hosts-tools api test test-deploy test-nightly check format audit bench soak scale faults instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -11,6 +11,7 @@ BENCH_ARGS ?=
 SOAK_ARGS ?=
 SCALE_ARGS ?=
 AUDIT_ARGS ?=
+FAULTS_ARGS ?=
 INSTRUCTIONS_ARGS ?=
 
 BIN := .venv/bin
@@ -82,8 +83,11 @@ bench: $(STAMP) ## the table of performance, each row against a baseline of the 
 soak: $(STAMP) ## an hour with both sensors: memory, latency, loss; SOAK_ARGS='--minutes 5' for less
 	@$(BIN)/python -m bench.soak $(SOAK_ARGS)
 
-scale: $(STAMP) ## 2, 4, 8, 16 simulated cameras: cost of each, loss, latency
-	@$(BIN)/python -m bench.scale $(SCALE_ARGS)
+scale: $(STAMP) ## what 2 to 16 simulated cameras cost, what is lost, how late poses are; into docs/scale.html
+	@$(BIN)/python -m bench.scale --page docs/scale.html $(SCALE_ARGS)
+
+faults: $(STAMP) ## every fault on real processes: what is expected, what is measured; FAULTS_ARGS='--runs 1'
+	@$(BIN)/python -m bench.faults $(FAULTS_ARGS)
 
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
 	@$(BIN)/python -m bench.audit $(AUDIT_ARGS)
