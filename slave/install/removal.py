@@ -53,6 +53,8 @@ def uninstall(machine: Machine, dry_run: bool = False) -> list[str]:
             shutil.rmtree(target)
         else:
             target.unlink()
+    with contextlib.suppress(OSError):  # Debian has no such folder before; it stays where others use it
+        (root / SYSUSERS).parent.rmdir()
     run(["systemctl", "daemon-reload"])
     for unit in units:
         with contextlib.suppress(InstallError):  # it had not failed

@@ -102,7 +102,6 @@ class Board:
         self.root, self.keys = root, keys
         for folder in (
             "etc/systemd/system",
-            "etc/sysusers.d",
             "etc/chrony/conf.d",
             "boot/firmware",
             "opt",
