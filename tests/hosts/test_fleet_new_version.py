@@ -29,7 +29,7 @@ def main(arguments=None):
         told = "WATCHDOG=1"
         time.sleep(1.0)
 """
-DEADLINE_S = 60.0
+DEADLINE_S = 150.0  # of a host; the one that is off is given up long before
 
 
 NOTES = "opt/phalanx/before"  # what can be taken back; it has been
@@ -115,8 +115,9 @@ def test_a_host_that_is_off_does_not_keep_the_other_from_a_new_version(
     measured("a deployment, one of two hosts off", ran.seconds)
     assert ran.code == 1, str(ran)
     assert ran.seconds <= DEADLINE_S
-    assert left.address in last_line(ran), str(ran)
-    assert right.address not in last_line(ran), str(ran)
+    failures = [line for line in ran.err.splitlines() if "FAILED" in line]
+    assert len(failures) == 1, str(ran)
+    assert left.address in failures[0], str(ran)
     assert release(right).startswith("releases/93.0-")
     assert release(left).startswith(f"releases/{rig.version}-")
     streams(rig)
