@@ -10,7 +10,7 @@ from tests.hosts.measured import Measured
 from tests.hosts.rig import ROOT
 
 RATE_HZ = 10.0  # what an emulated processor draws, copies and looks at
-SIZE_PX = (320, 240)
+WIDTH_PX, HEIGHT_PX = 320, 180  # the smallest of vivid
 PATIENCE_S = 900.0
 # A camera of vivid: it is asked for a gain and takes it; exposure and white balance it does not have.
 VIVID = "--control gain=100 --allow-missing exposure --allow-missing white_balance --colours fixed"
@@ -18,9 +18,11 @@ LOAD = "modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0"
 
 
 @pytest.fixture(scope="session")
-def told() -> Measured:
+def told() -> Iterator[Measured]:
     """Where numbers go."""
-    return Measured(ROOT / "out" / "nightly.json")
+    numbers = Measured(ROOT / "out" / "nightly.json")
+    yield numbers
+    print("\n" + "\n".join(numbers.lines))  # noqa: T201  # with -s
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +37,10 @@ def rig(told: Measured) -> Iterator[BoardRig]:
         pc.run(LOAD)
         one = BoardRig(pc)
         file = one.calibration / "cameras/left.json"
-        file.write_text(json.dumps(json.loads(file.read_text()) | {"frame_rate_hz": RATE_HZ}, indent=1))
+        camera = json.loads(file.read_text())
+        camera |= {"frame_rate_hz": RATE_HZ, "width_px": WIDTH_PX, "height_px": HEIGHT_PX}
+        camera["intrinsics"] |= {"cx_px": 0.5 * (WIDTH_PX - 1), "cy_px": 0.5 * (HEIGHT_PX - 1)}
+        file.write_text(json.dumps(camera, indent=1))
         one.start_master()
         slow = ("--ready-s", str(PATIENCE_S / 2), "--hear-s", str(PATIENCE_S / 4))
         camera = ("--camera", "left=v4l2:/dev/video0", "--options", f"left={VIVID}")
