@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -21,6 +23,7 @@ from slave.install.removal import packages, uninstall
 from slave.install.systemd import Systemd
 
 Say = Callable[[str], None]
+_LEFT_S = 3600.0  # no installation takes so long
 
 
 def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -> int:
@@ -32,6 +35,7 @@ def run(options: argparse.Namespace, say: Say, systemd: Systemd | None = None) -
         systemd: The machine's services; None: those of this machine.
     """
     machine = steps.Machine(options.root, systemd or Systemd(), say, options.ready_s, options.settle_s)
+    os.umask(0o022)  # the slave, who is not root, runs what is installed
     try:
         if os.geteuid() != 0 and options.root == Path("/") and not options.dry_run:
             raise InstallError("only root can install a service: sudo phalanx-slave install ...")
@@ -70,8 +74,17 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
         outcome = steps.install(plan, source, name, machine, options.dry_run)
     finally:
         if options.bundle is not None and options.wheelhouse is not None and not options.dry_run:
-            shutil.rmtree(options.wheelhouse.parent, ignore_errors=True)  # sent by the PC for this alone
+            _clear(options.wheelhouse)
     return {**asdict(outcome), "text": told(outcome, options.dry_run)}
+
+
+def _clear(stage: Path) -> None:
+    """Remove what the PC sent for this installation, and what others left that were cut off long ago."""
+    for one in stage.parent.glob("*"):
+        if one == stage or time.time() - one.stat().st_mtime > _LEFT_S:
+            shutil.rmtree(one, ignore_errors=True)
+    with contextlib.suppress(OSError):  # somebody else's are there
+        stage.parent.rmdir()
 
 
 def told(outcome: steps.Outcome, dry_run: bool) -> str:

@@ -6,6 +6,7 @@ from a folder of wheels, without a network, or from the environment that the ins
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
@@ -24,7 +25,6 @@ from slave.install.systemd import run_command
 from slave.install.wanted import OPT
 
 RELEASES = f"{OPT}/releases"
-KEPT = 2
 OURS = "phalanx-hand"
 _PACKAGES = ("slave", "common", "master", "deploy")
 _UNPACKED = 1.4  # what is compiled and what a disk rounds up, share of what is unpacked
@@ -120,14 +120,23 @@ def make(root: Path, name: str, source: Source, say: Callable[[str], None]) -> b
 
 
 def prune(root: Path, current: str, before: str | None) -> list[str]:
-    """Remove all but the current release and the one before it; their names."""
-    keep = {current, before} - {None}
-    folders = sorted((root / RELEASES).glob("[!.]*"), key=lambda path: path.stat().st_mtime, reverse=True)
-    keep |= {path.name for path in folders if path.name not in keep and len(keep) < KEPT}
-    gone = [path for path in folders if path.name not in keep]
-    for path in gone:
-        shutil.rmtree(path)
-    return [path.name for path in gone]
+    """Remove all but the current release and the one before it, else the newest of the others; their names."""
+    folders = sorted((root / RELEASES).glob("[!.]*"), key=lambda path: path.stat().st_mtime)
+    others = [path.name for path in folders if path.name != current]
+    kept = before if before in others else others[-1] if others else None
+    gone = [name for name in others if name != kept]
+    for name in gone:
+        remove(root, name)
+    return gone
+
+
+def remove(root: Path, name: str) -> None:
+    """Remove a release. Its name goes first: half of one must never be taken for a whole one."""
+    left = root / RELEASES / f".new-{name}"
+    shutil.rmtree(left, ignore_errors=True)
+    with contextlib.suppress(FileNotFoundError):
+        (root / RELEASES / name).rename(left)
+    shutil.rmtree(left, ignore_errors=True)
 
 
 def _check_room(releases: Path, source: Source) -> None:
@@ -149,6 +158,8 @@ def _check_room(releases: Path, source: Source) -> None:
 def _install_wheels(fresh: Path, wheels: Path) -> None:
     """Install one of each package of the folder; pip itself comes out of it, too."""
     found = sorted(wheels.glob("*.whl"))
+    if not found:
+        raise InstallError(f"{wheels}: no wheels there (another installation removed its own?); deploy again")
     names = sorted({wheel.name.split("-")[0] for wheel in found} - {"pip"})
     pips = [wheel for wheel in found if wheel.name.startswith("pip-")]
     pip = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]

@@ -20,8 +20,14 @@ def uninstall(machine: Machine, dry_run: bool = False) -> list[str]:
     """Remove it; what was there, as paths below the root.
 
     Raises:
-        InstallError: A service does not stop, or a file cannot be removed.
+        InstallError: A service does not stop, or another installation has no end.
+        OSError: A file cannot be removed.
     """
+    with contextlib.nullcontext() if dry_run else machine.alone():
+        return _remove(machine, dry_run)
+
+
+def _remove(machine: Machine, dry_run: bool) -> list[str]:
     root, run = machine.root, machine.systemd.run
     try:
         groups = Record.read(root).groups

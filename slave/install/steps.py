@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import shutil
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from slave.install import release
+from slave.install.alone import alone
 from slave.install.errors import InstallError, NotReadyError
 from slave.install.options import Plan, Sender
-from slave.install.release import RELEASES, Source
+from slave.install.release import Source
 from slave.install.systemd import Systemd
-from slave.install.transaction import CURRENT, Transaction, changed, point, write
+from slave.install.transaction import CURRENT, Transaction, changed, point, remove, write
 from slave.install.wanted import (
     BOOT,
     CHRONY,
@@ -30,8 +29,6 @@ from slave.install.wanted import (
     wanted_files,
 )
 
-LOCK = "run/phalanx-install.lock"
-_LOOKS, _LOOK_S = 300, 1.0
 _UNITS = "phalanx-slave@{}.service"
 
 
@@ -52,6 +49,14 @@ class Machine:
     say: Callable[[str], None]
     ready_s: float
     settle_s: float
+
+    def alone(self) -> contextlib.AbstractContextManager[None]:
+        """While nobody else installs on it.
+
+        Raises:
+            InstallError: Somebody else does, and has no end.
+        """
+        return alone(self.root, self.say, self.systemd.sleep)
 
 
 @dataclass(slots=True)
@@ -84,7 +89,7 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
     Raises:
         InstallError: It failed, and the machine is as before.
     """
-    with _alone(machine, dry_run):
+    with contextlib.nullcontext() if dry_run else machine.alone():
         notes = Transaction(machine.root)
         if notes.is_open and not dry_run:
             machine.say("an installation before was cut off: taking it back")
@@ -121,13 +126,13 @@ def roll_back(machine: Machine, gone: bool = True) -> str:
     Raises:
         InstallError: There was none before, or what was before does not run either.
     """
-    with _alone(machine, False):
+    with machine.alone():
         left = _current(machine.root)
         senders = _senders(machine.root)
         _take_back(machine, senders)
         now = _current(machine.root)
         if gone and left is not None and left != now:
-            shutil.rmtree(machine.root / RELEASES / left, ignore_errors=True)
+            release.remove(machine.root, left)
         return now or "none"
 
 
@@ -164,7 +169,7 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         if file is None:
             if path.endswith(".env"):
                 run(["systemctl", "disable", "--now", _UNITS.format(Path(path).stem)])
-            (root / path).unlink(missing_ok=True)
+            remove(root, path)
         else:
             write(root, path, file)
     if SYSUSERS in outcome.changed:
@@ -205,7 +210,7 @@ def _undo(machine: Machine, senders: tuple[Sender, ...], fresh: str | None) -> N
     except (InstallError, OSError) as error:
         machine.say(f"what was before does not run either: {error}")
     if fresh is not None and _current(machine.root) != fresh:
-        shutil.rmtree(machine.root / RELEASES / fresh, ignore_errors=True)
+        release.remove(machine.root, fresh)
 
 
 def _take_back(machine: Machine, started: set[str] | None = None) -> None:
@@ -256,36 +261,3 @@ def _has_group(root: Path, group: str) -> bool:
         return any(line.startswith(f"{group}:") for line in (root / "etc/group").read_text().splitlines())
     except FileNotFoundError:
         return False
-
-
-def _wait_for(lock: int, machine: Machine) -> None:
-    for look in range(_LOOKS):
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if look == 0:
-                machine.say("another installation runs on this machine: waiting for its end")
-            machine.systemd.sleep(_LOOK_S)
-        else:
-            return
-    raise InstallError("another installation runs on this machine and has no end")
-
-
-@contextlib.contextmanager
-def _alone(machine: Machine, dry_run: bool) -> Generator[None]:
-    """One installation at a time: one whose PC went away goes on to its end, and is waited for.
-
-    Raises:
-        InstallError: Another one has no end.
-    """
-    if dry_run:
-        yield
-        return
-    file = machine.root / LOCK
-    file.parent.mkdir(parents=True, exist_ok=True)
-    with file.open("w") as lock:
-        _wait_for(lock.fileno(), machine)
-        try:
-            yield
-        finally:
-            file.unlink(missing_ok=True)

@@ -11,7 +11,7 @@ from slave.install.errors import InstallError, NotReadyError
 
 _STEP_S = 0.25
 _COMMAND_S = 60.0
-_TRIES = 3  # restarts after which it is not going to run
+_TRIES = 2  # ends after which it is not going to run; each second of waiting is one without its camera
 # Where systemd ends a service before its program begins (systemd.exec(5)): status -> what is wrong.
 _STATUS = {
     200: "200/CHDIR: its folder is missing",
@@ -107,6 +107,7 @@ class Systemd:
         while True:
             for unit in units:
                 state = self.state(unit)
+                first[unit] = min(first[unit], state.restarts)  # a start by hand begins to count again
                 if state.restarts >= first[unit] + _TRIES:
                     raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state)}")
                 if not state.active:

@@ -6,11 +6,13 @@ power went) takes it back first.
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
 import os
 import shutil
 import stat
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,13 +21,16 @@ from slave.install.wanted import OPT, File
 
 NOTES = f"{OPT}/before"
 CURRENT = f"{OPT}/current"
+_MANIFEST = "manifest.json"
 _STATE = "var/lib/phalanx"
+_NO_SLAVES = "/{}: is a link or a special file, which no slave makes; look at it before you install again"
+_LINKS = (errno.ELOOP, errno.ENOTDIR, errno.ENXIO, errno.EISDIR)
 _FOLDER_MODES = {"etc/phalanx/keys": 0o700, NOTES: 0o700}
 
 
 def changed(root: Path, files: Mapping[str, File | None]) -> list[str]:
     """Paths of those that are not as they are wanted."""
-    return [path for path, file in files.items() if not _as_wanted(root / path, file, path)]
+    return [path for path, file in files.items() if not _as_wanted(root, path, file)]
 
 
 class Transaction:
@@ -34,7 +39,7 @@ class Transaction:
     def __init__(self, root: Path) -> None:
         """Of the machine whose files are below `root`."""
         self._root, self._notes = root, root / NOTES
-        self._manifest = self._notes / "manifest.json"
+        self._manifest = self._notes / _MANIFEST
 
     @property
     def is_open(self) -> bool:
@@ -53,14 +58,13 @@ class Transaction:
             paths: Below the root; those that are not there yet are noted as such.
             restarted: Services that will be restarted, so that taking it back restarts them again.
         """
-        shutil.rmtree(self._notes, ignore_errors=True)
-        _make_folder(self._root, NOTES)
+        self._forget()
         kept: dict[str, str | None] = {}
         for number, path in enumerate(paths):
-            file = self._root / path
-            kept[path] = f"{number:04d}" if file.exists() else None
-            if file.exists():
-                shutil.copy2(file, self._notes / f"{number:04d}")
+            file = read(self._root, path)
+            kept[path] = None if file is None else f"{number:04d}"
+            if file is not None:
+                write(self._root, f"{NOTES}/{number:04d}", file)
         link = self._root / CURRENT
         current = str(link.readlink()) if link.is_symlink() else None
         self._write({"open": True, "files": kept, "current": current, "restarted": restarted})
@@ -79,18 +83,17 @@ class Transaction:
         if not notes:
             raise InstallError("there is no earlier installation to go back to")
         for path, kept in notes["files"].items():
-            target = self._root / path
-            if kept is None:
-                target.unlink(missing_ok=True)
+            before = None if kept is None else read(self._root, f"{NOTES}/{kept}")
+            if before is None:
+                remove(self._root, path)
             else:
-                before = self._notes / kept
-                write(self._root, path, File(before.read_bytes(), stat.S_IMODE(before.stat().st_mode)))
+                write(self._root, path, before)
         link = self._root / CURRENT
         if notes["current"] is None:
             link.unlink(missing_ok=True)
         else:
             point(link, notes["current"])
-        shutil.rmtree(self._notes)
+        self._forget()
         return [str(unit) for unit in notes["restarted"]]
 
     def _read(self) -> dict[str, Any]:
@@ -100,9 +103,12 @@ class Transaction:
             return {}
 
     def _write(self, notes: Mapping[str, object]) -> None:
-        fresh = self._manifest.with_suffix(".new")
-        fresh.write_text(json.dumps(notes, indent=1))
-        fresh.replace(self._manifest)
+        write(self._root, f"{NOTES}/{_MANIFEST}", File(json.dumps(notes, indent=1).encode(), 0o600))
+
+    def _forget(self) -> None:
+        """The manifest goes first: without it what is left means nothing."""
+        self._manifest.unlink(missing_ok=True)
+        shutil.rmtree(self._notes, ignore_errors=True)
 
 
 def point(link: Path, target: str) -> None:
@@ -113,65 +119,124 @@ def point(link: Path, target: str) -> None:
     fresh.replace(link)
 
 
+def read(root: Path, path: str) -> File | None:
+    """A file as it is; None: it is not there.
+
+    Raises:
+        InstallError: It is in the slave's folder, and no plain file: root follows no link that a slave may have made.
+        OSError: It cannot be read.
+    """
+    own = _is_slaves(path)
+    try:
+        with _folder(root, path, make=False) as folder:
+            flags = os.O_RDONLY | (os.O_NOFOLLOW | os.O_NONBLOCK if own else 0)
+            with open(os.open(Path(path).name, flags, dir_fd=folder), "rb") as file:  # noqa: PTH123 - a descriptor
+                mode = os.fstat(file.fileno()).st_mode
+                if own and not stat.S_ISREG(mode):
+                    raise InstallError(_NO_SLAVES.format(path))
+                return File(file.read(), stat.S_IMODE(mode))
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        if own and error.errno in _LINKS:
+            raise InstallError(_NO_SLAVES.format(path)) from error
+        raise
+
+
 def write(root: Path, path: str, file: File) -> None:
-    """Write a file whole or not at all; it belongs to whom its folder belongs.
+    """Write a file whole or not at all; it belongs to whom its folder belongs, so that a slave may save its own again.
 
     Raises:
         InstallError: A folder of the slave's is a link: whoever made it would have root write elsewhere.
         OSError: It cannot be written.
     """
-    folder = _make_folder(root, str(Path(path).parent))
-    fresh = folder / f".{Path(path).name}.new"
-    fresh.unlink(missing_ok=True)
+    name, fresh = Path(path).name, f".{Path(path).name}.new"
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW
+    with _folder(root, path, make=True) as folder:
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(fresh, dir_fd=folder)
+            with open(os.open(fresh, flags, 0o600, dir_fd=folder), "wb") as out:  # noqa: PTH123 - a descriptor
+                out.write(file.content)
+                _give_to_owner(out.fileno(), folder)
+                os.fchmod(out.fileno(), file.mode)
+                out.flush()
+                os.fsync(out.fileno())
+            os.replace(fresh, name, src_dir_fd=folder, dst_dir_fd=folder)
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.unlink(fresh, dir_fd=folder)
+            raise
+
+
+def remove(root: Path, path: str) -> None:
+    """Remove a file, if it is there.
+
+    Raises:
+        InstallError: A folder of the slave's is a link.
+        OSError: It cannot be removed.
+    """
+    with contextlib.suppress(FileNotFoundError), _folder(root, path, make=False) as folder:
+        os.unlink(Path(path).name, dir_fd=folder)
+
+
+@contextlib.contextmanager
+def _folder(root: Path, path: str, *, make: bool) -> Generator[int]:
+    """A descriptor of the folder of a file; what is missing is made, if it is to be, as it should be.
+
+    Raises:
+        InstallError: A folder of the slave's is a link.
+        OSError: It is not there, or cannot be made.
+    """
+    below = os.open(root, os.O_RDONLY | os.O_DIRECTORY)
+    so_far = Path()
     try:
-        with open(os.open(fresh, flags, 0o600), "wb") as out:  # noqa: PTH123 - a descriptor
-            out.write(file.content)
-            owner = folder.stat()
-            if os.geteuid() == 0:
-                os.fchown(out.fileno(), owner.st_uid, owner.st_gid)
-            os.fchmod(out.fileno(), file.mode)
-            out.flush()
-            os.fsync(out.fileno())
-        fresh.replace(root / path)
-    except OSError:
-        fresh.unlink(missing_ok=True)
+        for part in Path(path).parent.parts:
+            so_far /= part
+            inner = _inner(part, below, str(so_far), make)
+            os.close(below)
+            below = inner
+        if make and str(so_far) in _FOLDER_MODES:
+            os.fchmod(below, _FOLDER_MODES[str(so_far)])
+        yield below
+    finally:
+        os.close(below)
+
+
+def _inner(name: str, folder: int, path: str, make: bool) -> int:
+    """A descriptor of the folder `name` in `folder`; `path` says where that is."""
+    own, fresh = _is_slaves(path), False
+    if make:
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(name, 0o755, dir_fd=folder)
+            fresh = True
+    flags = os.O_RDONLY | os.O_DIRECTORY | (os.O_NOFOLLOW if own else 0)
+    try:
+        inner = os.open(name, flags, dir_fd=folder)
+    except OSError as error:
+        if own and error.errno in _LINKS:
+            raise InstallError(_NO_SLAVES.format(path)) from error
         raise
+    if fresh:
+        _give_to_owner(inner, folder)
+    return inner
 
 
-def _make_folder(root: Path, path: str) -> Path:
-    """Make a folder and those above it, as they should be."""
-    if path.startswith(f"{_STATE}/"):
-        base = (root / _STATE).resolve()
-        inner = [base / part for part in _prefixes(path.removeprefix(f"{_STATE}/"))]
-        if any(one.is_symlink() for one in inner):
-            raise InstallError(
-                f"/{path}: is a link, which no slave makes; look at it before you install again"
-            )
-    folder = root / path
-    missing = [one for one in (folder, *folder.parents) if not one.exists()]
-    for one in reversed(missing):
-        one.mkdir(mode=0o755)
-        if os.geteuid() == 0:
-            owner = one.parent.stat()
-            os.chown(one, owner.st_uid, owner.st_gid)
-    if path in _FOLDER_MODES:
-        folder.chmod(_FOLDER_MODES[path])
-    return folder
+def _give_to_owner(descriptor: int, folder: int) -> None:
+    """Let what is open belong to whom `folder` belongs."""
+    if os.geteuid() == 0:
+        owner = os.fstat(folder)
+        os.fchown(descriptor, owner.st_uid, owner.st_gid)
 
 
-def _prefixes(path: str) -> list[str]:
-    parts = Path(path).parts
-    return ["/".join(parts[: n + 1]) for n in range(len(parts))]
+def _is_slaves(path: str) -> bool:
+    """Whether a slave can have put something else there."""
+    return path.startswith(f"{_STATE}/")
 
 
-def _as_wanted(path: Path, file: File | None, name: str) -> bool:
-    if file is None:
-        return not path.exists()
-    try:
-        if path.read_bytes() != file.content:
-            return False
-    except FileNotFoundError:
-        return False
+def _as_wanted(root: Path, path: str, file: File | None) -> bool:
+    there = read(root, path)
+    if file is None or there is None:
+        return file is there
     # What the slave owns, and a FAT partition, have modes of their own.
-    return not name.startswith("etc/") or stat.S_IMODE(path.stat().st_mode) == file.mode
+    return there.content == file.content and (not path.startswith("etc/") or there.mode == file.mode)

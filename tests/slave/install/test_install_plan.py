@@ -148,7 +148,7 @@ def test_a_link_that_a_slave_made_leads_root_nowhere(board: Board, site: Path, t
     folder = board.root / "var/lib/phalanx/calib_json/cameras"
     shutil.rmtree(folder)
     folder.symlink_to(tmp_path)
-    with pytest.raises(InstallError, match="is a link, which no slave makes"):
+    with pytest.raises(InstallError, match="is a link or a special file, which no slave makes"):
         board.install(site)
     assert not (tmp_path / "left.json").exists()
 
@@ -222,6 +222,11 @@ def test_a_service_that_restarts_or_says_nothing_is_not_ready() -> None:
     services([state("activating")] * 3 + [state("active", 7)]).wait_ready(["a"], 30.0, 2.0)
     with pytest.raises(NotReadyError, match="a ends again and again: phalanx-slave: no camera"):
         services([state("active", n, n) for n in range(9)]).wait_ready(["a"], 30.0, 2.0)
+    old = state("deactivating", 3, 9)  # a count of before, until systemd has begun again
+    with pytest.raises(NotReadyError, match="again and again"):
+        services([old, old, *(state("activating", n, n // 4) for n in range(12))]).wait_ready(
+            ["a"], 30.0, 2.0
+        )
     with pytest.raises(NotReadyError, match="not ready after 5 s: status 243/CREDENTIALS"):
         services([state("activating", status=243)]).wait_ready(["a"], 5.0, 2.0)
     restarted = [state("active", 7)] * 5 + [state("active", 8, 1)] * 9

@@ -2,17 +2,21 @@
 
 import fcntl
 import os
+import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
 from slave.install import release, steps
+from slave.install.alone import LOCKED
 from slave.install.errors import InstallError
+from slave.install.options import STATE
 from slave.install.release import Source
 from slave.install.removal import uninstall
 from slave.install.transaction import NOTES, Transaction
-from tests.slave.install.conftest import Board, site_of
+from slave.install.wanted import CALIB
+from tests.slave.install.conftest import ROOT, Board, site_of
 
 UNIT = "phalanx-slave@left.service"
 
@@ -186,11 +190,66 @@ def _enough(_releases: Path, _source: Source) -> None:
 
 
 def test_an_installation_waits_for_another_and_not_for_ever(board: Board, site: Path) -> None:
-    lock = board.root / steps.LOCK
-    lock.parent.mkdir()
-    with lock.open("w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        with pytest.raises(InstallError, match="another installation runs on this machine and has no end"):
-            board.install(site)
-    assert board.said == ["another installation runs on this machine: waiting for its end"]
-    assert board.install(site).changed
+    board.install(site)
+    other = os.open(board.root / LOCKED, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    try:
+        for act in (lambda: board.install(site), lambda: uninstall(board.machine)):
+            board.said.clear()
+            with pytest.raises(InstallError, match="still runs on this machine after 600 s"):
+                act()
+            assert board.said == [
+                "another installation runs on this machine: waiting for its end, at most 600 s"
+            ]
+    finally:
+        os.close(other)
+    assert uninstall(board.machine)
+
+
+@pytest.mark.parametrize("place", ["rigs/desk.json", "rigs"])
+def test_what_a_slave_put_there_as_a_link_is_neither_read_nor_written(
+    board: Board, site: Path, tmp_path: Path, place: str
+) -> None:
+    board.install(site)
+    secret = tmp_path / "secret"
+    (secret / "rigs").mkdir(parents=True)
+    (secret / "rigs/desk.json").write_text("of root alone")
+    mine = board.root / CALIB / place
+    mine.rename(tmp_path / "away")
+    mine.symlink_to(secret / place)
+    other = tmp_path / "other"
+    shutil.copytree(ROOT / "calib_json", other)
+    (other / "rigs/desk.json").write_text((other / "rigs/desk.json").read_text() + "\n")
+    with pytest.raises(InstallError, match=rf"/{CALIB}/{place}: is a link or a special file"):
+        board.install(site, calibration=other)
+    assert (secret / "rigs/desk.json").read_text() == "of root alone"
+    kept = [file.read_bytes() for file in (board.root / NOTES).iterdir()]
+    assert b"of root alone" not in kept, "what is kept goes back to the slave's folder"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to give files away")
+def test_new_files_of_the_slave_belong_to_the_slave(board: Board, site: Path, tmp_path: Path) -> None:
+    board.install(site)
+    for path in [board.root / STATE.lstrip("/"), *(board.root / STATE.lstrip("/")).rglob("*")]:
+        os.chown(path, 64000, 64000)  # as systemd does when the service starts
+    other = tmp_path / "other"
+    shutil.copytree(ROOT / "calib_json", other)
+    shutil.copy(other / "rigs/desk.json", other / "rigs/second.json")
+    board.install(site, "--rig", "second", calibration=other)
+    fresh = board.root / CALIB / "rigs/second.json"
+    assert (fresh.stat().st_uid, fresh.stat().st_gid) == (64000, 64000)
+
+
+def test_a_release_that_was_half_removed_is_made_again(
+    board: Board, site: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = board.install(site).release
+    with monkeypatch.context() as patch:
+        patch.setattr(release.shutil, "rmtree", _nothing)  # the power goes
+        release.remove(board.root, name)
+    assert not (board.root / release.RELEASES / name).exists()
+    assert release.make(board.root, name, Source(None, site), board.said.append)
+
+
+def _nothing(_path: Path, ignore_errors: bool = False) -> None:
+    """Remove nothing."""
