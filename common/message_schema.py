@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Ids
-from common.messages import WIRE_VERSION, Message
+from common.messages import WIRE_VERSION, Backlog, Message
 from common.streams import ALIVE_KEY, STREAMS, Path
 
 _DTYPES: dict[object, str] = {Float: "<f8", Bool: "?", Code: "u1", Ids: "<u2"}
@@ -24,13 +24,15 @@ _REF = "#/$defs/{name}"
 
 def bus_schema() -> bytes:
     """Streams of the bus with their keys, and the messages they carry; the same bytes on every Python version."""
-    kinds = sorted({row.message for row in STREAMS.values()} - {Message}, key=lambda kind: kind.__name__)
+    kinds = sorted(
+        {row.message for row in STREAMS.values()} - {Message} | {Backlog}, key=lambda kind: kind.__name__
+    )
     parts = _parts(kinds)
     streams = {
         name: {
             "key": row.key,
             "message": (
-                [{"$ref": _REF.format(name=kind)} for kind in datagrams()]
+                [{"$ref": _REF.format(name=kind)} for kind in [Backlog.__name__, *datagrams()]]
                 if row.message is Message
                 else {"$ref": _REF.format(name=row.message.__name__)}
             ),

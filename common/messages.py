@@ -568,6 +568,20 @@ class Command(Message, frozen=True, eq=False, tag=True):
     body: Annotated[str, Meta(max_length=MAX_BODY_CHARACTERS)] = ""
 
 
+class Backlog(Message, frozen=True, eq=False, tag=True):
+    """How far behind a master is that records, from the message on that it shows next until it says otherwise.
+
+    Attributes:
+        source: Process name: "master".
+        t_ns: When that message was there [ns], master's clock.
+        leave_out: How many instants of each hand are left out between two that are solved; 0: it is not behind.
+    """
+
+    source: Name
+    t_ns: TimeNs
+    leave_out: Annotated[int, Meta(ge=0, le=64)]
+
+
 class Preview(Message, frozen=True, eq=False, tag=True):
     """What a camera sees, small, for the eyes of whoever asked. Nothing is measured in it.
 
@@ -621,6 +635,7 @@ AnyMessage: TypeAlias = (
     | Health
     | Checklist
     | Command
+    | Backlog
     | Preview
     | Still
 )
@@ -647,6 +662,7 @@ _DECODER = msgspec.msgpack.Decoder(
     | Health
     | Checklist
     | Command
+    | Backlog
     | Preview
     | Still,
     dec_hook=lambda kind, raw: _from_bytes(kind, raw),

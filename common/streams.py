@@ -59,7 +59,8 @@ STREAMS = {
     "gesture": Stream(Gesture, Path.ZENOH, "phalanx/gesture/{name}", True),
     "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
     "checklist": Stream(Checklist, Path.ZENOH, "phalanx/checklist/{name}", True),
-    # What came as datagrams, in the order and with the times in which the master solves it, while somebody records.
+    # What came as datagrams, in the order and with the times in which the master solves it, while somebody records;
+    # before it a `Backlog` where the master falls behind or has caught up.
     "taken": Stream(Message, Path.ZENOH, "phalanx/taken/{name}", False),
     "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
     "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False),

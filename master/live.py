@@ -92,7 +92,8 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    hurry = Hurry(len(cameras_of(setups)))
+    rates_hz = [camera.frame_rate_hz for setup in setups for camera in setup.cameras.values()]
+    hurry = Hurry(len(cameras_of(setups)), max(rates_hz))
     pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
@@ -152,7 +153,7 @@ def run_live(
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest, bus), tap)
+        source = Tapped(DevicePoses(ingest, bus), tap, hurry)
         run(source, world, sinks, clock, figures, stop, watch.push)
         source.flush()
         tap.drain()

@@ -8,6 +8,7 @@ from common.bus import Bus, Subscription
 from common.clock import now_ns
 from common.messages import Command, Health, Message
 from master.recording.recorder import MessageRecorder
+from master.recording.tap import came_ns
 
 DEPTH = {"taken": 20_000, "preview": 32, "still": 32}  # messages that may wait for their thread
 _DEPTH = 5_000
@@ -85,9 +86,9 @@ class Feed:
     def _taken_ns(self, message: Message, now_ns: int) -> int:
         """When a message was there: the master shows several at once, and a replay at the speed of then wants to know.
 
-        A frame was, when its slave got it; what a device measured, when it did. None before the one before.
+        None before the one before.
         """
-        there = getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
+        there = came_ns(message, now_ns)
         if not 0 <= now_ns - there < _LONG_NS:
             there = now_ns  # a master that plays tells the times of then
         self._last_ns = max(self._last_ns, there)

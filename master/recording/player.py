@@ -1,9 +1,9 @@
 """Plays a recording: what the master took goes through the very same `World` again, at any speed, from any moment.
 
 What comes out depends on nothing but the messages and their order, so that every pass over the same stretch tells the
-same, bit for bit, however fast. To begin anywhere but at the start, a new world is shown what came two seconds before,
-silently: filters and tracks have settled by then, but what it tells from there on is near to that of a whole pass, not
-equal to it.
+same, bit for bit, however fast; a `Backlog` among them says what the live master left out, and so does the player. To
+begin anywhere but at the start, a new world is shown what came two seconds before, silently: filters and tracks have
+settled by then, but what it tells from there on is near to that of a whole pass, not equal to it.
 """
 
 import threading
@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from typing import cast
 
 from common.clock import now_ns
-from common.messages import Contact, Gesture, HandPose, Message, Told
+from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
+from master.hurry import Hurry, Shedding
 from master.link import Taken
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
@@ -51,14 +52,14 @@ class Passed:
         return self.digest.counts["poses"] / max(self.seconds, 1e-9)
 
 
-def world_of(setups: Sequence[RigSetup]) -> World:
-    """The world as a live master builds it.
+def world_of(setups: Sequence[RigSetup], hurry: Hurry) -> World:
+    """The world as a live master builds it, which leaves out instants as `hurry` says.
 
     Raises:
         CalibrationError: The files do not fit together.
     """
     stages = StageTimes()
-    return World(setups, [LivePipeline(setup, stages) for setup in setups], stages)
+    return World(setups, [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups], stages)
 
 
 class Player:
@@ -184,7 +185,8 @@ class Player:
 
     def _pass(self, start_ns: int, digest: ToldDigest) -> bool:
         """Play from `start_ns`; False: not to the end."""
-        world = None if self._solved else world_of(self._setups)
+        hurry = Hurry()
+        world = None if self._solved else world_of(self._setups, hurry)
         events = EventWatch(self._recording.begin_t_ns)
         with self._changed:
             self._clock.seek(start_ns, now_ns())  # to build a world took its time
@@ -196,7 +198,10 @@ class Player:
             if one.stream == "health":
                 self._tell_events(events.push(one.t_ns, one.message))
                 if events.restarted and world is not None:
-                    world = world_of(self._setups)
+                    hurry = Hurry()
+                    world = world_of(self._setups, hurry)
+            if isinstance(one.message, Backlog):
+                hurry.leave_out = one.message.leave_out
             told = self._told(world, one)
             if not silent:
                 self._write(told, digest)
@@ -221,7 +226,7 @@ class Player:
         """What a message tells: the world makes it, or it was told live."""
         if one.stream in SOLVED:
             return (cast(Told, one.message),)
-        if one.stream != "taken" or world is None:
+        if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
             return ()
         return (_plain(solved) for solved in world.push(cast(Taken, one.message)))
 

@@ -14,8 +14,10 @@ from typing import Generic, TypeVar
 from common.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
-from common.messages import Message
+from common.messages import Backlog, Message
 from common.recording import sender_of
+from common.streams import MASTER
+from master.hurry import Hurry
 from master.outputs.devices import Taking
 
 LEASE_NS = 3_000_000_000
@@ -44,6 +46,7 @@ class Tap:
         self._hurry = threading.Event()
         self._busy = self._closed = False
         self._shown = self._dropped = 0
+        self._left_out, self._again = 0, False  # as was shown last; a reader may not have been there
         if always:
             self._start()
 
@@ -56,18 +59,26 @@ class Tap:
         )
 
     def lease(self) -> None:
-        """Show everything for three seconds from now."""
+        """Show everything for three seconds from now, and again how far behind the master is."""
+        self._again = True
         self._until_ns = self._clock.now_ns() + LEASE_NS
         self._start()
 
-    def show(self, message: Message) -> None:
-        """Publish it soon, if somebody taps."""
+    def show(self, message: Message, leave_out: int = 0) -> None:
+        """Publish it soon, if somebody taps; and before it that so many instants are left out, if that is news."""
         if not self._always:
             if self._until_ns == 0:
                 return
             if self._clock.now_ns() >= self._until_ns:
                 self._until_ns = 0
                 return
+        if leave_out != self._left_out or (self._again and leave_out):
+            self._left_out = leave_out
+            self._put(Backlog(MASTER, came_ns(message, self._clock.now_ns()), leave_out))
+        self._again = False
+        self._put(message)
+
+    def _put(self, message: Message) -> None:
         self._shown += 1
         if len(self._queue) >= ROOM:
             self._dropped += 1
@@ -120,25 +131,32 @@ class Tap:
             self._hurry.wait(_STEP_S if self._hurry.is_set() else _TOGETHER_S)
 
 
+def came_ns(message: Message, now_ns: int) -> int:
+    """When a message was there: a frame, when its slave got it; what a device measured, when it did; else `now_ns`."""
+    return getattr(message, "ready_t_ns", None) or getattr(message, "t_ns", now_ns)
+
+
 class Tapped(Generic[TakenT]):
     """A source of messages that shows each when the next is asked for: what reads it has made of it all it can by then.
 
-    Holds the last message.
+    With each message it sees how far behind the master is, which holds until the next. Holds the last message.
     """
 
-    def __init__(self, source: Taking[TakenT], tap: Tap) -> None:
+    def __init__(self, source: Taking[TakenT], tap: Tap, hurry: Hurry) -> None:
         """Stand between a source and who reads it."""
-        self._source, self._tap = source, tap
+        self._source, self._tap, self._hurry = source, tap, hurry
         self._last: TakenT | None = None
 
     def get(self, timeout_s: float) -> TakenT | None:
         """The next message, or None when none came in time."""
         self.flush()
         self._last = self._source.get(timeout_s)
+        if self._last is not None:
+            self._hurry.look()
         return self._last
 
     def flush(self) -> None:
         """At the end: the last message, too."""
         last, self._last = self._last, None
         if last is not None:
-            self._tap.show(last)
+            self._tap.show(last, self._hurry.leave_out)

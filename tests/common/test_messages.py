@@ -22,6 +22,7 @@ from common.messages import (
     MAX_STILL_BYTES,
     MAX_TAGS,
     AnyMessage,
+    Backlog,
     CheckItem,
     Checklist,
     Command,
@@ -221,6 +222,7 @@ healths = st.builds(
     gauges=st.dictionaries(names, st.floats(-1e18, 1e18), max_size=64),
 )
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
+backlogs = st.builds(Backlog, source=names, t_ns=times, leave_out=st.integers(0, 64))
 previews = st.builds(
     Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: b"\xff\xd8\xff" + tail)
 )
@@ -293,6 +295,7 @@ SAMPLES: tuple[Message, ...] = (
     Health("left", 1, 2, {"frames": 3}, {"rate_hz": 59.9}, "pi-left", "0.1.0"),
     Checklist("master", 1, 2, (CheckItem("camera_absent", "left", "It is not there.", "Start its slave."),)),
     Command("left", "stop"),
+    Backlog("master", 5, 3),
     Preview("left", 2, b"\xff\xd8\xff\xe0jpeg"),
     Still("left", 1, 2, b"\xff\xd8\xff\xe0jpeg"),
 )
@@ -316,7 +319,7 @@ def as_map(message: Message) -> dict[str, object]:
 
 EVERY = (
     *(detections(), triples(), tags(), trackers, imu_samples, hand_poses(), objects, contacts, gestures),
-    *(healths, commands, previews),
+    *(healths, commands, backlogs, previews),
 )
 
 
@@ -465,6 +468,8 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
         (Health, {"gauges": {"rate_hz": float("inf")}}),
         (Health, {"gauges": {"a b": 1.0}}),
         (Command, {"verb": ""}),
+        (Backlog, {"leave_out": -1}),
+        (Backlog, {"leave_out": 65}),
         (Preview, {"jpeg": b""}),
         (Preview, {"jpeg": b"GIF89a"}),
         (Preview, {"jpeg": "text"}),

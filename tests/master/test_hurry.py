@@ -3,17 +3,20 @@
 import numpy as np
 import pytest
 
-from master.hurry import BEGIN_FRAMES, HARD_FRAMES, Hurry, Shedding
+from master.hurry import BEGIN_FRAMES, BEGIN_S, HARD_FRAMES, Hurry, Shedding
 from master.ingest import QUEUE, QUEUE_PER_CAMERA, ROOM, room
 from master.rig import build_pipeline
 from master.stages import StageTimes
 from tests.hand_helpers import MARKERS, RIGHT
 from tests.synthetic_run import hand_at, synthetic_run
 
+SLOW_HZ = 15.0
 
-def behind(frames: float, cameras: int = 4) -> Hurry:
-    hurry = Hurry(cameras)
+
+def behind(frames: float, cameras: int = 4, frame_rate_hz: float = SLOW_HZ) -> Hurry:
+    hurry = Hurry(cameras, frame_rate_hz)
     hurry.waiting = lambda: round(frames * cameras)
+    hurry.look()
     return hurry
 
 
@@ -36,9 +39,21 @@ def test_who_has_begun_to_leave_out_goes_on_until_the_queue_is_worked_off() -> N
     shedding = Shedding(hurry)
     assert shedding()
     hurry.waiting = lambda: 8  # two frames of each of four cameras: less than where it began
+    hurry.look()
     assert [shedding() for _ in range(4)] == [False, True, False, True]
     hurry.waiting = lambda: 4
+    assert [shedding() for _ in range(2)] == [False, True], (
+        "what a message was taken with holds until the next"
+    )
+    hurry.look()
     assert not any(shedding() for _ in range(4))
+
+
+@pytest.mark.parametrize("frame_rate_hz", [SLOW_HZ, 60.0, 90.0, 200.0])
+def test_a_short_pause_costs_no_pose(frame_rate_hz: float) -> None:
+    pause = BEGIN_S * frame_rate_hz  # frames of each camera
+    assert behind(int(pause), 2, frame_rate_hz).leave_out == 0
+    assert behind(max(pause, BEGIN_FRAMES) + 1, 2, frame_rate_hz).leave_out > 0
 
 
 def test_what_is_solved_beside_what_is_left_out_is_as_right_as_ever() -> None:

@@ -1,15 +1,20 @@
 """A short recording as a live master would have left it: messages pushed through a `World`, and what it told."""
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from common.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
 from common.recording import MessageWriter
+from master.hurry import Hurry
 from master.recording.digest import ToldDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
+from master.recording.tap import Tap, Tapped, came_ns
 from master.tuning import RigFiles
+from tests.network_helpers import ManualClock
 from tests.synthetic_run import synthetic_run
 
 LATE_NS = 4_000_000
@@ -40,13 +45,13 @@ def recorded_run(
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    world, live = world_of(setups), ToldDigest()
+    world, live = world_of(setups, Hurry()), ToldDigest()
     messages = scene()[: 2 * frames]
     writer.write("health", report(messages[0].t_ns), messages[0].t_ns)
     for number, message in enumerate(messages):
         t_ns = message.t_ns + LATE_NS
         if number == restart_at:
-            world = world_of(setups)
+            world = world_of(setups, Hurry())
             writer.write("health", report(t_ns, 6), t_ns)
         writer.write("taken", message, t_ns)
         for solved in world.push(message):
@@ -55,3 +60,39 @@ def recorded_run(
             writer.write("hand" if isinstance(told, HandPose) else "gesture", told, t_ns)
     writer.close()
     return RecordedRun(path, live)
+
+
+class Ingested:
+    """The queue of a master: what comes next, while so many frames wait behind each."""
+
+    def __init__(self, waiting: Sequence[int]) -> None:
+        self._waiting, self._number = waiting, 0
+
+    def get(self, timeout_s: float) -> MarkerDetections | None:
+        del timeout_s
+        self._number += 1
+        return scene()[self._number - 1] if self._number <= len(self._waiting) else None
+
+    def waiting(self) -> int:
+        return self._waiting[self._number - 1]
+
+
+def overloaded_run(path: Path, calibration: Path, waiting: Sequence[int]) -> tuple[RecordedRun, int]:
+    """Of a master that has so many frames behind each message, as its tap shows it; and how many instants it shed."""
+    files = RigFiles(calibration, ("desk",))
+    setups = files.load()
+    writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
+    bus, hurry, queue, live = LoopbackBus(), Hurry(2), Ingested(waiting), ToldDigest()
+    hurry.waiting, world = queue.waiting, world_of(setups, hurry)
+    shown = bus.subscribe("taken", depth=1000)
+    tap = Tap(bus, ManualClock(), always=True)
+    source = Tapped(queue, tap, hurry)
+    while (message := source.get(0.0)) is not None:
+        for solved in world.push(message):
+            live.take(solved if isinstance(solved, Contact | Gesture) else solved.pose)
+    tap.drain()
+    while (one := shown.get(0.01)) is not None:
+        writer.write("taken", one, came_ns(one, 0))
+    tap.close()
+    writer.close()
+    return RecordedRun(path, live), world.counts["instants_shed"]

@@ -9,7 +9,7 @@ import pytest
 
 from common.bus import LoopbackBus
 from common.errors import BusError, PhalanxError, RecordingError
-from common.messages import Command, HandPose, Told
+from common.messages import Backlog, Command, HandPose, Told
 from common.recording import open_messages
 from common.streams import MASTER
 from master.outputs.files import load_poses
@@ -18,7 +18,7 @@ from master.recording.files import recorded_setups, unpack
 from master.recording.lines import events_of, table
 from master.recording.play import PlaySettings, run_play
 from master.recording.player import Passed, Player
-from tests.master.recording.recorded_run import MOST_FRAMES, RecordedRun, recorded_run
+from tests.master.recording.recorded_run import MOST_FRAMES, RecordedRun, overloaded_run, recorded_run
 from tests.network_helpers import until
 
 FRAMES, SHORT = MOST_FRAMES, 8
@@ -68,6 +68,19 @@ def test_every_speed_tells_what_was_told_live(run: RecordedRun, whole: tuple[Pas
         assert passed.digest.lines() == run.live.lines()
     solved = Player(recording, setups, [], solved=True).run()
     assert solved.digest.lines() == run.live.lines()
+
+
+def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Path, root: Path) -> None:
+    waiting = [0] * 12 + [18] * 16 + [6] * 8 + [2] * 12
+    (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", waiting)
+    recording = open_messages(path)
+    said = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
+    assert [one.leave_out for one in said] == [3, 1, 0]
+    assert (shed, live.counts["poses"]) == (8, FRAMES - 8)
+    setups = recorded_setups(recording)
+    for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):
+        assert passed.digest.counts == live.counts
+        assert passed.digest.lines() == live.lines()
 
 
 def test_a_message_less_is_another_sum(twice: RecordedRun) -> None:

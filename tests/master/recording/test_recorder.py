@@ -13,16 +13,17 @@ import pytest
 from common.bus import Bus, LoopbackBus
 from common.clock import now_ns
 from common.errors import BusError, CalibrationError, RecordingError
-from common.messages import Command, Health, MarkerDetections, Message, Preview, Still
+from common.messages import Backlog, Command, Health, MarkerDetections, Message, Preview, Still
 from common.recording import MessageWriter, open_messages
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
+from master.hurry import Hurry
 from master.recording import feed, process
 from master.recording.feed import MasterClock
 from master.recording.lines import ProgressLine, events_of, progress_text
 from master.recording.process import NAME, RecordSettings, run_recorder
 from master.recording.recorder import MessageRecorder, Progress
-from master.recording.tap import LEASE_NS, Tap, Tapped
+from master.recording.tap import LEASE_NS, Tap, Tapped, came_ns
 from master.tuning import RigFiles
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
 
@@ -48,7 +49,7 @@ def test_the_tap_shows_only_while_somebody_asks_and_all_of_it_in_order() -> None
     bus, clock = LoopbackBus(), ManualClock(10)
     shown = bus.subscribe("taken", depth=100)
     tap = Tap(bus, clock)
-    source = Tapped(Listed(frames(9)), tap)
+    source = Tapped(Listed(frames(9)), tap, Hurry())
     assert tap.counts == {}
     assert source.get(0.0) is not None
     assert source.get(0.0) is not None
@@ -81,6 +82,28 @@ def test_a_tap_from_the_beginning_shows_everything_until_its_recorder_is_gone() 
     tap.drain()
     assert len(list(iter(lambda: shown.get(0.01), None))) == 4
     bus.close()
+    tap.close()
+
+
+def test_how_far_behind_the_master_is_comes_before_the_message_it_holds_for() -> None:
+    bus, waits, hurry = LoopbackBus(), [0, 9, 9, 9, 0, 0], Hurry()
+    shown = bus.subscribe("taken", depth=100)
+    tap = Tap(bus, ManualClock(10))
+    source = Tapped(Listed(frames(6)), tap, hurry)
+    hurry.waiting = lambda: waits.pop(0)
+    tap.lease()
+    for number in range(7):
+        if number == 3:
+            tap.lease()  # of a second reader, who knows nothing yet
+        source.get(0.0)
+    tap.drain()
+    told = [
+        (one.leave_out, one.t_ns) if isinstance(one, Backlog) else cast(MarkerDetections, one).seq
+        for one in iter(lambda: shown.get(0.01), None)
+    ]
+    at = [came_ns(one, 0) for one in frames(6)]
+    assert told == [0, (3, at[1]), 1, (3, at[2]), 2, 3, (0, at[4]), 4, 5]
+    assert tap.counts == {"tap.shown": 9, "tap.dropped": 0}
     tap.close()
 
 
