@@ -1,12 +1,12 @@
-"""Options of `phalanx deploy`, `uninstall` and `fleet`, and what they mean."""
+"""Options of `phalanx deploy`, `uninstall`, `fleet` and `wheels`, and what they mean."""
 
 import argparse
-import os
 import socket
 from collections.abc import Callable
 from pathlib import Path
 
-from deploy.deployment import Ears, Reached, reach_of
+from deploy.checks import check_reach, check_wish, default_keys
+from deploy.deployment import HEAR_S, Ears, Reached, reach_of
 from deploy.one_host import Wish
 from deploy.targets import DeployError, RigFile, read_rig
 
@@ -47,13 +47,13 @@ FLEET_EXAMPLES = """examples:
 
 
 def add_commands(add_parser: AddParser, calibration: Path) -> None:
-    """Add the three."""
+    """Add `deploy`, `uninstall`, `fleet` and `wheels`."""
     deploy = _command(
         add_parser,
         "deploy",
         "slaves to their machines by ssh",
-        "Installs a slave for each camera as a service of its machine, and waits until it streams. Goes back to what "
-        "was before where it does not. Needs ssh and rsync here, ssh, Python 3.11 and systemd there.",
+        "Installs a slave for each camera as a service of its machine, and waits until it streams.\nGoes back to what "
+        "was before where it does not. Needs ssh and rsync here, ssh, Python 3.11\nand systemd there.",
         DEPLOY_EXAMPLES,
     )
     deploy.add_argument(
@@ -90,7 +90,7 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
         "--no-hear", action="store_true", help="do not wait for datagrams, only until slaves are ready"
     )
     deploy.add_argument("--ready-s", type=float, default=_READY_S, metavar="S", help=argparse.SUPPRESS)
-    deploy.add_argument("--hear-s", type=float, default=20.0, metavar="S", help=argparse.SUPPRESS)
+    deploy.add_argument("--hear-s", type=float, default=HEAR_S, metavar="S", help=argparse.SUPPRESS)
     deploy.add_argument(
         "--beacon", metavar="ADDRESS:PORT", help="where slaves listen for the start (default: broadcast)"
     )
@@ -114,14 +114,14 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
         add_parser,
         "fleet",
         "how all machines of a rig are",
-        "A row for each camera and IMU that has keys or reports itself: machine, version, temperature, clock, rate.",
+        "A row for each camera and IMU that has keys or reports itself: machine, version,\ntemperature, clock, rate.",
         FLEET_EXAMPLES,
     )
     _keys(fleet, "keys folder")
     fleet.add_argument("--bus", metavar="ENDPOINT", help="of the master (default: of this machine)")
     fleet.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
-    _add_wheels(add_parser)
     fleet.add_argument("--json", action="store_true", help="as JSON")
+    _add_wheels(add_parser)
 
 
 def _add_wheels(add_parser: AddParser) -> None:
@@ -163,6 +163,7 @@ def rig_of(options: argparse.Namespace) -> RigFile:
 
 def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
     """What is wanted on the machines."""
+    check_wish(options, rig)
     handed = [
         word
         for name in ("camera", "options", "overlay")
@@ -174,19 +175,13 @@ def wish_of(options: argparse.Namespace, rig: RigFile) -> Wish:
         for name in ("role", "imu", "lights")
         if (value := getattr(options, name)) is not None
     ]
-    drivers = [one.partition("=")[2] if one.partition("=")[0] in rig.names else one for one in options.camera]
-    camera = (
-        "picamera2"
-        if not drivers
-        else next((one for one in drivers if one.startswith("picamera2")), drivers[0])
-    )
     return Wish(
         options.master,
         rig,
         options.calibration,
         options.keys,
         tuple(handed),
-        camera,
+        tuple(options.camera),
         options.wheelhouse,
         not options.no_apt,
         options.dry_run,
@@ -210,6 +205,7 @@ def ears_of(options: argparse.Namespace) -> Ears | None:
 
 def reached_of(options: argparse.Namespace) -> Reached:
     """How the machines are reached."""
+    check_reach(options)
     return Reached(
         reach_of(options.user, options.port, options.identity, options.ssh_option), options.deadline
     )
@@ -250,9 +246,8 @@ def _command(
 
 
 def _keys(command: argparse.ArgumentParser, what: str) -> None:
-    default = Path(os.environ.get("PHALANX_KEYS") or Path.home() / ".config/phalanx/keys")
     command.add_argument(
-        "--keys", type=Path, default=default, metavar="DIR", help=f"{what} (default: %(default)s)"
+        "--keys", type=Path, default=default_keys(), metavar="DIR", help=f"{what} (default: %(default)s)"
     )
 
 

@@ -15,6 +15,7 @@ from deploy.wheelhouse import Kind, wheelhouse
 STAGE = "/opt/phalanx/wheels"  # of root; the installer removes it
 _CLOCK_S = 0.5  # from here on it is said
 _PROBE_S = 60.0
+_PICAMERA2 = "picamera2"  # the default of cameras
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,7 +28,7 @@ class Wish:
         calibration: calib_json tree of the PC.
         keys: Keys folder of the PC.
         options: Of the installer, handed on.
-        camera: Driver of the cameras, which decides what the system has to have.
+        cameras: What was said of their drivers: DRIVER or NAME=DRIVER.
         wheels: Folder of wheels; None: they are downloaded.
         apt: Whether packages of the system are installed.
         dry_run: Write nothing.
@@ -39,11 +40,24 @@ class Wish:
     calibration: Path
     keys: Path | None
     options: tuple[str, ...]
-    camera: str
+    cameras: tuple[str, ...]
     wheels: Path | None
     apt: bool
     dry_run: bool
     ready_s: float
+
+    def driver(self, names: Sequence[str]) -> str:
+        """Driver of the cameras among `names`, which decides what their machine has to have; empty: none is one.
+
+        Of several, picamera2 asks for the most.
+        """
+        drivers: list[str] = []
+        for name in [one for one in names if one in self.rig.cameras]:
+            said = [one.partition("=") for one in self.cameras]
+            own = [driver if whose == name else whose + sign + driver for whose, sign, driver in said
+                   if whose == name or whose not in self.rig.names]  # fmt: skip
+            drivers.append(own[-1] if own else _PICAMERA2)
+        return next((one for one in drivers if one.startswith(_PICAMERA2)), (drivers or [""])[0])
 
 
 @dataclass(slots=True)
@@ -72,9 +86,10 @@ class Host:
         Raises:
             DeployError: It failed; the machine is as before.
         """
-        facts = self.look(wish.camera)
-        self._packages(facts, wish)
-        picamera2 = wish.camera.startswith("picamera2")
+        camera = wish.driver(self.target.names)
+        picamera2 = camera.startswith(_PICAMERA2)
+        facts = self.look(camera)
+        self._packages(facts, wish, picamera2)
         old = facts["codename"] == "bookworm"  # whose simplejpeg was built for numpy 1
         kind = Kind(
             str(facts["machine"]),
@@ -151,14 +166,14 @@ class Host:
         words = ["install", "--json", "--uninstall", *(["--dry-run"] if dry_run else [])]
         self.say(str(self._act(words, _plain_bundle())["text"]))
 
-    def _packages(self, facts: dict[str, object], wish: Wish) -> None:
+    def _packages(self, facts: dict[str, object], wish: Wish, picamera2: bool) -> None:
         """Bring what the system lacks, or say what it lacks.
 
         Raises:
             DeployError: apt failed, or it cannot be done without.
         """
         there = cast(list[str], facts["packages"])
-        wanted = ["rsync", "chrony", *(["python3-picamera2"] if wish.camera.startswith("picamera2") else [])]
+        wanted = ["rsync", "chrony", *(["python3-picamera2"] if picamera2 else [])]
         missing = [name for name in wanted if name not in there]
         if not missing:
             return

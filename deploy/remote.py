@@ -17,6 +17,7 @@ from deploy.targets import DeployError
 CONNECT_S = 10
 ALIVE_S, ALIVE_TIMES = 3, 3  # a link that is gone shows after nine seconds
 STALLED_S = 15
+_LOOK_S = 0.5
 _SETTINGS = (
     "BatchMode=yes",
     f"ConnectTimeout={CONNECT_S}",
@@ -25,7 +26,12 @@ _SETTINGS = (
 )
 _NOT_REACHED = 255  # ssh's own exit code
 _HINTS = (
-    ("Permission denied", "its key is not known there: ssh-copy-id HOST"),
+    (
+        "Could not resolve hostname",
+        "no machine of that name is known here; switched on, in this network? Or give its address in place of HOST",
+    ),
+    ("Connection refused", "no sshd answers on HOST: sudo systemctl enable --now ssh there, or give --port"),
+    ("Permission denied", "your key is not known there: ssh-copy-id HOST"),
     ("Host key verification failed", "its host key is not known here: ssh HOST once, and look at it"),
     (
         "REMOTE HOST IDENTIFICATION",
@@ -35,11 +41,16 @@ _HINTS = (
 
 
 class Deadline:
-    """A moment by which all must be done. Holds that moment."""
+    """A moment by which all must be done. Holds that moment, and whether somebody wanted an end before."""
 
     def __init__(self, seconds: float) -> None:
         """So many seconds from now."""
         self._end, self._seconds = time.monotonic() + seconds, seconds
+        self.ended = threading.Event()
+
+    def end(self) -> None:
+        """Nothing more is to be done, and what runs is ended."""
+        self.ended.set()
 
     def left_s(self) -> float:
         """What is left of it.
@@ -47,6 +58,8 @@ class Deadline:
         Raises:
             DeployError: Nothing.
         """
+        if self.ended.is_set():
+            raise DeployError("interrupted")
         left = self._end - time.monotonic()
         if left <= 0.0:
             raise DeployError(f"not done within {self._seconds:.0f} s (--deadline)")
@@ -76,7 +89,9 @@ class Remote:
             DeployError: The machine is not reached, the link broke, or the time is over.
         """
         words = [*self._ssh(), "--", self.host, shlex.join(command)]
-        code, errors = run_bounded(words, send, on_line, min(limit_s, self.deadline.left_s()))
+        code, errors = run_bounded(
+            words, send, on_line, min(limit_s, self.deadline.left_s()), ended=self.deadline.ended
+        )
         if code is None:
             self.deadline.left_s()
             raise DeployError(f"no answer within {limit_s:.0f} s")
@@ -102,7 +117,9 @@ class Remote:
         if sudo:
             words += ["--rsync-path", "sudo -n rsync"]
         words += ["-e", shlex.join(self._ssh()), "--", *map(str, files), f"{_bracketed(self.host)}:{to}/"]
-        code, errors = run_bounded(words, b"", lambda _line: None, self.deadline.left_s())
+        code, errors = run_bounded(
+            words, b"", lambda _line: None, self.deadline.left_s(), ended=self.deadline.ended
+        )
         if code is None:
             self.deadline.left_s()
         if code != 0:
@@ -118,8 +135,17 @@ def run_bounded(
     on_line: Callable[[str], None],
     limit_s: float,
     environment: Mapping[str, str] | None = None,
+    ended: threading.Event | None = None,
 ) -> tuple[int | None, list[str]]:
-    """Run a command of this machine; its exit code and the lines of its errors. None: it was ended, the time was over.
+    """Run a command of this machine; its exit code and the lines of its errors. None: it was ended.
+
+    Args:
+        words: The command.
+        send: Its input.
+        on_line: Told each line that it says.
+        limit_s: After so many seconds it is ended, with all that it started.
+        environment: Variables besides those of this process.
+        ended: It is ended when this is set, too.
 
     Raises:
         DeployError: There is no such command.
@@ -148,11 +174,12 @@ def run_bounded(
     ]
     for thread in threads:
         thread.start()
+    end = time.monotonic() + limit_s
     code: int | None = None
     try:
-        code = child.wait(limit_s)
-    except subprocess.TimeoutExpired:
-        code = None
+        while code is None and time.monotonic() < end and not (ended is not None and ended.is_set()):
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                code = child.wait(min(_LOOK_S, max(0.0, end - time.monotonic())))
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(child.pid, signal.SIGKILL)

@@ -134,10 +134,11 @@ def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys:
         raise InstallError(f"--master {options.master or ''}: give the host name or the address of the PC")
     rig = _rig(calibration, options.rig)
     names = tuple(options.names) or _only(rig, options.rig)
-    senders = tuple(_sender(name, rig, options, names) for name in names)
+    senders = tuple(_sender(name, rig, options) for name in names)
     if len(set(names)) < len(names):
         raise InstallError(f"--name {' --name '.join(names)}: one stands twice")
-    drivers = [_of(name, options.cameras, names) or "picamera2" for name in names if name in rig["cameras"]]
+    everybody = _names(rig)
+    drivers = [_of(n, options.cameras, everybody) or "picamera2" for n in names if n in rig["cameras"]]
     return Plan(
         options.master,
         senders,
@@ -148,11 +149,12 @@ def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys:
     )
 
 
-def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace, names: Sequence[str]) -> Sender:
+def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace) -> Sender:
     if not _NAME.fullmatch(name):
         raise InstallError(f"--name {name!r}: letters, digits, - and _ only")
     place = ["--name", name, "--rig", options.rig, "--calibration", CALIBRATION]
-    more = [word for text in _all_of(name, options.more, names) for word in shlex.split(text)]
+    names = _names(rig)  # what is said of another machine's camera is not for this one
+    more = [word for text in _all_of(name, options.more, names) for word in _split(text)]
     worn = rig.get("kind") == "wrist"
     if options.role is not None and (options.role == "wrist") != worn:
         raise InstallError(f"--role {options.role}: rig {options.rig!r} is one of kind {rig.get('kind')!r}")
@@ -177,13 +179,20 @@ def _sender(name: str, rig: dict[str, Any], options: argparse.Namespace, names: 
             )
         command, words = "imu", [*place, "--imu", options.imu]
     else:
-        there = ", ".join(_names(rig))
+        there = ", ".join(names)
         raise InstallError(f"rig {options.rig!r} has no camera or IMU {name!r}; it has {there}")
     words += more
     for word in [*words, *stop_post]:
         if not _UNQUOTED.fullmatch(word):
             raise InstallError(f"{word!r}: blanks and quotes cannot be in an option of a service")
     return Sender(name, command, tuple(words), tuple(stop_post))
+
+
+def _split(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise InstallError(f"--options {text!r}: {error}") from error
 
 
 def _rig(calibration: Mapping[str, bytes], name: str) -> dict[str, Any]:

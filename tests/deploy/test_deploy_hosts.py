@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from collections.abc import Callable
@@ -18,7 +19,7 @@ from deploy.__main__ import main
 from deploy.bundle import BUNDLE, bundle, command
 from deploy.deployment import Ears, make_keys
 from deploy.fleet import table
-from deploy.one_host import Host
+from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
 from deploy.wheelhouse import own_wheel, wheelhouse
@@ -160,11 +161,15 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
     [
         (
             "ssh: Could not resolve hostname pi: Name or service not known",
-            "Could not resolve hostname pi: Name or",
+            "Could not resolve hostname: no machine of that name is known here; switched on, in this network? Or give",
         ),
         (
             "pi@pi: Permission denied (publickey,password).",
-            "Permission denied: its key is not known there: ssh-copy-id pi",
+            "Permission denied: your key is not known there: ssh-copy-id pi",
+        ),
+        (
+            "ssh: connect to host pi port 22: Connection refused",
+            "Connection refused: no sshd answers on pi: sudo",
         ),
         ("Host key verification failed.", "its host key is not known here: ssh pi once"),
     ],
@@ -267,3 +272,54 @@ def test_a_table_has_a_dash_where_nothing_is_known() -> None:
 def _file(path: Path, content: bytes) -> Path:
     path.write_bytes(content)
     return path
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--options", "rihgt=--sync client"], "--options 'rihgt=--sync client': rig 'desk' has no 'rihgt'"),
+        (["--camera", "up=v4l2"], "--camera 'up=v4l2': rig 'desk' has no 'up'; it has left, right"),
+        (["--wheelhouse", "nowhere"], "--wheelhouse nowhere: no wheels in it; phalanx wheels DIR"),
+        (["--identity", "nokey"], "--identity nokey: no such file"),
+    ],
+)
+def test_what_is_mistyped_is_told_before_a_machine_is_asked(
+    words: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tree = str(ROOT / "calib_json")
+    line = ["deploy", "left=a.invalid", "--master", "127.0.0.1", "--dry-run", "--calibration", tree, *words]
+    assert main(line) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_a_fleet_with_a_keys_folder_that_is_not_there_is_told_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["fleet", "--keys", "nokeys"]) == 1
+    assert "--keys nokeys: no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("said", "names", "driver"),
+    [
+        ((), ("left",), "picamera2"),
+        (("v4l2:0",), ("left",), "v4l2:0"),
+        (("left=v4l2", "right=picamera2:1"), ("left",), "v4l2"),
+        (("left=v4l2", "right=picamera2:1"), ("right",), "picamera2:1"),
+        (("left=v4l2",), ("left", "right"), "picamera2"),
+        (("picamera2",), (), ""),
+    ],
+)
+def test_each_machine_gets_what_its_own_cameras_need(
+    said: tuple[str, ...], names: tuple[str, ...], driver: str
+) -> None:
+    wish = Wish("10.0.0.2", DESK, ROOT, None, (), said, None, apt=True, dry_run=True, ready_s=9.0)
+    assert wish.driver(names) == driver
+
+
+def test_an_interruption_ends_what_waits_for_a_machine(fake_ssh: Callable[[str], None]) -> None:
+    fake_ssh("sleep 300")
+    deadline = Deadline(200.0)
+    threading.Timer(0.3, deadline.end).start()
+    began = time.monotonic()
+    with pytest.raises(DeployError, match="interrupted"):
+        Remote("host", (), deadline).run(["true"], b"", print)
+    assert time.monotonic() - began < 60.0

@@ -57,6 +57,9 @@ def test_drivers_and_options_are_of_one_camera_or_of_all() -> None:
     assert left.endswith("--camera picamera2 --seed 1 --sync server")
     assert right.endswith("--camera v4l2 --seed 1")
     assert made.picamera2
+    (alone,) = plan("--name", "left", "--camera", "left=v4l2", "--camera", "right=picamera2:1",
+                    "--options", "left=--sync server", "--options", "right=--sync client").senders  # fmt: skip
+    assert " ".join(alone.options).endswith("--camera v4l2 --sync server"), "right is on another machine"
 
 
 @pytest.mark.parametrize(
@@ -70,6 +73,7 @@ def test_drivers_and_options_are_of_one_camera_or_of_all() -> None:
         (("--rig", "wrist", "--imu", "ximu3:/dev/ttyACM0"), "say who switches its lights, --lights DRIVER"),
         (("--rig", "wrist", "--lights", "camera"), "say which one it is, --imu DRIVER"),
         (("--name", "left", "--options", "--note 'a b'"), "'a b': blanks and quotes cannot be in an option"),
+        (("--name", "left", "--options", "--note 'a"), '--options "--note \'a": No closing quotation'),
         (("--name", "left", "--options", "--seed $(id)"), "blanks and quotes"),
         (("--name", "left", "--master", "a b"), "--master a b: give the host name or the address"),
     ],
