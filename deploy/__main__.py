@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from deploy.checks import keys_of_fleet
 from deploy.demo import DemoSettings, run_demo, stop_on_signals
 from deploy.deployment import Lines, deploy, make_keys, uninstall
 from deploy.fleet import fleet_once, table, watch_fleet
@@ -86,10 +87,10 @@ def _replay(options: argparse.Namespace) -> int:
 def _deploy(options: argparse.Namespace) -> int:
     rig = rig_of(options)
     targets = targets_of(options.hosts, rig)
-    wish, ears, say = wish_of(options, rig), ears_of(options), Lines(_say)
+    wish, ears, reached, say = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_say)
     if not options.dry_run:
         make_keys(options.keys, [name for target in targets for name in target.names], say)
-    return _told(deploy(targets, wish, reached_of(options), ears, say))
+    return _told(deploy(targets, wish, reached, ears, say))
 
 
 def _uninstall(options: argparse.Namespace) -> int:
@@ -113,9 +114,10 @@ def _wheels(options: argparse.Namespace) -> int:
 
 
 def _fleet(options: argparse.Namespace) -> int:
+    keys = keys_of_fleet(options)
     if options.watch:
-        return watch_fleet(options.keys, options.bus, _say)
-    devices = fleet_once(options.keys, options.bus)
+        return watch_fleet(keys, options.bus, _say)
+    devices = fleet_once(keys, options.bus)
     _say(json.dumps(devices) if options.json else "\n".join(table(devices)))
     return 0
 
