@@ -276,7 +276,8 @@ class ZenohBus:
 
 def _plain(error: zenoh.ZError) -> str:
     """What went wrong, without the places in zenoh's source that it names."""
-    return re.sub(r" at /\S+:\d+\.?", "", str(error)).rstrip(".")
+    text = re.sub(r" at /\S+:\d+\.?", "", str(error)).rstrip(".")
+    return re.sub(r"Unable to connect to any of .*Timeout!", "nobody answers there", text)
 
 
 def _start(name: str, step: Callable[[], None]) -> threading.Thread:

@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 from common.errors import PhalanxError
 from common.keys import ENVIRONMENT, FOLDER, OPEN
 
-_NEEDED_BY = frozenset({"bus", "key_file"})  # parameters of the commands that need them
+_NEEDED_BY = frozenset({"bus", "key_file", "listen"})  # parameters of the commands that need them
 
 
 def program(app: typer.Typer) -> TyperGroup:
