@@ -54,10 +54,10 @@ define apt
 endef
 
 emulator: ## what runs aarch64 programs in the tests; without root it says what to install
-	$(call apt,the tests on aarch64,qemu-user mmdebstrap,qemu-aarch64 mmdebstrap)
+	$(call apt,the tests on aarch64,mmdebstrap gcc libc6-dev debian-archive-keyring,mmdebstrap gcc)
 
 hosts-tools: emulator ## what the tests with whole machines need; without root it says what to install
-	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump,qemu-system-aarch64 systemd-nspawn rsync ssh ip tcpdump)
+	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
 
 test: check browser emulator ## check, then all tests
 	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)

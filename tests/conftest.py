@@ -24,6 +24,7 @@ settings.load_profile("house")
 # Several processes or a browser each: beside one another they would starve, so one worker has them all, from the start.
 LIVE = (
     "tests/loopback/",
+    "tests/aarch64/",
     "tests/docs/examples/",
     "tests/master/console/",
     "tests/master/web/test_page.py",
