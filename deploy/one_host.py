@@ -135,11 +135,10 @@ class Host:
             lambda line: lines.append((time.time(), line)),
             _PROBE_S,
         )
-        results = [(at, line) for at, line in lines if line.startswith('{"result"')]
+        results = [(at, found) for at, line in lines if (found := _result(line)) is not None]
         if code != 0 or not results:
             raise DeployError(f"cannot look at it: {lines[-1][1] if lines else f'python3 ended with {code}'}")
-        arrived, text = results[-1]
-        facts = cast(dict[str, object], json.loads(text)["result"])
+        arrived, facts = results[-1]
         if facts["why_not"] is not None:
             raise DeployError(str(facts["why_not"]))
         self.sudo = facts["user"] != "root"
@@ -193,8 +192,8 @@ class Host:
 
         def hear(line: str) -> None:
             nonlocal last
-            if line.startswith('{"result"'):
-                result.update(json.loads(line)["result"])
+            if (found := _result(line)) is not None:
+                result.update(found)
             else:
                 last = line
                 self.say(line)
@@ -205,6 +204,16 @@ class Host:
         if code != 0 or not result:
             raise DeployError(last.removeprefix("! ") or f"the installer ended with {code}")
         return result
+
+
+def _result(line: str) -> dict[str, object] | None:
+    """What the installer found or did; None: the line is another, or the link broke within it."""
+    if not line.startswith('{"result"'):
+        return None
+    try:
+        return cast(dict[str, object], json.loads(line)["result"])
+    except ValueError:
+        return None
 
 
 def _plain_bundle() -> bytes:

@@ -80,6 +80,13 @@ def wheelhouse(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wh
     Raises:
         DeployError: A wheel cannot be had.
     """
+    try:
+        return _gathered(kind, given, say)
+    except OSError as error:
+        raise DeployError(f"wheels: {error.filename or cache()}: {error.strerror or error}") from error
+
+
+def _gathered(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Wheels:
     with _LOCK:  # the second machine of a kind waits for the first
         folder = _downloaded(kind, say) if given is None else given
         files = sorted(folder.glob("*.whl"))
@@ -176,6 +183,9 @@ def _downloaded(kind: Kind, say: Callable[[str], None]) -> Path:
         try:
             _download(kind, requirements, limits, fresh)
             fresh.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # else another program was quicker
+                raise
         finally:
             shutil.rmtree(fresh, ignore_errors=True)
     return folder

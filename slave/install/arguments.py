@@ -8,8 +8,8 @@ from slave.install.options import READY_S, SETTLE_S, add_options
 PURPOSE = "install it as a service of this machine"
 EXAMPLES = """\
   sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --keys keys --calibration calib_json
-        on the Raspberry Pi itself, after `pipx install --global --system-site-packages`; keys and calib_json are
-        copied from the PC. From the PC, for all machines at once: phalanx deploy
+        on the Raspberry Pi itself, out of an environment that sees the system's packages (docs/deploy.md); keys and
+        calib_json are copied from the PC. From the PC, for all machines at once: phalanx deploy
   sudo phalanx-slave install --master 192.168.1.2 --rig wrist --imu lsm6dsox:1:0x6a --lights gpio:0:17,27 --keys keys
         a wrist device: its camera and its IMU, each a service
   sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run

@@ -323,3 +323,21 @@ def test_an_interruption_ends_what_waits_for_a_machine(fake_ssh: Callable[[str],
     with pytest.raises(DeployError, match="interrupted"):
         Remote("host", (), deadline).run(["true"], b"", print)
     assert time.monotonic() - began < 60.0
+
+
+def test_a_link_that_breaks_within_the_last_line_is_told(fake_ssh: Callable[[str], None]) -> None:
+    fake_ssh(
+        """cat > /dev/null; printf '{"result": {"mach'; echo 'client_loop: send disconnect' >&2; exit 255"""
+    )
+    host = Host(Target("pi", ("left",)), Remote("pi", (), Deadline(60.0)), print)
+    with pytest.raises(DeployError, match="send disconnect"):
+        host.look()
+
+
+def test_wheels_that_cannot_be_kept_are_told_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "cache").write_text("no folder")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(DeployError, match=r"wheels: .*cache.*: Not a directory"):
+        wheelhouse(wheels_module.Kind("aarch64", "3.13"), None, print)
