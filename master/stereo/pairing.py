@@ -5,7 +5,8 @@ delivered a dozen frames since its last). It is *complete* when every other came
 it, so that tracks can be interpolated; `predict` waits only for those whose next frame is nearer to the instant than
 their last, and carries the others forward, half a period at most. An instant is emitted when it is complete, or when
 the message time has passed its deadline, with whatever there is. Message time is the newest capture time seen: no clock
-is read here, so a replay pairs exactly as the live run did.
+is read here, so a replay pairs exactly as the live run did. An instant that still waited for a partner when all cameras
+fell silent, for as long as makes one silent, is *outdated* and left out: nobody asks any more where the hand was then.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
 than the back of the hand. `master.stereo.tracks` carries each to the instant; a sideways error Dt v would turn into a
@@ -53,7 +54,11 @@ class Instant:
 
 
 class Pairing:
-    """Push machine. Holds the last few sightings of each camera and the instants not yet emitted."""
+    """Push machine. Holds the last few sightings of each camera and the instants not yet emitted.
+
+    Attributes:
+        outdated: Instants that were left out because they waited for as long as nothing came at all.
+    """
 
     def __init__(
         self,
@@ -77,10 +82,12 @@ class Pairing:
         period_ns = int(1e9 / min(frame_rate_hz[name] for name in self._names))
         self._deadline_ns = int(1.25 * period_ns)
         self._gap_ns = int((SIGHTINGS + 0.25) * period_ns)
+        self._outdated_ns = SILENT_FRAMES * period_ns
         self._half_ns = [int(0.5e9 / frame_rate_hz[name]) for name in self._names]
         self._scale_px_m = np.array([camera.matrix[0, 0] / _REACH_M for camera in self._cameras])
         self._patience = SILENT_FRAMES * len(cameras)
         self._policy, self._continuous = policy, continuous
+        self.outdated = 0
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
         self._waiting = [0] * len(self._names)  # frames of other cameras since this one's last
         self._pending: deque[int] = deque()
@@ -144,11 +151,14 @@ class Pairing:
         out: list[Instant] = []
         while self._pending:
             t_ns = self._pending[0]
-            due = self._newest_ns - t_ns > self._deadline_ns
-            if not (flush or due or self._complete(t_ns)):
+            waited_ns, complete = self._newest_ns - t_ns, self._complete(t_ns)
+            if not (flush or complete or waited_ns > self._deadline_ns):
                 break
             self._pending.popleft()
             self._emitted_ns = t_ns
+            if self._continuous and not complete and waited_ns > self._outdated_ns:
+                self.outdated += 1
+                continue
             out.append(self._at(t_ns))
         return out
 

@@ -132,6 +132,8 @@ class MarkerPipeline:
             message = msgspec.structs.replace(message, t_ns=message.t_ns + late_ns)
         with self._stage("pairing"):
             instants = self._pairing.push(message)
+        if self._pairing.outdated:
+            self.counts["instants_outdated"] = self._pairing.outdated
         return self._solved(instants)
 
     def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:

@@ -281,6 +281,33 @@ def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
     assert [i.t_ns for i in machine.push(frame("right", 5, 5 * PERIOD + 5 * MS))] == [5 * PERIOD]
 
 
+@pytest.mark.parametrize(
+    ("pause", "kept"), [(SILENT_FRAMES - 2, True), (SILENT_FRAMES + 2, False), (300, False)]
+)
+def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, kept: bool) -> None:
+    """A cable is out between the leader's frame and its partner's: the pose would be as old as the cut."""
+    machine = pairing()
+    for message in interleaved(stream("left", 6), stream("right", 5, 5 * MS)):
+        machine.push(message)
+    back = 5 + pause
+    late = [
+        frame(c, k, k * PERIOD + at) for k in (back, back + 1) for c, at in (("left", 0), ("right", 5 * MS))
+    ]
+    found = [instant.t_ns for message in late for instant in machine.push(message)]
+    assert found == [5 * PERIOD] * kept + [back * PERIOD, (back + 1) * PERIOD]
+    assert machine.outdated == (not kept)
+
+
+def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
+    machine = pairing()
+    times = [0, 1, 400, 401, 800]
+    found = push_all(
+        machine, [frame(c, k, t * PERIOD) for k, t in enumerate(times) for c in ("left", "right")]
+    )
+    assert [instant.t_ns for instant in found] == [t * PERIOD for t in times]
+    assert machine.outdated == 0
+
+
 def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
     cameras = ("left", "right", "top")
     streams = [stream(camera, 10, late * MS) for camera, late in zip(cameras, (0, 5, 11), strict=True)]
