@@ -277,14 +277,19 @@ def _source(
         late_ns = round(options.start_offset_ms * 1e6)
         waits = isinstance(true_clock, FrameClock)
         sleep = true_clock.sleep if isinstance(true_clock, FrameClock) else time.sleep
-        drawn = SyntheticCamera(
-            scene, camera, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
-        )
+
+        def draw(file: CameraCalibration) -> SyntheticCamera:
+            return SyntheticCamera(
+                scene, file, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
+            )
+
         if getattr(options, "faults", None) is None:
-            return drawn
+            return draw(camera)
         from slave.cameras.faulty import FaultyCamera
 
-        return FaultyCamera(drawn, camera, options.faults)
+        return real.lasting(
+            lambda file: FaultyCamera(draw(file), file, options.faults), camera, clock, stop, away
+        )
     raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
 
 

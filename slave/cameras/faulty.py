@@ -43,6 +43,7 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
         patches: Things before the camera that the scene does not have.
         keep_one_in: Of so many frames one is delivered: a camera, or a cable, that is too slow.
         swap_every: Of so many frames two come in the wrong order: the strobe of a wrist device slips. 0: none.
+        unplugged: It is not there: lost while it runs, and not to be opened.
     """
 
     exposes: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
@@ -50,6 +51,7 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
     patches: tuple[Patch, ...] = ()
     keep_one_in: Annotated[int, Meta(ge=1, le=100)] = 1
     swap_every: Annotated[int, Meta(ge=0, le=1000)] = 0
+    unplugged: bool = False
 
 
 class FaultyCamera:
@@ -59,7 +61,7 @@ class FaultyCamera:
         """Have the faults that `path` says; there need be no such file yet.
 
         Raises:
-            CameraError: The file is broken.
+            CameraError: The file is broken, or says that the camera is unplugged.
         """
         self._source, self._camera, self._path = source, camera, path
         self._faults = Faults()
@@ -68,9 +70,14 @@ class FaultyCamera:
         self._count = 0
         self._held: Frame | None = None
         self._look()
+        self._refuse_unplugged()
 
     def read(self) -> Frame | None:
-        """The next frame, spoiled."""
+        """The next frame, spoiled.
+
+        Raises:
+            CameraError: The camera was unplugged.
+        """
         while (frame := self._source.read()) is not None:
             if frame.ready_t_ns - self._looked_ns >= LOOK_NS:
                 self._looked_ns = frame.ready_t_ns
@@ -78,6 +85,7 @@ class FaultyCamera:
                     self._look()
                 except CameraError as error:
                     _LOG.warning("%s", error)
+                self._refuse_unplugged()
             self._count += 1
             if self._count % self._faults.keep_one_in:
                 continue
@@ -104,6 +112,10 @@ class FaultyCamera:
     def counts(self) -> dict[str, int]:
         """Those of the camera inside."""
         return self._source.counts()
+
+    def _refuse_unplugged(self) -> None:
+        if self._faults.unplugged:
+            raise CameraError(f"camera {self._camera.name!r} is unplugged, says {self._path}")
 
     def _look(self) -> None:
         """Read the file if it was changed.

@@ -105,10 +105,10 @@ def open_real(
         if options.sync != "off":  # the others may have to be started first
             away = partial(away, patience_s=AWAY_S + options.sync_timeout)
             away("opens the camera, in step with others")
-        return _lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, away)
+        return lasting(lambda file: Picamera2Camera(file, pi, clock, stop), camera, clock, stop, away)
     if kind == "v4l2":
         usb = V4l2Options(_path(place), _controls(options.control), tuple(options.allow_missing), pixels)
-        return _lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, away)
+        return lasting(lambda file: V4l2Camera(file, usb, clock), camera, clock, stop, away)
     return None
 
 
@@ -126,13 +126,18 @@ def _pixels(kind: str, as_luma: bool, wrist: bool) -> Pixels:
     return Pixels.COLOUR
 
 
-def _lasting(
+def lasting(
     opener: Callable[[CameraCalibration], FrameSource],
     camera: CameraCalibration,
     clock: Clock,
     stop: threading.Event | None,
     away: Away,
 ) -> FrameSource:
+    """Open a camera that is opened again whenever it is lost, until `stop` is set; None: losing it is an error.
+
+    Raises:
+        CameraError: It cannot be opened the first time.
+    """
     return opener(camera) if stop is None else ReopeningCamera(opener, camera, clock, stop, away)
 
 

@@ -14,7 +14,8 @@ import pytest
 
 from bench.checklist import clean, rehearse
 from bench.checklist_faults import of_markers, of_wrist
-from bench.checklist_rig import Rig
+from bench.checklist_rig import Rig, until
+from common.streams import MASTER
 
 FAULTS = {fault.code: fault for fault in (*of_markers(), *of_wrist())}
 # The others take a fresh process or a slow way to come about, or are the same path as one of these with another number:
@@ -23,6 +24,7 @@ LIVE = ("auto_mode", "colour_collision", "background_in_range", "calibration_sta
         "too_hot", "imu_silent")  # fmt: skip
 NOMINAL = 2  # reports
 STEP_S = 0.02
+BACK_S = 2.0
 AFTER_S = 1.2  # the bench waits longer
 # A machine that is behind draws fewer pictures than it should: then that is told as well, and it is true.
 BEHIND = {"rate_low"}
@@ -97,3 +99,27 @@ def test_a_killed_slave_is_told_alone_until_it_is_there_again(rig: Rig, lag: Lag
     assert {other for other, _ in shown.others} <= BEHIND
     assert shown.shown_reports <= NOMINAL + lag.reports
     assert shown.cleared_reports <= NOMINAL + lag.reports
+
+
+def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_plug(
+    rig: Rig, lag: Lag
+) -> None:
+    """The slave lives on, with the session it had; from the plug to frames of it: the longest wait of its retries."""
+    until(lambda: not rig.lists.now() - {("rate_low", "left"), ("rate_low", "right")}, 10.0)
+    before, told = rig.ask("left", "report").counts, rig.ask(MASTER, "report").counts
+    rig.fault("left", unplugged=True)
+    assert until(lambda: ("camera_absent", "left") in rig.lists.now(), BACK_S + lag.reports)
+    away = rig.ask("left", "report").counts
+    assert away["camera.lost"] == before["camera.lost"] + 1
+    sent = rig.ask(MASTER, "report").counts["left.received"]
+    rig.fault("left")
+    plugged = time.monotonic()
+    assert until(lambda: rig.ask(MASTER, "report").counts["left.received"] > sent + 3, 30.0)
+    assert (
+        time.monotonic() - plugged < BACK_S + 1.0 + lag.reports
+    )  # of retries; three frames; what the machine lacks
+    assert until(lambda: ("camera_absent", "left") not in rig.lists.now(), BACK_S + lag.reports)
+    after = rig.ask(MASTER, "report").counts
+    assert rig.processes["left"].poll() is None
+    assert after.get("left.restarts", 0) == told.get("left.restarts", 0)
+    assert after["poses"] > told["poses"]

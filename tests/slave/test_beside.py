@@ -5,9 +5,11 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pytest
 
 from common.calibration import CameraCalibration, HsvRange, RigCalibration, load
 from common.clock import SystemClock
+from common.errors import CameraError
 from slave.cameras.faulty import FaultyCamera
 from slave.cameras.synthetic import SyntheticCamera
 from slave.colours_in_use import in_use, overlap
@@ -89,6 +91,12 @@ def test_a_simulated_camera_is_spoiled_as_its_file_says_and_well_without(tmp_pat
     clock.sleep(0.2)
     faulty.read()
     assert faulty.figures()["exposure_us"] == camera.exposure_us
+    path.write_text(json.dumps({"unplugged": True}))
+    clock.sleep(0.2)
+    with pytest.raises(CameraError, match="unplugged"):
+        faulty.read()
+    with pytest.raises(CameraError, match="unplugged"):
+        FaultyCamera(drawn, camera, path)
 
 
 def test_nothing_is_told_of_a_detector_that_is_not_there() -> None:
