@@ -34,6 +34,7 @@ CLIENTS = 16
 ECHO_BYTES = 256  # the longest text of a client; one that begins with "ping" comes back, the rest is ignored
 SEND_BUFFER_BYTES = 32 * 1024  # about five poses: what lies in the system's buffer is old when it is read
 PING_S, SILENT_S = 10.0, 20.0
+OPEN_S = 5.0  # for who connects to say what is wanted; so long a stranger who says nothing keeps a connection
 _JOIN_S = 3.0
 _COOKIE_S = 30 * 24 * 3600
 _TYPES = {
@@ -166,6 +167,8 @@ class WebServer:
             self._client,
             sock=self._socket,
             ssl=self._guard.tls,
+            ssl_handshake_timeout=None if self._guard.tls is None else OPEN_S,
+            open_timeout=OPEN_S,
             process_request=self._answer,
             compression=None,  # it costs more than it saves on the machine itself
             max_size=ECHO_BYTES,
@@ -186,7 +189,10 @@ class WebServer:
             mailbox.put(texts)
 
     async def _client(self, connection: ServerConnection) -> None:
-        """Serve one client until it goes."""
+        """Serve one client until it goes; one of many that came at once, for whom there is no room, goes now."""
+        if len(self._mailboxes) >= self._clients:
+            await connection.close(1013, f"{self._clients} clients are connected already")
+            return
         mailbox = self._mailboxes[connection] = Mailbox()
         sending = asyncio.create_task(_send(connection, mailbox))
         try:
