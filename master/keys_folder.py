@@ -57,7 +57,7 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
             authority = new_authority(now)
             add(folder / AUTHORITY, authority.certificate, 0o644)
             add(folder / AUTHORITY_KEY, authority.key, 0o600)
-        authority = KeyPair((folder / AUTHORITY).read_bytes(), (folder / AUTHORITY_KEY).read_bytes())
+        authority = _authority(folder)
         for place in [folder / MASTER, folder / OPERATOR, *(folder / DEVICES / name for name in names)]:
             certificate, key = (place.with_name(f"{place.name}.{ending}") for ending in ("pem", "key"))
             if certificate.exists() and key.exists():
@@ -111,13 +111,17 @@ def renew_device(folder: Path, name: str, now: datetime) -> None:
     """Make a new certificate for one device. Its old one stays valid: for one that was lost or stolen use `renew`.
 
     Raises:
-        PhalanxError: No such folder or device.
+        PhalanxError: No such folder or device; it cannot be written. The old one is still there then.
     """
     if name not in (names := devices_of(folder)):
         raise PhalanxError(f"{folder}: no device {name!r}; there are: {', '.join(names) or 'none'}")
-    for ending in ("key", "pem"):
-        (folder / DEVICES / f"{name}.{ending}").unlink(missing_ok=True)
-    make(folder, [name], now)
+    place = folder / DEVICES / name
+    try:
+        pair = issue(_authority(folder), name, now)
+        _write(place.with_name(f"{name}.key"), pair.key, 0o600)
+        _write(place.with_name(f"{name}.pem"), pair.certificate, 0o644)
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot renew {name!r}: {error}") from error
 
 
 def devices_of(folder: Path) -> list[str]:
@@ -152,6 +156,10 @@ def certificates_of(folder: Path) -> list[Shown]:
         except (OSError, ValueError) as error:
             raise PhalanxError(f"{path}: cannot read the certificate ({error})") from error
     return told
+
+
+def _authority(folder: Path) -> KeyPair:
+    return KeyPair((folder / AUTHORITY).read_bytes(), (folder / AUTHORITY_KEY).read_bytes())
 
 
 def _check_name(name: str) -> None:

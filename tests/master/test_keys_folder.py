@@ -115,3 +115,11 @@ def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path, keys: Path) ->
     (keys / "ca.key").unlink()  # as on a device
     with pytest.raises(PhalanxError, match=r"has ca\.pem but not ca\.key"):
         make(keys, ["late"], NOW)
+
+
+def test_a_device_keeps_its_certificate_where_none_can_be_made(keys: Path) -> None:
+    before = files(keys)
+    (keys / "ca.key").write_text("broken")
+    with pytest.raises(PhalanxError, match=r"ca\.pem or ca\.key: broken"):
+        renew_device(keys, "left", NOW)
+    assert files(keys) == before | {"ca.key": b"broken"}
