@@ -48,6 +48,21 @@ FLEET_EXAMPLES = """examples:
 
 def add_commands(add_parser: AddParser, calibration: Path) -> None:
     """Add `deploy`, `uninstall`, `fleet` and `wheels`."""
+    _add_deploy(add_parser, calibration)
+    uninstall = _command(
+        add_parser,
+        "uninstall",
+        "slaves from their machines again",
+        "Leaves nothing of ours there.",
+        UNINSTALL_EXAMPLES,
+    )
+    uninstall.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
+    _reach(uninstall)
+    _add_fleet(add_parser)
+    _add_wheels(add_parser)
+
+
+def _add_deploy(add_parser: AddParser, calibration: Path) -> None:
     deploy = _command(
         add_parser,
         "deploy",
@@ -101,15 +116,9 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
         "--bus", metavar="ENDPOINT", help="bus of the master, if it runs (default: that of --master)"
     )
     _reach(deploy)
-    uninstall = _command(
-        add_parser,
-        "uninstall",
-        "slaves from their machines again",
-        "Leaves nothing of ours there.",
-        UNINSTALL_EXAMPLES,
-    )
-    uninstall.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
-    _reach(uninstall)
+
+
+def _add_fleet(add_parser: AddParser) -> None:
     fleet = _command(
         add_parser,
         "fleet",
@@ -121,7 +130,6 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
     fleet.add_argument("--bus", metavar="ENDPOINT", help="of the master (default: of this machine)")
     fleet.add_argument("--watch", action="store_true", help="again each second, until Ctrl-C")
     fleet.add_argument("--json", action="store_true", help="as JSON")
-    _add_wheels(add_parser)
 
 
 def _add_wheels(add_parser: AddParser) -> None:
