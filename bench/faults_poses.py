@@ -38,6 +38,14 @@ class Told:
     beyond: float
 
 
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How poses come: so many a second, with gaps no longer than this [s]."""
+
+    rate_hz: float
+    gap_s: float = GAP_S
+
+
 class Judge:
     """Where the joints truly are at each moment. Holds a table of one way of the scene."""
 
@@ -97,10 +105,17 @@ class Poses:
                     self._told.append(told)
 
 
-def steady_from(told: list[Told], moment_s: float, rate_hz: float) -> float | None:
+def pace_of(told: list[Told], began_s: float, ended_s: float, rate_hz: float) -> Pace:
+    """The pace of what came from `began_s` to `ended_s`: at most `rate_hz`; gaps half as long again as the longest."""
+    came = [began_s, *(one.came_s for one in told), ended_s]
+    longest_s = max(b - a for a, b in pairwise(came))
+    return Pace(min(rate_hz, len(told) / (ended_s - began_s)), max(GAP_S, 1.5 * longest_s))
+
+
+def steady_from(told: list[Told], moment_s: float, pace: Pace) -> float | None:
     """When, after `moment_s`, poses came steadily and were right for half a second; None: not yet.
 
-    Steady: four fifths of the nominal number, no gap above 0.2 s, no tracked joint off by more than 20 mm.
+    Steady: four fifths of the number of the pace, no gap above its own, no tracked joint off by more than 20 mm.
     """
     came = [one for one in told if one.came_s >= moment_s]
     for k, first in enumerate(came):
@@ -108,7 +123,7 @@ def steady_from(told: list[Told], moment_s: float, rate_hz: float) -> float | No
         if came[-1].came_s < first.came_s + STEADY_S:
             return None
         gaps = [b.came_s - a.came_s for a, b in pairwise(window)]
-        enough = len(window) >= STEADY_SHARE * STEADY_S * rate_hz and max(gaps, default=9.0) < GAP_S
+        enough = len(window) >= STEADY_SHARE * STEADY_S * pace.rate_hz and max(gaps, default=9.0) < pace.gap_s
         if enough and all(one.worst_mm < SANE_MM for one in window):
             return first.came_s
     return None

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from bench.faults_poses import Judge, Poses, steady_from
+from bench.faults_poses import Judge, Pace, Poses, pace_of, steady_from
 from bench.local_rig import free_port, join_bus
 from bench.processes import footprint
 from bench.udp_relay import UdpRelay
@@ -44,6 +44,7 @@ class FaultRig:
         processes: Name -> process, each of them alive or not.
         poses: What came.
         master_options: More options of the master's command line, used at its next start.
+        pace: What is steady for this rig: nominal, or its own where a machine has other things to do (`own_pace`).
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class FaultRig:
         Raises:
             FaultRigError: It does not within a minute.
         """
-        self.folder, self.master_options = folder, tuple(master_options)
+        self.folder, self.master_options, self.pace = folder, tuple(master_options), Pace(RATE_HZ)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._files = _slower(self.folder / "calib_json")
         self.key = secrets.token_hex(32)
@@ -153,11 +154,19 @@ class FaultRig:
         found: list[float] = []
 
         def steady() -> bool:
-            at = steady_from(self.poses.since(moment_s), moment_s, RATE_HZ)
+            at = steady_from(self.poses.since(moment_s), moment_s, self.pace)
             found.extend([] if at is None else [at - moment_s])
             return bool(found)
 
         return found[0] if until(steady, patience_s) else None
+
+    def own_pace(self, seconds: float = 1.0) -> Pace:
+        """Measure how poses come while nothing is wrong; what is steady is measured against that from now on."""
+        began = time.monotonic()
+        time.sleep(seconds)
+        ended = time.monotonic()
+        self.pace = pace_of(self.poses.since(began, ended), began, ended, RATE_HZ)
+        return self.pace
 
     def _begin(self) -> None:
         self.start_master()
@@ -168,8 +177,9 @@ class FaultRig:
         self._lists, self._listed = self.bus.subscribe("checklist", depth=64), frozenset[tuple[str, str]]()
         self.poses = Poses(self.bus, Judge(self.epoch_ns))
         self._closing.append(self.poses.close)
-        if self.steady_after(time.monotonic(), UP_S) is None:
-            raise FaultRigError(f"no steady poses; logs are in {self.folder}")
+        if not until(lambda: len(self.poses.since(0.0)) > RATE_HZ, UP_S):
+            raise FaultRigError(f"no poses; logs are in {self.folder}")
+        self.steady_after(time.monotonic())  # a machine that has other things to do may never be
 
     def _start(self, name: str, command: list[str], key: str) -> None:
         if (old := self.processes.get(name)) is not None:

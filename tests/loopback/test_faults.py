@@ -1,25 +1,30 @@
 """Faults on real processes, each once: steady and right poses again within two seconds of its end, counted, none false.
 
-`python -m bench.faults` brings all of them about, several times, and prints the table of docs/faults.md. Here are those
-that no test of the link alone can show. How far this machine is behind is measured by how long a sleep really takes.
+`python -m bench.faults` brings all of them about, several times, and prints the table of docs/faults.md: the goal is
+judged there. Here are those that no test of the link alone can show, on a machine that may have other things to do:
+steady is what the rig did before the fault, how far the machine is behind is measured by how long a sleep really takes,
+and a fault that was not over in time while it was behind is brought about once more. What is false is false anywhere.
 """
 
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 
 import pytest
 
 from bench.faults_flood import Capture, flood, hostile, targets
-from bench.faults_links import of_links
-from bench.faults_measured import GOAL_S, false, measure
+from bench.faults_links import Fault, of_links
+from bench.faults_measured import GOAL_S, Run, false, measure
 from bench.faults_ports import assault
-from bench.faults_rig import FaultRig
+from bench.faults_rig import UP_S, FaultRig
 
 FAULTS = {fault.name: fault for fault in of_links(long=False)}
 # Loss, reordering, duplicates, a cut, restarts and twins are in simulated time, or over sockets, in the tests beside.
-LIVE = ("step_ahead", "slave_stopped", "master_stopped", "master_restart")
+LIVE = ("step_ahead", "slave_stopped", "master_stopped")
 STEP_S = 0.02
+BEHIND_S = 0.05  # so late a sleep is where a machine has other things to do
+LEAST_HZ = 6.0  # two cameras and a master that make fewer poses before any fault have no machine to run on
 
 
 class Lag:
@@ -49,17 +54,81 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FaultRig]:
         made.close()
 
 
+@pytest.fixture(autouse=True)
+def paced(rig: FaultRig) -> None:
+    """What is steady is what the rig does now, before anything is put wrong."""
+    rate_hz = rig.own_pace().rate_hz
+    if rate_hz < LEAST_HZ:
+        pytest.skip(f"{rate_hz:.0f} poses a second before any fault: this machine has too much else to do")
+
+
+def measured(rig: FaultRig, fault: Fault) -> Run:
+    """Bring it about; once more where it was not over in time and the machine was behind."""
+    for last in (False, True):
+        lag = Lag()
+        run = measure(rig, fault)
+        lag.close()
+        assert not run.false
+        allowed_s = GOAL_S + 20.0 * lag.worst_s  # twenty things follow one another until all is well
+        over = run.recovery_s is not None and run.recovery_s < allowed_s
+        if over or last or lag.worst_s < BEHIND_S:
+            assert over, f"{fault.name}: over after {run.recovery_s} s, {allowed_s:.1f} s are allowed"
+            return run
+        warnings.warn(f"{fault.name} again: this machine was {lag.worst_s:.2f} s behind", stacklevel=2)
+    raise AssertionError("unreachable")
+
+
 @pytest.mark.parametrize("name", LIVE)
 def test_a_fault_ends_and_all_is_well_within_two_seconds(name: str, rig: FaultRig) -> None:
-    lag = Lag()
-    run = measure(rig, FAULTS[name])
-    lag.close()
-    assert run.recovery_s is not None
-    assert run.recovery_s < GOAL_S + 20.0 * lag.worst_s  # twenty things follow one another until all is well
-    assert not run.false
-    fault = FAULTS[name]
-    assert not fault.counts or any(run.counts.values())
+    run = measured(rig, FAULTS[name])
+    assert not FAULTS[name].counts or any(run.counts.values())
     assert run.grown_mb < 10.0
+
+
+def test_after_a_pause_no_pose_is_as_old_as_the_pause(rig: FaultRig) -> None:
+    """A frame still waited for its partner's when the cable was pulled: nobody asks for that pose any more."""
+    out_s = 3.0
+
+    def cut(rig: FaultRig) -> float:
+        rig.relay.cut = True
+        time.sleep(out_s)
+        rig.relay.cut = False
+        return time.monotonic()
+
+    run = measured(rig, Fault("short cut", "", "", cut))
+    assert run.oldest_s < 0.8 * out_s
+
+
+def test_what_was_captured_is_not_taken_after_either_side_began_again(rig: FaultRig) -> None:
+    """Old hellos, beacons, echoes and frames: of processes that are gone, told to those that came after."""
+    capture = Capture(rig)
+    time.sleep(1.0)
+    rig.kill("left")
+    rig.start_camera("left")  # its hello is captured, too
+    assert rig.steady_after(time.monotonic(), UP_S) is not None
+    capture.end()
+    _replay(rig, capture)
+    measured(rig, FAULTS["master_restart"])
+    _replay(rig, capture)
+
+
+def _replay(rig: FaultRig, capture: Capture) -> None:
+    """Send all of it again to the side that it was for, and see that nothing of it is taken."""
+    before, began = rig.counts(), time.monotonic()
+    frames = capture.to_master[-4000:]
+    flood(frames, [("127.0.0.1", rig.master_port)], len(frames), per_s=2000.0)
+    slaves = [*rig.relay.slaves(), ("127.255.255.255", rig.port)]
+    for slave in slaves:
+        flood(capture.to_slaves, [slave], len(capture.to_slaves), per_s=2000.0)
+    assert rig.steady_after(time.monotonic(), UP_S) is not None
+    after = rig.counts()
+    rise = {name: after[name] - before.get(name, 0) for name in after if name.startswith("refused.")}
+    assert sum(rise.values()) >= 0.9 * len(frames)
+    for name in ("left.restarts", "right.restarts", "left.clock_steps", "right.clock_steps"):
+        assert after.get(name, 0) == before.get(name, 0), name
+    told = rig.poses.since(began)
+    assert len(told) > 0.5 * rig.pace.rate_hz * (told[-1].came_s - began)
+    assert not any(false(one) for one in told)
 
 
 def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(rig: FaultRig) -> None:
@@ -70,7 +139,7 @@ def test_hostile_datagrams_at_every_port_are_refused_while_the_hand_is_tracked(r
     before, began = rig.counts(), time.monotonic()
     flood(pool, targets(rig), 20_000, per_s=10_000.0)
     ended = time.monotonic()
-    recovery_s = rig.steady_after(ended)
+    recovery_s = rig.steady_after(ended, UP_S)
     after = rig.counts()
     assert recovery_s is not None
     told = rig.poses.since(began, ended)
@@ -120,7 +189,7 @@ def test_what_was_captured_is_not_taken_again_by_either_side(rig: FaultRig) -> N
     # And to the side that said it.
     flood(capture.to_slaves, [("127.0.0.1", rig.master_port)], len(capture.to_slaves), per_s=2000.0)
     began = time.monotonic()
-    assert rig.steady_after(began) is not None
+    assert rig.steady_after(began, UP_S) is not None
     after = rig.counts()
     refused = sum(after[name] - before.get(name, 0) for name in after if name.startswith("refused."))
     assert refused >= 0.9 * (len(capture.to_master) + len(capture.to_slaves))
@@ -138,6 +207,6 @@ def test_strangers_at_the_bus_neither_stop_the_hand_nor_cost_memory(rig: FaultRi
     told = rig.poses.since(began, ended)
     assert told
     assert not any(false(one) for one in told)
-    assert rig.steady_after(ended) is not None
+    assert rig.steady_after(ended, UP_S) is not None
     assert rig.report().source == "master"
     assert rig.anonymous_mb() - memory_mb < 20.0

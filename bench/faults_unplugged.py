@@ -1,0 +1,64 @@
+"""A camera that is unplugged and comes back, on real slaves with simulated cameras: what its slave and the master say.
+
+`python -m bench.faults_unplugged [--runs 3]`, for docs/faults.md. The camera is away for 3 s; from the plug on it takes
+as long as the retry that is under way waits (2 s at most), the opening, and the first frame.
+"""
+
+import argparse
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+from bench.checklist_rig import Rig, until
+from common.streams import MASTER
+
+AWAY_S, PATIENCE_S = 3.0, 30.0
+ABSENT = ("camera_absent", "left")
+
+
+def unplug(rig: Rig, away_s: float) -> tuple[float, float, int]:
+    """Unplug the left camera and plug it in.
+
+    Returns:
+        From the unplugging to the line of the checklist [s], from the plug to the first frame [s], poses meanwhile.
+    """
+    poses = rig.ask(MASTER, "report").counts["poses"]
+    began = time.monotonic()
+    rig.fault("left", unplugged=True)
+    until(lambda: ABSENT in rig.lists.now(), PATIENCE_S)
+    told_s = time.monotonic() - began
+    time.sleep(max(0.0, away_s - told_s))
+    counts = rig.ask(MASTER, "report").counts
+    rig.fault("left")
+    plugged = time.monotonic()
+    until(lambda: rig.ask(MASTER, "report").counts["left.received"] > counts["left.received"], PATIENCE_S)
+    back_s = time.monotonic() - plugged
+    until(lambda: ABSENT not in rig.lists.now(), PATIENCE_S)
+    return told_s, back_s, counts["poses"] - poses
+
+
+def main() -> int:
+    """Measure and print; 1 if a slave did not live through it."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=3, metavar="N")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="phalanx-faults-") as folder:
+        rig = Rig(Path(folder) / "desk", "desk")
+        try:
+            runs = [unplug(rig, AWAY_S) for _ in range(options.runs)]
+            lost = rig.ask("left", "report").counts["camera.lost"]
+            restarts = rig.ask(MASTER, "report").counts.get("left.restarts", 0)
+            alive = rig.processes["left"].poll() is None
+        finally:
+            rig.close()
+    told_s, back_s, poses = zip(*runs, strict=True)
+    print(f"told after {statistics.median(told_s):.2f} s, {max(told_s):.2f} s")
+    print(f"first frame after the plug {statistics.median(back_s):.2f} s, {max(back_s):.2f} s")
+    print(f"poses while it was away {statistics.median(poses):.0f} in {AWAY_S:g} s")
+    print(f"camera.lost {lost}, left.restarts {restarts}, slave {'alive' if alive else 'gone'}")
+    return 0 if alive and restarts == 0 else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
