@@ -53,8 +53,8 @@ define apt
 	  else echo "missing:$$missing; $(1) will be skipped (Debian: apt install $(2))"; fi; fi
 endef
 
-emulator: ## what runs aarch64 programs in the tests; without root it says what to install
-	$(call apt,the tests on aarch64,mmdebstrap gcc libc6-dev debian-archive-keyring,mmdebstrap gcc)
+emulator: ## what checks the service and runs aarch64 programs in the tests; without root it says what to install
+	$(call apt,the tests of the service and on aarch64,systemd mmdebstrap gcc libc6-dev debian-archive-keyring,systemd-analyze mmdebstrap gcc)
 
 hosts-tools: emulator ## what the tests with whole machines need; without root it says what to install
 	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
