@@ -76,7 +76,7 @@ def judge(facts: dict[str, Any], camera: str = "") -> str | None:
     if not facts["venv"]:
         return "its Python cannot make virtual environments: apt install python3-venv"
     if not facts["systemd"]:
-        return "systemd does not run there, which keeps the slave running"
+        return "systemd does not run there, which keeps the slave running: without it start `phalanx-slave run` by hand"
     if not facts["root"]:
         return (
             f"user {facts['user']} may not become root without a password: log in as root, or give "
