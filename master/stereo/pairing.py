@@ -151,12 +151,12 @@ class Pairing:
         out: list[Instant] = []
         while self._pending:
             t_ns = self._pending[0]
-            waited_ns, complete = self._newest_ns - t_ns, self._complete(t_ns)
-            if not (flush or complete or waited_ns > self._deadline_ns):
+            waited_ns = self._newest_ns - t_ns
+            if not (flush or waited_ns > self._deadline_ns or self._complete(t_ns)):
                 break
             self._pending.popleft()
             self._emitted_ns = t_ns
-            if self._continuous and not complete and waited_ns > self._outdated_ns:
+            if self._continuous and waited_ns > self._outdated_ns and self._lonely(t_ns):
                 self.outdated += 1
                 continue
             out.append(self._at(t_ns))
@@ -177,6 +177,14 @@ class Pairing:
             if self._policy == "interpolate" or t_ns - newest > self._half_ns[camera]:
                 return False
         return True
+
+    def _lonely(self, t_ns: int) -> bool:
+        """Whether a camera that is not silent had no frame for an instant: half a period before, or a while after."""
+        return any(
+            self._waiting[c] < self._patience
+            and not any(-self._half_ns[c] <= s.centre_ns - t_ns <= self._outdated_ns for s in seen)
+            for c, seen in enumerate(self._seen)
+        )
 
     def _at(self, t_ns: int) -> Instant:
         assert self._origin_ns is not None
