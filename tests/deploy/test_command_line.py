@@ -221,7 +221,9 @@ def test_others_read_along_at_the_bus_that_the_user_names(tmp_path: Path) -> Non
     settings = demo.DemoSettings(
         1.0, True, tmp_path, ROOT / "calib_json", ("desk",), 7, bus="tcp/127.0.0.1:47999"
     )
-    (master,) = (command for name, command, _ in demo._table(settings, tmp_path / "keys", 10**12) if name == "master")
+    (master,) = (
+        command for name, command, _ in demo._table(settings, tmp_path / "keys", 10**12) if name == "master"
+    )
     assert master[master.index("--bus") + 1] == "tcp/127.0.0.1:47999"
 
 
