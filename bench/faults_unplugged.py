@@ -1,7 +1,7 @@
 """A camera that is unplugged and comes back, on real slaves with simulated cameras: what its slave and the master say.
 
 `python -m bench.faults_unplugged [--runs 3]`, for docs/faults.md. The camera is away for 3 s; from the plug on it takes
-as long as the retry that is under way waits (2 s at most), the opening, and the first frame.
+as long as the retry that is under way waits (1 s at most), the opening, and the first frame.
 """
 
 import argparse

@@ -20,7 +20,7 @@ from slave.cameras.source import Frame, FrameSource
 from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
-LONGEST_WAIT_S = 2.0
+LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
 LOG_EVERY_NS = 10_000_000_000
 _LOG = logging.getLogger(__name__)
 

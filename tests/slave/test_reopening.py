@@ -122,14 +122,14 @@ def test_numbers_go_on_after_a_loss_and_the_gap_is_the_absence(caplog: pytest.Lo
     assert "back after loss number 1" in caplog.text
 
 
-def test_waits_grow_to_two_seconds_and_begin_anew_with_a_frame() -> None:
+def test_waits_grow_to_one_second_and_begin_anew_with_a_frame() -> None:
     world = World()
     world.lives = [1, 1, 10**6]
     source = frames(reopening_camera(world))
     next(source)
     world.plugged, world.back_at_ns = False, 20_000_000_000
     next(source)
-    assert world.waits[:5] == [0.2, 0.4, 0.8, 1.6, 2.0]
+    assert world.waits[:5] == [0.2, 0.4, 0.8, 1.0, 1.0]
     assert max(world.waits) == LONGEST_WAIT_S
     world.waits.clear()
     next(source)
@@ -142,7 +142,7 @@ def test_a_camera_that_opens_but_never_delivers_is_not_opened_in_a_hurry() -> No
     source = frames(reopening_camera(world))
     next(source)
     next(source)
-    assert world.waits == [0.2, 0.4, 0.8, 1.6, 2.0, 2.0, 2.0]
+    assert world.waits == [0.2, 0.4, 0.8, 1.0, 1.0, 1.0, 1.0]
 
 
 def test_a_stop_and_a_close_end_the_wait() -> None:
