@@ -14,6 +14,7 @@ from master.checklist.unseen import COLOUR, SEEN
 from slave import live
 from slave.markers.engine import NUMPY
 from slave.report import Reporter
+from slave.service import Service
 from slave.tuning import CameraTuning
 from tests.network_helpers import until
 from tests.slave.test_tuning import FILE, RIG, Knobs, Wire, tree
@@ -44,7 +45,9 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
     files, clock, stop = tree(tmp_path), SystemClock(), threading.Event()
     nothing = cast(Any, None)  # neither frames nor datagrams are needed to be asked
     with ThreadPoolExecutor(1) as workers:
-        line = live._marker_line("left", files, nothing, nothing, clock, "follow", NUMPY, stop, workers)
+        line = live._marker_line(
+            "left", files, nothing, nothing, clock, "follow", NUMPY, stop, workers, Service({})
+        )
     tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.picker)
     reporter = Reporter(
         "left", Alone(), line.numbers, clock, lambda _: LoopbackBus(), stop.set, 0.01, camera=tuning
