@@ -1,5 +1,6 @@
 """What a soak says of courses whose truth is known: a leak is found, noise is none, a loss is never hidden."""
 
+import mmap
 import os
 
 import numpy as np
@@ -89,9 +90,11 @@ def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
 
 def test_memory_of_a_process_is_read_as_the_kernel_has_it() -> None:
     before = footprint(os.getpid())
-    kept = np.ones(4_000_000)
-    after = footprint(os.getpid())
-    assert after.anonymous_mb - before.anonymous_mb == pytest.approx(kept.nbytes * 1e-6, abs=3.0)
+    # Fresh pages of the kernel: an array might get what this process freed before.
+    with mmap.mmap(-1, 32_000_000, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as kept:
+        kept.write(bytes([1]) * len(kept))
+        after = footprint(os.getpid())
+    assert after.anonymous_mb - before.anonymous_mb == pytest.approx(32.0, abs=3.0)
     assert after.uss_mb <= after.pss_mb <= after.rss_mb
     assert after.threads >= 1
     assert after.files >= 3
