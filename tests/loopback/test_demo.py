@@ -89,8 +89,8 @@ def test_demo_tracks_scores_and_leaves_its_results(tmp_path: Path) -> None:
     assert demo.wait(60) == 0, "\n".join(lines)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary == json.loads((tmp_path / "copy.json").read_text())
-    # No bar of speed here: machines that run tests are busy. Markers are right at any rate; a hand of 1 m/s that is drawn
-    # ten times a second leaps by its own size between two frames, and its joints are only near then.
+    # No bar of speed here: machines that run tests are busy. Markers are right at any rate; a hand of 1 m/s that
+    # is drawn ten times a second leaps by its own size between two frames, and its joints are only near then.
     assert summary["poses"] > 60
     drawn = summary["poses_per_s"] > 30.0
     assert summary["joint_mm_visible"] < (6.0 if drawn else 20.0)

