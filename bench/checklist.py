@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bench.checklist_faults import Fault, of_markers, of_wrist, settle
-from bench.checklist_rig import Key, Rig, until
+from bench.checklist_rig import Key, Rig
+from bench.local_rig import until
 
 WAIT_S = 30.0
 AFTER_S = 2.5  # what follows from a fault would be told by then

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from bench.checklist_rig import Rig, measured, until
+from bench.checklist_rig import Rig, measured
+from bench.local_rig import until
 from bench.udp_relay import Impairment
 from common.messages import CheckCode
 

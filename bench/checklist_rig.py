@@ -11,11 +11,11 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.local_rig import free_port, join_bus
+from bench.local_rig import free_port, join_bus, until
 from bench.udp_relay import UdpRelay
 from common.errors import BusError, PhalanxError
 from common.messages import Checklist, Command, Health
@@ -236,16 +236,6 @@ def measured(day: str) -> dict[str, object]:
         "residual": {"rms_px": 0.1},
         "note": "",
     }
-
-
-def until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Wait until it holds; False if it never did."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def _put(path: Path, text: str) -> None:

@@ -17,7 +17,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from bench.faults_poses import Judge, Pace, Poses, pace_of, steady_from
-from bench.local_rig import free_port, join_bus
+from bench.local_rig import free_port, join_bus, until
 from bench.processes import footprint
 from bench.udp_relay import UdpRelay
 from common.errors import BusError, PhalanxError
@@ -212,16 +212,6 @@ def end(process: subprocess.Popen[str]) -> None:
             process.stdin.close()
     process.kill()
     process.wait()
-
-
-def until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Wait until it holds; False if it never did."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 def asked(rig: FaultRig) -> dict[str, int]:

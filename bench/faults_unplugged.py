@@ -10,7 +10,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from bench.checklist_rig import Rig, until
+from bench.checklist_rig import Rig
+from bench.local_rig import until
 from common.streams import MASTER
 
 AWAY_S, PATIENCE_S = 3.0, 30.0

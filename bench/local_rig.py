@@ -1,8 +1,9 @@
-"""What rigs of real processes on this machine need: ports that nobody has, and the bus once its master listens."""
+"""What rigs of real processes on this machine need: free ports, the bus once its master listens, and patience."""
 
 import os
 import socket
 import time
+from collections.abc import Callable
 
 from common.certificates import OPERATOR
 from common.errors import BusError
@@ -31,3 +32,13 @@ def join_bus(endpoint: str, patience_s: float) -> ZenohBus:
             if time.monotonic() > until:
                 raise
             time.sleep(0.2)
+
+
+def until(condition: Callable[[], bool], timeout_s: float) -> bool:
+    """Wait until it holds; False if it never did."""
+    deadline = time.monotonic() + timeout_s
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True

@@ -13,6 +13,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+from bench.processes import cpu_s
 from tests.hosts.board_image import NETWORK, Image, board_image, pc_image, run
 from tests.hosts.fleet import Fleet
 from tests.hosts.rig import Rig
@@ -228,8 +229,7 @@ class Board:
     def processor_s(self) -> float:
         """Processor time [s] of this machine that it has taken since power."""
         assert self._process is not None
-        fields = Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        return cpu_s(self._process.pid)
 
     def close(self) -> None:
         """Off, and everything as it was before. Safe to call twice."""

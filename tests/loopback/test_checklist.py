@@ -14,7 +14,8 @@ import pytest
 
 from bench.checklist import clean, rehearse
 from bench.checklist_faults import of_markers, of_wrist
-from bench.checklist_rig import Rig, until
+from bench.checklist_rig import Rig
+from bench.local_rig import until
 from common.streams import MASTER
 
 FAULTS = {fault.code: fault for fault in (*of_markers(), *of_wrist())}

@@ -13,8 +13,8 @@ import pytest
 from bench.faults_flood import Capture, Watch, flood, hostile, memory_mb, targets
 from bench.faults_measured import false
 from bench.faults_ports import assault
-from bench.faults_rig import ROOT, FaultRig, end, until
-from bench.local_rig import free_port
+from bench.faults_rig import ROOT, FaultRig, end
+from bench.local_rig import free_port, until
 
 MILLION = 1_000_000
 DISK_MB, RESERVE_MB = 203, 200
