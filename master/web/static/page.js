@@ -17,10 +17,13 @@ function connect() {
   const secure = location.protocol === "https:" ? "wss" : "ws";
   const socket = new WebSocket(`${secure}://${location.host}/hands`);
   let pinging;
+  const ping = () => {
+    if (socket.readyState === WebSocket.OPEN) socket.send(`ping ${performance.now()}`);
+  };
   socket.onopen = () => {
     tries = 0;
-    pinging = setInterval(() => socket.send(`ping ${performance.now()}`), PING_MS);
-    socket.send(`ping ${performance.now()}`);
+    pinging = setInterval(ping, PING_MS);
+    ping();
   };
   socket.onmessage = ({ data }) => take(data);
   socket.onclose = () => {

@@ -35,6 +35,15 @@ SKIN = """() => {
   return near;
 }"""
 
+# Keeps the page's sockets and what it does by the clock within reach of a test.
+REACH = """
+globalThis.sockets = [];
+globalThis.ticks = [];
+globalThis.WebSocket = class extends WebSocket { constructor(...given) { super(...given); sockets.push(this); } };
+const every = globalThis.setInterval;
+globalThis.setInterval = (tick, ms) => (ticks.push(tick), every(tick, ms));
+"""
+
 
 def moving(k: int) -> HandPose:
     """A right hand that bends and turns, its joints' radii 8 mm."""
@@ -95,6 +104,23 @@ def test_the_page_moves_a_rigged_hand_and_asks_nobody_else(tmp_path: Path) -> No
         assert any(url.startswith("ws://") for url in asked)
     # A browser itself reports that a connection was refused while the server was away.
     assert [text for text in trouble if "WebSocket connection to" not in text] == []
+
+
+def test_a_closing_socket_is_not_asked_for_the_round_trip() -> None:
+    trouble: list[str] = []
+    sink = WebSink(WebOutput(host="127.0.0.1", port=0))
+    try:
+        with chromium() as browser:
+            page = browser.new_page()
+            page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
+            page.add_init_script(REACH)
+            page.goto(f"http://127.0.0.1:{sink.server.port}/", timeout=WAIT_S * 1e3)
+            until(page, "sockets[0]?.readyState === WebSocket.OPEN && ticks.length >= 2")
+            page.evaluate("() => { sockets[0].close(); for (const tick of ticks) tick(); }")
+            until(page, "sockets[1]?.readyState === WebSocket.OPEN")
+    finally:
+        sink.close()
+    assert trouble == []
 
 
 def an_object(page: Page, sink: WebSink) -> None:
