@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.machine import ROOT
+from slave.install.program import finished
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +31,7 @@ Run = Callable[[Sequence[str], float], Ran]
 def run(command: Sequence[str], timeout_s: float) -> Ran:
     """Run a program that asks for nothing."""
     try:
-        done = subprocess.run(
-            list(command),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            check=False,
-        )
+        done = finished(command, timeout_s)
     except FileNotFoundError:
         return Ran(None, "", f"there is no {command[0]}")
     except subprocess.TimeoutExpired as error:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from slave.install.errors import InstallError, NotReadyError
+from slave.install.program import finished
 
 _STEP_S = 0.25
 _COMMAND_S = 60.0
@@ -46,15 +47,7 @@ def run_command(command: Sequence[str], deadline_s: float = _COMMAND_S) -> str:
         InstallError: It failed, or takes too long; its last line is the reason.
     """
     try:
-        done = subprocess.run(
-            list(command),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=deadline_s,
-            check=False,
-        )
+        done = finished(command, deadline_s)
     except FileNotFoundError as error:
         raise InstallError(f"{command[0]}: not found on this machine") from error
     except subprocess.TimeoutExpired as error:
