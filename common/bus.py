@@ -15,7 +15,7 @@ from typing import Protocol
 
 from common.errors import BusError, MessageError, PhalanxError
 from common.messages import AnyMessage, Command, Health, Message, decode, encode
-from common.streams import STREAMS, Path, key_of
+from common.streams import STREAMS, Path, key_of, sender_of
 
 Handler = Callable[[Command], Health]
 ANY = "*"
@@ -26,7 +26,7 @@ class Subscription(Protocol):
 
     Attributes:
         dropped: Messages that were pushed out by newer ones before they were read.
-        refused: Payloads that were not a message of the stream.
+        refused: Payloads that were not a message of the stream, or of another than who sent them.
     """
 
     dropped: int
@@ -93,7 +93,8 @@ class Bus(Protocol):
 class Inbox:
     """The queue behind every subscription: bounded, drops the oldest, decodes on reading.
 
-    Holds at most `depth` encoded messages of the type `kind`.
+    Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
+    under which name is the bus' to say, so what is in a message cannot be another's.
     """
 
     def __init__(self, stream: str, depth: int, on_close: Callable[["Inbox"], None]) -> None:
@@ -105,20 +106,20 @@ class Inbox:
         if depth < 1:
             raise ValueError(f"depth={depth}: must be at least 1")
         self._kind = STREAMS[stream].message
-        self._waiting: deque[bytes] = deque(maxlen=depth)
+        self._waiting: deque[tuple[str, bytes]] = deque(maxlen=depth)
         self._changed = threading.Condition()
         self._on_close: Callable[[Inbox], None] | None = on_close
         self.dropped = 0
         self.refused = 0
 
-    def put(self, payload: bytes) -> None:
-        """Append one encoded message; the oldest makes room."""
+    def put(self, name: str, payload: bytes) -> None:
+        """Append one encoded message that came under `name`; the oldest makes room."""
         with self._changed:
             if self._on_close is None:
                 return
             if len(self._waiting) == self._waiting.maxlen:
                 self.dropped += 1
-            self._waiting.append(payload)
+            self._waiting.append((name, payload))
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Message | None:
@@ -128,9 +129,9 @@ class Inbox:
                 self._changed.wait_for(lambda: self._waiting or self._on_close is None, timeout_s)
                 if not self._waiting:
                     return None
-                payload = self._waiting.popleft()
+                name, payload = self._waiting.popleft()
             message = decoded(payload, self._kind)
-            if message is not None:
+            if message is not None and sender_of(message) == name:
                 return message
             self.refused += 1
 
@@ -212,7 +213,7 @@ class LoopbackBus:
         with self._hub.lock:
             for inbox, (wanted_stream, wanted) in self._hub.inboxes.items():
                 if wanted_stream == stream and wanted in (ANY, name):
-                    inbox.put(payload)
+                    inbox.put(name, payload)
 
     def subscribe(self, stream: str, name: str = ANY, depth: int = 16) -> Subscription:
         """Receive a stream (see `Bus.subscribe`)."""

@@ -5,7 +5,7 @@ master passes on:
 
 | who | may |
 |---|---|
-| a device | publish, announce itself and answer commands under its own name; it hears nothing else |
+| a device | say how it is, show pictures, answer commands, all under its own name; it tells no poses, and hears nothing |
 | an operator (viewer, console, recorder ...) | read everything, command everybody, be a program with its own name |
 | the master | everything |
 
@@ -23,6 +23,7 @@ from common.streams import ALIVE_KEY, STREAMS, Path, key_of
 
 _SPEAKING = ("put", "declare_queryable", "liveliness_token", "reply")
 _LISTENING = ("declare_subscriber", "liveliness_query", "declare_liveliness_subscriber")
+_TOLD_BY_DEVICES = ("health", "preview", "still", "command")  # of the streams of the bus
 _ALL = ("put", "delete", "query", "reply", "declare_subscriber", "declare_queryable", "liveliness_token",
         "liveliness_query", "declare_liveliness_subscriber")  # fmt: skip
 _EVERYTHING = ["phalanx/**"]
@@ -52,7 +53,7 @@ def rules_of_master(devices: Iterable[str]) -> dict[str, object]:
         _policy(["told all", "reads", "commands", "is a program", "is no other"], OPERATOR),
     ]
     for name in names:
-        rules.append(_rule(f"{name} speaks", "ingress", _SPEAKING, _own(name)))
+        rules.append(_rule(f"{name} speaks", "ingress", _SPEAKING, _of_device(name)))
         rules.append(_rule(f"{name} is told", "egress", ("query",), [key_of("command", name)]))
         policies.append(_policy([f"{name} speaks", f"{name} is told", "is asked for"], name))
     return _access(rules, [MASTER, OPERATOR, *names], policies)
@@ -63,7 +64,7 @@ def rules_of_device(name: str) -> dict[str, object]:
     rules = [
         _rule("is told", "ingress", ("query",), [key_of("command", name)]),
         _rule("is asked for", "ingress", ("declare_subscriber", "liveliness_query"), _EVERYTHING),
-        _rule("speaks", "egress", _SPEAKING, _own(name)),
+        _rule("speaks", "egress", _SPEAKING, _of_device(name)),
     ]
     return _access(rules, [MASTER], [_policy(["is told", "is asked for", "speaks"], MASTER)])
 
@@ -75,8 +76,13 @@ def rules_of_router() -> dict[str, object]:
     return _access(rules, [MASTER, OPERATOR], policies)
 
 
+def _of_device(name: str) -> list[str]:
+    """All keys under which a device speaks. The name inside a message is compared with its key by who reads it."""
+    return [*(key_of(stream, name) for stream in _TOLD_BY_DEVICES), ALIVE_KEY.format(name=name)]
+
+
 def _own(name: str) -> list[str]:
-    """All keys under which `name` speaks."""
+    """All keys that are of `name` alone."""
     streams = [key_of(row, name) for row, stream in STREAMS.items() if stream.path is Path.ZENOH]
     return [*streams, ALIVE_KEY.format(name=name)]
 

@@ -28,15 +28,11 @@ from common.message_schema import message_schema
 from common.messages import (
     WIRE_VERSION,
     AnyMessage,
-    Command,
-    Contact,
-    Gesture,
-    HandPose,
     Message,
-    ObjectPose,
     decode,
     encode,
 )
+from common.streams import sender_of
 
 PROFILE = "phalanx"
 _CHUNK_NS = 500_000_000
@@ -297,14 +293,3 @@ def open_messages(path: Path) -> MessageRecording:
     if content.profile != PROFILE:
         raise RecordingError(f"{path}: an MCAP file of profile {content.profile!r}, not a recording of ours")
     return MessageRecording(path, content)
-
-
-def sender_of(message: Message) -> str:
-    """The name under which a message travels: its camera, sensor, hand, object or process."""
-    if isinstance(message, HandPose | Contact | Gesture):
-        return message.hand
-    if isinstance(message, ObjectPose):
-        return message.object
-    if isinstance(message, Command):
-        return message.target
-    return cast(str, getattr(message, "camera", None) or getattr(message, "source", ""))

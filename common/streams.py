@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import cast
 
 from common.messages import (
     Checklist,
@@ -81,3 +82,14 @@ def key_of(stream: str, name: str) -> str:
     if key is None:
         raise ValueError(f"stream {stream!r} travels as datagrams, it has no key")
     return key.format(name=name)
+
+
+def sender_of(message: Message) -> str:
+    """The name under which a message travels: its camera, sensor, hand, object or process."""
+    if isinstance(message, HandPose | Contact | Gesture):
+        return message.hand
+    if isinstance(message, ObjectPose):
+        return message.object
+    if isinstance(message, Command):
+        return message.target
+    return cast(str, getattr(message, "camera", None) or getattr(message, "source", ""))

@@ -159,7 +159,12 @@ class ZenohBus:
         undeclare.append(_quietly(subscriber))
         # The handler by itself: a thread that waits in `subscriber.recv` would block `undeclare`.
         handler = subscriber.handler
-        thread = _start(f"bus {key}", lambda: inbox.put(handler.recv().payload.to_bytes()))
+
+        def take_next() -> None:
+            sample = handler.recv()
+            inbox.put(str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes())
+
+        thread = _start(f"bus {key}", take_next)
         with self._lock:
             self._threads = [alive for alive in self._threads if alive.is_alive()] + [thread]
             self._inboxes.append(inbox)
@@ -198,6 +203,8 @@ class ZenohBus:
                 raise BusError(f"no answer from {command.target!r} to {command.verb!r}: {error}") from error
             for reply in replies:
                 if reply.ok is not None:
+                    if str(reply.ok.key_expr) != key:
+                        raise BusError(f"somebody else answered for {command.target!r}")
                     return _health(command, reply.ok.payload.to_bytes())
                 text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
                 if text == "Timeout":  # zenoh's own word for a target that took the query and kept silent
@@ -313,9 +320,9 @@ def _answer(query: zenoh.Query, handler: Handler) -> None:
 
 def _health(command: Command, payload: bytes) -> Health:
     health = decoded(payload, Health)
-    if not isinstance(health, Health):
+    if not isinstance(health, Health) or health.source != command.target:
         raise BusError(
-            f"{command.target!r} answered {command.verb!r} with something that is not a health report"
+            f"{command.target!r} answered {command.verb!r} with something that is not its health report"
         )
     return health
 

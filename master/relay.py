@@ -13,7 +13,7 @@ from common.bus import Bus, Subscription
 from common.clock import Clock
 from common.machine import program
 from common.messages import Command, Health
-from common.recording import sender_of
+from common.streams import sender_of
 
 STREAMS = ("hand", "object", "contact", "gesture", "health", "checklist")
 NAME = "relay"

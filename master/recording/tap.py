@@ -15,8 +15,7 @@ from common.bus import Bus
 from common.clock import Clock
 from common.errors import BusError
 from common.messages import Backlog, Message
-from common.recording import sender_of
-from common.streams import MASTER
+from common.streams import MASTER, sender_of
 from master.hurry import Hurry
 from master.outputs.devices import Taking
 

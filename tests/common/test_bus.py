@@ -153,7 +153,8 @@ def test_closing_wakes_a_reader_and_is_safe_twice(pair: Pair) -> None:
 def test_a_foreign_payload_is_counted_and_skipped() -> None:
     inbox = Inbox("health", 8, lambda _: None)
     for payload in (b"", b"\xc1", encode(Command("left", "report")), encode(health("left"))[:-1]):
-        inbox.put(payload)
-    inbox.put(encode(health("left")))
+        inbox.put("left", payload)
+    inbox.put("right", encode(health("left")))  # in another's name
+    inbox.put("left", encode(health("left")))
     assert isinstance(inbox.get(0.0), Health)
-    assert inbox.refused == 4
+    assert inbox.refused == 5

@@ -150,6 +150,22 @@ def test_a_camera_speaks_for_itself_alone(rig: Rig) -> None:
             asker.ask(Command("outputs", "report"), 0.3)
 
 
+def test_a_camera_tells_no_poses_and_nothing_in_the_name_of_another(rig: Rig) -> None:
+    """Also not inside a message that travels under its own name, nor under a name that stands for several."""
+    told = {stream: rig.viewer.subscribe(stream) for stream in ("health", "hand", "gesture", "taken")}
+    assert until(lambda: arrives(rig.right, told["health"], "right"))
+    for name in ("right", "*", "r$*"):
+        rig.right.publish("gesture", name, gesture())
+        rig.right.publish("taken", name, gesture())
+        rig.right.publish("health", name, health("left"))
+    rig.right.serve("right", lambda command: health("left", 666))
+    assert until(lambda: arrives(rig.right, told["health"], "right"))
+    assert all_heard(told["health"]) <= {"right"}
+    assert all(told[stream].get(0.0) is None for stream in ("hand", "gesture", "taken"))
+    with pytest.raises(BusError, match="not its health report"):
+        rig.master.ask(Command("right", "report"), 5.0)
+
+
 def test_a_viewer_is_a_program_of_its_own_but_tells_no_poses_and_speaks_for_no_camera(rig: Rig) -> None:
     rig.viewer.announce("outputs")
     rig.viewer.serve("outputs", lambda command: health("outputs", 5))
@@ -163,6 +179,7 @@ def test_a_viewer_is_a_program_of_its_own_but_tells_no_poses_and_speaks_for_no_c
     rig.viewer.publish("gesture", "hand", gesture())
     for name in ("left", MASTER, "outputs"):
         rig.viewer.publish("health", name, health(name))
+    rig.viewer.publish("health", "*", health("left"))
     assert all_heard(heard) == {"outputs"}
     assert gestures.get(0.0) is None
 

@@ -17,7 +17,8 @@ from mcap.reader import make_reader
 
 from common.errors import RecordingError
 from common.messages import Health, Message, TagDetections, encode
-from common.recording import MessageRecording, MessageWriter, Recorded, open_messages, sender_of
+from common.recording import MessageRecording, MessageWriter, Recorded, open_messages
+from common.streams import sender_of
 from tests.network_helpers import detections, triple
 
 FILES = {"rigs/desk.json": b'{"version": 1}', "cameras/left.json": b"{}"}
