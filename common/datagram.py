@@ -47,6 +47,7 @@ class Kind(IntEnum):
     ECHO_ASK = 6
     ECHO_ANSWER = 7
     DATA = 8
+    UNPROVEN = 9
 
 
 class Refusal(StrEnum):
@@ -60,6 +61,7 @@ class Refusal(StrEnum):
     UNEXPECTED = "unexpected"  # unknown kind, or one that this side does not take
     STALE = "stale"  # sealed for a session that is over, or never was
     FORGED = "forged"  # the seal does not fit
+    SECRET = "secret"  # of the rig, but not proven by the secret of the device that it is about
     DUPLICATE = "duplicate"  # this counter was taken already
     REPLAYED = "replayed"  # so old that it can only be a replay; a handshake of an earlier life
     UNDECODABLE = "undecodable"  # sealed rightly, but not a message of its kind

@@ -20,7 +20,7 @@ from msgspec import Meta, Struct, field
 from common.arrays import Bool, Code, Float, Ids
 from common.errors import MessageError
 
-WIRE_VERSION = 10
+WIRE_VERSION = 11
 MAX_MARKERS = 48
 MAX_TAGS = 16  # in one frame: their corners fit one Ethernet packet
 JOINT_COUNT = 26
@@ -86,6 +86,7 @@ CheckCode = Literal[
     "imu_silent",
     "twin_sender",
     "version_mismatch",
+    "secret_mismatch",
 ]
 
 

@@ -3,27 +3,32 @@
 From the rig key (32 random bytes that every process of a rig shares) HKDF-SHA256 (RFC 5869) makes
 - the rig tag, by which a datagram of another rig is told at once,
 - one key for every process that says beacon, hello or welcome, named by its random process id, so
-  that two processes never seal under one key with the same nonce,
+  that two processes never seal under one key with the same nonce.
+
+From the rig key and the secret of one device (`common.link_key`), which only that device and the master know,
+- the proof in its hello: nobody else of the rig begins a session in its name,
 - for every session two keys, one per direction, and the session's id, from random numbers of both
-  sides: what was captured in one session opens in no other, whoever restarted.
+  sides: what was captured in one session opens in no other, whoever restarted, and in no other device,
+- the proof in the welcome: nobody else of the rig ends the session that it has.
 """
 
 from collections.abc import Callable, Mapping
+from hmac import compare_digest
 from typing import Annotated, NamedTuple, TypeVar
 
 import msgspec
 from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
-from cryptography.hazmat.primitives.hashes import SHA256
-from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 from msgspec import Meta, Struct
 
 from common.datagram import KEY_BYTES, Header, Kind, Refusal, Sealer, unseal
+from common.link_key import LinkKey, derive
 from common.messages import Count, Name, TimeNs
 
-NONCE_BYTES = 16
+NONCE_BYTES = PROOF_BYTES = 16
 MAX_CAMERAS = 32
 Random = Callable[[int], bytes]  # so many random bytes, as `os.urandom` gives them
 Nonce = Annotated[bytes, Meta(min_length=NONCE_BYTES, max_length=NONCE_BYTES)]
+Proof = Annotated[bytes, Meta(min_length=PROOF_BYTES, max_length=PROOF_BYTES)]
 
 
 class Handshake(Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,19 +53,21 @@ class Beacon(Handshake, frozen=True):
 
 
 class Hello(Handshake, frozen=True):
-    """A slave answers a beacon.
+    """A slave answers a beacon. `RigKeys.hello` makes it.
 
     Attributes:
         name: Camera.
         process: Random id of the slave's process, the `session` of its messages.
         slave_nonce: Drawn for this one attempt to get a session.
         master_nonce: That of the beacon: a hello to an earlier master is a replay.
+        proof: That who says it has the secret of `name`, and says it of all the fields above.
     """
 
     name: Name
     process: Count
     slave_nonce: Nonce
     master_nonce: Nonce
+    proof: Proof
 
 
 class _AnyHello(Struct, frozen=True):
@@ -70,11 +77,27 @@ class _AnyHello(Struct, frozen=True):
 
 
 class Welcome(Handshake, frozen=True):
-    """The master's share of the session's keys, for the hello with this `slave_nonce`."""
+    """The master's share of the session's keys, for the hello with this `slave_nonce`.
+
+    `proof`, of `SessionKeys`: that the master has the secret of that name.
+    """
 
     master_nonce: Nonce
     slave_nonce: Nonce
     session_nonce: Nonce
+    proof: Proof
+
+
+class Unproven(Handshake, frozen=True):
+    """The hello with this `slave_nonce` was not proven: the master has another secret for its name. No session.
+
+    `apart`: whether the secrets of the master's devices are more than the rig key. It says no more than why: it is not
+    proven itself, and whoever has the rig key can say it.
+    """
+
+    master_nonce: Nonce
+    slave_nonce: Nonce
+    apart: bool
 
 
 class Start(Handshake, frozen=True):
@@ -111,6 +134,7 @@ _BODIES: Mapping[Kind, type[Handshake]] = {
     Kind.STARTED: Started,
     Kind.ECHO_ASK: EchoAsk,
     Kind.ECHO_ANSWER: EchoAnswer,
+    Kind.UNPROVEN: Unproven,
 }
 _DECODERS = {kind: msgspec.msgpack.Decoder(body) for kind, body in _BODIES.items()}
 _KINDS: Mapping[type[Handshake], Kind] = {body: kind for kind, body in _BODIES.items()}
@@ -132,26 +156,26 @@ def read(kind: Kind, body: bytes) -> Handshake | None:
 
 
 class SessionKeys(NamedTuple):
-    """The keys of one session: 32 bytes for each direction, and the id that datagrams name."""
+    """The keys of one session: 32 bytes for each direction, the id that datagrams name, the proof of the welcome."""
 
     key_id: int
     to_master: bytes
     to_slave: bytes
+    proof: bytes
 
 
 class RigKeys:
-    """Everything that follows from the rig key. Holds the key."""
+    """Everything that follows from the rig key and the secrets of devices. Holds them."""
 
-    def __init__(self, key: bytes) -> None:
-        """Derive from the rig key.
+    def __init__(self, key: LinkKey | bytes) -> None:
+        """Derive from the rig key, alone or with what there is of secrets.
 
         Raises:
-            ValueError: It is not 32 bytes.
+            ValueError: One is not 32 bytes.
         """
-        if len(key) != KEY_BYTES:
-            raise ValueError(f"rig key of {len(key)} bytes, must be {KEY_BYTES}")
-        self._key = key
-        self.rig_tag = int.from_bytes(self._derive(4, b"", b"phalanx rig tag"), "big")
+        self._key = key if isinstance(key, LinkKey) else LinkKey(key)
+        self.apart = self._key.apart
+        self.rig_tag = int.from_bytes(derive(self._key.rig, 4, b"", b"phalanx rig tag"), "big")
 
     def sealer(self, process: int) -> Sealer:
         """Return the sealer for the handshakes of `process`, to be made once in its life."""
@@ -177,22 +201,34 @@ class RigKeys:
         except (msgspec.MsgspecError, ValueError, RecursionError):
             return None
 
+    def hello(self, name: str, process: int, slave_nonce: bytes, master_nonce: bytes) -> Hello:
+        """Return the hello of the device `name`, proven by the secret that this side has for it."""
+        info = b"phalanx hello " + process.to_bytes(8, "big") + name.encode()
+        proof = derive(self._of_device(name), PROOF_BYTES, master_nonce + slave_nonce, info)
+        return Hello(name, process, slave_nonce, master_nonce, proof)
+
+    def proves(self, hello: Hello) -> bool:
+        """Whether who said `hello` has the secret of its name."""
+        wanted = self.hello(hello.name, hello.process, hello.slave_nonce, hello.master_nonce)
+        return compare_digest(hello.proof, wanted.proof)
+
     def session(self, hello: Hello, session_nonce: bytes) -> SessionKeys:
         """Return the keys of the session that `hello` and the master's `session_nonce` make."""
         nonces = hello.master_nonce + session_nonce + hello.slave_nonce
-        block = self._derive(8 + 2 * KEY_BYTES, nonces, b"phalanx session " + hello.name.encode())
+        size, info = 8 + 2 * KEY_BYTES + PROOF_BYTES, b"phalanx session " + hello.name.encode()
+        block = derive(self._of_device(hello.name), size, nonces, info)
         key_id = int.from_bytes(block[:8], "big") >> 1  # 63 bits, as ids in messages have
-        return SessionKeys(key_id, block[8 : 8 + KEY_BYTES], block[8 + KEY_BYTES :])
+        return SessionKeys(key_id, block[8:40], block[40:72], block[72:])
 
     def session_sealer(self, key: bytes, key_id: int) -> Sealer:
         """Return the sealer of one direction of a session, to be made once."""
         return Sealer(key, self.rig_tag, key_id)
 
     def _process_key(self, process: int) -> bytes:
-        return self._derive(KEY_BYTES, process.to_bytes(8, "big"), b"phalanx handshake")
+        return derive(self._key.rig, KEY_BYTES, process.to_bytes(8, "big"), b"phalanx handshake")
 
-    def _derive(self, length: int, salt: bytes, info: bytes) -> bytes:
-        return HKDF(algorithm=SHA256(), length=length, salt=salt, info=info).derive(self._key)
+    def _of_device(self, name: str) -> bytes:
+        return self._key.rig + self._key.secret(name)
 
 
 def new_process_id(random: bytes) -> int:

@@ -17,6 +17,7 @@ from common.clock import Clock
 from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
+from common.link_key import LinkKey
 from common.messages import ImuSample, TagDetections, TrackerPose
 from common.session import Random
 from common.udp import UdpSocket
@@ -44,7 +45,7 @@ class Ingest:
     def __init__(
         self,
         cameras: tuple[str, ...],
-        key: bytes,
+        key: LinkKey | bytes,
         clock: Clock,
         beacon: Address,
         bind: Address,
@@ -59,7 +60,7 @@ class Ingest:
 
         Args:
             cameras: Names that may take part; any other slave is refused.
-            key: Rig key (32 bytes).
+            key: Rig key (32 bytes), alone or with the root of the secrets of devices.
             clock: The clock that every time is moved to.
             beacon: Where beacons go: a broadcast address and the slaves' beacon port.
             bind: Own address and port (0: any).
@@ -163,12 +164,13 @@ class Ingest:
         with self._lock:
             return self._link.counts_of(sender)
 
-    def turned_away(self) -> tuple[dict[str, Away], dict[str, Away]]:
-        """Sender -> where a second process of its name was turned away lately; and where it speaks another version."""
+    def turned_away(self) -> tuple[dict[str, Away], dict[str, Away], dict[str, Away]]:
+        """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
+        somebody says hello without its secret."""
         t_ns = self._clock.now_ns()
         with self._lock:
             away = self._link.turned_away
-            return away.twins(t_ns), away.versions(t_ns)
+            return away.twins(t_ns), away.versions(t_ns), away.secrets(t_ns)
 
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """Return how the clock of `camera` runs against this one; None while unknown.

@@ -3,6 +3,8 @@
 Rules that must stay in step with `slave.link` and docs/wire.md:
 - A hello makes a *pending* session; it replaces the live one only when its slave has sealed
   something with the new keys. So a replayed or late hello never ends a live session.
+- A hello counts only with the proof that who says it has the secret of its name: a stolen device of the rig begins no
+  session in another's name, and takes no room of it.
 - A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns. Who was
   silent for longer is replaced by whoever says hello.
 - A message whose time is yet to come is not taken: the slave's clock was stepped, and the echoes will tell how far.
@@ -19,12 +21,11 @@ from dataclasses import dataclass, field, replace
 from math import hypot
 from typing import TypeAlias
 
-import msgspec
-
 from common.clock import Clock
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
 from common.errors import MessageError
+from common.link_key import LinkKey
 from common.messages import (
     WIRE_VERSION,
     Detections,
@@ -34,6 +35,7 @@ from common.messages import (
     TrackerPose,
     WristDetections,
     decode,
+    restamped,
 )
 from common.session import (
     MAX_CAMERAS,
@@ -46,6 +48,7 @@ from common.session import (
     RigKeys,
     Start,
     Started,
+    Unproven,
     Welcome,
     new_process_id,
     read,
@@ -78,6 +81,7 @@ class _Session:
     name: str
     hello: Hello
     session_nonce: bytes
+    proof: bytes
     key_id: int
     address: Address
     sealer: Sealer
@@ -122,7 +126,7 @@ class MasterLink:
     def __init__(
         self,
         cameras: tuple[str, ...],
-        key: bytes,
+        key: LinkKey | bytes,
         clock: Clock,
         beacon_to: Address,
         zenoh_endpoint: str,
@@ -270,6 +274,11 @@ class MasterLink:
         sender = self._senders.get(hello.name)
         if sender is None:
             return Refusal.UNKNOWN
+        if not self._keys.proves(hello):
+            self.turned_away.unproven(hello.name, address[0], WIRE_VERSION, t_ns)
+            unproven = Unproven(self._nonce, hello.slave_nonce, self._keys.apart)
+            self._outbox.append((seal(self._sealer, unproven), address))
+            return Refusal.SECRET
         for session in (sender.live, sender.pending):
             if session is not None and session.hello.slave_nonce == hello.slave_nonce:
                 self._welcome(session)  # ours was lost; always to the address of the first hello
@@ -293,12 +302,12 @@ class MasterLink:
         keys = self._keys.session(hello, session_nonce)
         sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
         return _Session(
-            hello.name, hello, session_nonce, keys.key_id, address, sealer, Opener(keys.to_master),
+            hello.name, hello, session_nonce, keys.proof, keys.key_id, address, sealer, Opener(keys.to_master),
             since_ns=t_ns, heard_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
         )  # fmt: skip
 
     def _welcome(self, session: _Session) -> None:
-        welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce)
+        welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
     def _hear_slave(self, header: Header, datagram: bytes, t_ns: int) -> Taken | Refusal | None:
@@ -368,8 +377,8 @@ class MasterLink:
             self.unsynchronised += 1
             return None
         if isinstance(message, ImuSample | TrackerPose):
-            return msgspec.structs.replace(message, t_ns=t_ns)
-        return msgspec.structs.replace(
+            return restamped(message, t_ns=t_ns)
+        return restamped(
             message,
             t_ns=t_ns,
             ready_t_ns=clock.to_local(message.ready_t_ns),

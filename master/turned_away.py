@@ -1,4 +1,5 @@
-"""Who was turned away lately, by name: second processes under one name, and slaves of another wire version.
+"""Who was turned away lately, by name: second processes under one name, slaves of another wire version, and slaves
+whose secret is not the one that the master has for their name.
 
 A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
 the rig, and forgotten `LATELY_NS` after the last time.
@@ -29,11 +30,16 @@ class TurnedAway:
         self._keys, self._names = keys, frozenset(names)
         self._twins: dict[str, tuple[int, Away]] = {}
         self._versions: dict[str, tuple[int, Away]] = {}
+        self._unproven: dict[str, tuple[int, Away]] = {}
         self._next_ns: int | None = None
 
     def twin(self, name: str, host: str, version: int, t_ns: int) -> None:
         """A second process under `name` said hello at `t_ns` [ns] while the first one was well."""
         self._twins[name] = t_ns, Away(host, version)
+
+    def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
+        """Somebody at `host` said hello at `t_ns` [ns] as `name`, without that device's secret."""
+        self._unproven[name] = t_ns, Away(host, version)
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
         """Take a datagram of another wire version; what is no hello of this rig, rightly sealed, is left."""
@@ -54,6 +60,10 @@ class TurnedAway:
     def versions(self, t_ns: int) -> dict[str, Away]:
         """Name -> where it is and what it speaks, as of `t_ns` [ns]."""
         return _lately(self._versions, t_ns)
+
+    def secrets(self, t_ns: int) -> dict[str, Away]:
+        """Name -> where somebody says hello without its secret, as of `t_ns` [ns]."""
+        return _lately(self._unproven, t_ns)
 
 
 def _lately(seen: dict[str, tuple[int, Away]], t_ns: int) -> dict[str, Away]:

@@ -3,7 +3,8 @@
 Rules that must stay in step with `master.link` and docs/wire.md:
 - While the master of the session is heard, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
-- An offer (one slave nonce) lasts until a welcome that carries it; the session changes only then.
+- An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
+  this device; the session changes only then. Who only has the rig key ends none.
 - A session that the master's beacons do not list for a second is lost to it: say hello again.
 - Whoever is not welcomed though the beacons list its name has a twin. It goes on saying hello: the master takes it as
   soon as the other one is silent.
@@ -13,10 +14,12 @@ Rules that must stay in step with `master.link` and docs/wire.md:
 
 from collections import Counter
 from dataclasses import dataclass
+from hmac import compare_digest
 
 from common.clock import Clock
 from common.datagram import HEADER, OVERHEAD, Address, Header, Kind, Opener, Refusal, Sealer, parse
 from common.endpoints import reached_at
+from common.link_key import LinkKey
 from common.messages import WIRE_VERSION, Message, encode
 from common.session import (
     NONCE_BYTES,
@@ -28,6 +31,7 @@ from common.session import (
     RigKeys,
     Start,
     Started,
+    Unproven,
     Welcome,
     new_process_id,
     read,
@@ -44,6 +48,19 @@ STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire ver
 LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
 _TWIN = "the master has another process that is {!r}: two of one name, end one of them"
 _OTHER_VERSION = "the master at {} speaks wire version {}, this slave {}: install one version on both"
+
+_SECRET = (
+    "the secret of {0!r} is not the one that the master at {1} has for it: phalanx deploy brings"
+    " device-{0}.secret"
+)
+_NO_SECRET = (
+    "the master at {1} asks for the secret of {0!r}, and this device has the rig key alone: phalanx deploy brings"
+    " device-{0}.secret; --keys DIR says where it is"
+)
+_MASTER_HAS_NONE = (
+    "the master at {1} has the rig key alone, and {0!r} a secret of its own: start the master with --keys DIR, a folder"
+    " that has devices.key (phalanx-master keys make DIR)"
+)
 
 
 @dataclass(slots=True)
@@ -82,7 +99,7 @@ class SlaveLink:
     Holds the session, the offer under way, and the counters.
     """
 
-    def __init__(self, name: str, key: bytes, clock: Clock, random: Random) -> None:
+    def __init__(self, name: str, key: LinkKey | bytes, clock: Clock, random: Random) -> None:
         """Begin a new life of the slave `name`, with an id from `random`.
 
         Raises:
@@ -103,7 +120,7 @@ class SlaveLink:
 
     @property
     def wrong(self) -> str | None:
-        """Why no master takes this slave, where that is known: a twin, another wire version."""
+        """Why no master takes this slave, where that is known: a twin, another wire version, another secret."""
         if self._wrong is None or not 0 <= self._clock.now_ns() - self._wrong[0] < LATELY_NS:
             return None
         return self._wrong[1]
@@ -140,6 +157,8 @@ class SlaveLink:
             self._count(header)
         elif header.kind is Kind.WELCOME:
             self._count(self._hear_welcome(header, datagram, address, t_ns))
+        elif header.kind is Kind.UNPROVEN:
+            self._count(self._hear_unproven(header, datagram, address, t_ns))
         elif header.kind in (Kind.START, Kind.ECHO_ASK):
             self._count(self._hear_master(header, datagram, t_ns))
         else:
@@ -188,7 +207,8 @@ class SlaveLink:
         session = self._session
         if session is not None:
             if beacon.master_nonce == session.master_nonce:
-                if header.counter <= session.beacon_counter:
+                silent = t_ns - session.heard_ns >= VANISHED_NS  # then no counter is worth being deaf for it
+                if header.counter <= session.beacon_counter and not silent:
                     return Refusal.REPLAYED
                 session.beacon_counter = header.counter
                 listed = beacon.sessions.get(self._name) == session.key_id
@@ -231,7 +251,8 @@ class SlaveLink:
             return
         self._next_strange_ns = t_ns + STRANGE_NS
         self._wrong = t_ns, _OTHER_VERSION.format(address[0], version, WIRE_VERSION)
-        hello = Hello(self._name, self.process, self._random(NONCE_BYTES), bytes(NONCE_BYTES))
+        nonces = self._random(NONCE_BYTES), bytes(NONCE_BYTES)
+        hello = self._keys.hello(self._name, self.process, *nonces)
         self._outbox.append((seal(self._sealer, hello), address))
 
     def _say_hello(self, offer: _Offer, t_ns: int) -> None:
@@ -239,7 +260,7 @@ class SlaveLink:
         self._outbox.append((seal(self._sealer, self._hello(offer)), offer.address))
 
     def _hello(self, offer: _Offer) -> Hello:
-        return Hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
+        return self._keys.hello(self._name, self.process, offer.slave_nonce, offer.beacon.master_nonce)
 
     def _hear_welcome(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal | None:
         welcome = self._keys.hear(header, datagram, Welcome)
@@ -253,6 +274,8 @@ class SlaveLink:
         if welcome.master_nonce != offer.beacon.master_nonce:
             return Refusal.STALE  # a beacon of another life came meanwhile, and hello went there
         keys = self._keys.session(self._hello(offer), welcome.session_nonce)
+        if not compare_digest(keys.proof, welcome.proof):
+            return Refusal.SECRET
         self._session = _Session(
             welcome.master_nonce,
             welcome.slave_nonce,
@@ -267,6 +290,19 @@ class SlaveLink:
         )
         self._offer = None
         return None
+
+    def _hear_unproven(self, header: Header, datagram: bytes, address: Address, t_ns: int) -> Refusal:
+        """Why there is no welcome. It changes nothing here: whoever has the rig key can say it."""
+        unproven = self._keys.hear(header, datagram, Unproven)
+        if isinstance(unproven, Refusal):
+            return unproven
+        if self._offer is None or unproven.slave_nonce != self._offer.slave_nonce:
+            return Refusal.REPLAYED
+        why = _SECRET
+        if unproven.apart != self._keys.apart:
+            why = _NO_SECRET if unproven.apart else _MASTER_HAS_NONE
+        self._wrong = t_ns, why.format(self._name, address[0])
+        return Refusal.SECRET
 
     def _hear_master(self, header: Header, datagram: bytes, t_ns: int) -> Refusal | None:
         session = self._session

@@ -15,6 +15,7 @@ from ipaddress import AddressValueError, IPv4Address
 from common.clock import Clock
 from common.datagram import Address
 from common.errors import BusError
+from common.link_key import LinkKey
 from common.messages import Message
 from common.session import Random
 from common.udp import READ_TIMEOUT_S, UdpSocket
@@ -35,7 +36,7 @@ class Uplink:
     def __init__(
         self,
         name: str,
-        key: bytes,
+        key: LinkKey | bytes,
         clock: Clock,
         beacon_port: int,
         bind: str = ANYWHERE,
@@ -45,7 +46,7 @@ class Uplink:
 
         Args:
             name: Camera or IMU, as the rig's file calls it.
-            key: Rig key (32 bytes).
+            key: Rig key (32 bytes), alone or with this device's secret.
             clock: The clock of all times that this slave sends.
             beacon_port: UDP port of the beacons; several slaves of one machine share it.
             bind: Where to be heard from: 0.0.0.0 for every network, or an address of this machine.
@@ -97,7 +98,7 @@ class Uplink:
 
     @property
     def wrong(self) -> str | None:
-        """Why no master takes this slave, where that is known: a twin, another wire version."""
+        """Why no master takes this slave, where that is known: a twin, another wire version, another secret."""
         with self._lock:
             return self._link.wrong
 

@@ -52,6 +52,7 @@ class SenderNow:
         clock_sigma_ns: Standard deviation of its clock's offset now [ns]; None: not known.
         twin: Where a second process under its name was turned away lately; None: there was none.
         stranger: Where it speaks another wire version, and which; None: it does not.
+        unproven: Where somebody says that he is it, without its secret; None: nobody does.
     """
 
     connected: bool
@@ -60,6 +61,7 @@ class SenderNow:
     clock_sigma_ns: float | None
     twin: Away | None = None
     stranger: Away | None = None
+    unproven: Away | None = None
 
 
 @dataclass(frozen=True, slots=True)

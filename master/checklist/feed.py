@@ -46,8 +46,9 @@ class Heard(Protocol):
         """How its clock runs."""
         ...
 
-    def turned_away(self) -> tuple[Mapping[str, Away], Mapping[str, Away]]:
-        """Sender -> where a second process of its name was turned away lately; and where it speaks another version."""
+    def turned_away(self) -> tuple[Mapping[str, Away], Mapping[str, Away], Mapping[str, Away]]:
+        """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
+        somebody says hello without its secret."""
         ...
 
 
@@ -130,14 +131,14 @@ class ChecklistFeed:
 
     def _now(self, t_ns: int) -> MasterNow:
         connected = self._heard.connected
-        twins, strangers = self._heard.turned_away()
+        turned_away = self._heard.turned_away()
         names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
         senders: dict[str, SenderNow] = {}
         for name in names:
             counts, clock = self._heard.counts_of(name), self._heard.clock_of(name)
             sigma_ns = None if clock is None else clock.sigma_at(t_ns)
             missed = counts.lost + counts.late
-            away = twins.get(name), strangers.get(name)
+            away = (of.get(name) for of in turned_away)
             senders[name] = SenderNow(name in connected, counts.received, missed, sigma_ns, *away)
         groups = [
             line.counts

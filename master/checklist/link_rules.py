@@ -108,6 +108,15 @@ class LinkRules:
             f"{name} at {host} speaks wire version {version}, this master {WIRE_VERSION}: neither takes the other.",
             "Install the same version of Phalanx on both, for example by phalanx deploy.",
         )
+        yield Verdict(
+            "secret_mismatch",
+            name,
+            sender.unproven is not None,
+            f"Somebody at {sender.unproven and sender.unproven.host} says that he is {name}, and has not the secret"
+            " that this master has for it.",
+            f"phalanx deploy brings it, device-{name}.secret; both sides need --keys, or both the rig key alone. If"
+            " that machine is not yours: phalanx-master keys revoke.",
+        )
 
     def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether it is not heard: at once where it was there, after a grace where it never was."""

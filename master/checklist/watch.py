@@ -32,7 +32,7 @@ _ABSENT: frozenset[CheckCode] = frozenset(("camera_absent", "imu_silent"))
 _COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_range"))
 _LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
 _MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
-_NOT_TAKEN: frozenset[CheckCode] = frozenset(("twin_sender", "version_mismatch"))
+_NOT_TAKEN: frozenset[CheckCode] = frozenset(("twin_sender", "version_mismatch", "secret_mismatch"))
 _OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN
 # Cause -> what is not told of the same camera, its markers, or a group with it in it.
 _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
@@ -47,6 +47,7 @@ _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "strobe_slipped": frozenset[CheckCode](("rate_low",)),
     "too_hot": frozenset[CheckCode](("rate_low",)),
     "version_mismatch": _ABSENT,
+    "secret_mismatch": _ABSENT,
 }
 
 

@@ -12,15 +12,16 @@ from hypothesis import strategies as st
 from common.datagram import Header, Kind, Refusal, parse
 from common.errors import PhalanxError
 from common.keys import ENVIRONMENT, new_key, rig_key
+from common.link_key import LinkKey, device_secret
 from common.session import (
     Beacon,
     EchoAnswer,
     EchoAsk,
     Handshake,
-    Hello,
     RigKeys,
     Start,
     Started,
+    Unproven,
     Welcome,
     new_process_id,
     read,
@@ -30,17 +31,18 @@ from tests.network_helpers import seeded
 
 KEY = bytes(range(32))
 A, B, C = (bytes([value]) * 16 for value in b"ABC")
-HELLO = Hello("left", 5, slave_nonce=A, master_nonce=B)
+HELLO = RigKeys(KEY).hello("left", 5, slave_nonce=A, master_nonce=B)
 
 MESSAGES: list[tuple[Kind, Handshake]] = [
     (Kind.BEACON, Beacon(A, "tcp/127.0.0.1:47802", {"left": 3, "right": 2**63 - 1})),
     (Kind.BEACON, Beacon(A, "", {})),
     (Kind.HELLO, HELLO),
-    (Kind.WELCOME, Welcome(A, B, C)),
+    (Kind.WELCOME, Welcome(A, B, C, A)),
     (Kind.START, Start(-5)),
     (Kind.STARTED, Started(2**63 - 1)),
     (Kind.ECHO_ASK, EchoAsk(0)),
     (Kind.ECHO_ANSWER, EchoAnswer(1, 2, 3)),
+    (Kind.UNPROVEN, Unproven(A, B, apart=True)),
 ]
 
 
@@ -98,27 +100,59 @@ def test_broken_utf8_and_deep_nesting_are_none() -> None:
 
 def test_keys_are_hkdf_of_every_share() -> None:
     """RFC 5869 by hand, from docs/wire.md."""
-    keys = RigKeys(KEY).session(HELLO, C)
-    prk = hmac.new(B + C + A, KEY, sha256).digest()
-    info, block, okm = b"phalanx session left", b"", b""
-    for i in (1, 2, 3):
+    root = bytes(range(32, 64))
+    secret = _hkdf(root, b"", b"phalanx device left", 32)
+    rig = RigKeys(LinkKey(KEY, root))
+    okm = _hkdf(KEY + secret, B + C + A, b"phalanx session left", 88)
+    keys = rig.session(HELLO, C)
+    assert keys.key_id == int.from_bytes(okm[:8], "big") >> 1
+    assert keys[1:] == (okm[8:40], okm[40:72], okm[72:])
+    proof = _hkdf(KEY + secret, B + A, b"phalanx hello " + (5).to_bytes(8, "big") + b"left", 16)
+    assert rig.hello("left", 5, slave_nonce=A, master_nonce=B).proof == proof
+
+
+def _hkdf(key: bytes, salt: bytes, info: bytes, size: int) -> bytes:
+    prk, block, okm = hmac.new(salt or bytes(32), key, sha256).digest(), b"", b""
+    for i in range(1, size // 32 + 2):
         block = hmac.new(prk, block + info + bytes([i]), sha256).digest()
         okm += block
-    assert keys.key_id == int.from_bytes(okm[:8], "big") >> 1
-    assert (keys.to_master, keys.to_slave) == (okm[8:40], okm[40:72])
+    return okm[:size]
+
+
+def test_a_hello_proves_every_field_and_by_the_secret_of_its_name_alone() -> None:
+    master, thief = RigKeys(LinkKey(KEY, C + C)), RigKeys(LinkKey(KEY, own=device_secret(C + C, "right")))
+    left = RigKeys(LinkKey(KEY, own=device_secret(C + C, "left")))
+    hello = left.hello("left", 5, A, B)
+    assert master.proves(hello)
+    assert left.session(hello, C) == master.session(hello, C)
+    changed = msgspec.structs.replace
+    for other in (
+        changed(hello, name="right"),
+        changed(hello, process=6),
+        changed(hello, slave_nonce=C),
+        changed(hello, master_nonce=C),
+        changed(hello, proof=A),
+        thief.hello("left", 5, A, B),
+        RigKeys(KEY).hello("left", 5, A, B),
+        RigKeys(LinkKey(B + B, C + C)).hello("left", 5, A, B),
+    ):
+        assert not master.proves(other)
+    assert master.proves(thief.hello("right", 5, A, B))
 
 
 def test_any_other_share_gives_other_keys() -> None:
     base = RigKeys(KEY).session(HELLO, C)
     others = [
         RigKeys(bytes(32)).session(HELLO, C),
+        RigKeys(LinkKey(KEY, bytes(32))).session(HELLO, C),
+        RigKeys(LinkKey(KEY, own=bytes(32))).session(HELLO, C),
         RigKeys(KEY).session(HELLO, A),
         RigKeys(KEY).session(msgspec.structs.replace(HELLO, slave_nonce=C), C),
         RigKeys(KEY).session(msgspec.structs.replace(HELLO, master_nonce=C), C),
         RigKeys(KEY).session(msgspec.structs.replace(HELLO, name="right"), C),
     ]
     values = {value for keys in (base, *others) for value in keys}
-    assert len(values) == 3 * (1 + len(others))
+    assert len(values) == 4 * (1 + len(others))
 
 
 def test_a_process_opens_only_with_its_own_key() -> None:
@@ -141,6 +175,19 @@ def test_ids_have_63_bits() -> None:
 def test_a_rig_key_has_32_bytes(size: int) -> None:
     with pytest.raises(ValueError, match="32"):
         RigKeys(bytes(size))
+    for other in ({"root": bytes(size)}, {"own": bytes(size)}):
+        with pytest.raises(ValueError, match="32"):
+            LinkKey(KEY, **other)
+
+
+def test_without_secrets_of_their_own_all_follow_from_the_rig_key() -> None:
+    alone, apart = LinkKey(KEY), LinkKey(KEY, A + A)
+    assert not alone.apart
+    assert apart.apart
+    assert LinkKey(KEY, own=B + B).apart
+    assert alone.secret("left") == device_secret(KEY, "left") != alone.secret("right")
+    assert apart.secret("left") == device_secret(A + A, "left") != alone.secret("left")
+    assert repr(apart) == "LinkKey()"
 
 
 def test_the_rig_key_comes_from_the_environment_or_a_private_file(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ import pytest
 from common import datagram, session
 from common.datagram import HEADER, MAX_DATAGRAM, OVERHEAD, WINDOW, Kind, Refusal
 from common.messages import MAX_MARKERS, WIRE_VERSION
-from common.session import Beacon, EchoAnswer, EchoAsk, Handshake, Hello, Start, Started, Welcome
+from common.session import Beacon, EchoAnswer, EchoAsk, Handshake, Hello, Start, Started, Unproven, Welcome
 from common.streams import ALIVE_KEY, STREAMS
 
 TEXT = (Path(__file__).parents[2] / "docs" / "wire.md").read_text(encoding="utf-8")
 CODE = set(re.findall(r"`([^`\n]+)`", TEXT))
-HANDSHAKES = (Beacon, Hello, Welcome, Start, Started, EchoAsk, EchoAnswer)
+HANDSHAKES = (Beacon, Hello, Welcome, Start, Started, EchoAsk, EchoAnswer, Unproven)
 TRAVELS = (*(row.message for row in STREAMS.values()), *HANDSHAKES)
 
 

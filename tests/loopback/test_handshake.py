@@ -12,6 +12,7 @@ import pytest
 
 from common.clock import SkewedClock
 from common.datagram import Address, Header, Kind, Refusal, Sealer, parse
+from common.link_key import LinkKey
 from common.messages import (
     Command,
     Detections,
@@ -59,15 +60,18 @@ class Wires:
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
         trackers: tuple[str, ...] = (),
+        key: LinkKey | bytes = KEY,
     ) -> MasterLink:
         self.lives += 1
         source, timeout_ns = seeded(1000 * self.seed + self.lives), round(timeout_s * S)
         self.master = MasterLink(
-            cameras, KEY, self.clock, BROADCAST, "tcp/10.0.0.1:47802", timeout_ns, source, imus, wrists, trackers
+            cameras, key, self.clock, BROADCAST, "tcp/10.0.0.1:47802", timeout_ns, source, imus, wrists, trackers
         )  # fmt: skip
         return self.master
 
-    def new_slave(self, name: str, skewed: SkewedClock | None = None, key: bytes = KEY) -> SlaveLink:
+    def new_slave(
+        self, name: str, skewed: SkewedClock | None = None, key: LinkKey | bytes = KEY
+    ) -> SlaveLink:
         self.lives += 1
         clock = self.clock if skewed is None else skewed
         slave = SlaveLink(name, key, clock, seeded(1000 * self.seed + self.lives))
@@ -376,7 +380,7 @@ def test_without_the_rig_key_nothing_is_said_and_nothing_heard() -> None:
     assert all(to == BROADCAST for _, _, to in wires.seen)
     tag = RigKeys(KEY).rig_tag  # the tag is no secret: forge with it
     nonce = bytes(16)
-    hello = seal(Sealer(bytes(32), tag, 5), Hello("left", 5, nonce, nonce))
+    hello = seal(Sealer(bytes(32), tag, 5), Hello("left", 5, nonce, nonce, nonce))
     wires.carry(hello, ("6.6.6.6", 6), MASTER)
     assert master.refused == {Refusal.FORGED: 1}
 
@@ -439,9 +443,10 @@ def test_echo_and_start_out_of_order_are_fine() -> None:
 def test_a_flood_of_hellos_grows_nothing() -> None:
     wires = Wires()
     master, _, _ = started_pair(wires)
-    sealer = RigKeys(KEY).sealer(5)
+    keys = RigKeys(KEY)
+    sealer = keys.sealer(5)
     for i in range(2000):
-        hello = Hello(("left", "right")[i % 2], 5, i.to_bytes(16, "big"), master._nonce)
+        hello = keys.hello(("left", "right")[i % 2], 5, i.to_bytes(16, "big"), master._nonce)
         master.receive(seal(sealer, hello), ("6.6.6.6", 6), wires.clock.now_ns())
         master._outbox.clear()
     assert len(master._sessions) <= 4

@@ -30,6 +30,7 @@ class Bench:
     rate: dict[str, float] = field(default_factory=dict[str, float])
     twin: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
     stranger: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
+    unproven: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
     sigma_ns: dict[str, float | None] = field(default_factory=dict[str, float | None])
     disk_mb: float = 9000.0
     apart: float = 0.0
@@ -100,6 +101,7 @@ class Bench:
                 self.sigma_ns.get(name, 5e4),
                 self.twin.get(name),
                 self.stranger.get(name),
+                self.unproven.get(name),
             )
             for name in NAMES
         }

@@ -64,8 +64,14 @@ def _stranger(bench: Bench) -> None:
     bench.away.add("right")
 
 
+def _unproven(bench: Bench) -> None:
+    bench.unproven["right"] = Away("10.0.0.9", 11)
+    bench.away.add("right")
+
+
 def _as_ours(bench: Bench) -> None:
     bench.stranger.clear()
+    bench.unproven.clear()
     bench.away.clear()
 
 
@@ -242,6 +248,14 @@ CASES = [
         _as_ours,
         "right at 10.0.0.8 speaks wire version 9",
         "Install the same version",
+    ),
+    Case(
+        "secret_mismatch",
+        "right",
+        _unproven,
+        _as_ours,
+        "10.0.0.9 says that he is right",
+        "device-right.secret",
     ),
 ]
 
