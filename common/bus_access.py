@@ -5,7 +5,7 @@ master passes on:
 
 | who | may |
 |---|---|
-| a device | say how it is, show pictures, answer commands, all under its own name; it tells no poses, and hears nothing |
+| a device | say how it is, show pictures, answer commands, all under its own name; no poses, and it hears nothing |
 | an operator (viewer, console, recorder ...) | read everything, command everybody, be a program with its own name |
 | the master | everything |
 

@@ -9,7 +9,10 @@ import os
 import socket
 import ssl
 import stat
+import struct
+import sys
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
@@ -28,6 +31,7 @@ LIFE = timedelta(days=397)  # browsers refuse a longer life
 _RENEW_BEFORE = timedelta(days=14)
 _MOST_BYTES = 65536
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
+_SIOCGIFADDR = 0x8915  # netdevice(7)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +127,35 @@ def machine_names() -> frozenset[str]:
     """Names under which this machine is reached."""
     machine = socket.gethostname().lower()
     return frozenset({"localhost", machine, f"{machine.split('.')[0]}.local"})
+
+
+def places_of(host: str) -> tuple[str, ...]:
+    """Under what a browser finds a page that listens on `host`: itself, or where that is everywhere, each IPv4 address.
+
+    Those that other machines reach come first, this machine's own last.
+    """
+    if host not in _ANYWHERE:
+        return (f"[{host}]" if ":" in host else host,)
+    return (*dict.fromkeys(one for one in _addresses() if not ip_address(one).is_loopback), "127.0.0.1")
+
+
+def _addresses() -> list[str]:
+    """IPv4 addresses of this machine, as Linux tells of each network; elsewhere, and without one, of its name."""
+    found: list[str] = []
+    if sys.platform == "linux":
+        from fcntl import ioctl
+
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            for _, name in socket.if_nameindex():
+                with suppress(OSError):  # it has none
+                    told = ioctl(probe.fileno(), _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))
+                    found.append(socket.inet_ntoa(told[20:24]))
+    else:
+        with suppress(OSError):
+            found += [
+                str(one[4][0]) for one in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)
+            ]
+    return found
 
 
 def _fits(pem: bytes, host: str, now: datetime) -> bool:

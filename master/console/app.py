@@ -18,16 +18,15 @@ from master.console.login import PasswordHash, kept_password, password_from
 from master.console.login_page import LoginRequired
 from master.console.neighbours import same_user
 from master.console.pages import checklist, gestures, live, outputs, plots, tune
+from master.console.serving import console_server
 from master.console.setup import page as setup_page
 from master.console.shell import Entry, shell
 from master.console.sockets import serve_sockets
 from master.console.state import ConsoleSettings, ConsoleState
-from master.listening import is_loopback, page_certificate, private_folder
+from master.listening import is_loopback, page_certificate, places_of, private_folder
 
 TITLE = "Phalanx"
 _AWAY_S = 30.0  # a page that was not heard for so long, as on a busy machine, goes on where it was
-_MOST_CONNECTIONS = 256  # a page has about ten; whoever opens more finds a 503, and takes no more of us
-_LEAVE_S = 2  # pages that are open do not keep the console from ending
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,10 +130,10 @@ def run_console(settings: ConsoleSettings, stop: threading.Event, say: Callable[
     state = ConsoleState(settings)
     try:
         register(state, logout=door.password is not None)
-        server = _server(console_app(state, settings.host, port, door), door)
+        server = console_server(console_app(state, settings.host, port, door), door.tls)
         threading.Thread(target=_end_with, args=(stop, server), name="console stop", daemon=True).start()
         scheme = "http" if door.tls is None else "https"
-        say(f"console: {scheme}://{f'[{host}]' if ':' in host else host}:{port}/")
+        say("console: " + " ".join(f"{scheme}://{place}:{port}/" for place in places_of(host)))
         server.run(sockets=[listening])
     finally:
         stop.set()
@@ -166,21 +165,6 @@ def console_app(state: ConsoleState, host: str, port: int, door: Door) -> FastAP
     neighbours = same_user if door.password is None else None
     app.add_middleware(OwnPagesOnly, allowed=names_of(host), same_user=neighbours)  # the outermost
     return app
-
-
-def _server(app: FastAPI, door: Door) -> uvicorn.Server:
-    config = uvicorn.Config(
-        app,
-        log_level="warning",
-        timeout_graceful_shutdown=_LEAVE_S,
-        access_log=False,
-        lifespan="on",
-        limit_concurrency=_MOST_CONNECTIONS,
-        proxy_headers=False,  # who asks is who is connected, whatever a header says
-    )
-    config.load()
-    config.ssl = door.tls
-    return uvicorn.Server(config)
 
 
 def _end_with(stop: threading.Event, server: uvicorn.Server) -> None:

@@ -22,8 +22,11 @@ def same_user(client: Peer, server: Peer, net: Path = Path("/proc/net")) -> bool
     if not tables:
         return True  # no Linux
     wanted = (_plain(client), _plain(server))
+    ports = f":{client[1]:04X} ", f":{server[1]:04X} "  # thousands of lines are looked at quickly by these
     for path in tables:
         for line in path.read_text(encoding="ascii").splitlines()[1:]:
+            if ports[0] not in line or ports[1] not in line:
+                continue
             fields = line.split()
             if (_socket(fields[1]), _socket(fields[2])) == wanted:
                 return int(fields[7]) in (os.getuid(), _ROOT)

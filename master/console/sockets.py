@@ -50,7 +50,7 @@ class Shown:
 def _mask(text: str, before: tuple[str, ...]) -> tuple[str, ...]:
     try:
         return msgspec.json.decode(text, type=_Wish).mask
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, RecursionError):
         return before
 
 

@@ -15,6 +15,7 @@ from master.listening import (
     is_loopback,
     is_open,
     page_certificate,
+    places_of,
     private_folder,
     read_private,
     write_private,
@@ -45,11 +46,11 @@ def guard_of(settings: WebOutput, environment: Mapping[str, str]) -> Guard:
 
 
 def address_of(settings: WebOutput, environment: Mapping[str, str]) -> str:
-    """What to open in a browser: with the key, where one is needed."""
+    """What to open in a browser, by blanks: with the key, where one is needed."""
     guard = guard_of(settings, environment)
-    place = f"[{settings.host}]" if ":" in settings.host else settings.host
     asked = "" if guard.key is None else f"?key={guard.key}"
-    return f"{'http' if guard.tls is None else 'https'}://{place}:{settings.port}/{asked}"
+    scheme = "http" if guard.tls is None else "https"
+    return " ".join(f"{scheme}://{place}:{settings.port}/{asked}" for place in places_of(settings.host))
 
 
 class WebSink:

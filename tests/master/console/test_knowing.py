@@ -234,7 +234,7 @@ def test_state_reads_the_bus_and_files_and_refuses_paths(tmp_path: Path) -> None
         assert state.cameras() == ("left", "right")
         bus.announce("master")
         assert until(lambda: state.alive == {"master"})
-        assert until(lambda: (bus.publish("hand", "me", pose(1)), bool(state.poses))[1])
+        assert until(lambda: (bus.publish("hand", "default-right", pose(1)), bool(state.poses))[1])
         assert not state.checklist
         for bad in ("../x", "a/b", "", ".hidden", "x" * 80):
             with pytest.raises(PhalanxError, match="is called by letters"):
