@@ -3,6 +3,17 @@
 import argparse
 from pathlib import Path
 
+PURPOSE = "what of this device is well, and what is not"
+EXAMPLES = """\
+  sudo phalanx-slave doctor
+        on a device with a service: machine, clock, libraries, keys, devices, camera, service, and whether its master
+        is heard; each line ok, warn or fail, with what mends it; exit 1 where something fails
+  phalanx-slave doctor --name left --rig desk --camera v4l2 --calibration calib_json --keys keys --master pc.local
+        before it is installed; as root it sees the keys, as another user the rest
+  phalanx-slave doctor --json
+        the same for programs; docs/doctor.md
+"""
+
 
 def add_options(parser: argparse.ArgumentParser, beacon_port: int) -> None:
     """Add the options of `phalanx-slave doctor`."""

@@ -1,0 +1,140 @@
+"""The camera of `run` and `record`: its options, and how it is opened, with the lights of a wrist device."""
+
+import argparse
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from common.calibration import CameraCalibration, RigCalibration
+from common.clock import Clock
+from common.errors import CameraError, PhalanxError
+from slave.cameras import real
+from slave.cameras.source import FrameSource
+from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
+from slave.lights.opening import CHOICES, SYNTHETIC, choose, limits_for, open_guarded
+from slave.service import Away, nobody
+
+if TYPE_CHECKING:
+    from slave.cameras.synthetic import LitBy
+
+CAMERAS = f"{real.CAMERAS} | synthetic | replay:FOLDER"
+
+
+def add_camera(command: argparse.ArgumentParser) -> None:
+    """All that opening a camera asks for."""
+    add_place(command, "camera of this slave, a member of the rig")
+    command.add_argument("--camera", required=True, metavar="DRIVER", help=CAMERAS)
+    command.add_argument(
+        "--lights",
+        metavar="DRIVER",
+        help=f"who switches laser and LEDs of a wrist device: {CHOICES} (docs/safety.md); the last two: the camera's "
+        "own strobe output, or another controller. Before a synthetic camera synthetic (default) or camera",
+    )
+    real.add_options(command)
+    sim = command.add_argument_group("synthetic camera")
+    add_simulated(sim.add_argument)
+    sim.add_argument("--start-offset-ms", type=number, default=0.0, metavar="Z", help="its frames come later")
+
+
+def open_lit(
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    clock: Clock,
+    true_clock: Clock,
+    stop: threading.Event | None = None,
+    away: Away = nobody,
+) -> FrameSource:
+    """Open the camera, and the lights of a wrist device, which are dark before it is opened.
+
+    Args:
+        options: What `add_camera` added.
+        rig: Whose camera it is.
+        camera: The camera file.
+        clock: The slave's clock.
+        true_clock: What the simulated world goes by.
+        stop: Set when the slave is to end; until then a camera that is lost is opened again. None: losing it is an
+            error.
+        away: Told when it takes time to open it, now or again.
+
+    Raises:
+        CameraError: There is no such driver, or the camera cannot be opened.
+        LightsError: The lights are not said, do not fit, or cannot be opened.
+        CalibrationError: A file of the simulated world is missing or broken.
+    """
+    lights = choose(options.lights, rig, str(options.camera))
+    if lights is None or (lights == SYNTHETIC and options.scene == "board"):  # a simulated board is not lit
+        return _open(options, rig, camera, clock, true_clock, stop, away)
+    from slave.lights.controller import StrobeController
+    from slave.lights.simulated import SimulatedStrobe
+    from slave.lights.strobed import StrobedCamera, schedule_of
+
+    limits, schedule = limits_for(lights, rig), schedule_of(rig, camera)
+    if lights == SYNTHETIC:
+        strobe = SimulatedStrobe(schedule, limits)
+        source = _open(options, rig, camera, clock, true_clock, stop, nobody, strobe)
+        return StrobedCamera(source, camera, rig, strobe)
+    guard = open_guarded(lights, rig)
+    try:
+        source = _open(options, rig, camera, clock, true_clock, stop, away)
+    except PhalanxError:
+        guard.close()
+        raise
+    return StrobedCamera(source, camera, rig, StrobeController(schedule, guard, clock))
+
+
+def _open(
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    clock: Clock,
+    true_clock: Clock,
+    stop: threading.Event | None,
+    away: Away,
+    lights: "LitBy | None" = None,
+) -> FrameSource:
+    found = real.open_real(options.camera, options, camera, clock, stop, wrist=rig.kind == "wrist", away=away)
+    if found is not None:
+        return found
+    kind, _, folder = str(options.camera).partition(":")
+    if kind == "replay" and folder:
+        from slave.cameras.replay import ReplayCamera
+
+        return ReplayCamera(Path(folder), options.name, paced=True, clock=clock)
+    if kind == "synthetic" and not folder:
+        return _open_synthetic(options, rig, camera, clock, true_clock, stop, away, lights)
+    raise CameraError(f"--camera {options.camera}: no such driver; there are {CAMERAS}")
+
+
+def _open_synthetic(
+    options: argparse.Namespace,
+    rig: RigCalibration,
+    camera: CameraCalibration,
+    clock: Clock,
+    true_clock: Clock,
+    stop: threading.Event | None,
+    away: Away,
+    lights: "LitBy | None",
+) -> FrameSource:
+    from slave.cameras.synthetic import SyntheticCamera
+    from slave.simulated import FrameClock, scene_of
+
+    scene = scene_of(*world_of(options, rig), options.scene, options.seed)
+    epoch_ns = epoch_of(options, true_clock)
+    late_ns = round(options.start_offset_ms * 1e6)
+    waits = isinstance(true_clock, FrameClock)
+    sleep = true_clock.sleep if isinstance(true_clock, FrameClock) else time.sleep
+
+    def draw(file: CameraCalibration) -> SyntheticCamera:
+        return SyntheticCamera(
+            scene, file, epoch_ns, clock, late_ns, true_clock, sleep, lights, live=not waits
+        )
+
+    if getattr(options, "faults", None) is None:
+        return draw(camera)
+    from slave.cameras.faulty import FaultyCamera
+
+    return real.lasting(
+        lambda file: FaultyCamera(draw(file), file, options.faults), camera, clock, stop, away
+    )

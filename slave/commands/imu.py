@@ -1,0 +1,82 @@
+"""`phalanx-slave imu`: sends what an IMU measures."""
+
+import argparse
+import os
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from common.clock import SystemClock
+from common.errors import CalibrationError
+from slave.commands.options import (
+    add_link,
+    add_place,
+    add_simulated,
+    clock_of,
+    epoch_of,
+    rig_of,
+    secrets_of,
+    world_of,
+)
+from slave.imu import opening
+from slave.service import Service
+from slave.stopping import stop_by_signal
+
+if TYPE_CHECKING:
+    from slave.imu.source import ImuSource
+
+PURPOSE = "send what an IMU measures"
+EXAMPLES = """\
+  phalanx-slave imu --name imu --rig wrist --imu synthetic --bind 127.0.0.1 --key-file rig.key
+        waits for the master's start, then sends one sealed datagram per sample: that of the simulated hand; with
+        cameras in other processes, all with the same --scene, --seed and --scene-epoch-ns
+  phalanx-slave imu --list
+        says which serial ports and I2C buses there are, then ends
+  phalanx-slave imu --name imu --rig wrist --imu ximu3:/dev/serial/by-id/PORT --key-file rig.key
+        an x-IMU3 on USB; on the pins of a Pi: ximu3:/dev/serial0@115200; docs/imu.md says what is set and checked
+  phalanx-slave imu --name imu --rig wrist --imu lsm6dsox:1:0x6a --key-file rig.key
+        an LSM6DSOX on I2C bus 1 of a Pi
+"""
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """The options of `imu`."""
+    add_place(command, "IMU of this slave, that of the rig")
+    opening.add_options(command)
+    add_link(command)
+    add_simulated(command.add_argument_group("synthetic IMU").add_argument)
+
+
+def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
+    """Send samples until it is told to end.
+
+    Raises:
+        PhalanxError: A file, the IMU, a key or the network is not as it must be.
+    """
+    from slave.imu.live import run_live
+    from slave.imu.synthetic import SyntheticImu
+    from slave.simulated import imu_of
+    from slave.uplink import Uplink
+
+    rig = rig_of(options)
+    if rig.imu is None or options.name != rig.imu.name:
+        has = "it has none" if rig.imu is None else f"its IMU is {rig.imu.name!r}"
+        raise CalibrationError(f"rig {rig.name!r} has no IMU {options.name!r}; {has}")
+    orientation = opening.orientation_of(rig.imu)
+    true_clock = SystemClock()
+    clock = clock_of(options, true_clock)
+    key, access = secrets_of(options)
+
+    def tell(line: str) -> None:
+        say(f"{options.name}: {line}")
+
+    service = Service(os.environ, noun="samples")
+    with stop_by_signal() as stop:
+        if options.imu == "synthetic":
+            epoch_ns = epoch_of(options, true_clock)
+            imu = imu_of(options.imu, *world_of(options, rig), options.scene, options.seed)
+            source: ImuSource = SyntheticImu(imu, epoch_ns, clock, stop)
+        else:
+            source = opening.open_real(options.name, options.imu, rig.imu.rate_hz, clock, stop, service.away)
+        uplink = Uplink(options.name, key, clock, options.beacon_port, options.bind)
+        run_live(options.name, source, orientation, uplink, clock, stop, tell, service, access)
+    return 0

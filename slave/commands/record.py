@@ -1,0 +1,203 @@
+"""`phalanx-slave record`: raw frames of one camera to disk, and a real IMU beside it, without master or network."""
+
+import argparse
+import os
+import sys
+import threading
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from common.calibration import CameraCalibration, RigCalibration, load
+from common.clock import Clock, SkewedClock, SystemClock
+from common.errors import CalibrationError, CameraError, PhalanxError
+from slave.commands.camera import add_camera, open_lit
+from slave.commands.options import (
+    camera_of,
+    camera_path,
+    clock_of,
+    count,
+    megabytes,
+    objects_of,
+    positive,
+    skew_of,
+    world_of,
+)
+from slave.imu import opening
+from slave.stopping import stop_by_signal
+
+if TYPE_CHECKING:
+    from common.frame_recording import Manifest
+    from slave.imu.recording import ImuRecorder
+    from slave.progress import Progress
+
+PURPOSE = "raw frames to disk"
+EXAMPLES = """\
+  phalanx-slave record --name left --rig desk --camera synthetic --seconds 10 -o recordings/wave-left
+        without master or network; one folder per camera
+  phalanx-slave record --name wrist --rig wrist --camera synthetic --imu ximu3:/dev/ttyACM0 --seconds 10 -o out
+        the rig's IMU beside the camera, as imu.csv on the clock of the frames
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """What is recorded, and by what clocks: the slave's, and that of the simulated world."""
+
+    rig: RigCalibration
+    camera: CameraCalibration
+    clock: SkewedClock
+    true_clock: Clock
+
+
+def add_options(command: argparse.ArgumentParser) -> None:
+    """The options of `record`."""
+    add_camera(command)
+    command.add_argument(
+        "-o", "--output", type=Path, required=True, metavar="FOLDER", help="new or empty; one per camera"
+    )
+    command.add_argument("--seconds", type=positive, metavar="S", help="default: until Ctrl-C")
+    command.add_argument("--frames", type=count, metavar="N", help="end after so many recorded frames")
+    command.add_argument(
+        "--imu",
+        nargs="?",
+        const="synthetic",
+        metavar="DRIVER",
+        help=f"what the rig's IMU says, too, as imu.csv: {opening.REAL}; without a driver, that of a synthetic camera",
+    )
+    command.add_argument(
+        "--every-frame",
+        action="store_true",
+        help="a synthetic camera does not keep time but draws every frame, however long that takes; all cameras of one "
+        "scene need the same --scene-epoch-ns",
+    )
+    command.add_argument("--note", default="", metavar="TEXT", help="kept in recording.json")
+    command.add_argument(
+        "--reserve-mb", type=megabytes, default=200.0, metavar="MB", help="stay free (default: %(default)g)"
+    )
+    command.add_argument(
+        "--queue-mb", type=megabytes, default=128.0, metavar="MB", help="may wait (default: %(default)g)"
+    )
+
+
+def run(options: argparse.Namespace, say: Callable[[str], None], aside: Callable[[str], None]) -> int:
+    """Record until the length is reached, or it is told to end.
+
+    Raises:
+        PhalanxError: A file, the camera, its lights, the IMU or the disk is not as it must be; no frame came.
+    """
+    from common.frame_writing import refuse_occupied
+    from slave.simulated import add_imu, imu_of
+
+    scene = _scene(options)
+    manifest = _manifest(options, scene)
+    refuse_occupied(options.output)  # before a camera is opened
+    imu = None
+    if options.imu == "synthetic":
+        imu = imu_of(str(options.camera), *world_of(options, scene.rig), options.scene, options.seed)
+    with _imu_beside(options, scene, aside) as beside:
+        done, failure = _record(options, scene, manifest, beside)
+        if beside is not None and done.frames:
+            beside.keep()
+    if imu is not None and done.frames:
+        add_imu(options.output, imu, options.scene_epoch_ns, scene.clock)
+    os.sync()  # what was said to be recorded is there, also when the power goes now
+    if failure is None and beside is not None:
+        failure = beside.failure
+    if failure is not None:
+        raise failure
+    if not done.frames:
+        raise CameraError(f"camera {options.name!r} gave no frame; nothing was recorded")
+    say(f"{options.name}: recorded in {options.output}")
+    return 0
+
+
+def _scene(options: argparse.Namespace) -> _Scene:
+    from slave.simulated import FrameClock
+
+    rig, camera = camera_of(options)
+    true_clock: Clock = SystemClock()
+    if options.scene_epoch_ns is None:
+        options.scene_epoch_ns = true_clock.now_ns()
+    if options.every_frame:
+        if options.camera != "synthetic":
+            raise CameraError(f"--every-frame: only a synthetic camera can wait, not {options.camera}")
+        true_clock = FrameClock(options.scene_epoch_ns)
+    return _Scene(rig, camera, clock_of(options, true_clock), true_clock)
+
+
+def _manifest(options: argparse.Namespace, scene: _Scene) -> "Manifest":
+    from common.frame_recording import Manifest
+    from slave.recorder import clock_of as recorded_clock
+
+    rig, skewed = scene.rig, skew_of(options, scene.true_clock)
+    if options.every_frame:
+        skewed = f" as frames are drawn{skewed}"
+    return Manifest(
+        version=1,
+        kind=rig.kind,
+        cameras={name: load(camera_path(options, name), CameraCalibration) for name in rig.cameras},
+        rig=rig,
+        note=options.note,
+        clock=recorded_clock(scene.clock, skewed),
+        objects=objects_of(options, rig),
+    )
+
+
+def _record(
+    options: argparse.Namespace, scene: _Scene, manifest: "Manifest", beside: "ImuRecorder | None"
+) -> "tuple[Progress, PhalanxError | None]":
+    """Record the camera to its end; how much that is, and what has ended it before its time."""
+    from slave.progress import Length, ProgressDisplay
+    from slave.recorder import Recorder, feed
+
+    display = ProgressDisplay(options.name, sys.stderr)
+    source = open_lit(options, scene.rig, scene.camera, scene.clock, scene.true_clock)
+    try:
+        recorder = Recorder(
+            options.output,
+            manifest,
+            options.name,
+            Length(options.seconds, options.frames),
+            display.show,
+            round(options.reserve_mb * 1e6),
+            round(options.queue_mb * 1e6),
+        )
+        try:
+            if beside is not None:
+                beside.start(options.output)
+            with stop_by_signal() as stop:
+                feed(source, recorder, stop)
+        finally:
+            recorder.close()
+            done = recorder.progress()
+            display.end(done)
+    finally:
+        source.close()
+    return done, recorder.failure
+
+
+@contextmanager
+def _imu_beside(
+    options: argparse.Namespace, scene: _Scene, aside: Callable[[str], None]
+) -> "Generator[ImuRecorder | None, None, None]":
+    """A real IMU of the rig that is recorded with a camera, if one is asked for."""
+    if options.imu is None or options.imu == "synthetic":
+        yield None
+        return
+    from slave.imu.recording import ImuRecorder
+
+    imu = scene.rig.imu
+    if imu is None:
+        raise CalibrationError(f"rig {scene.rig.name!r}: imu: missing; there is none to record")
+    orientation, stop = opening.orientation_of(imu), threading.Event()
+    beside = ImuRecorder(
+        opening.open_real(imu.name, options.imu, imu.rate_hz, scene.clock, stop), orientation, stop
+    )
+    try:
+        yield beside
+    finally:
+        counts = beside.close()
+        aside(", ".join(f"{event} {count}" for event, count in counts.items()))
