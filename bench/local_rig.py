@@ -1,21 +1,35 @@
 """What rigs of real processes on this machine need: free ports, the bus once its master listens, and patience."""
 
 import os
+import secrets
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from common.certificates import OPERATOR
 from common.errors import BusError
 from common.keys import access_of
 from common.zenoh_bus import ZenohBus
 
+_PORTS = range(15_000, 32_000)  # below those that Linux gives to whoever names none (32768 to 60999)
+_TRIES = 100
+
 
 def free_port(kind: int) -> int:
-    """A port of 127.0.0.1 that nobody has now, for `socket.SOCK_DGRAM` or `socket.SOCK_STREAM`."""
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A port of this machine that nobody has now, for `socket.SOCK_DGRAM` or `socket.SOCK_STREAM`.
+
+    None of those that a system gives to whoever names none: before its own process has it, nobody else gets it.
+
+    Raises:
+        OSError: None is free.
+    """
+    for _ in range(_TRIES):
+        port = _PORTS.start + secrets.randbelow(len(_PORTS))
+        with socket.socket(socket.AF_INET, kind) as probe, suppress(OSError):
+            probe.bind(("0.0.0.0", port))
+            return port
+    raise OSError(f"of {_TRIES} ports from {_PORTS.start} to {_PORTS.stop - 1} none was free")
 
 
 def join_bus(endpoint: str, patience_s: float) -> ZenohBus:

@@ -7,24 +7,26 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bench.local_rig import free_port
 from common.messages import FINGER_COUNT, Health, MarkerDetections, WristDetections
+from master.ingest import Ingest
+
+PATIENCE_S = (
+    60.0  # what a test waits for comes at once; a machine with other things to do may take as long as this
+)
 
 
 def free_endpoint() -> str:
     """Return a zenoh endpoint on 127.0.0.1 that nobody listens on."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
 
 
 def free_udp_port() -> int:
     """Return a UDP port that nobody is bound to."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("0.0.0.0", 0))
-        return int(probe.getsockname()[1])
+    return free_port(socket.SOCK_DGRAM)
 
 
-def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
+def until(condition: Callable[[], bool], timeout_s: float = PATIENCE_S) -> bool:
     """Wait until `condition` holds; False if it never did."""
     deadline = time.monotonic() + timeout_s
     while not condition():
@@ -32,6 +34,16 @@ def until(condition: Callable[[], bool], timeout_s: float = 10.0) -> bool:
             return False
         time.sleep(0.005)
     return True
+
+
+def clock_known(ingest: Ingest, sender: str, bound_ns: int = 5_000_000) -> bool:
+    """Wait until times of `sender` are moved with an error of at most half a round trip of `bound_ns`."""
+
+    def known() -> bool:
+        estimate = ingest.clock_of(sender)
+        return estimate is not None and estimate.bound_ns < bound_ns
+
+    return until(known)
 
 
 def health(source: str, frames: int = 0) -> Health:

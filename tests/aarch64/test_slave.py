@@ -34,9 +34,9 @@ def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
     slave = guest.start(["-m", "slave", "run", *options, *link])
     try:
         seen = _frames(ingest)
-        reports = [report for _ in range(3) if (report := health.get(20.0)) is not None]
-        answer = bus.ask(Command("left", "stop"), 20.0)
-        said, errors = slave.communicate(timeout=60)
+        reports = [report for _ in range(3) if (report := health.get(PATIENCE_S)) is not None]
+        answer = bus.ask(Command("left", "stop"), PATIENCE_S)
+        said, errors = slave.communicate(timeout=PATIENCE_S)
     finally:
         slave.kill()
         slave.wait()

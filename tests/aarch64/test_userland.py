@@ -32,7 +32,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Told, Told, bytes]:
         here = subprocess.run(
             [sys.executable, *program], capture_output=True, text=True, cwd=ROOT, check=True
         )
-        said, errors = there.communicate(timeout=300)
+        said, errors = there.communicate(timeout=600)
     assert there.returncode == 0, errors
     return json.loads(said), json.loads(here.stdout), bodies
 

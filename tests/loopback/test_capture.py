@@ -11,7 +11,7 @@ from common.keys import new_key
 from master.calibrate.cameras.boards import Checkerboard
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.cameras.views import look
-from tests.network_helpers import free_endpoint, free_udp_port
+from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -39,12 +39,12 @@ def test_slaves_without_colours_give_the_pictures_for_a_calibration(tmp_path: Pa
     master += ["--beacon", f"127.255.255.255:{beacon}", "--bind", "127.0.0.1:0", "--bus", free_endpoint()]
     try:
         done = subprocess.run(
-            master, cwd=ROOT, env=env, capture_output=True, text=True, timeout=120, check=False
+            master, cwd=ROOT, env=env, capture_output=True, text=True, timeout=300, check=False
         )
     finally:
         for process in slaves:
             process.terminate()
-        codes = [process.wait(20) for process in slaves]
+        codes = [process.wait(PATIENCE_S) for process in slaves]
     assert done.returncode == 0, done.stdout + done.stderr
     assert codes == [0, 0]
     assert "view 5 of 5" in done.stdout

@@ -19,7 +19,7 @@ from common.messages import MarkerDetections
 from master.stereo.depth import AffineDisparity
 from slave.uplink import Uplink
 from tests.hand_helpers import camera_file, rig_file
-from tests.network_helpers import free_udp_port
+from tests.network_helpers import PATIENCE_S, free_udp_port
 
 CAMERAS = ("left", "right")
 RIG = AffineDisparity(37.3, 2.64)
@@ -93,7 +93,7 @@ def test_a_person_measures_a_rig(root: Path, tmp_path: Path) -> None:
             told = person.stdout.readline()
             assert f"{distance:.3f} m: disparity" in told
         rest = person.stdout.read()
-        assert person.wait(30) == 0
+        assert person.wait(PATIENCE_S) == 0
     assert "wrote" in rest
     rig = load(tmp_path / "rigs" / "bench.json", RigCalibration)
     assert rig.affine_disparity is not None

@@ -16,7 +16,7 @@ from master.link import MasterLink
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
-from tests.network_helpers import detections, free_udp_port, seeded, until
+from tests.network_helpers import PATIENCE_S, clock_known, detections, free_udp_port, seeded, until
 
 
 def sample(source: str, session: int, seq: int, t_ns: int = 0) -> ImuSample:
@@ -151,7 +151,8 @@ def test_samples_come_over_real_sockets(stack: ExitStack) -> None:
     senders["palm-imu"] = Uplink("palm-imu", KEY, skewed, port, "127.0.0.1")
     for sender in senders.values():
         stack.callback(sender.close)
-        assert sender.wait_for_start(10)
+        assert sender.wait_for_start(PATIENCE_S)
+    assert clock_known(ingest, "palm-imu")
     sent: dict[int, int] = {}
     for seq in range(40):
         sent[seq] = clock.now_ns()
@@ -159,7 +160,7 @@ def test_samples_come_over_real_sockets(stack: ExitStack) -> None:
         senders["left"].send(detections("left", senders["left"].session, seq, clock.now_ns()))
         time.sleep(0.005)
     assert until(lambda: ingest.counts["palm-imu.received"] == ingest.counts["left.received"] == 40)
-    assert ingest.connected == {"left", "palm-imu"}
+    assert until(lambda: ingest.connected == {"left", "palm-imu"})
     got: list[ImuSample] = []
     frames = 0
     while (message := ingest.get(0.0)) is not None:

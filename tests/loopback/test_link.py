@@ -8,14 +8,19 @@ import pytest
 
 from bench.udp_relay import Impairment, UdpRelay
 from common.clock import Clock, SkewedClock, SystemClock
+from common.clock_offset import ClockEstimate
 from common.messages import MarkerDetections
 from master.ingest import Ingest
 from slave.uplink import Uplink
-from tests.network_helpers import detections, free_udp_port, until
+from tests.network_helpers import PATIENCE_S, detections, free_udp_port, until
 
 KEY = bytes(range(32))
 BROADCAST = "127.255.255.255"
-CLOCK_NS = 20_000_000  # clocks are 5 s apart; microseconds are asserted in simulated time (test_clock)
+# Clocks are 5 s apart; microseconds are asserted in simulated time (test_clock). Where no echo came back sooner than
+# this, a time may be off by as much as the master says it may be.
+CLOCK_NS = 20_000_000
+WITHIN = 3.0  # of what a time is said to be good to; half a round trip is 1.7
+QUIET_S = 0.5
 BAD = Impairment(loss=0.2, delay_s=0.002, jitter_s=0.004, reorder=0.05, duplicate=0.05)
 
 
@@ -66,7 +71,7 @@ def rig() -> Iterator[Rig]:
         yield Rig(stack)
 
 
-def drain(ingest: Ingest, wait_s: float = 0.2) -> list[MarkerDetections]:
+def drain(ingest: Ingest, wait_s: float) -> list[MarkerDetections]:
     messages: list[MarkerDetections] = []
     while (message := ingest.get(wait_s)) is not None:
         assert isinstance(message, MarkerDetections)
@@ -75,9 +80,12 @@ def drain(ingest: Ingest, wait_s: float = 0.2) -> list[MarkerDetections]:
 
 
 def stream(
-    rig: Rig, slaves: dict[str, Uplink], ingest: Ingest, seconds: float
-) -> tuple[dict[str, int], list[int]]:
-    """Send 100 frames/s from both; return how many came from each, and the errors of their times."""
+    rig: Rig, slaves: dict[str, Uplink], ingest: Ingest, seconds: float, whole: bool = False
+) -> tuple[dict[str, int], list[float]]:
+    """Send 100 frames/s from both; return how many came from each, and the errors of their times in CLOCK_NS.
+
+    With `whole` nothing is lost: wait for all; else until nothing has come for some time.
+    """
     sent: dict[tuple[str, int, int], int] = {}
     received: list[MarkerDetections] = []
     for _ in range(round(seconds * 100)):
@@ -86,8 +94,14 @@ def stream(
             sent[(name, uplink.session, seq)] = rig.send(name, uplink)
         time.sleep(0.01)
         received += drain(ingest, 0.0)
-    received += drain(ingest)
-    errors = [message.t_ns - sent[(message.camera, message.session, message.seq)] for message in received]
+    if whole:
+        until(lambda: bool(received.extend(drain(ingest, 0.0))) or len(received) >= len(sent))
+    received += drain(ingest, QUIET_S)
+    errors = [
+        abs(message.t_ns - sent[(message.camera, message.session, message.seq)])
+        / max(CLOCK_NS, WITHIN * message.t_sigma_ns)
+        for message in received
+    ]
     return {name: sum(message.camera == name for message in received) for name in slaves}, errors
 
 
@@ -99,29 +113,38 @@ def test_a_clean_network_loses_nothing(rig: Rig) -> None:
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     assert not slaves["left"].wait_for_start(0.05)  # no master yet
     ingest = rig.master()
-    assert all(uplink.wait_for_start(5) for uplink in slaves.values())
-    assert ingest.connected == {"left", "right"}
+    assert all(uplink.wait_for_start(PATIENCE_S) for uplink in slaves.values())
+    assert until(lambda: ingest.connected == {"left", "right"})
     assert slaves["left"].zenoh_endpoint == "tcp/127.0.0.1:1"
-    got, errors = stream(rig, slaves, ingest, 1.0)
+    got, errors = stream(rig, slaves, ingest, 1.0, whole=True)
     assert got == {"left": 100, "right": 100}
-    assert max(map(abs, errors)) < CLOCK_NS
-    rig.send("right", slaves["right"])
-    last = ingest.get(1.0)
-    estimate = ingest.clock_of("right")
-    assert isinstance(last, MarkerDetections)
-    assert estimate is not None
-    assert last.t_sigma_ns == pytest.approx(estimate.sigma_at(last.t_ns), rel=0.5)  # their stamps are exact
+    assert max(errors) < 1.0
+    last, estimate = between_echoes(rig, slaves["right"], ingest)
+    assert last.t_sigma_ns == pytest.approx(estimate.sigma_at(last.t_ns), rel=1e-6)  # their stamps are exact
     assert ingest.counts["right.clock_steps"] == 0
     assert ingest.lost == 0
     assert not ingest.refused
     assert slaves["left"].counts["sent"] == 100
 
 
+def between_echoes(rig: Rig, uplink: Uplink, ingest: Ingest) -> tuple[MarkerDetections, ClockEstimate]:
+    """A frame of the right camera, and by what clock its time was moved: none was measured meanwhile."""
+    deadline = time.monotonic() + PATIENCE_S
+    while time.monotonic() < deadline:
+        before = ingest.clock_of("right")
+        rig.send("right", uplink)
+        message = ingest.get(PATIENCE_S)
+        assert isinstance(message, MarkerDetections)
+        if before is not None and before == ingest.clock_of("right"):
+            return message, before
+    raise AssertionError("the clock was measured at every frame")
+
+
 def test_twenty_percent_loss_jitter_duplicates_and_reordering(rig: Rig) -> None:
     relay = rig.through(BAD, seed=3)
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     ingest = rig.master()
-    assert all(uplink.wait_for_start(10) for uplink in slaves.values())
+    assert all(uplink.wait_for_start(PATIENCE_S) for uplink in slaves.values())
     got, errors = stream(rig, slaves, ingest, 3.0)
     assert relay.lost > 100
     assert (
@@ -139,7 +162,7 @@ def test_twenty_percent_loss_jitter_duplicates_and_reordering(rig: Rig) -> None:
         assert abs(counts.received + counts.lost + counts.late - uplink.counts["sent"]) < 20
     estimate = ingest.clock_of("right")
     assert estimate is not None
-    assert max(map(abs, errors)) < CLOCK_NS
+    assert max(errors) < 1.0
     assert set(ingest.refused) <= {"duplicate", "replayed", "stale"}
 
 
@@ -148,12 +171,12 @@ def test_either_side_may_die_and_the_others_go_on(rig: Rig, impairment: Impairme
     rig.through(impairment, seed=5)
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     ingest = rig.master()
-    assert until(all_started(slaves), 10)
+    assert until(all_started(slaves))
 
     session = slaves["right"].session
     slaves["left"].close()
     slaves["left"] = rig.slave("left")
-    assert slaves["left"].wait_for_start(5)
+    assert slaves["left"].wait_for_start(PATIENCE_S)
     assert slaves["right"].session == session
     assert slaves["right"].started
     got, _ = stream(rig, slaves, ingest, 0.5)
@@ -161,8 +184,8 @@ def test_either_side_may_die_and_the_others_go_on(rig: Rig, impairment: Impairme
 
     ingest.close()
     ingest = rig.master()
-    assert until(lambda: ingest.started, 10)
-    assert until(all_started(slaves), 10)
+    assert until(lambda: ingest.started)
+    assert until(all_started(slaves))
     got, _ = stream(rig, slaves, ingest, 0.5)
     assert min(got.values()) > 15
     assert {uplink.session for uplink in slaves.values()} >= {session}
@@ -172,13 +195,13 @@ def test_a_pulled_cable_is_noticed_on_both_ends_and_its_return_too(rig: Rig) -> 
     relay = rig.through(Impairment(), seed=1)
     slaves = {name: rig.slave(name) for name in ("left", "right")}
     ingest = rig.master()
-    assert until(all_started(slaves), 5)
+    assert until(all_started(slaves))
     relay.cut = True
-    assert until(lambda: not ingest.connected, 5)
-    assert until(lambda: not any(uplink.started for uplink in slaves.values()), 5)
+    assert until(lambda: not ingest.connected)
+    assert until(lambda: not any(uplink.started for uplink in slaves.values()))
     relay.cut = False
-    assert until(all_started(slaves), 5)
-    got, _ = stream(rig, slaves, ingest, 0.3)
+    assert until(all_started(slaves))
+    got, _ = stream(rig, slaves, ingest, 0.3, whole=True)
     assert min(got.values()) == 30
 
 
@@ -188,8 +211,8 @@ def test_a_late_slave_joins_at_once(rig: Rig) -> None:
         ("left", "right"), KEY, SystemClock(), rig.beacon, ("127.0.0.1", 0), "", start_timeout_s=0.2
     )  # fmt: skip
     rig.stack.callback(ingest.close)
-    assert left.wait_for_start(5)
+    assert left.wait_for_start(PATIENCE_S)
     assert left.zenoh_endpoint is None
     right = rig.slave("right")
-    assert right.wait_for_start(5)
+    assert right.wait_for_start(PATIENCE_S)
     assert until(lambda: ingest.connected == {"left", "right"})

@@ -15,7 +15,7 @@ from common.recording import open_messages
 from master.recording.digest import ToldDigest
 from master.recording.files import recorded_setups
 from master.recording.player import Player
-from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]
 POSES = 60
@@ -57,12 +57,12 @@ def recorded_run(folder: Path, file: Path) -> str:
             # As many poses as 6 s have on a slow machine: how long that takes is its own affair.
             assert until(lambda: poses_told(log.read_text()) >= POSES, 90.0), log.read_text()
             running[0].send_signal(signal.SIGINT)
-            assert running[0].wait(30) == 0, log.read_text()
+            assert running[0].wait(PATIENCE_S) == 0, log.read_text()
         finally:
             for process in running:
                 process.terminate()
             for process in running:
-                process.wait(20)
+                process.wait(PATIENCE_S)
     return log.read_text()
 
 

@@ -11,7 +11,7 @@ import msgspec
 
 from common.calibration import CameraCalibration, load, save
 from common.keys import new_key
-from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = sys.executable
@@ -46,7 +46,7 @@ class Rig:
 
     def said(self, process: str, text: str) -> bool:
         """Whether the process has said it, after some patience."""
-        return until(lambda: text in self.logs[process].read_text(), 30.0)
+        return until(lambda: text in self.logs[process].read_text())
 
     def shown(self, *options: str) -> dict[str, tuple[str, ...]]:
         """Setting -> wanted and read back, of a command that must succeed."""
@@ -70,7 +70,7 @@ def rig(folder: Path) -> Generator[Rig, None, None]:
         for process in running:
             process.terminate()
         for process in running:
-            process.wait(20)
+            process.wait(PATIENCE_S)
 
 
 def test_a_camera_is_set_by_command_and_by_file_while_everything_runs(tmp_path: Path) -> None:

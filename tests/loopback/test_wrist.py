@@ -15,14 +15,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from common.bus import Bus, Subscription
+from common.bus import Bus
 from common.calibration import RigCalibration, load, save
 from common.clock import SystemClock
 from common.keys import new_key
 from common.messages import Command, Health, Preview, WristDetections
 from common.zenoh_bus import ZenohBus
 from master.ingest import Ingest
-from tests.network_helpers import free_endpoint, free_udp_port, until
+from tests.network_helpers import PATIENCE_S, free_endpoint, free_udp_port, until
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -36,7 +36,7 @@ class Device:
     def triples(self, count: int) -> list[WristDetections]:
         """The next so many."""
         found: list[WristDetections] = []
-        assert until(lambda: len(found) >= count or self._take(found), 60.0), self.log.read_text()
+        assert until(lambda: len(found) >= count or self._take(found)), self.log.read_text()
         return found
 
     def _take(self, found: list[WristDetections]) -> bool:
@@ -47,10 +47,21 @@ class Device:
         return False
 
     def ask(self, verb: str, body: str = "") -> Health:
-        return self.bus.ask(Command("wrist", verb, body), 10.0)
+        return self.bus.ask(Command("wrist", verb, body), PATIENCE_S)
 
-    def pictures(self) -> Subscription:
-        return self.bus.subscribe("preview")
+    def picture(self) -> Preview:
+        """One of the pictures that it shows for some seconds after it was asked for them."""
+        pictures = self.bus.subscribe("preview")
+        found: list[Preview] = []
+
+        def comes() -> bool:
+            self.ask("preview")
+            if isinstance(message := pictures.get(2.0), Preview):
+                found.append(message)
+            return bool(found)
+
+        assert until(comes), self.log.read_text()
+        return found[0]
 
 
 @contextmanager
@@ -78,7 +89,7 @@ def device(folder: Path) -> Generator[Device, None, None]:
         yield Device(files, ingest, bus, log)
     finally:
         process.terminate()
-        code = process.wait(20)
+        code = process.wait(PATIENCE_S)
         ingest.close()
         bus.close()
     assert code == 0, log.read_text()
@@ -95,16 +106,19 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
         )  # at any time of a curl
         assert all(message.t_ns < message.ready_t_ns for message in sent)
 
-        assert until(lambda: "wrist" in wrist.bus.alive(), 20.0)
-        counts = wrist.ask("report").counts
-        assert counts["frames"] >= 3 * counts["strobe.triples"] >= 15
+        assert until(lambda: "wrist" in wrist.bus.alive())
+        assert until(
+            lambda: wrist.ask("report").counts["frames"] >= 15
+        )  # counted a moment after they are sent
+        counts, later = wrist.ask("report").counts, wrist.ask("report").counts
+        assert counts["strobe.triples"] >= 5
+        assert (
+            later["frames"] + 1 >= 3 * counts["strobe.triples"]
+        )  # a triple is counted before its last frame
         assert sum(count for name, count in counts.items() if name.startswith("seen.laser.")) >= 12
         assert {f"seen.tip.{finger}" for finger in ("thumb", "little")} <= counts.keys()
 
-        pictures = wrist.pictures()
-        wrist.ask("preview")
-        picture = pictures.get(10.0)
-        assert isinstance(picture, Preview)
+        picture = wrist.picture()
         shown = cv2.imdecode(np.frombuffer(picture.jpeg, np.uint8), cv2.IMREAD_UNCHANGED)
         assert shown is not None
         assert shown.shape == (240, 320)
@@ -130,7 +144,7 @@ def test_a_slave_sends_triples_reports_them_and_follows_its_files(tmp_path: Path
 def test_the_demo_of_the_device_scores_against_its_truth_and_leaves_its_results(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "deploy", "demo", "--wrist", "--headless", "--seconds", "4"]
     done = subprocess.run(
-        [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=180, check=False
+        [*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
     summary = json.loads((tmp_path / "summary.json").read_text())

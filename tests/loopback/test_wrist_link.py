@@ -15,7 +15,7 @@ from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.loopback.test_imu_link import sample
-from tests.network_helpers import detections, free_udp_port, seeded, triple, until
+from tests.network_helpers import PATIENCE_S, detections, free_udp_port, seeded, triple, until
 
 
 def started(wires: Wires, clock: SkewedClock | None = None) -> tuple[MasterLink, SlaveLink, SlaveLink]:
@@ -156,10 +156,10 @@ def test_triples_come_over_real_sockets_and_none_is_lost(stack: ExitStack) -> No
     stack.callback(ingest.close)
     wrist = Uplink("wrist", KEY, clock, port, "127.0.0.1")
     stack.callback(wrist.close)
-    assert wrist.wait_for_start(10.0)
+    assert wrist.wait_for_start(PATIENCE_S)
     for k in range(30):
         wrist.send(triple("wrist", wrist.session, 3 * k + 1, clock.now_ns()))
         assert until(lambda k=k: ingest.counts_of("wrist").received == k + 1)
-    taken = [ingest.get(1.0) for _ in range(30)]
+    taken = [ingest.get(PATIENCE_S) for _ in range(30)]
     assert [one.seq for one in taken if isinstance(one, WristDetections)] == [3 * k + 1 for k in range(30)]
     assert ingest.lost == ingest.skipped == 0

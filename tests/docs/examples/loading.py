@@ -17,7 +17,7 @@ def example(root: Path, name: str) -> ModuleType:
     return module
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 10.0) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
     """Look again until it holds."""
     end = time.monotonic() + seconds
     while not condition():

@@ -177,7 +177,7 @@ def test_on_a_bus_the_scene_says_what_it_waits_for_and_follows(
         wait_for(lambda: abs(float(orbit.shown[0])) > 1.0)
     finally:
         stop.set()
-        thread.join(10.0)
+        thread.join(60.0)
     assert not thread.is_alive()
     show.flush(timeout_sec=5.0)
     show.disconnect()

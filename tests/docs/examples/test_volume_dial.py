@@ -101,7 +101,7 @@ def test_on_the_bus_it_follows_a_hand_and_stops_at_the_end(
         wait_for(lambda: output.percent == 100)
     finally:
         stop.set()
-        thread.join(10.0)
+        thread.join(60.0)
     assert not thread.is_alive()
     assert "100 %, the end" in capsys.readouterr().out
     bus.close()
@@ -217,7 +217,7 @@ def test_as_a_process_it_waits_for_the_master_and_follows_it(root: Path) -> None
 def run_app(root: Path, *words: str, path: str | None = None) -> subprocess.CompletedProcess[str]:
     environment = os.environ | ({} if path is None else {"PATH": path})
     command = [sys.executable, str(root / "docs/examples/volume_dial.py"), *words]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=60)
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=120)
 
 
 def test_its_help_says_what_it_is_and_the_output_must_be_chosen(root: Path) -> None:

@@ -13,7 +13,7 @@ from common.errors import PhalanxError
 from master.console.local import LocalProcesses
 from master.console.warden import watch
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 
 
 def until(condition: Callable[[], bool]) -> None:

@@ -13,7 +13,7 @@ from common.messages import HandPose
 from master.export.gltf import write_gltf
 from master.export.hand_mesh import skin_of
 from master.export.motion import complete
-from tests.browser import chromium
+from tests.browser import WAIT_MS, chromium
 from tests.master.export.made import NEAR_M, REST, STEP_NS, poses_of, positions, stacked
 
 KINDS = {5126: "<f4", 5125: "<u4", 5121: "u1"}
@@ -169,11 +169,12 @@ def test_three_js_in_a_browser_sees_the_joints_where_they_were(tmp_path: Path) -
     three = Path(nicegui.__file__).parent / "elements" / "scene" / "dist" / "index.js"
     with chromium() as browser:
         page = browser.new_page()
+        page.set_default_timeout(WAIT_MS)
         page.route("**/", lambda route: route.fulfill(body=PAGE, content_type="text/html"))
         page.route("**/three.js", lambda route: route.fulfill(path=three, content_type="text/javascript"))
         page.route("**/hand.glb", lambda route: route.fulfill(path=tmp_path / "hand.glb"))
         page.goto("http://phalanx.test/")
-        page.wait_for_function("Boolean(window.places || window.failed)", timeout=60_000)
+        page.wait_for_function("Boolean(window.places || window.failed)")
         assert page.evaluate("window.failed") is None
         assert tuple(page.evaluate("window.bones")) == JOINTS
         for key, true in enumerate(positions(poses)):

@@ -13,7 +13,7 @@ from common.arrays import Float
 from common.messages import HandPose, ObjectPose
 from common.output_settings import WebOutput
 from master.send.web import WebSink
-from tests.browser import chromium
+from tests.browser import WAIT_MS, chromium
 from tests.master.send.hands import hand_pose
 
 WAIT_S = 60.0
@@ -74,11 +74,12 @@ def test_the_page_moves_a_rigged_hand_and_asks_nobody_else(tmp_path: Path) -> No
     trouble: list[str] = []
     with chromium() as browser:
         page = browser.new_page(viewport={"width": 640, "height": 480}, color_scheme="dark")
+        page.set_default_timeout(WAIT_MS)
         page.on("request", lambda request: asked.append(request.url))
         page.on("websocket", lambda opened: asked.append(opened.url))
         page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
         page.on("pageerror", lambda error: trouble.append(str(error)))
-        page.goto(address, timeout=WAIT_S * 1e3)
+        page.goto(address)
         until(page, "globalThis.handView?.hands.size === 1", sink, moving(0))
 
         for k in range(1, 21):
@@ -112,9 +113,10 @@ def test_a_closing_socket_is_not_asked_for_the_round_trip() -> None:
     try:
         with chromium() as browser:
             page = browser.new_page()
+            page.set_default_timeout(WAIT_MS)
             page.on("console", lambda said: trouble.append(said.text) if said.type == "error" else None)
             page.add_init_script(REACH)
-            page.goto(f"http://127.0.0.1:{sink.server.port}/", timeout=WAIT_S * 1e3)
+            page.goto(f"http://127.0.0.1:{sink.server.port}/")
             until(page, "sockets[0]?.readyState === WebSocket.OPEN && ticks.length >= 2")
             page.evaluate("() => { sockets[0].close(); for (const tick of ticks) tick(); }")
             until(page, "sockets[1]?.readyState === WebSocket.OPEN")
