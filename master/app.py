@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Protocol, TypeAlias, TypeVar
 
-import msgspec
 import numpy as np
 
 from common.clock import Clock
@@ -21,6 +20,7 @@ from common.messages import (
     TagDetections,
     Told,
     TrackerPose,
+    restamped,
 )
 from master.outputs.sink import Sink
 from master.rates import CameraRates
@@ -152,7 +152,7 @@ def told_at(solved: Solved, t_ns: int) -> Told:
     """The message that is published at `t_ns`: a pose says how long it took."""
     if isinstance(solved, Contact | Gesture):
         return solved
-    return msgspec.structs.replace(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
+    return restamped(solved.pose, latency_ns=t_ns - solved.ready_t_ns)
 
 
 def health(

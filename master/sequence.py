@@ -12,7 +12,7 @@ for in some frames only: their numbers rise as they like, and nothing is missing
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 REMEMBERED = 1024
 TRIPLE = 3  # frames that become one message of a wrist device
@@ -40,23 +40,38 @@ class CameraCounts:
 
 
 class Sequence:
-    """Push machine over frame numbers. Holds the last one, and the newest skipped ones (<= 1024)."""
+    """Push machine over frame numbers. Holds what was counted, the last one, and the newest skipped ones (<= 1024).
+
+    Attributes:
+        lost: Numbers that have not come so far.
+    """
 
     def __init__(self, step: int | None = 1) -> None:
         """Begin with nothing received; `step` is how much the number rises from one message to the next.
 
         None: as it likes, and nothing is ever missing.
         """
-        self.counts = CameraCounts()
+        self.lost = 0
+        self._received = self._late = self._duplicate = self._reordered = 0
         self._regular, self._step = step is not None, step or 1
         self._slip = self._step // 2
         self._session: int | None = None
         self._last = -1
         self._missing: dict[int, None] = {}
 
+    @property
+    def counts(self) -> CameraCounts:
+        """What was counted so far."""
+        return CameraCounts(
+            received=self._received,
+            lost=self.lost,
+            late=self._late,
+            duplicate=self._duplicate,
+            reordered=self._reordered,
+        )
+
     def take(self, session: int, seq: int) -> bool:
         """Count frame `seq` of the slave process `session`; whether it is to be used."""
-        counts = self.counts
         if session != self._session:
             self._session = session
             self._missing.clear()
@@ -65,25 +80,26 @@ class Sequence:
             found = next((number for number in near if number in self._missing), None)
             if found is not None:
                 del self._missing[found]
-            self.counts = replace(counts, late=counts.late + 1, lost=counts.lost - (found is not None))
+                self.lost -= 1
+            self._late += 1
             return False
-        elif self._regular:
+        elif self._regular and seq != self._last + self._step:
             skipped = range(self._last + self._step, seq - self._slip, self._step)
-            counts = replace(counts, lost=counts.lost + len(skipped))
+            self.lost += len(skipped)
             self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
             while len(self._missing) > REMEMBERED:
                 del self._missing[next(iter(self._missing))]
         self._last = seq
-        self.counts = replace(counts, received=counts.received + 1)
+        self._received += 1
         return True
 
     def duplicate(self) -> None:
         """Count a datagram that came twice."""
-        self.counts = replace(self.counts, duplicate=self.counts.duplicate + 1)
+        self._duplicate += 1
 
     def reordered(self) -> None:
         """Count a datagram that came after a later one."""
-        self.counts = replace(self.counts, reordered=self.counts.reordered + 1)
+        self._reordered += 1
 
 
 @dataclass(slots=True)
@@ -149,9 +165,9 @@ class Counted:
             counter: Of the datagram, in its session of the link.
             missing: How many datagrams between two that came did not (`Opener.missing_between`).
         """
-        before = self.sequence.counts.lost
+        before = self.sequence.lost
         used = self.sequence.take(session, seq)
-        missed = self.sequence.counts.lost - before
+        missed = self.sequence.lost - before
         if not used:
             self.losses.late(counter, -missed)
             return False

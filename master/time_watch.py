@@ -5,10 +5,8 @@ Gauges for `Health`, and lines for a person. Nothing here corrects anything.
 
 from collections.abc import Callable, Sequence
 
-import msgspec
-
 from common.clock_offset import ClockEstimate
-from common.messages import Detections, MarkerDetections
+from common.messages import Detections, MarkerDetections, restamped
 from master.phases import CameraPhases
 from master.rig import RigSetup
 from master.stereo.timing import ResidualTiming
@@ -33,7 +31,7 @@ class _Machines:
 
     def push(self, message: MarkerDetections) -> None:
         if late_ns := self.late_ns.get(message.camera):
-            message = msgspec.structs.replace(message, t_ns=message.t_ns + late_ns)
+            message = restamped(message, t_ns=message.t_ns + late_ns)
         self.phases.push(message)
         self.residual.push(message)
 

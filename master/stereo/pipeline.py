@@ -11,14 +11,13 @@ from dataclasses import dataclass, replace
 from math import nan
 from typing import Protocol
 
-import msgspec
 import numpy as np
 
 from common.arrays import Bool, Float
 from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
-from common.messages import HandPose, MarkerDetections
+from common.messages import HandPose, MarkerDetections, restamped
 from master.filters import PointFilter
 from master.ik.hand import HandSolution
 from master.ik.hand_filter import HandFilter
@@ -129,7 +128,7 @@ class MarkerPipeline:
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
         if late_ns := self._late_ns.get(message.camera):
-            message = msgspec.structs.replace(message, t_ns=message.t_ns + late_ns)
+            message = restamped(message, t_ns=message.t_ns + late_ns)
         with self._stage("pairing"):
             instants = self._pairing.push(message)
         if self._pairing.outdated:
