@@ -4,6 +4,7 @@ One outlet a hand, opened with its first pose; a sample a pose, at the instant a
 is this machine's, so a recording aligns hands with whatever other machines measure.
 """
 
+import logging
 import socket
 from typing import ClassVar
 
@@ -15,12 +16,14 @@ from common.errors import PhalanxError
 from common.hand_model import FINGERS, JOINTS
 from common.messages import HandPose, Told
 from common.output_settings import LslOutput
-from master.send.lsl_library import Library, Outlet, load_library
+from master.send.here_only import keep_here, sockets
+from master.send.lsl_library import PORTS, Library, Outlet, load_library
 from master.send.times import Times
 
 FINGER_ANGLES = ("abduction", "flexion", "pip", "dip")
 THUMB_ANGLES = ("cmc-abduction", "cmc-flexion", "mcp", "ip")
 _BUFFERED = 60  # hundreds of samples, for an inlet that is slow
+_LOG = logging.getLogger(__name__)
 _COMPARE_NS = 1_000_000_000  # how often LSL's clock is compared with ours
 
 
@@ -58,7 +61,7 @@ class LslSink:
         """
         self._library: Library = load_library(settings.scope, LslSink._told)
         LslSink._told = settings.scope
-        self._name, self._times = settings.name, times
+        self._name, self._scope, self._times = settings.name, settings.scope, times
         self._outlets: dict[str, Outlet] = {}
         self._clock = self._compared()
 
@@ -102,10 +105,21 @@ class LslSink:
             listed.append_child("channel").append_child_value("label", label).append_child_value(
                 "type", kind
             ).append_child_value("unit", unit)
+        before = sockets()
         try:
-            return self._library.StreamOutlet(info, 0, _BUFFERED)
+            outlet = self._library.StreamOutlet(info, 0, _BUFFERED)
         except RuntimeError as error:
-            raise PhalanxError(f"{self._name}-{hand}: {error}; are ports 16572 to 16604 free?") from error
+            raise PhalanxError(
+                f"{self._name}-{hand}: {error}; are ports {PORTS[0]} to {PORTS[-1]} free?"
+            ) from error
+        if self._scope == "machine" and not keep_here(before, PORTS):
+            _LOG.warning(
+                "lsl: liblsl listens on every network, and this system cannot keep it to itself: let a firewall"
+                " close tcp and udp %d to %d",
+                PORTS[0],
+                PORTS[-1],
+            )
+        return outlet
 
     def _compared(self) -> tuple[int, float]:
         """Our clock [ns], and by how many seconds LSL's is ahead of it."""

@@ -14,11 +14,13 @@ INSTALL = (
     "pip install 'phalanx-hand[lsl]'; where that brings no liblsl, install it"
     " (https://github.com/sccn/liblsl/releases) and name it in the variable PYLSL_LIB"
 )
+PORTS = range(16572, 16604)  # where liblsl listens for who reads a stream, and for who compares clocks
 # Discovery by a datagram on the loopback interface, nothing joined and nothing sent on any other.
 _MACHINE = """[log]
 level = -2
 [ports]
 IPv6 = disable
+AllowRandomPorts = 0
 [multicast]
 ResolveScope = machine
 ListenAddress = 127.0.0.1

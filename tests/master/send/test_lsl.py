@@ -1,6 +1,7 @@
 """The LSL output: a real outlet read by a real inlet of this machine, and what is said where the library is missing."""
 
 import importlib
+import os
 import socket
 import sys
 from pathlib import Path
@@ -14,7 +15,9 @@ from common.clock import now_ns
 from common.errors import PhalanxError
 from common.hand_model import JOINTS
 from common.output_settings import LslOutput
+from master.send.here_only import keep_here, sockets
 from master.send.lsl import LslSink, channels, sample_of
+from master.send.lsl_library import PORTS
 from master.send.times import MasterTimes
 from tests.master.send.hands import hand_pose
 
@@ -32,6 +35,7 @@ def test_an_inlet_reads_names_units_values_and_the_time_of_the_pose(pylsl: Modul
     sink = LslSink(LslOutput(name=name), MasterTimes())
     pose = hand_pose("right", np.arange(20.0).reshape(5, 4) / 40.0, t_ns=now_ns() - 50_000_000)
     sink.write(pose)  # opens the stream
+    _is_kept_to_this_machine()
     (found,) = pylsl.resolve_byprop("name", f"{name}-my-right", timeout=20.0)
     inlet = pylsl.StreamInlet(found)
     inlet.open_stream(timeout=20.0)
@@ -67,6 +71,30 @@ def sockets_and_groups() -> tuple[set[str], bool]:
     rows = [line.split()[1].split(":") for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
     joined = socket.inet_aton("224.0.0.183")[::-1].hex().upper() in Path("/proc/net/igmp").read_text()
     return {address for address, port in rows if int(port, 16) == 16571}, joined
+
+
+def _is_kept_to_this_machine() -> None:
+    """The library itself listens on every network, whatever it is told."""
+    devices: list[bytes] = []
+    for descriptor in sockets():
+        with socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family == socket.AF_INET and one.getsockname()[1] in PORTS:
+                assert one.getsockname()[0] == "0.0.0.0"
+                devices.append(one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16))
+    assert devices == [b"lo\0"] * 2  # TCP and UDP
+
+
+def test_a_socket_kept_here_answers_this_machine_and_others_that_were_there_before_are_left() -> None:
+    with socket.create_server(("0.0.0.0", 0)) as other:
+        before = sockets()
+        with socket.create_server(("0.0.0.0", 0)) as one:
+            port = int(one.getsockname()[1])
+            assert not keep_here(before, range(port + 1, port + 2))
+            assert keep_here(before, range(port, port + 1))
+            assert one.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16) == b"lo\0"
+            socket.create_connection(("127.0.0.1", port), 20.0).close()
+        assert not keep_here(before, range(1 << 16))
+        assert other.getsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, 16) == b""
 
 
 def test_nobody_on_the_network_is_asked_or_heard(pylsl: ModuleType) -> None:

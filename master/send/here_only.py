@@ -1,0 +1,62 @@
+"""Sockets of a library that listens on every network, and has no setting to do otherwise: kept to this machine.
+
+Linux gives a socket that is bound to a device only what comes through that device. The loopback device carries all that
+a machine says to itself, under each of its addresses, and nothing else.
+"""
+
+import os
+import socket
+import sys
+from collections.abc import Collection, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+_LOOPBACK = b"lo\0"
+_ANYWHERE = frozenset({"0.0.0.0", "::"})
+_FOLDER = Path("/proc/self/fd")
+
+
+def sockets() -> frozenset[int]:
+    """Descriptors of all sockets of this process; none where the system does not tell."""
+    found: set[int] = set()
+    if _FOLDER.is_dir():
+        for entry in _FOLDER.iterdir():
+            with suppress(OSError):  # closed meanwhile
+                if str(entry.readlink()).startswith("socket:"):
+                    found.add(int(entry.name))
+    return frozenset(found)
+
+
+def keep_here(before: Collection[int], ports: range) -> bool:
+    """Bind to the loopback device what listens everywhere at one of the ports, and was not there before.
+
+    Args:
+        before: `sockets` before the library opened its own.
+        ports: Where it may listen.
+
+    Returns:
+        Whether each is bound; False: there is one that is not, or the system cannot tell, or do it.
+    """
+    bound = [_bound(one) for one in _listening(sockets() - frozenset(before), ports)]
+    return bool(bound) and all(bound)
+
+
+def _listening(descriptors: Collection[int], ports: range) -> Iterator[socket.socket]:
+    """Copies of those sockets that listen everywhere at one of the ports."""
+    for descriptor in descriptors:
+        with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as one:
+            if one.family not in (socket.AF_INET, socket.AF_INET6):
+                continue
+            address, port = one.getsockname()[:2]
+            if address in _ANYWHERE and port in ports:
+                yield one
+
+
+def _bound(one: socket.socket) -> bool:
+    if sys.platform != "linux":
+        return False
+    try:
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, _LOOPBACK)
+    except OSError:  # before Linux 5.7 only root may
+        return False
+    return True
