@@ -43,6 +43,7 @@ BusEnd = Annotated[
         callback=_bus,
     ),
 ]
+Hand = Annotated[Path | None, typer.Option(help="Hand profile; default: the one the rig names.")]
 Beacon = Annotated[str, typer.Option(help="ADDRESS:PORT where slaves listen for the start.")]
 RecordingRig = Annotated[
     str | None, typer.Option("--rig", help="Rig of CALIBRATION/rigs; default: the recording's own.")

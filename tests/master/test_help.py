@@ -9,24 +9,9 @@ from unittest.mock import patch
 import pytest
 import typer
 
-from master.__main__ import app
-from master.calibrate.cli import calibrate_app
-from master.camera_command import camera
-from master.export.command import export
-from master.recording.command import info, play, record
-from master.send.command import send
+from master.__main__ import command_line
 
 WIDE = {"COLUMNS": "4000", "TERMINAL_WIDTH": "4000"}
-
-
-def whole() -> typer.Typer:
-    """The command line as `main` puts it together."""
-    top = typer.Typer()
-    top.add_typer(app, name="master")
-    top.add_typer(calibrate_app(), name="calibrate")
-    for command in (camera, export, record, play, info, send):
-        top.command()(command)
-    return top
 
 
 def swallowed(top: typer.Typer) -> tuple[int, list[str]]:
@@ -46,7 +31,7 @@ def swallowed(top: typer.Typer) -> tuple[int, list[str]]:
 
 
 def test_no_help_loses_its_unit() -> None:
-    count, lost = swallowed(whole())
+    count, lost = swallowed(command_line())
     assert count > 60, "the commands were not found: the check would pass on nothing"
     assert lost == []
 
