@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO
 
 _TAIL = 12
-_STOP_S = 5.0
+_STOP_S = 20.0  # a master writes what it has; whoever cannot wait presses Ctrl-C again
 _SESSION_TRIES, _SESSION_AGAIN_S = 3, 0.11  # who is not root may change one session in a tenth of a second
 
 
@@ -72,7 +72,7 @@ class Process:
         return self._child.poll()
 
     def stop(self) -> int:
-        """Ask it to end (SIGINT), insist after five seconds (SIGKILL); return the exit code."""
+        """Ask it to end (SIGINT), insist after twenty seconds (SIGKILL); return the exit code."""
         self._stopping = True
         if self._child.poll() is None:
             self._child.send_signal(signal.SIGINT)

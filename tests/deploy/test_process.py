@@ -4,6 +4,8 @@ import os
 import sys
 from pathlib import Path
 
+import pytest
+
 from deploy.process import Process
 from tests.network_helpers import until
 
@@ -57,7 +59,8 @@ def test_a_killed_child_is_started_again_and_counted(tmp_path: Path) -> None:
     process.stop()
 
 
-def test_a_child_that_ignores_the_request_is_killed(tmp_path: Path) -> None:
+def test_a_child_that_ignores_the_request_is_killed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("deploy.process._STOP_S", 0.5)
     lines: list[str] = []
     deaf = (
         "import signal, time\nsignal.signal(signal.SIGINT, signal.SIG_IGN)\nprint('deaf')\ntime.sleep(60)\n"

@@ -6,9 +6,12 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import pytest
@@ -18,8 +21,35 @@ from common.sim.scenes import scene_by_name
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
 from master.rig import load_setup
+from tests.network_helpers import until
 
 ROOT = Path(__file__).resolve().parents[2]
+LEAST_HZ = (
+    8.0  # of poses so far apart only what is measured can be judged: what filter and model make of it lags
+)
+ENOUGH = 20  # poses, however long a machine takes to draw what they are made of
+
+
+Demo: TypeAlias = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(name="demo_of")
+def _demos() -> Iterator[Demo]:
+    """Starts demos; a test that fails on the way leaves none behind to slow down the next."""
+    started: list[subprocess.Popen[str]] = []
+
+    def start(out: Path, seconds: float, *more: str) -> subprocess.Popen[str]:
+        started.append(_demo(out, seconds, *more))
+        return started[-1]
+
+    yield start
+    for demo in started:
+        for _ in range(2):
+            demo.send_signal(signal.SIGTERM)  # nothing where it has ended
+            time.sleep(0.2 if demo.poll() is None else 0.0)
+        demo.wait(60)
+        if demo.stdout is not None:
+            demo.stdout.close()
 
 
 def _demo(out: Path, seconds: float, *more: str) -> subprocess.Popen[str]:
@@ -83,19 +113,21 @@ def _gone(pids: dict[str, int]) -> bool:
     return not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
 
-def test_demo_tracks_scores_and_leaves_its_results(tmp_path: Path) -> None:
-    demo = _demo(tmp_path, 6.0)
+def test_demo_tracks_scores_and_leaves_its_results(demo_of: Demo, tmp_path: Path) -> None:
+    demo = demo_of(tmp_path, 6.0)
     lines = list(_lines(demo))
     assert demo.wait(60) == 0, "\n".join(lines)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary == json.loads((tmp_path / "copy.json").read_text())
     # No bar of speed here: machines that run tests are busy. Markers are right at any rate; a hand of 1 m/s that
     # is drawn ten times a second leaps by its own size between two frames, and its joints are only near then.
-    assert summary["poses"] > 60
+    assert summary["poses"] > ENOUGH
     drawn = summary["poses_per_s"] > 30.0
-    assert summary["joint_mm_visible"] < (6.0 if drawn else 20.0)
-    assert summary["pip_deg_visible"] < (7.5 if drawn else 15.0)
-    assert summary["marker_mm"] < 4.0
+    if summary["poses_per_s"] > LEAST_HZ:
+        assert summary["joint_mm_visible"] < (6.0 if drawn else 20.0)
+        assert summary["pip_deg_visible"] < (7.5 if drawn else 15.0)
+        assert summary["marker_mm"] < 4.0
+    assert summary["marker_raw_mm"] < 4.0
     for key in ("latency_p50_ms", "latency_p99_ms", "lost", "joint_mm", "pip_deg", "poses_per_s"):
         assert np.isfinite(summary[key]), key
     assert summary["camera_hz"] == pytest.approx({"left": 60.0, "right": 60.0}, rel=2e-3)
@@ -109,35 +141,58 @@ def test_demo_tracks_scores_and_leaves_its_results(tmp_path: Path) -> None:
     assert _gone(_pids(lines[0]))
 
 
-def _new_child(demo: subprocess.Popen[str], old: dict[str, int]) -> int:
-    """The process that was started since the first ones."""
+class HeldUp:
+    """How long the processes of a demo could have run and others had the core. Holds a thread that looks."""
+
+    def __init__(self, demo: subprocess.Popen[str]) -> None:
+        self._demo, self._waited_ns = demo, dict[int, int]()
+        self._rows: list[tuple[int, int]] = [(0, 0)]
+        threading.Thread(target=self._look, daemon=True).start()
+
+    def between(self, began_ns: int, ended_ns: int) -> int:
+        """All of them together [ns], between two moments of the monotonic clock."""
+        at_ns, waited_ns = np.array(self._rows).T
+        began, ended = np.interp([began_ns, ended_ns], at_ns, waited_ns)
+        return int(ended - began)
+
+    def _look(self) -> None:
+        pid = self._demo.pid
+        while self._demo.poll() is None:
+            with suppress(OSError):  # one has just ended
+                children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+                for one in (pid, *map(int, children)):
+                    self._waited_ns[one] = int(Path(f"/proc/{one}/schedstat").read_text().split()[1])
+            self._rows.append((time.monotonic_ns(), sum(self._waited_ns.values())))
+            time.sleep(0.02)
+
+
+def _running(demo: subprocess.Popen[str], pids: dict[str, int], again: str) -> dict[str, int]:
+    """The processes once one of them was started again."""
     children = Path(f"/proc/{demo.pid}/task/{demo.pid}/children").read_text().split()
-    (new,) = {int(pid) for pid in children} - set(old.values())
-    return new
+    (new,) = {int(pid) for pid in children} - set(pids.values())
+    return pids | {again: new}
 
 
-def _held_up_ns(pid: int) -> int:
-    """How long [ns] a process could have run and another one had the core."""
-    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1])
+def _scene_s(line: str) -> int:
+    """How long the scene has run, where a line of progress says so; else 0."""
+    found = re.search(r"(\d+) of \d+ s ", line)
+    return int(found[1]) if found else 0
 
 
-def _wait_until_back(demo: subprocess.Popen[str], log: Path, ready: str, pid: int) -> int:
-    """Until a process that was started again says so; how long [ns] it could have run and another had the core."""
-    held_up_ns = 0
-    while log.read_text().count(ready) < 2 and demo.poll() is None:
-        held_up_ns = _held_up_ns(pid)
-        time.sleep(0.02)
-    return held_up_ns
+def _poses_told(out: Path) -> int:
+    """How many poses the master has told so far, by its lines of every second."""
+    return sum(map(int, re.findall(r"rate (\d+) poses/s", (out / "master.log").read_text())))
 
 
 def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_sums_up(
-    tmp_path: Path,
+    demo_of: Demo, tmp_path: Path
 ) -> None:
-    demo = _demo(tmp_path, 60.0)
+    demo = demo_of(tmp_path, 180.0)
+    held_up = HeldUp(demo)
     heard: list[str] = []
     killed_ns: dict[str, int] = {}
-    held_up_ns: dict[str, int] = {}
     pids: dict[str, int] = {}
+    back, told, back_s = "", 0, 0.0  # who is back, how many poses were told before, and when it was
 
     def kill(victim: str) -> None:
         killed_ns[victim] = time.monotonic_ns()
@@ -146,18 +201,19 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
     for line in _lines(demo):
         heard.append(line)
         pids = pids or _pids(line)
-        if "2 of 60 s" in line and not killed_ns:
+        if _scene_s(line) >= 2 and not killed_ns:
             kill("master")  # first: rows that it had not yet written are lost with it
         for victim, ready in (("right", "right: ready"), ("master", "listening on")):
             if f"{victim} ended with code -9: started again" in line:
-                new = _new_child(demo, pids)
-                held_up_ns[victim] = _wait_until_back(demo, tmp_path / f"{victim}.log", ready, new)
-                pids[victim] = new
-                time.sleep(3.0)
-                if victim == "master":
-                    kill("right")
-                else:
-                    demo.send_signal(signal.SIGINT)
+                pids = _running(demo, pids, victim)
+                assert until(lambda v=victim, r=ready: (tmp_path / f"{v}.log").read_text().count(r) == 2)
+                back, told, back_s = victim, _poses_told(tmp_path), time.monotonic()
+        if back and _poses_told(tmp_path) > told + ENOUGH and time.monotonic() - back_s > 3.0:
+            if back == "master":
+                kill("right")
+            else:
+                demo.send_signal(signal.SIGINT)
+            back = ""
     assert demo.wait(60) == 0, "\n".join(heard)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["restarts"] == {"right": 1, "master": 1}
@@ -174,28 +230,40 @@ def test_a_killed_process_is_back_within_two_seconds_and_ctrl_c_still_ends_and_s
         for victim, killed in killed_ns.items()
     }
     for victim, killed in killed_ns.items():
-        assert len(after[victim]) > 5  # it goes on; how fast is up to the machine
-        # Two seconds are the promise, and a loaded machine gets one more. What it waited for a core is not its own.
-        assert (after[victim][0] - killed - held_up_ns[victim]) * 1e-9 < 3.0
+        assert len(after[victim]) > 0  # it goes on; how fast is up to the machine
+        # Two seconds are the promise, and a loaded machine gets one more. What they waited for a core is not their own.
+        first = int(after[victim][0])
+        assert (first - killed - held_up.between(killed, first)) * 1e-9 < 3.0
 
 
-def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_path: Path) -> None:
-    demo = _demo(tmp_path, 8.0, "--rig", "desk4", "--scene", "poses")
+def _ready_again_ns(log: Path) -> int:
+    """When a process that was started again was ready, on this machine's monotonic clock."""
+    said = [line for line in log.read_text().splitlines() if "ready, waiting" in line]
+    return int(float(said[1].split()[0]) * 1e9)
+
+
+def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(
+    demo_of: Demo, tmp_path: Path
+) -> None:
+    demo = demo_of(tmp_path, 180.0, "--rig", "desk4", "--scene", "poses")
     heard: list[str] = []
-    killed_ns = epoch_ns = tracking = 0
+    killed_ns = epoch_ns = told = 0
+    ended = False
     pids: dict[str, int] = {}
+    gone = ("left2", "right2")
+    logs = [tmp_path / f"{name}.log" for name in gone]
     for line in _lines(demo):
         heard.append(line)
         pids = pids or _pids(line)
-        if rate := re.search(r" of 8 s +(\d+) poses/s", line):
-            tracking += (
-                int(rate[1]) >= 5
-            )  # for so many seconds; four renderers on a busy machine draw few frames
-        if tracking >= 3 and not killed_ns:
+        if _scene_s(line) >= 3 and not killed_ns and _poses_told(tmp_path) > ENOUGH:
             epoch_ns = _epoch_ns(pids["left"])
-            killed_ns = time.monotonic_ns()
-            for name in ("left2", "right2"):
+            killed_ns, told = time.monotonic_ns(), _poses_told(tmp_path)
+            for name in gone:
                 os.kill(pids[name], signal.SIGKILL)
+        back = killed_ns and all(log.read_text().count("ready, waiting") == 2 for log in logs)
+        if back and not ended and _poses_told(tmp_path) > told + ENOUGH:
+            ended = True
+            demo.send_signal(signal.SIGINT)
     assert demo.wait(90) == 0, "\n".join(heard)
     assert killed_ns, "\n".join(heard)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -203,7 +271,9 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     # From the stamps, so it does not matter how many frames a busy machine had no time for.
     rates = {"left": 60.0, "right": 60.0, "left2": 30.0, "right2": 30.0}
     assert summary["camera_hz"] == pytest.approx(rates, rel=2e-3)
-    assert summary["marker_mm"] < 4.0
+    assert summary["marker_raw_mm"] < 4.0
+    if summary["poses_per_s"] > LEAST_HZ:
+        assert summary["marker_mm"] < 4.0
     poses = load_poses(tmp_path / "poses.npz")
     assert not _lost_while_seen(poses).any()
     # How long a pair is gone, and fingers unseen, depends on how busy the machine is: all joints only until then.
@@ -211,8 +281,8 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     assert together.valid[-1].all()
     if len(together) > 60:  # of fewer, drawn by a busy machine, nothing can be said
         assert _joint_mm(together.rows(len(together) // 4, len(together)), "poses", "desk4", epoch_ns) < 4.0
-    # A process needs longer than this to be back: whatever is measured is measured by the other pair.
-    alone = (poses.t_ns > killed_ns) & (poses.t_ns < killed_ns + 500_000_000)
+    # Until one is back, whatever is measured is measured by the other pair.
+    alone = (poses.t_ns > killed_ns) & (poses.t_ns < min(_ready_again_ns(log) for log in logs))
     measured = np.isfinite(poses.markers_raw_m.min(axis=2)).sum(axis=1) > 0
     assert (alone & measured).any()
     assert poses.valid[alone & measured].all()
@@ -220,14 +290,18 @@ def test_two_pairs_track_together_and_one_goes_on_while_the_other_is_gone(tmp_pa
     assert _gone(pids)
 
 
-def test_a_second_ctrl_c_ends_at_once_and_leaves_nobody_behind(tmp_path: Path) -> None:
-    demo = _demo(tmp_path, 60.0)
+def test_a_second_ctrl_c_ends_at_once_and_leaves_nobody_behind(demo_of: Demo, tmp_path: Path) -> None:
+    demo = demo_of(tmp_path, 60.0)
     heard: list[str] = []
     for line in _lines(demo):
         heard.append(line)
-        if "1 of 60 s" in line:
-            demo.send_signal(signal.SIGINT)
-            time.sleep(0.1)
-            demo.send_signal(signal.SIGINT)
-    assert demo.wait(10) == 130, "\n".join(heard)
-    assert _gone(_pids(heard[0]))
+        if _scene_s(line) >= 1:
+            break
+    pids = _pids(heard[0])
+    demo.send_signal(signal.SIGINT)
+    # It was heard, and everybody is being ended: two at the same moment would be one.
+    assert until(lambda: (tmp_path / "live.json").exists() or not Path(f"/proc/{pids['master']}").exists())
+    demo.send_signal(signal.SIGINT)
+    heard += _lines(demo)
+    assert demo.wait(60) == 130, "\n".join(heard)
+    assert _gone(pids)
