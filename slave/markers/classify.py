@@ -5,6 +5,9 @@ the camera file by running OpenCV's own conversion over all 2^24 colours, so a l
 `inRange` exactly and the thresholds stay the user's HSV thresholds; no frame is ever converted to HSV. One look-up
 costs the same for one colour and for eight (Bruce, Balch, Veloso, CMVision, 2000, do the same with one table
 per axis; a packed table also carries ranges that are no boxes).
+
+Under another light the same table is looked up at other colours (`ColourTable.relit`): a slave has one for as long as
+its colours are the same, whatever the light does.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +23,7 @@ from common.calibration import HsvRange
 from common.errors import CalibrationError
 
 Codes: TypeAlias = npt.NDArray[np.unsignedinteger]
+Places: TypeAlias = npt.NDArray[np.uint32]
 HUES = 180
 PLANES = (
     16  # of the table that are made at once: a thread beside a busy loop waits for its turn at every step
@@ -33,7 +37,8 @@ SKIN = HsvRange(hsv_low=(174, 60, 70), hsv_high=(22, 190, 255))
 class ColourTable:
     """Which markers a colour may belong to: bit m of an entry belongs to marker m, the bit after the last to skin.
 
-    Holds the table (2^24 entries of 1, 2, 4 or 8 bytes) and the work buffers of the scan.
+    Holds the table (2^24 entries of 1, 2, 4 or 8 bytes), which it shares with those made of it for another light, the
+    bytes to look up for those of a picture, and the work buffers of the scan.
     """
 
     def __init__(self, ranges: Sequence[HsvRange]) -> None:
@@ -51,31 +56,34 @@ class ColourTable:
         self.bits = tuple(1 << m for m in range(self.count))
         self.skin = 1 << self.count
         self._table = _build([*ranges, SKIN])
+        self._bytes: Image | None = None  # (3, 256); None: as they are
+        self._coarse: Codes | None = None  # for the scan, where they are others
+        self._places = _places(np.tile(np.arange(256, dtype=np.uint8), (3, 1)))
         self._index = np.empty((0, 0), np.int64)
         self._codes: Codes = np.empty((0, 0), self._table.dtype)
 
     @property
     def entries(self) -> Codes:
-        """The table itself: codes (2^24,) of packed pixels, blue in the lowest byte."""
+        """The table itself: codes (2^24,) at the sum of the `places` of a pixel's blue, green and red."""
         return self._table
 
+    @property
+    def places(self) -> Places:
+        """What each byte of blue, green and red (3, 256) adds to the place of a pixel in `entries`."""
+        return self._places
+
     def relit(self, tables: Image) -> "ColourTable":
-        """The table for pictures whose bytes must be mapped before these ranges hold, about 50 ms.
+        """The table for pictures whose bytes must be mapped before these ranges hold, about 1 ms; shares the entries.
 
         Colours that belong to one marker before belong to one marker after: no ranges can come to overlap.
 
         Args:
             tables: (3, 256) byte -> byte of blue, green and red.
         """
-        blue, green, red = tables
-        cube = self._table.reshape(256, 256, 256)
-        made = np.empty_like(cube)
-        for start in range(0, 256, PLANES):
-            some = slice(start, start + PLANES)
-            cube[red[some]].take(green, axis=1).take(blue, axis=2, out=made[some])
         other = copy(self)
-        other._table = made.reshape(-1)
-        other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), made.dtype)
+        other._bytes = tables if self._bytes is None else np.take_along_axis(self._bytes, tables, axis=1)
+        other._coarse, other._places = _coarse(self._table, other._bytes), _places(other._bytes)
+        other._index, other._codes = np.empty((0, 0), np.int64), np.empty((0, 0), self._table.dtype)
         return other
 
     def codes(self, image: Image) -> Codes:
@@ -91,6 +99,11 @@ class ColourTable:
 
     def packed_codes(self, packed: npt.NDArray[np.uint32]) -> Codes:
         """Class codes of pixels packed into words: blue, green, red from the lowest byte on; the highest is ignored."""
+        if self._bytes is not None:
+            mapped = np.zeros((1, 256, 4), np.uint8)
+            mapped[0, :, :3] = self._bytes.T
+            pixels = np.ascontiguousarray(packed).view(np.uint8).reshape(-1, 1, 4)
+            return self._table.take(cv2.LUT(pixels, mapped).view(np.uint32).reshape(packed.shape))
         return self._table.take(packed & 0xFFFFFF)
 
     def scan(self, image: Image, step: int, dx: int = 0, dy: int = 0) -> Codes:
@@ -121,6 +134,9 @@ class ColourTable:
         if self._index.shape != words.shape:
             self._index = np.empty(words.shape, np.int64)
             self._codes = np.empty(words.shape, self._table.dtype)
+        if self._coarse is not None:
+            np.bitwise_and(words >> (11 if late else 3), COARSE >> 3, out=self._index, casting="unsafe")
+            return self._coarse.take(self._index, out=self._codes, mode="clip")
         np.bitwise_and(words >> 8 if late else words, COARSE, out=self._index, casting="unsafe")
         return self._table.take(self._index, out=self._codes, mode="clip")
 
@@ -171,6 +187,24 @@ def _build(ranges: Sequence[HsvRange]) -> Codes:
         codes = table[start : start + PLANES].reshape(PLANES * 256, 256)  # a view
         codes[:] = hues.take(hue) & saturations.take(saturation) & values.take(value)
     return table.reshape(-1)
+
+
+def _places(levels: Image) -> Places:
+    """Levels (3, 256) of blue, green and red, each where it stands in a packed pixel."""
+    return levels.astype(np.uint32) << np.array([[0], [8], [16]], np.uint32)
+
+
+def _coarse(table: Codes, levels: Image) -> Codes:
+    """What the scan asks: entries (2^21,) of colours whose lowest three bits are 0, at packed pixels >> 3.
+
+    Args:
+        table: (2^24,) entries.
+        levels: (3, 256) bytes of blue, green and red to look up for those of a picture.
+    """
+    blue, green, red = levels[:, ::8]
+    coarse = np.empty((32, 256, 256), table.dtype)  # the rest is never asked, and never becomes memory
+    coarse[:, :32, :32] = table.reshape(256, 256, 256)[np.ix_(red, green, blue)]
+    return coarse.reshape(-1)
 
 
 def _bits(ranges: Sequence[HsvRange], channel: int, kind: type[np.unsignedinteger]) -> Codes:

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from slave.markers.classify import Codes, ColourTable
+from slave.markers.classify import Codes, ColourTable, Places
 from slave.markers.fast_compile import compiled
 
 CELLS = 32  # of each channel
@@ -39,26 +39,28 @@ def cells_of(table: ColourTable) -> Cells:
         kind = table.entries.dtype
         skin = np.array([table.skin], np.uint64).astype(kind)
         known = Cells(np.empty(CELLS**3, kind), np.empty(CELLS**3, kind), skin)
-        _fill(table.entries, skin, known.first, known.markers)
+        _fill(table.entries, table.places, skin, known.first, known.markers)
         _KNOWN[table] = known
     return known
 
 
 @compiled
-def _fill(entries: Codes, skin: Codes, first: Codes, markers: Codes) -> None:
+def _fill(entries: Codes, places: Places, skin: Codes, first: Codes, markers: Codes) -> None:
     flag = skin[0]
     for red in range(CELLS):
         for green in range(CELLS):
             for blue in range(CELLS):
-                start = red << 19 | green << 11 | blue << 3
-                any_of, all_of = entries[start], entries[start]
-                for r in range(8):
-                    for g in range(8):
-                        row = start + (r << 16 | g << 8)
-                        for code in entries[row : row + 8]:
+                columns = places[0, 8 * blue : 8 * blue + 8]
+                start = entries[places[2, 8 * red] | places[1, 8 * green] | columns[0]]
+                any_of, all_of = start, start
+                for r in places[2, 8 * red : 8 * red + 8]:
+                    for g in places[1, 8 * green : 8 * green + 8]:
+                        row = r | g
+                        for b in columns:
+                            code = entries[row | b]
                             any_of |= code
                             all_of &= code
                 cell = red << 10 | green << 5 | blue
-                first[cell] = entries[start]
+                first[cell] = start
                 same = any_of & ~flag == all_of & ~flag
                 markers[cell] = all_of & ~flag if same else flag

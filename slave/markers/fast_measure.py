@@ -58,7 +58,9 @@ def measure(
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
     requests = np.array(asked, np.int64).reshape(-1, ASKED)
     _, cells, skin = cells_of(table)
-    measure_windows(pixels, table.entries, cells, skin, shares.LIGHT, requests, RULES, answers, windows)
+    measure_windows(
+        pixels, table.entries, table.places, cells, skin, shares.LIGHT, requests, RULES, answers, windows
+    )
     return [
         Measured(
             u,

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from common.arrays import Float, Image, Int
-from slave.markers.classify import Codes
+from slave.markers.classify import Codes, Places
 from slave.markers.fast_compile import compiled
 
 Float32: TypeAlias = npt.NDArray[np.float32]
@@ -25,7 +25,7 @@ EDGE = 4  # px
 CACHE_LINE = 64  # bytes
 OWN, OTHER = 1, 2  # classes
 CORE, INNER, NEAR, SOLID = 1, 2, 4, 8  # kinds
-SHIFTS = tuple(np.uint64(n) for n in (3, 5, 8, 10, 16))  # of one type with what they shift
+SHIFTS = tuple(np.uint64(n) for n in (3, 5, 10))  # of one type with what they shift
 # Columns of what is asked for, and of what is answered.
 ASKED, ANSWERED = 7, 14
 LEFT, TOP, RIGHT, BOTTOM, BIT, ALONE, START = range(ASKED)
@@ -73,6 +73,7 @@ class Frame(NamedTuple):
 def measure_windows(
     image: Image,
     table: Codes,
+    places: Places,
     cells: Codes,
     skin: Codes,
     curve: Float32,
@@ -94,7 +95,7 @@ def measure_windows(
         return
     for k in range(len(asked)):
         _measure_window(
-            image, table, cells, skin, curve, asked[k], rules, answers[k], windows, room, levels, ramp
+            image, table, places, cells, skin, curve, asked[k], rules, answers[k], windows, room, levels, ramp
         )
 
 
@@ -115,6 +116,7 @@ def _ask_ahead(image: Image, asked: Int, pad: int) -> int:
 def _measure_window(
     image: Image,
     table: Codes,
+    places: Places,
     cells: Codes,
     skin: Codes,
     curve: Float32,
@@ -131,6 +133,7 @@ def _measure_window(
     Args:
         image: (H, W, 3) BGR.
         table: (2^24,) codes.
+        places: (3, 256) what each byte of blue, green and red adds to the place in the table.
         cells: (32^3,) codes of cells; skin: (1,) the bit that says that a cell has none (`fast_cells`).
         curve: (256,) byte -> linear light.
         ask: (7,) box, bit, whether alone, where its window starts in `windows`.
@@ -155,7 +158,7 @@ def _measure_window(
     x0, y0 = max(0, -left), max(0, -top)
     x1, y1 = min(width, image.shape[1] - left), min(height, image.shape[0] - top)
     whole = Frame(x0, y0, x1, y1, stride, x_middle, y_middle)
-    _classify(image, table, cells, skin, curve, ask[BIT], left, top, whole, classes, light)
+    _classify(image, table, places, cells, skin, curve, ask[BIT], left, top, whole, classes, light)
     if ask[ALONE] == 0:
         _keep_parts_inside(rules.pad + rules.grid - 1, width, height, stride, classes)
     own, u0, v0, u1, v1 = _box_of_own(whole, classes, room)
@@ -211,6 +214,7 @@ def _measure_window(
 def _classify(
     image: Image,
     table: Codes,
+    places: Places,
     cells: Codes,
     skin: Codes,
     curve: Float32,
@@ -233,9 +237,9 @@ def _classify(
         )
         for x in range(count):
             blue, green, red = np.uint64(row[x, 0]), np.uint64(row[x, 1]), np.uint64(row[x, 2])
-            code = cells[blue >> SHIFTS[0] | green >> SHIFTS[0] << SHIFTS[1] | red >> SHIFTS[0] << SHIFTS[3]]
+            code = cells[blue >> SHIFTS[0] | green >> SHIFTS[0] << SHIFTS[1] | red >> SHIFTS[0] << SHIFTS[2]]
             if code & skin[0]:
-                code = table[blue | green << SHIFTS[2] | red << SHIFTS[4]] & ~skin[0]
+                code = table[places[0, blue] | places[1, green] | places[2, red]] & ~skin[0]
             into[x] = OWN if np.int64(code) & bit else (OTHER if code else 0)
             first[x], second[x], third[x] = curve[blue], curve[green], curve[red]
 

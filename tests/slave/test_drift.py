@@ -1,5 +1,7 @@
 """The light estimated from colours: the law it inverts, its bounds, and what it does where colours tell nothing."""
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pytest
@@ -165,6 +167,33 @@ def test_a_relit_table_sees_the_picture_as_it_was(factors: tuple[float, float, f
     before = np.ascontiguousarray(np.stack([tables[k][image[..., k]] for k in range(3)], axis=-1))
     np.testing.assert_array_equal(table.relit(tables).codes(image), table.codes(before))
     assert set(np.unique(table.relit(tables).codes(image))) <= set(np.unique(table.codes(before)))
+
+
+def test_a_relit_table_scans_the_colours_that_it_has() -> None:
+    image = np.random.default_rng(6).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    relit = TABLE.relit(relit_bytes((1.3, 0.8, 1.0))).relit(relit_bytes((0.9, 1.1, 1.2)))
+    coarse = relit.codes(image & np.uint8(0xF8))
+    assert np.count_nonzero(coarse)
+    for dx, dy in ((0, 0), (1, 2), (2, 1)):
+        np.testing.assert_array_equal(relit.scan(image, 3, dx, dy), coarse[dy::3, dx::3][:13, :20])
+
+
+def test_a_relit_table_of_a_relit_table_maps_twice() -> None:
+    first, second = relit_bytes((1.3, 0.8, 1.0)), relit_bytes((0.9, 1.1, 1.2))
+    image = np.random.default_rng(7).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    before = np.stack([first[k][second[k][image[..., k]]] for k in range(3)], axis=-1)
+    np.testing.assert_array_equal(TABLE.relit(first).relit(second).codes(image), TABLE.codes(before))
+
+
+def test_a_light_that_changes_makes_no_second_table() -> None:
+    tracemalloc.start()
+    try:
+        relit = [TABLE.relit(relit_bytes((1.0 + 0.1 * k, 1.0, 1.0))) for k in range(4)]
+        _, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert all(np.shares_memory(one.entries, TABLE.entries) for one in relit)
+    assert most < len(relit) * TABLE.entries.nbytes / 6  # addresses; of the memory, an eighth of that
 
 
 TABLE = ColourTable([painted.RANGES[name] for name in painted.NAMES])

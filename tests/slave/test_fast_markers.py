@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from common.calibration import CameraCalibration, HandProfile, HsvRange, RigCali
 from common.errors import PhalanxError
 from common.sim.render import Renderer
 from common.sim.scene import Scene
+from common.srgb import relit_bytes
 from slave.markers import centroid
 from slave.markers.blobs import Blob, find_blobs
 from slave.markers.centroid import Measured
@@ -167,6 +169,26 @@ def test_noise_of_all_colours_has_the_same_blobs_in_tables_of_every_width(numba:
             ours = numba.measure(image, table, [table.bits[m]], blobs, [True])
             theirs = centroid.measure(image, table, [table.bits[m]], blobs, [True])
             assert (ours[0] is None) == (theirs[0] is None)
+
+
+@needs_numba
+@pytest.mark.parametrize("gains", [(1.4, 1.0, 0.7), (0.6, 1.2, 1.0)])
+def test_under_another_light_both_engines_look_up_the_same_colours(
+    numba: Engine, gains: tuple[float, float, float]
+) -> None:
+    image = np.asarray(cv2.LUT(render(hand()), relit_bytes(gains).T[None]), np.uint8)
+    table = TABLE.relit(relit_bytes(1.0 / np.array(gains)))
+    codes, options = numba.scan_blobs(image, table, table.bits, 4, 0, 0)
+    np.testing.assert_array_equal(codes, table.scan(image, 4))
+    assert_same_blobs(find_blobs(codes, table.bits, 4), options)
+    call = [b[0] for b in options if b], [bit for bit, b in zip(table.bits, options, strict=True) if b]
+    assert len(call[0]) == len(table.bits)
+    ours = numba.measure(image, table, call[1], call[0], [True] * len(call[0]))
+    theirs = centroid.measure(image, table, call[1], call[0], [True] * len(call[0]))
+    for a, b in zip(ours, theirs, strict=True):
+        assert a is not None
+        assert b is not None
+        assert (a.u, a.v, a.area) == pytest.approx((b.u, b.v, b.area), abs=1e-3)
 
 
 @needs_numba
