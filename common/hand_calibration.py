@@ -1,0 +1,89 @@
+"""Typed files of hands: bones and markers of one hand, its limits and couplings."""
+
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from common.calibration_parts import NonNegative, Number, Part, Positive, Provenance, Quaternion, Vector3
+from common.messages import Name
+
+
+class RestJoint(Part, frozen=True):
+    """One joint of the flat hand, palm frame; OpenXR axes: -z along the bone to the tip, +y dorsal."""
+
+    position_m: Vector3
+    orientation_wxyz: Quaternion
+
+
+class MarkerMount(Part, frozen=True):
+    """Where a painted cap sits: the joint it is fixed to (or palm_frame), its centroid there, its painted length."""
+
+    joint: str
+    offset_m: Vector3
+    painted_m: Positive = 0.016
+
+
+Span = tuple[Number, Number]
+Share = Annotated[float, Meta(ge=0.0, le=1.0)]
+
+
+class FingerLimits(Part, frozen=True):
+    """Low and high of the four angles [rad], zero in the rest pose; for the thumb CMC, CMC, MCP, IP.
+
+    `spread_at_full_flexion`: share of the abduction range that is left at the highest flexion, less on the way there;
+    1: the range stays.
+    """
+
+    abduction_rad: Span
+    flexion_rad: Span
+    pip_rad: Span
+    dip_rad: Span
+    spread_at_full_flexion: Share = 1.0
+
+
+class Limits(Part, frozen=True):
+    """Limits of the five fingers."""
+
+    thumb: FingerLimits
+    index: FingerLimits
+    middle: FingerLimits
+    ring: FingerLimits
+    little: FingerLimits
+
+
+class Couplings(Part, frozen=True):
+    """Natural relations between the angles of index ... little; each can be switched off.
+
+    `dip_per_pip` None: the DIP is free. `dip_spread_rad`: standard deviation of the DIP about that ratio; 0: it is
+    kept exactly. `mcp_per_pip` None: no natural flexion. `neighbours`: fingers side by side tend to bend alike.
+    """
+
+    dip_per_pip: NonNegative | None = 2.0 / 3.0
+    dip_spread_rad: Annotated[float, Meta(ge=0.0, le=3.2)] = 0.0
+    mcp_per_pip: NonNegative | None = 0.54
+    neighbours: bool = True
+
+
+Preset = Literal["K", "D"]
+Finger = Literal["thumb", "index", "middle", "ring", "little"]
+PalmarScale = Annotated[float, Meta(ge=0.5, le=2.0)]
+
+
+class HandProfile(Part, frozen=True):
+    """hands/<name>.json: bones and markers of one hand, optionally radii, skin, limits and couplings.
+
+    Limits and couplings may be the name of a preset: K (Kalbfleisch; also where there are none) or D (Digits).
+    `palmar_scale`: finger -> how thick its palmar flesh is against that which the radii or the size of the hand tell,
+    as a wrist device measures it; 1 where a finger is not named.
+    """
+
+    version: Literal[1]
+    name: Name
+    side: Literal["left", "right"]
+    rest_joints: dict[str, RestJoint]
+    markers: dict[Name, MarkerMount]
+    radius_m: dict[str, Positive] | None = None
+    palmar_scale: dict[Finger, PalmarScale] = {}
+    limits_rad: Limits | Preset | None = None
+    couplings: Couplings | Preset | None = None
+    provenance: dict[str, Provenance] = {}
