@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from bench.soak_steps import steps_of
 from bench.soak_verdict import memory_slope, slope, warm_up_s
 from bench.soak_watch import Course
 
@@ -61,6 +62,9 @@ def _growth(axes: Axes, course: Course) -> None:
             axes.plot(
                 times / 60.0, values - np.median(values[late][:12]), color=colour, label=label, linewidth=1.2
             )
+        for step in steps_of(course.times_s, values) or []:
+            axes.axvline(step.minute, color=colour, linewidth=1.0, linestyle="--")
+            axes.text(step.minute, 2.6, f" +{step.mb:.0f} MB", color=colour, fontsize=8)
     axes.axhline(1.0, color=_GREY, linewidth=0.8, linestyle=":")
     axes.set_ylim(-3.0, 3.0)
     axes.set_ylabel("resident memory since\nthe warm-up [MB]")

@@ -1,4 +1,4 @@
-"""What a soak says: does memory grow, does latency grow, was anything lost?
+"""What a soak says: does memory grow or step, does latency grow, was anything lost?
 
 Memory and latency on a machine that others use as well are noisy, and noise has outliers: slopes are those of Theil and
 Sen (median of the slopes of all pairs, P. K. Sen, "Estimates of the regression coefficient based on Kendall's tau",
@@ -12,6 +12,7 @@ from math import nan, sqrt
 
 import numpy as np
 
+from bench.soak_steps import STEP_MB, Step, steps_of
 from bench.soak_watch import Course, Minute
 from common.arrays import Float
 
@@ -113,6 +114,7 @@ def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
                 None if np.isnan(found.per_h) else found.per_h <= MB_PER_H,
             )
         )
+    findings += [_steps(course, process) for process in course.footprints]
     findings += [_latency(course.minutes, name) for name in ("p50", "p99")]
     counts = course.minutes[-1].counts if course.minutes else {}
     for what in ("lost", "dropped", "refused", "blocked"):
@@ -120,6 +122,23 @@ def judge(course: Course, ended: Sequence[str]) -> list[Finding]:
             Finding(what, str(counts.get(what, 0)), "0", counts.get(what, 0) == 0 if counts else None)
         )
     return findings
+
+
+def _steps(course: Course, process: str) -> Finding:
+    found, what = steps_of(course.times_s, course.series(process, "rss_mb")), f"steps of {process}"
+    limit = f"none of {STEP_MB:g} MB"
+    if found is None:
+        return Finding(what, "too short to say", limit, None)
+    told = "; ".join(_told(course, process, step) for step in found)
+    return Finding(what, told or "none", limit, not found)
+
+
+def _told(course: Course, process: str, step: Step) -> str:
+    """By how much, when, and where: what grew in that minute or the one before, for a median is late."""
+    near = [one for one in course.minutes if step.minute - 1 <= one.t_s // BLOCK_S - 1 <= step.minute]
+    where = [f"{name} +{mb:.1f}" for one in near for name, mb in one.grown.get(process, {}).items()]
+    places = ", ".join(where) or "mapping not known"
+    return f"+{step.mb:.1f} MB in minute {step.minute} ({places})"
 
 
 def _latency(minutes: Sequence[Minute], name: str) -> Finding:

@@ -8,6 +8,7 @@ import numpy as np
 
 from bench.processes import Footprint, cpu_s, footprint
 from bench.soak_rig import SoakRig
+from bench.soak_steps import grown, mapped
 from common.bus import Bus, Subscription
 from common.messages import HandPose, Health
 
@@ -28,6 +29,7 @@ class Minute:
         counts: What the master counted since the start: lost, skipped, dropped, refused, blocked.
         clock_offset_us: Sender -> by how much its clock is ahead of the master's.
         clock_sigma_us: Sender -> how sure the master is of that.
+        grown: Process -> mapping -> by how much that one has grown in this minute [MB].
     """
 
     t_s: float
@@ -39,6 +41,7 @@ class Minute:
     counts: dict[str, int]
     clock_offset_us: dict[str, float]
     clock_sigma_us: dict[str, float]
+    grown: dict[str, dict[str, float]] = field(default_factory=dict[str, dict[str, float]])
 
 
 @dataclass(slots=True)
@@ -77,6 +80,7 @@ class Watch:
         self._latency_ms: list[float] = []
         self._health: dict[str, Health] = {}
         self._since_s, self._cpu_s = 0.0, {one.name: cpu_s(one.pid) for one in rig.processes}
+        self._mapped = {one.name: mapped(one.pid) for one in rig.processes}
 
     @property
     def now_s(self) -> float:
@@ -109,6 +113,7 @@ class Watch:
         self.listen()
         now_s, latencies = self.now_s, np.array(self._latency_ms)
         spent = {one.name: cpu_s(one.pid) for one in self._rig.processes}
+        held = {one.name: mapped(one.pid) for one in self._rig.processes}
         took = now_s - self._since_s
         p50, p99 = np.percentile(latencies, [50, 99]) if len(latencies) else (np.nan, np.nan)
         gauges = self._health["master"].gauges if "master" in self._health else {}
@@ -122,10 +127,11 @@ class Watch:
             judged(self._health),
             _ending(gauges, ".clock_offset_us"),
             _ending(gauges, ".clock_sigma_us"),
+            {name: more for name, now in held.items() if (more := grown(self._mapped[name], now))},
         )
         self.course.minutes.append(minute)
         self.course.counts = {name: dict(told.counts) for name, told in self._health.items()}
-        self._since_s, self._cpu_s, self._latency_ms = now_s, spent, []
+        self._since_s, self._cpu_s, self._mapped, self._latency_ms = now_s, spent, held, []
         return minute
 
 

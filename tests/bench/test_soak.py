@@ -2,11 +2,14 @@
 
 import mmap
 import os
+from collections.abc import Generator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from bench.processes import Footprint, footprint
+from bench.soak_steps import grown, mapped, steps_of
 from bench.soak_verdict import judge, latency_slope, memory_slope, slope
 from bench.soak_watch import Course, Minute, judged
 from common.messages import Health
@@ -88,11 +91,63 @@ def test_the_counts_of_all_processes_are_summed_by_what_they_mean() -> None:
     assert judged({"master": master, "left": left}) == expected
 
 
+def stepped(at_s: float, mb: float, length_s: float = 1200.0) -> Course:
+    """A process that leaks nothing, and one buffer that comes late, in two halves."""
+    made = course(0.0, length_s)
+    times = np.array(made.times_s)
+    more = 0.5 * mb * ((times >= at_s).astype(float) + (times >= at_s + 5.0))
+    mbs = np.array(made.series("master", "rss_mb")) + more
+    made.footprints["master"] = [Footprint(x, x, x, x, 0.0, 5, 9) for x in mbs.tolist()]
+    return made
+
+
+@pytest.mark.parametrize("at_s", [250.0, 380.0, 598.0, 717.0])
+def test_a_step_is_found_in_the_minute_in_which_it_came(at_s: float) -> None:
+    made = stepped(at_s, 34.0)
+    (found,) = steps_of(made.times_s, made.series("master", "rss_mb")) or []
+    assert found.mb == pytest.approx(34.0, abs=1.5)
+    assert abs(60.0 * found.minute - at_s) <= 60.0
+
+
+def test_a_step_after_the_start_is_no_pass_though_the_slope_leaves_it_out() -> None:
+    said = verdict(stepped(66.0, 34.0))
+    assert said["memory of master"] is True
+    assert said["steps of master"] is False
+
+
+def test_a_leak_noise_and_a_process_that_settles_are_no_steps() -> None:
+    for per_h in (0.0, 3.0, 30.0):
+        assert verdict(course(per_h))["steps of master"] is True
+    assert verdict(course(0.0, 120.0))["steps of master"] is None
+
+
+def test_a_step_says_which_mapping_grew() -> None:
+    made = stepped(380.0, 34.0)
+    made.minutes[6].grown["master"] = {"7f0040000000 anonymous": 33.5}
+    (line,) = (one.value for one in judge(made, []) if one.what == "steps of master")
+    assert line.endswith("MB in minute 6 (7f0040000000 anonymous +33.5)")
+
+
+@contextmanager
+def fresh_pages(size: int) -> Generator[None]:
+    """Pages of the kernel, in use: an array might get what this process freed before, and leave what it frees."""
+    with mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as kept:
+        for place in range(0, size, mmap.PAGESIZE):
+            kept[place] = 1
+        yield
+
+
+def test_the_mapping_that_grew_is_told_by_the_kernel() -> None:
+    before = mapped(os.getpid())
+    with fresh_pages(32_000_000):
+        more = grown(before, mapped(os.getpid()))
+    assert max(more.values()) == pytest.approx(32.0, abs=3.0)
+    assert next(iter(more)).endswith("anonymous")
+
+
 def test_memory_of_a_process_is_read_as_the_kernel_has_it() -> None:
     before = footprint(os.getpid())
-    # Fresh pages of the kernel: an array might get what this process freed before.
-    with mmap.mmap(-1, 32_000_000, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS) as kept:
-        kept.write(bytes([1]) * len(kept))
+    with fresh_pages(32_000_000):
         after = footprint(os.getpid())
     assert after.anonymous_mb - before.anonymous_mb == pytest.approx(32.0, abs=3.0)
     assert after.uss_mb <= after.pss_mb <= after.rss_mb
