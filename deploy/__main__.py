@@ -4,14 +4,16 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from deploy.arguments import parser
 from deploy.checks import keys_of_fleet
 from deploy.demo import DemoSettings, run_demo, stop_on_signals
-from deploy.deployment import Lines, deploy, make_keys, uninstall
+from deploy.deployment import Lines, deploy, roll_back, uninstall
 from deploy.fleet import fleet_once, table, watch_fleet
 from deploy.host_options import ears_of, reached_of, rig_of, wish_of
+from deploy.keys import prepared_keys
 from deploy.replay import ReplayError, ReplaySettings, run_replay
 from deploy.sensors import DemoError, best_rigs
 from deploy.summary import summary_lines
@@ -67,14 +69,22 @@ def _deploy(options: argparse.Namespace) -> int:
     rig = rig_of(options)
     targets = targets_of(options.hosts, rig)
     wish, ears, reached, say = wish_of(options, rig), ears_of(options), reached_of(options), Lines(_say)
-    if not options.dry_run:
-        make_keys(options.keys, [name for target in targets for name in target.names], say)
-    return _told(deploy(targets, wish, reached, ears, say))
+    names = [name for target in targets for name in target.names]
+    with prepared_keys(options.keys, names, options.dry_run, say) as keys:
+        return _told(deploy(targets, replace(wish, keys=keys), reached, ears, say))
+
+
+def _rollback(options: argparse.Namespace) -> int:
+    return _told(roll_back(_all(options.hosts), reached_of(options), options.dry_run, Lines(_say)))
 
 
 def _uninstall(options: argparse.Namespace) -> int:
-    targets = [Target(host, ()) for host in dict.fromkeys(options.hosts)]
-    return _told(uninstall(targets, reached_of(options), options.dry_run, Lines(_say)))
+    return _told(uninstall(_all(options.hosts), reached_of(options), options.dry_run, Lines(_say)))
+
+
+def _all(hosts: Sequence[str]) -> list[Target]:
+    """Machines, whatever they serve."""
+    return [Target(host, ()) for host in dict.fromkeys(hosts)]
 
 
 def _told(results: dict[str, str | None]) -> int:
@@ -122,6 +132,7 @@ _COMMANDS = {
     "demo": _demo,
     "replay": _replay,
     "deploy": _deploy,
+    "rollback": _rollback,
     "uninstall": _uninstall,
     "fleet": _fleet,
     "wheels": _wheels,

@@ -1,21 +1,17 @@
 """All machines of a rig at once: each is deployed to by itself, then their first datagrams are waited for."""
 
-import json
 import sys
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
+from deploy.hearing import Before, Ears, Heard, heard_of
 from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote, run_bounded
 from deploy.targets import DeployError, Target
 
-HEAR_S = (
-    12.0  # from READY=1 to the first datagram is a second; each one of waiting is a second without pictures
-)
 _KEYS_S = 60.0
 Say = Callable[[str], None]
 
@@ -31,21 +27,6 @@ class Reached:
 
     options: tuple[str, ...]
     deadline_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Ears:
-    """How the first datagrams are heard.
-
-    Attributes:
-        options: Of `phalanx-master hear`.
-        keys: Keys folder.
-        seconds: How long they are waited for.
-    """
-
-    options: tuple[str, ...]
-    keys: Path
-    seconds: float = HEAR_S
 
 
 def make_keys(folder: Path, names: Sequence[str], say: Say) -> None:
@@ -78,24 +59,49 @@ def deploy(
         ears: How their first datagrams are heard; None: nobody listens.
         say: Told one line a step, each with its host.
     """
-    hosts = [_host(target, reached, say) for target in targets]
-    failed = _each(hosts, lambda host: host.deploy(wish))
+    hosts = _hosts(targets, reached, say)
     if ears is None or wish.dry_run:
-        return failed
+        return _each(hosts, lambda host: host.deploy(wish))
+    before = Before([name for target in targets for name in target.names], ears)
+
+    def one(host: Host) -> None:
+        host.deploy(wish)
+        if not host.reboot and before.at_master:  # at once: others may take longer, and it may be silent
+            _wait_heard(host, before.ears(host.start_s))
+
+    try:
+        failed = _each(hosts, one)
+    finally:
+        before.end()
     there = [host for host in hosts if failed[host.target.host] is None and not host.reboot]
-    if there:
+    if there and not before.at_master:  # then all are listened for together: one port, one start
         failed |= _hear(there, ears)
     return failed
 
 
 def uninstall(targets: Sequence[Target], reached: Reached, dry_run: bool, say: Say) -> dict[str, str | None]:
     """Take everything of ours away from all of them; host -> None, or one line why it failed there."""
-    return _each([_host(target, reached, say) for target in targets], lambda host: host.uninstall(dry_run))
+    return _each(_hosts(targets, reached, say), lambda host: host.uninstall(dry_run))
 
 
-def _host(target: Target, reached: Reached, say: Say) -> Host:
-    remote = Remote(target.host, reached.options, Deadline(reached.deadline_s))
-    return Host(target, remote, lambda line: say(f"{target.host}: {line}"))
+def roll_back(targets: Sequence[Target], reached: Reached, dry_run: bool, say: Say) -> dict[str, str | None]:
+    """Let all of them go back to what was before; host -> None, or one line why it failed there."""
+
+    def one(host: Host) -> None:
+        host.look()
+        host.say(host.roll_back(dry_run))
+
+    return _each(_hosts(targets, reached, say), one)
+
+
+def _hosts(targets: Sequence[Target], reached: Reached, say: Say) -> list[Host]:
+    known: dict[str, str] = {}
+
+    def host(target: Target) -> Host:
+        remote = Remote(target.host, reached.options, Deadline(reached.deadline_s))
+        return Host(target, remote, lambda line: say(f"{target.host}: {line}"), known=known)
+
+    return [host(target) for target in targets]
 
 
 def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str | None]:
@@ -121,49 +127,40 @@ def _each(hosts: Sequence[Host], act: Callable[[Host], None]) -> dict[str, str |
 
 def _hear(hosts: Sequence[Host], ears: Ears) -> dict[str, str | None]:
     """Wait until each sender was heard; a machine that is silent goes back to what it was."""
-    names = [name for host in hosts for name in host.target.names]
     for host in hosts:
         host.say("waiting for its first datagram")
-    heard, cause = heard_of(names, ears)
-    failed: dict[str, str | None] = {}
-    silent = {host.target.host: [n for n in host.target.names if n not in heard] for host in hosts}
-
-    def answer(host: Host) -> None:
-        if not (missing := silent[host.target.host]):
-            host.say(f"streams: {', '.join(f'{n} {heard[n]:.0f}/s' for n in host.target.names)}")
-            return
-        why = cause or f"no datagram of {', '.join(missing)} in {ears.seconds:.0f} s at the master"
-        if cause is not None or not host.changed:
-            raise DeployError(why)
-        try:
-            back = host.roll_back()
-        except DeployError as error:
-            raise DeployError(f"{why}; going back failed, too: {error}") from error
-        raise DeployError(f"{why}; {back}")
-
-    failed |= _each(hosts, answer)
-    return failed
+    heard = heard_of([name for host in hosts for name in host.target.names], ears)
+    return _each(hosts, lambda host: _judge(host, heard, ears))
 
 
-def heard_of(names: Sequence[str], ears: Ears) -> tuple[dict[str, float], str | None]:
-    """Ask `phalanx-master hear` which of the senders are heard.
+def _wait_heard(host: Host, ears: Ears) -> None:
+    """The same for one machine.
 
-    Returns:
-        Name -> datagrams a second, of those that were heard; and why nobody could listen, if that is so.
+    Raises:
+        DeployError: It is silent, and went back.
     """
-    words = [sys.executable, "-m", "master.hear", "--json", "--seconds", str(ears.seconds), *ears.options]
-    words += [word for name in names for word in ("--name", name)]
-    lines: list[str] = []
-    code, errors = run_bounded(
-        words, b"", lines.append, ears.seconds + 60.0, {"PHALANX_KEYS": str(ears.keys)}
-    )
-    results = [line for line in lines if line.startswith('{"heard"')]
-    if not results:
-        said = [*lines, *errors] or [f"phalanx-master hear ended with {code}"]
-        return {}, f"cannot listen for it: {said[-1]}"
-    return {
-        name: float(rate) for name, rate in cast(dict[str, float], json.loads(results[-1])["heard"]).items()
-    }, None
+    host.say("waiting for its first datagram")
+    _judge(host, heard_of(host.target.names, ears, host.remote.deadline.ended), ears)
+
+
+def _judge(host: Host, heard: Heard, ears: Ears) -> None:
+    """Let a machine go back of which somebody is not heard.
+
+    Raises:
+        DeployError: It is so.
+    """
+    missing = [name for name in host.target.names if name not in heard.rates]
+    if not missing:
+        host.say(f"streams: {', '.join(f'{n} {heard.rates[n]:.0f}/s' for n in host.target.names)}")
+        return
+    why = heard.cause or f"no datagram of {', '.join(missing)} in {ears.seconds:.0f} s at the master"
+    if heard.cause is not None or not host.changed:
+        raise DeployError(why)
+    try:
+        back = host.roll_back()
+    except DeployError as error:
+        raise DeployError(f"{why}; going back failed, too: {error}") from error
+    raise DeployError(f"{why}; {back}")
 
 
 class Lines:

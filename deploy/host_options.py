@@ -1,4 +1,4 @@
-"""Options of `phalanx deploy`, `uninstall`, `fleet` and `wheels`, and what they mean."""
+"""Options of `phalanx deploy`, `rollback`, `uninstall`, `fleet` and `wheels`, and what they mean."""
 
 import argparse
 import socket
@@ -6,7 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from deploy.checks import check_reach, check_wish, default_keys
-from deploy.deployment import HEAR_S, Ears, Reached, reach_of
+from deploy.deployment import Reached, reach_of
+from deploy.hearing import HEAR_S, Ears
 from deploy.one_host import Wish
 from deploy.targets import DeployError, RigFile, read_rig
 
@@ -29,6 +30,11 @@ DEPLOY_EXAMPLES = """examples:
   phalanx deploy pi-left.local pi-right.local --master 192.168.1.2 --dry-run
         what would be done; nothing is written, here or there
 """
+ROLLBACK_EXAMPLES = """examples:
+  phalanx rollback pi-left.local pi-right.local
+        programs, options, keys and calibration as they were before the last deployment that changed something
+  phalanx rollback pi-left.local --dry-run
+"""
 UNINSTALL_EXAMPLES = """examples:
   phalanx uninstall pi-left.local pi-right.local
         services, programs, keys and calibration are gone; what apt brought stays
@@ -47,8 +53,17 @@ FLEET_EXAMPLES = """examples:
 
 
 def add_commands(add_parser: AddParser, calibration: Path) -> None:
-    """Add `deploy`, `uninstall`, `fleet` and `wheels`."""
+    """Add `deploy`, `rollback`, `uninstall`, `fleet` and `wheels`."""
     _add_deploy(add_parser, calibration)
+    rollback = _command(
+        add_parser,
+        "rollback",
+        "machines back to what they had before the last deployment",
+        "One step back. It waits until what was before is ready; the release that is left is removed.",
+        ROLLBACK_EXAMPLES,
+    )
+    rollback.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
+    _reach(rollback)
     uninstall = _command(
         add_parser,
         "uninstall",

@@ -3,7 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
@@ -71,6 +71,8 @@ class Host:
         sudo: Whether root is reached by sudo.
         changed: Whether something was changed, which can be taken back.
         reboot: Whether it runs only after it was restarted.
+        start_s: How long its slaves took to start before [s]; None: none runs.
+        known: Machines that were looked at, and by which name; the same of all of a command.
     """
 
     target: Target
@@ -79,6 +81,8 @@ class Host:
     sudo: bool = False
     changed: bool = False
     reboot: bool = False
+    start_s: float | None = None
+    known: dict[str, str] = field(default_factory=dict[str, str])
 
     def deploy(self, wish: Wish) -> None:
         """Bring it to what is wanted.
@@ -88,7 +92,7 @@ class Host:
         """
         camera = wish.driver(self.target.names)
         picamera2 = camera.startswith(_PICAMERA2)
-        facts = self.look(camera)
+        facts = self.look(camera, wish.apt)
         self._packages(facts, wish, picamera2)
         old = facts["codename"] == "bookworm"  # whose simplejpeg was built for numpy 1
         kind = Kind(
@@ -122,7 +126,7 @@ class Host:
         self.reboot = bool(done.get("reboot"))
         self.say(str(done["text"]))
 
-    def look(self, camera: str = "") -> dict[str, object]:
+    def look(self, camera: str = "", apt: bool = True) -> dict[str, object]:
         """What it is like.
 
         Raises:
@@ -130,7 +134,7 @@ class Host:
         """
         lines: list[tuple[float, str]] = []
         code = self.remote.run(
-            command(["probe", *([camera] if camera else [])], sudo=False),
+            command(["probe", camera, *([] if apt else ["--no-apt"])], sudo=False),
             _plain_bundle(),
             lambda line: lines.append((time.time(), line)),
             _PROBE_S,
@@ -141,7 +145,11 @@ class Host:
         arrived, facts = results[-1]
         if facts["why_not"] is not None:
             raise DeployError(str(facts["why_not"]))
+        first = self.known.setdefault(str(facts["boot_id"]), self.target.host)
+        if first != self.target.host:
+            raise DeployError(f"is the same machine as {first}: write NAME+NAME=HOST for two cameras of one")
         self.sudo = facts["user"] != "root"
+        self.start_s = cast("float | None", facts["start_s"])
         python = ".".join(str(part) for part in cast(list[int], facts["python"]))
         self.say(f"{facts['model']}, {facts['os']}, {facts['machine']}, Python {python}")
         ahead_s = cast(int, facts["t_unix_ns"]) * 1e-9 - arrived
@@ -151,9 +159,14 @@ class Host:
             )
         return facts
 
-    def roll_back(self) -> str:
-        """Let it go back to what was before; the text of what is there now."""
-        return str(self._act(["install", "--json", "--roll-back"], _plain_bundle())["text"])
+    def roll_back(self, dry_run: bool = False) -> str:
+        """Let it go back to what was before; the text of what is there now.
+
+        Raises:
+            DeployError: There was nothing before, or it does not run.
+        """
+        words = ["install", "--json", "--rollback", *(["--dry-run"] if dry_run else [])]
+        return str(self._act(words, _plain_bundle())["text"])
 
     def uninstall(self, dry_run: bool) -> None:
         """Take everything of ours away.

@@ -25,18 +25,27 @@ _SETTINGS = (
     f"ServerAliveCountMax={ALIVE_TIMES}",
 )
 _NOT_REACHED = 255  # ssh's own exit code
-_HINTS = (
+_HINTS = (  # the first that is found: a changed host key is said with two of them
     (
         "Could not resolve hostname",
         "no machine of that name is known here; switched on, in this network? Or give its address in place of HOST",
     ),
     ("Connection refused", "no sshd answers on HOST: sudo systemctl enable --now ssh there, or give --port"),
+    (
+        "No route to host",
+        "nobody has the address HOST: switched on, in this network, is its address another now?",
+    ),
+    ("Network is unreachable", "this machine has no way to HOST: is its own network up?"),
+    (
+        "Connection timed out",
+        "HOST does not answer: switched on, in this network? A firewall that drops port 22?",
+    ),
     ("Permission denied", "your key is not known there: ssh-copy-id HOST"),
-    ("Host key verification failed", "its host key is not known here: ssh HOST once, and look at it"),
     (
         "REMOTE HOST IDENTIFICATION",
-        "another machine answers than before: ssh-keygen -R HOST, if that is meant",
+        "another machine answers than before: ssh-keygen -R ADDRESS, if that is meant",
     ),
+    ("Host key verification failed", "its host key is not known here: ssh HOST once, and look at it"),
 )
 
 
@@ -205,7 +214,7 @@ def _plain(errors: Sequence[str], host: str) -> str:
     text = "\n".join(errors)
     for sign, hint in _HINTS:
         if sign in text:
-            return f"{sign}: {hint.replace('HOST', host)}"
+            return f"{sign}: {hint.replace('HOST', host).replace('ADDRESS', host.rpartition('@')[2])}"
     own = [
         line
         for line in errors

@@ -92,6 +92,7 @@ def _gathered(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Whe
         files = sorted(folder.glob("*.whl"))
         if not files:
             raise DeployError(f"--wheelhouse {given}: no wheels in it")
+        _check_given(files, kind, given)
         if not any(file.name.startswith("phalanx_hand-") for file in files):
             files.append(own_wheel())
         files.sort(key=lambda file: file.name)  # as the installer there names it, too
@@ -100,6 +101,38 @@ def _gathered(kind: Kind, given: Path | None, say: Callable[[str], None]) -> Whe
             digest.update(file.name.encode() + hashlib.sha256(file.read_bytes()).digest())
         versions = [file.name.split("-")[1] for file in files if file.name.startswith("phalanx_hand-")]
         return Wheels(tuple(files), f"{versions[-1]}-{digest.hexdigest()[:8]}")
+
+
+def _check_given(files: Iterable[Path], kind: Kind, given: Path | None) -> None:
+    """Refuse wheels of another kind of machine here, where it costs nothing.
+
+    Raises:
+        DeployError: Names the first of them.
+    """
+    for file in files if given is not None else ():
+        if not fits(file.name, kind):
+            raise DeployError(
+                f"--wheelhouse {given}: {file.name} is not for {kind.machine} with Python {kind.python}; "
+                f"those that are: phalanx wheels DIR --machine {kind.machine} --python {kind.python}"
+            )
+
+
+def fits(wheel: str, kind: Kind) -> bool:
+    """Whether a wheel can be installed on such a machine, by the tags of its name (PEP 427)."""
+    parts = wheel.removesuffix(".whl").split("-")
+    if len(parts) < 5:
+        return False
+    pythons, abis, platforms = parts[-3:]
+    if platforms != "any" and not any(one.endswith(kind.machine) for one in platforms.split(".")):
+        return False
+    own = int(kind.python.replace(".", "", 1))
+    for python in pythons.split("."):
+        number = int(re.sub(r"\D", "", python) or 0)
+        if python.startswith("py") and number in (3, own):
+            return True
+        if python.startswith("cp") and (number == own or ("abi3" in abis and number <= own)):
+            return True
+    return False
 
 
 def export(kind: Kind, folder: Path, say: Callable[[str], None]) -> Wheels:

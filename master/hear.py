@@ -56,7 +56,7 @@ def hear(
     bus: BusEnd = HERE_BUS,
     key_file: KeyFile = None,
     as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object: name -> datagrams a second.")
+        bool, typer.Option("--json", help="As JSON: datagrams a second by name, and whether a master runs.")
     ] = False,
 ) -> None:
     """Wait until datagrams of all these senders come, at the master that runs or, where none does, here.
@@ -81,7 +81,7 @@ def hear(
         heard = here(names, setup, rig_key(os.environ, key_file), address(beacon, "--beacon"),
                      address(bind, "--bind"), seconds, stop)  # fmt: skip
     if as_json:
-        typer.echo(json.dumps({"heard": heard}))
+        typer.echo(json.dumps({"heard": heard, "master": connection is not None}))
     for name in names if not as_json else ():
         typer.echo(f"{name}: {f'{heard[name]:.0f} datagrams a second' if name in heard else 'not heard'}")
     if len(heard) < len(set(names)):

@@ -69,9 +69,10 @@ class Service:
         self._rounds, self._since_ns = 0, 0
         self._due_ns = NEVER_NS
 
-    def starting(self, patience_s: float) -> None:
-        """To become ready may take so long from now [s]."""
-        self._send(f"EXTEND_TIMEOUT_USEC={round(patience_s * 1e6)}")
+    def starting(self, patience_s: float, what: str = "compiles") -> None:
+        """To become ready may take so long from now [s]: the manager waits, and so does an installer, by the status."""
+        status = f"{_line(what)}: may take {patience_s:.0f} s"
+        self._send(f"STATUS={status}\nEXTEND_TIMEOUT_USEC={round(patience_s * 1e6)}")
 
     def ready(self, linked: Callable[[], bool]) -> None:
         """It is open, and waits for the master; from here on the loop is to come round.
@@ -107,7 +108,7 @@ class Service:
     def away(self, what: str, patience_s: float = AWAY_S) -> None:
         """A device is lost, or something else takes time: the next round may be so late [s]."""
         if not self._ready:
-            self.starting(patience_s)
+            self.starting(patience_s, what)
             return
         self._patient = True
         self._send(f"STATUS={_line(what)}{self._fed(round(patience_s * 1e6))}", wait=True)

@@ -1,8 +1,9 @@
 """`python3 -m slave.install`: the installer before anything is installed."""
 
+import json
 import sys
 
-from slave.install.command import main
+from slave.install.probe import OLDEST, judge, probe
 
 
 def say(line: str) -> None:
@@ -13,5 +14,22 @@ def say(line: str) -> None:
         sys.stdout = sys.stderr = open("/dev/null", "w")  # noqa: PTH123, SIM115 - until the end
 
 
+def refuse(action: str) -> int:
+    """Say what an old Python needs to be told, in its own words: the installer itself it cannot read."""
+    facts = probe()
+    why = judge(facts)
+    say(json.dumps({"result": {**facts, "why_not": why}}) if action == "probe" else f"phalanx-slave: {why}")
+    return 0 if action == "probe" else 1
+
+
+def main() -> int:
+    """Hand on what is asked for; the exit code."""
+    if sys.version_info[:2] < OLDEST:
+        return refuse("".join(sys.argv[1:2]))
+    from slave.install import command
+
+    return command.main(sys.argv[1:], say)
+
+
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:], say))
+    sys.exit(main())

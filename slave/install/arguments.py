@@ -14,6 +14,8 @@ EXAMPLES = """\
         a wrist device: its camera and its IMU, each a service
   sudo phalanx-slave install --master 192.168.1.2 --rig desk --name left --dry-run
         only say what would be changed; the keys that are there stay
+  sudo phalanx-slave install --rollback
+        go back to what was before the last installation
   sudo phalanx-slave install --uninstall
         take everything away again but the packages of apt
 """
@@ -36,7 +38,13 @@ def add_install(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-apt", action="store_true", help="install no packages of the system")
     parser.add_argument("--dry-run", action="store_true", help="write nothing; say what would be changed")
-    parser.add_argument("--uninstall", action="store_true", help="take everything away again")
+    ends = parser.add_mutually_exclusive_group()
+    ends.add_argument(
+        "--rollback",
+        action="store_true",
+        help="go back to release, options, keys and calibration as they were before the last installation",
+    )
+    ends.add_argument("--uninstall", action="store_true", help="take everything away again")
     parser.add_argument(
         "--ready-s",
         type=float,
@@ -48,5 +56,4 @@ def add_install(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--root", type=Path, default=Path("/"), help=argparse.SUPPRESS)
     parser.add_argument("--bundle", type=Path, help=argparse.SUPPRESS)  # keys and calibration, from the PC
     parser.add_argument("--release", help=argparse.SUPPRESS)
-    parser.add_argument("--roll-back", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--json", action="store_true", help=argparse.SUPPRESS)

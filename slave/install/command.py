@@ -21,6 +21,7 @@ from slave.install.probe import judge, probe
 from slave.install.release import Source
 from slave.install.removal import packages, uninstall
 from slave.install.systemd import Systemd
+from slave.install.wanted import ETC
 
 Say = Callable[[str], None]
 _LEFT_S = 3600.0  # no installation takes so long
@@ -58,9 +59,8 @@ def _act(options: argparse.Namespace, machine: steps.Machine) -> dict[str, objec
             else "nothing of ours is there"
         )
         return {"removed": gone, "text": text}
-    if options.roll_back:
-        current = steps.roll_back(machine)
-        return {"release": current, "text": f"back at release {current}"}
+    if options.rollback:
+        return {"text": steps.roll_back(machine, options.dry_run)}
     if options.bundle is not None:
         keys, calibration = bundle.from_archive(options.bundle)
     else:
@@ -106,8 +106,9 @@ def _prepare(options: argparse.Namespace, picamera2: bool, machine: steps.Machin
     """
     if options.root != Path("/"):
         return
-    facts = probe(options.root)
-    if (why := judge(facts)) is not None:
+    camera = "picamera2" if picamera2 else ""
+    facts = probe(options.root, camera)
+    if (why := judge(facts, camera, not options.no_apt)) is not None:
         raise InstallError(why)
     wanted = missing_packages(facts["packages"], picamera2)
     if options.no_apt or options.dry_run:
@@ -122,6 +123,16 @@ def missing_packages(there: list[str], picamera2: bool) -> list[str]:
     return [name for name in ("chrony", *(["python3-picamera2"] if picamera2 else [])) if name not in there]
 
 
+def _start_s(systemd: Systemd) -> float | None:
+    """How long the slowest slave of this machine took to start [s]; None: none runs, or nobody can tell."""
+    units = [f"phalanx-slave@{path.stem}.service" for path in (Path("/") / ETC).glob("*.env")]
+    try:
+        took = [systemd.state(unit).start_s for unit in units]
+    except InstallError:
+        return None
+    return max((one for one in took if one is not None), default=None)
+
+
 def _end(options: argparse.Namespace, say: Say, result: dict[str, object], text: str, code: int) -> int:
     say(json.dumps({"result": result}) if options.json else text)
     return code
@@ -130,12 +141,16 @@ def _end(options: argparse.Namespace, say: Say, result: dict[str, object], text:
 def main(arguments: list[str], say: Say, systemd: Systemd | None = None) -> int:
     """`python3 -m slave.install ACTION ...`: what the PC runs before a slave is installed.
 
-    `install` is `phalanx-slave install`; `probe [CAMERA]` says what the machine is like; `packages NAME...` calls apt.
+    `install` is `phalanx-slave install`; `probe [CAMERA [--no-apt]]` says what the machine is like; `packages NAME...`
+    calls apt.
     """
     action, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
     if action == "probe":
-        facts = probe(camera=rest[0] if rest else "")
-        say(json.dumps({"result": facts | {"why_not": judge(facts, rest[0] if rest else "")}}))
+        camera = rest[0] if rest else ""
+        facts = probe(camera=camera)
+        why_not = judge(facts, camera, "--no-apt" not in rest[1:])
+        found = {"why_not": why_not, "start_s": _start_s(systemd or Systemd())}
+        say(json.dumps({"result": facts | found}))
         return 0
     if action == "packages":
         try:

@@ -55,13 +55,20 @@ def probe(root: Path = Path("/"), camera: str = "") -> dict[str, Any]:
         "cameras": _cameras() if camera.startswith("picamera2") else None,
         "releases": sorted(path.name for path in (root / RELEASES / "releases").glob("[!.]*")),
         "hostname": platform.node(),
+        "boot_id": _text(root / "proc/sys/kernel/random/boot_id").strip(),
     }
     found["t_unix_ns"] = time.time_ns()  # last: the asker compares it with the moment at which it arrives
     return found
 
 
-def judge(facts: dict[str, Any], camera: str = "") -> str | None:
-    """One line why nothing can be installed there, with what to do; None: it can."""
+def judge(facts: dict[str, Any], camera: str = "", apt: bool = True) -> str | None:
+    """One line why nothing can be installed there, with what to do; None: it can.
+
+    Args:
+        facts: Of `probe`.
+        camera: Driver that will be used.
+        apt: Whether packages that are missing will be installed.
+    """
     python = tuple(facts["python"])
     if facts["bits"] != 64 or facts["machine"] not in MACHINES:
         return (
@@ -87,6 +94,11 @@ def judge(facts: dict[str, Any], camera: str = "") -> str | None:
     if facts["cameras"] == []:
         return "libcamera finds no camera: look at its cable, then at `rpicam-hello --list-cameras`"
     driver, _, device = camera.partition(":")
+    if driver == "picamera2" and facts["cameras"] is None and not apt:
+        return (
+            "--camera picamera2: the system's Python has none: sudo apt install python3-picamera2 there, leave out "
+            "--no-apt, or name another camera"
+        )
     if driver == "v4l2" and not facts["video"]:
         return f"--camera {camera}: no V4L2 camera is there ({device or '/dev/video0'}); is it plugged in?"
     return None

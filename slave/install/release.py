@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -60,6 +61,12 @@ class Source:
         """The environment that this runs in."""
         return Source(None, Path(sysconfig.get_path("purelib")))
 
+    def _release(self) -> str | None:
+        """The release that the installer runs from, if it does: then only options, keys or files change."""
+        assert self.site is not None
+        parts = self.site.resolve().parts
+        return parts[4] if parts[:4] == ("/", *RELEASES.split("/")) and len(parts) > 4 else None
+
     def name(self) -> str:
         """Version and a hash of all that is in it: other content is another release.
 
@@ -75,6 +82,8 @@ class Source:
             where = self.wheels
         else:
             assert self.site is not None
+            if (own := self._release()) is not None:
+                return own
             for package in distributions(path=[str(self.site)]):
                 digest.update((package.read_text("RECORD") or package.name).encode())
             for file in sorted(_own_packages(self.site).rglob("*.py")):
@@ -162,6 +171,10 @@ def _install_wheels(fresh: Path, wheels: Path) -> None:
         raise InstallError(f"{wheels}: no wheels there (another installation removed its own?); deploy again")
     names = sorted({wheel.name.split("-")[0] for wheel in found} - {"pip"})
     pips = [wheel for wheel in found if wheel.name.startswith("pip-")]
+    if not pips and importlib.util.find_spec("pip") is None:
+        raise InstallError(
+            f"{wheels}: no wheel of pip in it, and this system has no pip; on a PC `phalanx wheels DIR` gathers all"
+        )
     pip = [sys.executable, str(pips[-1] / "pip")] if pips else [sys.executable, "-m", "pip"]
     python = str(fresh / "bin/python")
     command = [

@@ -30,6 +30,10 @@ from slave.install.wanted import (
 )
 
 _UNITS = "phalanx-slave@{}.service"
+LEAST_S = (
+    10.0  # even a slave that starts in one second has so long, on a machine that is busy with its new release
+)
+TIMES = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class Machine:
         root: Where its files are.
         systemd: Its services.
         say: Told one line a step.
-        ready_s: How long its slaves may take until they are ready.
+        ready_s: How long its slaves may take until they are ready, at most.
         settle_s: How long they then have to stay so.
     """
 
@@ -49,6 +53,14 @@ class Machine:
     say: Callable[[str], None]
     ready_s: float
     settle_s: float
+
+    def limit_s(self, unit: str) -> float:
+        """How long the next start of a slave may take that runs now with the same options [s].
+
+        While it is waited for, its camera sees nothing: so it is judged by its own last start on this machine.
+        """
+        took_s = self.systemd.state(unit).start_s
+        return self.ready_s if took_s is None else min(self.ready_s, max(LEAST_S, TIMES * took_s))
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
         """While nobody else installs on it.
@@ -120,20 +132,21 @@ def install(plan: Plan, source: Source, name: str, machine: Machine, dry_run: bo
         return outcome
 
 
-def roll_back(machine: Machine, gone: bool = True) -> str:
-    """Go back to what was before the last installation; the release that is current then.
+def roll_back(machine: Machine, dry_run: bool = False) -> str:
+    """Go back to what was before the last installation; one line of what is there then, or would be.
 
     Raises:
-        InstallError: There was none before, or what was before does not run either.
+        InstallError: There was none before, or what was before does not run.
     """
-    with machine.alone():
-        left = _current(machine.root)
-        senders = _senders(machine.root)
-        _take_back(machine, senders)
-        now = _current(machine.root)
-        if gone and left is not None and left != now:
+    with contextlib.nullcontext() if dry_run else machine.alone():
+        left, before = _current(machine.root), Transaction(machine.root).release_before
+        text = f"release {before}" if before else "no release, as before the first installation"
+        if dry_run:
+            return f"would go back to {text}"
+        _take_back(machine, _senders(machine.root))
+        if left is not None and left != before:
             release.remove(machine.root, left)
-        return now or "none"
+        return f"back at {text}"
 
 
 def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: Machine) -> Outcome:
@@ -161,6 +174,10 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         OSError: A file cannot be written.
     """
     run, root = machine.systemd.run, machine.root
+    limits = {  # before anything is stopped
+        s.unit: machine.ready_s if f"{ETC}/{s.name}.env" in outcome.changed else machine.limit_s(s.unit)
+        for s in plan.senders
+    }
     for path in outcome.changed:
         if path == CURRENT:
             continue
@@ -185,7 +202,7 @@ def _apply(plan: Plan, files: dict[str, File | None], name: str, outcome: Outcom
         machine.say(f"starting {', '.join(outcome.restarted)}")
         run(["systemctl", "restart", "--no-block", *outcome.restarted])
     try:
-        machine.systemd.wait_ready([s.unit for s in plan.senders], machine.ready_s, machine.settle_s)
+        machine.systemd.wait_ready(limits, machine.settle_s)
     except NotReadyError as error:
         if not outcome.reboot:
             raise
@@ -231,7 +248,7 @@ def _take_back(machine: Machine, started: set[str] | None = None) -> None:
         run(["systemctl", "enable", "--quiet", _UNITS.format(name)])
     if again and _current(machine.root) is not None:
         run(["systemctl", "restart", "--no-block", *again])
-        machine.systemd.wait_ready(again, machine.ready_s, machine.settle_s)
+        machine.systemd.wait_ready(dict.fromkeys(again, machine.ready_s), machine.settle_s)
 
 
 def _enable(senders: tuple[Sender, ...], machine: Machine) -> None:

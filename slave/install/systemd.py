@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from slave.install.errors import InstallError, NotReadyError
@@ -25,9 +26,17 @@ _STATUS = {
 }
 
 
+_ASKS = re.compile(r"may take (\d+) s")  # of a service's status: slave/service.py
+
+
 @dataclass(frozen=True, slots=True)
 class UnitState:
-    """How a service is."""
+    """How a service is.
+
+    Attributes:
+        start_s: From the start of its process until it was ready [s]; None: it is not running.
+        says: What it says of itself.
+    """
 
     active: bool
     enabled: bool
@@ -35,6 +44,8 @@ class UnitState:
     restarts: int
     result: str
     status: int
+    start_s: float | None = None
+    says: str = ""
 
 
 Run = Callable[[Sequence[str]], str]
@@ -76,59 +87,76 @@ class Systemd:
         Raises:
             InstallError: systemd does not answer.
         """
-        wanted = "ActiveState,SubState,UnitFileState,MainPID,NRestarts,Result,ExecMainStatus"
+        wanted = "ActiveState,SubState,UnitFileState,MainPID,NRestarts,Result,ExecMainStatus,StatusText"
+        wanted += ",ExecMainStartTimestampMonotonic,ActiveEnterTimestampMonotonic"
         text = self.run(["systemctl", "show", "-p", wanted, unit])
         found = dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
+        runs = (found.get("ActiveState"), found.get("SubState")) == ("active", "running")
+        began, ready = (
+            int(found.get(f"{one}TimestampMonotonic") or 0) for one in ("ExecMainStart", "ActiveEnter")
+        )
         return UnitState(
-            (found.get("ActiveState"), found.get("SubState")) == ("active", "running"),
+            runs,
             found.get("UnitFileState") == "enabled",
             int(found.get("MainPID") or 0),
             int(found.get("NRestarts") or 0),
             found.get("Result", ""),
             int(found.get("ExecMainStatus") or 0),
+            (ready - began) * 1e-6 if runs and 0 < began <= ready else None,
+            found.get("StatusText", ""),
         )
 
-    def wait_ready(self, units: Sequence[str], deadline_s: float, settle_s: float) -> None:
+    def wait_ready(self, limits: Mapping[str, float], settle_s: float) -> None:
         """Wait until all of them said READY=1, and none has restarted since for `settle_s`.
+
+        Args:
+            limits: Service -> how long it may take [s]; one whose status asks for more time while it starts has that.
+            settle_s: How long they then have to stay so [s].
 
         Raises:
             NotReadyError: One does not; its last words are in the text.
         """
-        end = self._now() + deadline_s
-        first = {unit: self.state(unit).restarts for unit in units}
+        began, since = self._now(), time.time() - 1.0
+        ends = {unit: began + limit for unit, limit in limits.items()}
+        first = {unit: self.state(unit).restarts for unit in limits}
         steady: dict[str, tuple[int, float]] = {}
+        patient: set[tuple[str, int, str]] = set()
         while True:
-            for unit in units:
+            for unit in limits:
                 state = self.state(unit)
                 first[unit] = min(first[unit], state.restarts)  # a start by hand begins to count again
                 if state.restarts >= first[unit] + _TRIES:
-                    raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state)}")
+                    raise NotReadyError(f"{unit} ends again and again: {self._why(unit, state, since)}")
                 if not state.active:
                     steady.pop(unit, None)
+                    asked = (unit, state.pid, state.says)
+                    if asked not in patient and (found := _ASKS.search(state.says)):
+                        patient.add(asked)  # once: it does not live on what it said long ago
+                        ends[unit] = max(ends[unit], self._now() + float(found[1]))
                 elif unit not in steady or steady[unit][0] != state.pid:
                     steady[unit] = (state.pid, self._now())
-            since = [self._now() - steady[unit][1] for unit in units if unit in steady]
-            if len(since) == len(units) and (not since or min(since) >= settle_s):
+            stayed = [self._now() - steady[unit][1] for unit in limits if unit in steady]
+            if len(stayed) == len(limits) and (not stayed or min(stayed) >= settle_s):
                 return
-            if self._now() > end:
-                unit = next((unit for unit in units if unit not in steady), units[0])
-                raise NotReadyError(
-                    f"{unit} is not ready after {deadline_s:.0f} s: {self._why(unit, self.state(unit))}"
-                )
+            if late := [u for u in limits if u not in steady and self._now() > ends[u]]:
+                passed_s = self._now() - began
+                why = self._why(late[0], self.state(late[0]), since)
+                raise NotReadyError(f"{late[0]} is not ready after {passed_s:.0f} s: {why}")
+            if stayed and self._now() > max(ends.values()) + settle_s:
+                raise NotReadyError(f"{next(iter(limits))} does not stay ready for {settle_s:g} s")
             self.sleep(_STEP_S)
 
-    def _why(self, unit: str, state: UnitState) -> str:
-        """Its last words, or how systemd ended it."""
+    def _why(self, unit: str, state: UnitState, since: float) -> str:
+        """Its last words since then [s since 1970], or how systemd ended it."""
         if state.status in _STATUS:
             return f"status {_STATUS[state.status]}"
+        words = ["journalctl", f"_SYSTEMD_UNIT={unit}", f"--since=@{since:.0f}"]
         try:
-            text = self.run(
-                ["journalctl", f"_SYSTEMD_UNIT={unit}", "-n", "40", "-o", "cat", "--no-pager", "-q"]
-            )
+            text = self.run([*words, "-n", "40", "-o", "cat", "--no-pager", "-q"])
         except InstallError:
             text = ""
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         own = [line for line in lines if line.startswith("phalanx-slave:")]
         errors = [line for line in lines if "Error" in line]
-        last = (own or errors or lines or [f"result {state.result or 'unknown'}, status {state.status}"])[-1]
-        return last[:300]
+        ended = f"result {state.result}, status {state.status}" if state.status else "it says nothing"
+        return (own or errors or lines or [state.says or ended])[-1][:300]

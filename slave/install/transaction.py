@@ -47,9 +47,14 @@ class Transaction:
         return self._read().get("open", False) is True
 
     @property
-    def is_there(self) -> bool:
-        """Whether there is something that can be taken back."""
-        return bool(self._read())
+    def release_before(self) -> str | None:
+        """The release that was current before; None: there was none.
+
+        Raises:
+            InstallError: There is nothing to take back.
+        """
+        current = self._there()["current"]
+        return None if current is None else Path(current).name
 
     def begin(self, paths: list[str], restarted: list[str]) -> None:
         """Keep what is at `paths`, and which release is current.
@@ -79,9 +84,7 @@ class Transaction:
         Raises:
             InstallError: There is nothing to take back.
         """
-        notes = self._read()
-        if not notes:
-            raise InstallError("there is no earlier installation to go back to")
+        notes = self._there()
         for path, kept in notes["files"].items():
             before = None if kept is None else read(self._root, f"{NOTES}/{kept}")
             if before is None:
@@ -95,6 +98,11 @@ class Transaction:
             point(link, notes["current"])
         self._forget()
         return [str(unit) for unit in notes["restarted"]]
+
+    def _there(self) -> dict[str, Any]:
+        if not (notes := self._read()):
+            raise InstallError("there is no earlier installation to go back to")
+        return notes
 
     def _read(self) -> dict[str, Any]:
         try:

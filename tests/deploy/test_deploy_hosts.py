@@ -13,12 +13,14 @@ from pathlib import Path
 
 import pytest
 
-from deploy import deployment
+from deploy import deployment, hearing
 from deploy import wheelhouse as wheels_module
 from deploy.__main__ import main
 from deploy.bundle import BUNDLE, bundle, command
-from deploy.deployment import Ears, make_keys
+from deploy.deployment import make_keys
 from deploy.fleet import table
+from deploy.hearing import Ears, Heard
+from deploy.keys import prepared_keys
 from deploy.one_host import Host, Wish
 from deploy.remote import Deadline, Remote
 from deploy.targets import DeployError, RigFile, Target, read_rig, targets_of
@@ -172,6 +174,12 @@ def test_a_link_that_hangs_ends_by_the_deadline_with_all_that_it_started(
             "Connection refused: no sshd answers on pi: sudo",
         ),
         ("Host key verification failed.", "its host key is not known here: ssh pi once"),
+        (
+            "@ WARNING: REMOTE HOST IDENTIFICATION HAS CHANGED! @\nHost key verification failed.",
+            "another machine answers than before: ssh-keygen -R pi, if",
+        ),
+        ("ssh: connect to host pi port 22: No route to host", "nobody has the address pi: switched on"),
+        ("ssh: connect to host pi port 22: Connection timed out", "pi does not answer: switched on"),
     ],
 )
 def test_a_host_that_is_not_reached_is_told_in_one_line_with_what_to_do(
@@ -194,7 +202,7 @@ class Remembered(Host):
 
     back = 0
 
-    def roll_back(self) -> str:
+    def roll_back(self, dry_run: bool = False) -> str:
         self.back += 1
         return "back at release 1.0-0"
 
@@ -209,8 +217,8 @@ def _hosts(said: list[str]) -> list[Remembered]:
 
 
 def _hear_only(monkeypatch: pytest.MonkeyPatch, heard: dict[str, float], cause: str | None = None) -> None:
-    def answer(_names: object, _ears: object) -> tuple[dict[str, float], str | None]:
-        return heard, cause
+    def answer(_names: object, _ears: object) -> Heard:
+        return Heard(heard, cause)
 
     monkeypatch.setattr(deployment, "heard_of", answer)
 
@@ -226,6 +234,79 @@ def test_a_machine_that_is_not_heard_goes_back_and_others_stay(monkeypatch: pyte
     }
     assert [host.back for host in hosts] == [1, 0]
     assert "streams: right 30/s" in said
+
+
+def _before(monkeypatch: pytest.MonkeyPatch, heard: Heard) -> hearing.Before:
+    def answer(_names: object, _ears: object, _ended: object) -> Heard:
+        return heard
+
+    monkeypatch.setattr(hearing, "heard_of", answer)
+    return hearing.Before(["left", "right"], Ears((), Path("keys"), 12.0))
+
+
+def test_what_streamed_at_a_master_is_listened_for_as_long_as_it_needs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    streamed = _before(monkeypatch, Heard({"left": 30.0, "right": 30.0}, None, True))
+    assert streamed.at_master
+    assert streamed.ears(1.0).seconds == hearing.LEAST_S
+    assert streamed.ears(3.5).seconds == pytest.approx(7.0)
+    assert streamed.ears(60.0).seconds == pytest.approx(12.0)
+    assert streamed.ears(None).seconds == pytest.approx(12.0), "it did not run: nobody knows"
+    one_silent = _before(monkeypatch, Heard({"left": 30.0}, None, True))
+    assert one_silent.ears(1.0).seconds == pytest.approx(12.0)
+    no_master = _before(monkeypatch, Heard({"left": 30.0, "right": 30.0}, None, False))
+    assert not no_master.at_master
+    assert no_master.ears(1.0).seconds == pytest.approx(12.0)
+
+
+def test_one_machine_by_two_names_is_refused(fake_ssh: Callable[[str], None]) -> None:
+    facts = {"why_not": None, "user": "root", "boot_id": "7", "start_s": None, "model": "m", "os": "o",
+             "machine": "aarch64", "python": [3, 13], "t_unix_ns": time.time_ns()}  # fmt: skip
+    fake_ssh(f"cat > /dev/null; echo '{json.dumps({'result': facts})}'")
+    known: dict[str, str] = {}
+    for name in ("pi.local", "10.0.0.5"):
+        host = Host(Target(name, ("left",)), Remote(name, (), Deadline(60.0)), print, known=known)
+        if name == "pi.local":
+            host.look()
+            continue
+        with pytest.raises(DeployError, match=r"is the same machine as pi.local: write NAME\+NAME=HOST"):
+            host.look()
+
+
+def test_a_dry_run_without_keys_says_so_and_makes_none(tmp_path: Path) -> None:
+    keys, said = tmp_path / "keys", list[str]()
+    with prepared_keys(keys, ["left"], True, said.append) as lent:
+        assert (lent / "devices/left.key").is_file()
+    assert said == [f"would make keys in {keys}"]
+    assert not keys.exists()
+    assert not lent.exists()
+    with prepared_keys(keys, ["left"], False, said.append) as own:
+        assert own == keys
+    del said[:]
+    with prepared_keys(keys, ["left", "right"], True, said.append) as lent:
+        assert (lent / "rig.key").resolve() == (keys / "rig.key").resolve()
+        assert (lent / "devices/right.key").is_file()
+    assert said == [f"would make keys in {keys}"]
+    assert not (keys / "devices/right.key").exists()
+
+
+def test_wheels_of_another_machine_are_refused_here(tmp_path: Path) -> None:
+    kind = wheels_module.Kind("aarch64", "3.13")
+    for name, expected in (
+        ("numpy-2.4-cp313-cp313-manylinux_2_27_aarch64.manylinux_2_28_aarch64.whl", True),
+        ("zenoh-1.1-cp39-abi3-manylinux_2_28_aarch64.whl", True),
+        ("smbus2-0.6-py2.py3-none-any.whl", True),
+        ("numpy-2.4-cp312-cp312-manylinux_2_27_aarch64.whl", False),
+        ("numpy-2.4-cp313-cp313-manylinux_2_27_x86_64.whl", False),
+        ("new-1.0-cp314-abi3-manylinux_2_28_aarch64.whl", False),
+        ("none.whl", False),
+    ):
+        assert wheels_module.fits(name, kind) is expected, name
+    wrong = tmp_path / "numpy-2.4-cp312-cp312-manylinux_2_27_aarch64.whl"
+    wrong.write_bytes(b"")
+    with pytest.raises(DeployError, match=r"phalanx wheels DIR --machine aarch64 --python 3\.13"):
+        wheelhouse(kind, tmp_path, print)
 
 
 def test_what_was_not_changed_stays_and_so_does_all_if_nobody_can_listen(

@@ -31,7 +31,10 @@ LOADED = (
 
 @dataclass
 class FakeSystemd:
-    """Answers `systemctl` as far as an installer asks it. A release with a file BROKEN in it never gets ready."""
+    """Answers `systemctl` as far as an installer asks it.
+
+    A release with a file BROKEN in it ends again and again, one with HANGS never gets ready.
+    """
 
     root: Path
     asked: list[str] = field(default_factory=list[str])
@@ -39,6 +42,7 @@ class FakeSystemd:
     pids: dict[str, int] = field(default_factory=dict[str, int])
     restarts: dict[str, int] = field(default_factory=dict[str, int])
     now_s: float = 0.0
+    start_s: float | None = None  # that the next show tells of a service that runs
 
     def run(self, words: Sequence[str]) -> str:
         self.asked.append(" ".join(words))
@@ -80,16 +84,19 @@ class FakeSystemd:
         return ""
 
     def _show(self, unit: str) -> str:
-        broken = any((self.root / "opt/phalanx/current").resolve().rglob("BROKEN"))
+        current = (self.root / "opt/phalanx/current").resolve()
+        broken, hangs = (any(current.rglob(name)) for name in ("BROKEN", "HANGS"))
         if unit in self.pids and broken:
             self.restarts[unit] += 1
-        runs = unit in self.pids and not broken
+        runs = unit in self.pids and not broken and not hangs
         state = ("active", "running") if runs else ("inactive", "dead")
         enabled = "enabled" if unit in self.enabled else "disabled"
         return (
             f"ActiveState={state[0]}\nSubState={state[1]}\nUnitFileState={enabled}\nMainPID={self.pids.get(unit, 0)}\n"
             f"NRestarts={self.restarts.get(unit, 0)}\nResult=exit-code\nExecMainStatus=1\n"
-        )
+            + (f"ExecMainStartTimestampMonotonic=1\nActiveEnterTimestampMonotonic={1 + self.start_s * 1e6:.0f}\n"
+               if self.start_s is not None else "")
+        )  # fmt: skip
 
     def sleep(self, seconds: float) -> None:
         self.now_s += seconds
@@ -159,7 +166,7 @@ def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def site_of(folder: Path, version: str, broken: bool = False, text: str = "") -> Path:
+def site_of(folder: Path, version: str, broken: bool = False, text: str = "", hangs: bool = False) -> Path:
     """site-packages with a slave that does nothing."""
     package = folder / "slave"
     (package / "imu").mkdir(parents=True)
@@ -170,8 +177,8 @@ def site_of(folder: Path, version: str, broken: bool = False, text: str = "") ->
     info.mkdir()
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: phalanx-hand\nVersion: {version}\n")
     (info / "RECORD").write_text("")
-    if broken:
-        (package / "BROKEN").write_text("")
+    for name in [name for name, is_so in (("BROKEN", broken), ("HANGS", hangs)) if is_so]:
+        (package / name).write_text("")
     return folder
 
 

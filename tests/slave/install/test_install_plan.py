@@ -200,6 +200,13 @@ def test_a_machine_that_cannot_is_told_why(facts: dict[str, object], camera: str
     assert said in (judge(FACTS | facts, camera) or "")
 
 
+def test_picamera2_has_to_be_there_only_where_apt_may_not_bring_it() -> None:
+    without = FACTS | {"cameras": None}
+    assert judge(without, "picamera2") is None
+    assert "sudo apt install python3-picamera2" in (judge(without, "picamera2:1", apt=False) or "")
+    assert judge(without, "v4l2", apt=False) is None
+
+
 def test_this_machine_is_described() -> None:
     facts = probe()
     assert set(facts) >= set(FACTS)
@@ -223,16 +230,53 @@ def test_a_service_that_restarts_or_says_nothing_is_not_ready() -> None:
         sub = "running" if active == "active" else "start"
         return f"ActiveState={active}\nSubState={sub}\nMainPID={pid}\nNRestarts={restarts}\nExecMainStatus={status}\n"
 
-    services([state("activating")] * 3 + [state("active", 7)]).wait_ready(["a"], 30.0, 2.0)
+    services([state("activating")] * 3 + [state("active", 7)]).wait_ready({"a": 30.0}, 2.0)
     with pytest.raises(NotReadyError, match="a ends again and again: phalanx-slave: no camera"):
-        services([state("active", n, n) for n in range(9)]).wait_ready(["a"], 30.0, 2.0)
+        services([state("active", n, n) for n in range(9)]).wait_ready({"a": 30.0}, 2.0)
     old = state("deactivating", 3, 9)  # a count of before, until systemd has begun again
     with pytest.raises(NotReadyError, match="again and again"):
         services([old, old, *(state("activating", n, n // 4) for n in range(12))]).wait_ready(
-            ["a"], 30.0, 2.0
+            {"a": 30.0}, 2.0
         )
     with pytest.raises(NotReadyError, match="not ready after 5 s: status 243/CREDENTIALS"):
-        services([state("activating", status=243)]).wait_ready(["a"], 5.0, 2.0)
-    restarted = [state("active", 7)] * 5 + [state("active", 8, 1)] * 9
-    with pytest.raises(NotReadyError):
-        services(restarted).wait_ready(["a"], 2.2, 2.0)
+        services([state("activating", status=243)]).wait_ready({"a": 5.0}, 2.0)
+    with pytest.raises(NotReadyError, match="a does not stay ready for 2 s"):
+        services([state("active", pid) for pid in range(30)]).wait_ready({"a": 2.2}, 2.0)
+
+
+def test_a_service_that_asks_for_time_to_start_has_it_once() -> None:
+    clock = [0.0]
+
+    def services(says: str, ready_s: float) -> Systemd:
+        def run(words: object) -> str:
+            assert isinstance(words, list)
+            if words[0] == "journalctl":
+                return ""
+            active = clock[0] >= ready_s
+            state = ("active", "running") if active else ("activating", "start")
+            return f"ActiveState={state[0]}\nSubState={state[1]}\nMainPID=7\nStatusText={says}\n"
+
+        return Systemd(run, lambda: clock[0], lambda seconds: clock.__setitem__(0, clock[0] + seconds))
+
+    services("compiles: may take 180 s", 100.0).wait_ready({"a": 10.0}, 2.0)
+    clock[0] = 0.0
+    with pytest.raises(NotReadyError, match="a is not ready after 180 s: compiles"):
+        services("compiles: may take 180 s", 1e9).wait_ready({"a": 10.0}, 2.0)
+    clock[0] = 0.0
+    with pytest.raises(NotReadyError, match="a is not ready after 10 s: it says nothing"):
+        services("", 1e9).wait_ready({"a": 10.0}, 2.0)
+
+
+def test_how_long_a_service_took_to_start_is_known_while_it_runs() -> None:
+    def started(active: str, began_us: int, ready_us: int) -> float | None:
+        sub = "running" if active == "active" else "start"
+        text = (
+            f"ActiveState={active}\nSubState={sub}\nExecMainStartTimestampMonotonic={began_us}\n"
+            f"ActiveEnterTimestampMonotonic={ready_us}\n"
+        )
+        return Systemd(lambda _words: text).state("a").start_s
+
+    assert started("active", 7_000_000, 9_500_000) == pytest.approx(2.5)
+    assert started("activating", 7_000_000, 9_500_000) is None
+    assert started("activating", 12_000_000, 9_500_000) is None
+    assert started("active", 0, 0) is None

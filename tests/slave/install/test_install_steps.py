@@ -86,7 +86,55 @@ def test_a_sender_that_is_served_no_more_is_removed_with_its_keys(board: Board, 
 def test_an_upgrade_keeps_the_release_before_and_no_other(board: Board, tmp_path: Path) -> None:
     names = [board.install(site_of(tmp_path / f"site{n}", f"1.{n}")).release for n in range(3)]
     assert sorted(p.name for p in (board.root / "opt/phalanx/releases").iterdir()) == sorted(names[1:])
-    assert steps.roll_back(board.machine) == names[1]
+
+
+def test_going_back_restores_release_options_and_calibration_once(
+    board: Board, site: Path, tmp_path: Path
+) -> None:
+    old = board.install(site).release
+    before = board.files()
+    board.install(site_of(tmp_path / "site2", "2.0"), "--options", "--seed 8")
+    after, asked = board.files(), len(board.systemd.asked)
+    assert steps.roll_back(board.machine, dry_run=True) == f"would go back to release {old}"
+    assert board.files() == after
+    assert len(board.systemd.asked) == asked
+    assert steps.roll_back(board.machine) == f"back at release {old}"
+    assert {p: v for p, v in board.files().items() if not p.startswith(NOTES)} == {
+        p: v for p, v in before.items() if not p.startswith(NOTES)
+    }
+    assert UNIT in board.systemd.pids
+    with pytest.raises(InstallError, match="there is no earlier installation to go back to"):
+        steps.roll_back(board.machine)
+
+
+def test_going_back_from_the_first_installation_leaves_no_service(board: Board, site: Path) -> None:
+    board.install(site)
+    assert steps.roll_back(board.machine) == "back at no release, as before the first installation"
+    assert not board.systemd.pids
+    assert not list((board.root / "opt/phalanx/releases").iterdir())
+
+
+def test_a_version_that_hangs_is_taken_back_by_what_the_one_before_needed(
+    board: Board, site: Path, tmp_path: Path
+) -> None:
+    board.install(site)
+    board.systemd.start_s = 1.0
+    began = board.systemd.now_s
+    with pytest.raises(InstallError, match=r"is not ready after 10 s: .*; everything is as before"):
+        board.install(site_of(tmp_path / "bad", "2.0", hangs=True))
+    assert board.systemd.now_s - began < 13.0
+    board.systemd.start_s, began = 5.0, board.systemd.now_s
+    with pytest.raises(InstallError, match="is not ready after 20 s"):
+        board.install(site_of(tmp_path / "slower", "3.0", hangs=True))
+    with pytest.raises(InstallError, match="is not ready after 30 s"):  # with other options nobody knows
+        board.install(site_of(tmp_path / "other", "4.0", hangs=True), "--options", "--seed 8")
+    assert UNIT in board.systemd.pids
+
+
+def test_the_release_that_the_installer_runs_from_is_not_made_again(board: Board, site: Path) -> None:
+    name = board.install(site).release
+    inside = Path("/") / release.RELEASES / name / "lib/python3.13/site-packages"
+    assert Source(None, inside).name() == name
 
 
 def test_what_does_not_run_is_taken_back_and_says_why(board: Board, site: Path, tmp_path: Path) -> None:
