@@ -146,6 +146,11 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         if not np.isnan(self.rival_uv[np.isnan(self.uv[:, 0])]).all():
             raise ValueError("rival_uv: a rival of a marker that is not seen")
 
+    @property
+    def has_rivals(self) -> bool:
+        """Whether a marker has a rival."""
+        return self.rival_uv is not _nowhere(len(self.area)) and not bool(np.isnan(self.rival_uv).all())
+
 
 class WristDetections(Message, frozen=True, eq=False, tag=True):
     """What the camera of a wrist device saw in one strobed triple (ambient, laser, LED), fingers thumb ... little.
@@ -676,7 +681,7 @@ _DECODER = msgspec.msgpack.Decoder(
 
 def encode(message: Message) -> bytes:
     """Return the message as msgpack bytes."""
-    if isinstance(message, MarkerDetections) and np.isnan(message.rival_uv).all():
+    if isinstance(message, MarkerDetections) and not message.has_rivals:
         message = copy(message)
         msgspec.structs.force_setattr(message, "rival_uv", _NONE)
     return _ENCODER.encode(message)

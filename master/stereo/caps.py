@@ -16,6 +16,7 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import cross
 from common.hand_model import HandJoints, HandModel
+from master.stereo.together import together
 
 _RINGS, _SPOKES = 16, 48
 _ANGLES = 90  # steps of the tables
@@ -107,7 +108,7 @@ class CapModel:
     def anyhow(self, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
         """Directions (5, K, 3) of the K caps at (M, 3) [m] while no hand is known: towards the cameras, and four bent
         away from them as far as the cap is still seen."""
-        back = np.mean([camera.centre for camera in cameras], axis=0) - points_m[self._marker]
+        back = together(cameras).centre.mean(axis=0) - points_m[self._marker]
         back /= np.sqrt(np.vecdot(back, back))[:, None]
         right = cross(back, cameras[0].T_rig_camera[:3, 1])
         right /= np.sqrt(np.vecdot(right, right))[:, None]
@@ -122,16 +123,20 @@ class CapModel:
         if not self._joint:
             return CapLook(bias, whole)
         middle = points_m[self._marker]
-        back = np.array([camera.centre for camera in cameras])[:, None] - middle  # (C, K, 3)
+        every = together(cameras)
+        back = every.centre[:, None] - middle  # (C, K, 3)
         back /= np.sqrt(np.vecdot(back, back))[..., None]
         cosine = np.clip(np.vecdot(ahead[:, None], back), -1.0, 1.0)  # (T, C, K)
         across = back - cosine[..., None] * ahead[:, None]
         along, towards, shown = np.moveaxis(self._seen(np.arccos(cosine)), -1, 0)
         sine = np.maximum(np.sqrt(1.0 - cosine * cosine), 1e-9)
         shift = along[..., None] * ahead[:, None] + (towards / sine)[..., None] * across
-        for c, camera in enumerate(cameras):
-            there = camera.project(np.concatenate([middle + shift[:, c], middle[None]]))
-            bias[:, c, self._marker] = there[:-1] - there[-1]
+        # Of each camera the caps as they point in each direction, and last their centroids (C, (T + 1) K, 3).
+        points = np.empty((len(cameras), len(ahead) + 1, *middle.shape))
+        np.add(middle, shift.swapaxes(0, 1), out=points[:, :-1])
+        points[:, -1] = middle
+        there = every.project(points.reshape(len(cameras), -1, 3)).reshape(*points.shape[:3], 2)
+        bias[:, :, self._marker] = (there[:, :-1] - there[:, -1:]).swapaxes(0, 1)
         whole[..., self._marker] = shown
         return CapLook(np.nan_to_num(bias), np.nan_to_num(whole))
 
@@ -166,9 +171,9 @@ class CapModel:
             whole_m2: Areas (T, C, M) that the whole caps show where they point in T directions; doubted is what none
                 of them explains.
         """
-        scale = np.stack(
-            [_project_scale(camera) / np.linalg.norm(points_m - camera.centre, axis=1) for camera in cameras]
-        )
+        every = together(cameras)
+        away = points_m - every.centre[:, None]
+        scale = every.scale[:, None] / np.sqrt(np.vecdot(away, away))
         size_m2 = area_px2 / scale**2
         best_m2 = np.fmax.reduce(size_m2, axis=0)
         share = size_m2 / best_m2
@@ -207,10 +212,6 @@ def _looks(points: Float, normals: Float, areas: Float) -> Float:
     shown = facing.sum(axis=1)
     seen = facing @ points / np.maximum(shown, _SPECK_M2)[:, None]
     return np.stack([-seen[:, 2], seen[:, 0], shown], axis=1)
-
-
-def _project_scale(camera: CameraModel) -> float:
-    return float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
 
 
 def cap_surface(radius_m: float, ahead_m: float) -> tuple[Float, Float, Float]:

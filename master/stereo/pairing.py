@@ -78,6 +78,7 @@ class Pairing:
             continuous: False: frames are unrelated poses, nothing is carried from one to another.
         """
         self._names = tuple(cameras)
+        self._index = {name: c for c, name in enumerate(cameras)}
         self._cameras = tuple(cameras.values())
         period_ns = int(1e9 / min(frame_rate_hz[name] for name in self._names))
         self._deadline_ns = int(1.25 * period_ns)
@@ -89,7 +90,11 @@ class Pairing:
         self._policy, self._continuous = policy, continuous
         self.outdated = 0
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
-        self._waiting = [0] * len(self._names)  # frames of other cameras since this one's last
+        self._frames, self._last = (
+            0,
+            [0] * len(self._names),
+        )  # of all cameras; how many those were at each one's last
+        self._awaited = 0  # the camera that was waited for when somebody asked last
         self._pending: deque[int] = deque()
         self._origin_ns: int | None = None
         self._newest_ns = -(2**63)
@@ -101,11 +106,11 @@ class Pairing:
         Raises:
             ValueError: The camera is not of this rig (ingest lets no such message pass).
         """
-        if message.camera not in self._names:
+        index = self._index.get(message.camera)
+        if index is None:
             raise ValueError(
                 f"camera {message.camera!r} is not of this rig, which has {', '.join(self._names)}"
             )
-        index = self._names.index(message.camera)
         camera = self._cameras[index]
         if self._origin_ns is None:
             self._origin_ns = message.t_ns
@@ -113,7 +118,7 @@ class Pairing:
         centre_ns = message.t_ns + round(half)
         if self._seen[index] and centre_ns <= self._seen[index][-1].centre_ns:
             return []  # a restarted slave's first clock estimate may step back: wait until time goes on
-        rivals = None if np.isnan(message.rival_uv).all() else message.rival_uv
+        rivals = message.rival_uv if message.has_rivals else None
         self._seen[index].append(
             Sighting(
                 centre_ns=centre_ns,
@@ -125,7 +130,8 @@ class Pairing:
             )
         )
         self._newest_ns = max(self._newest_ns, centre_ns)
-        self._waiting = [0 if c == index else count + 1 for c, count in enumerate(self._waiting)]
+        self._frames += 1
+        self._last[index] = self._frames
         newest_instant = self._pending[-1] if self._pending else self._emitted_ns
         if index == self._leader() and centre_ns > newest_instant:
             self._pending.append(centre_ns)
@@ -144,8 +150,14 @@ class Pairing:
         return marks
 
     def _leader(self) -> int:
-        speaking = (c for c, seen in enumerate(self._seen) if seen and self._waiting[c] < self._patience)
-        return next(speaking, 0)
+        for camera, seen in enumerate(self._seen):
+            if seen and not self._silent(camera):
+                return camera
+        return 0
+
+    def _silent(self, camera: int) -> bool:
+        """Whether others delivered so many frames since its last."""
+        return self._frames - self._last[camera] >= self._patience
 
     def _emit(self, *, flush: bool) -> list[Instant]:
         out: list[Instant] = []
@@ -163,25 +175,32 @@ class Pairing:
         return out
 
     def _complete(self, t_ns: int) -> bool:
-        for camera, seen in enumerate(self._seen):
-            if self._waiting[camera] >= self._patience:
-                continue
-            if not seen:
-                return False
-            newest = seen[-1].centre_ns
-            if newest >= t_ns:
-                # At the very start one sighting is not yet a track.
-                if not self._continuous or len(seen) > 1:
-                    continue
-                return False
-            if self._policy == "interpolate" or t_ns - newest > self._half_ns[camera]:
+        # Asked with every message: the camera that was missing mostly still is.
+        if self._awaits(self._awaited, t_ns):
+            return False
+        for camera in range(len(self._seen)):
+            if self._awaits(camera, t_ns):
+                self._awaited = camera
                 return False
         return True
+
+    def _awaits(self, camera: int, t_ns: int) -> bool:
+        """Whether an instant waits for the next frame of a camera."""
+        if self._silent(camera):
+            return False
+        seen = self._seen[camera]
+        if not seen:
+            return True
+        newest = seen[-1].centre_ns
+        if newest >= t_ns:
+            # At the very start one sighting is not yet a track.
+            return self._continuous and len(seen) <= 1
+        return self._policy == "interpolate" or t_ns - newest > self._half_ns[camera]
 
     def _lonely(self, t_ns: int) -> bool:
         """Whether a camera that is not silent had no frame for an instant: half a period before, or a while after."""
         return any(
-            self._waiting[c] < self._patience
+            not self._silent(c)
             and not any(-self._half_ns[c] <= s.centre_ns - t_ns <= self._outdated_ns for s in seen)
             for c, seen in enumerate(self._seen)
         )
@@ -196,7 +215,7 @@ class Pairing:
             carried.sigma_px,
             # The sigma of a camera that sees nothing is NaN, and so is the area.
             area=np.array([v[0].area if v else s for v, s in zip(views, carried.sigma_px, strict=True)]),
-            ready_t_ns=max(sighting.ready_t_ns for view in views for sighting in view),
+            ready_t_ns=max([sighting.ready_t_ns for view in views for sighting in view]),
             missing=np.array([not view for view in views]),
             rival_uv=carried.rival_uv,
             rival_sigma_px=carried.rival_sigma_px,
@@ -210,14 +229,20 @@ class Pairing:
         Of those after the instant only the first counts (two where there are none before), as if the others had
         not yet come: what is emitted does not depend on how far a camera's messages ran ahead of another's.
         """
-        known = list(self._seen[camera])
-        before = sum(s.centre_ns < t_ns for s in known)
-        by_distance = sorted(
-            (abs(s.centre_ns - t_ns), k, s)
-            for k, s in enumerate(known[max(before - SIGHTINGS, 0) : max(before + 1, 2)])
-        )
-        reach = self._gap_ns if self._continuous else self._deadline_ns // 2
-        near = [s for away, _, s in by_distance[:SIGHTINGS] if away <= reach]
-        if near and by_distance[0][0] > self._deadline_ns:
+        known = self._seen[camera]
+        before = len(known)
+        while before and known[before - 1].centre_ns >= t_ns:
+            before -= 1
+        if not before:
+            near = [known[k] for k in range(min(len(known), 2))]
+        else:
+            near = [known[k] for k in range(before - 1, max(before - SIGHTINGS, 0) - 1, -1)]
+            if before < len(known):
+                away_ns = known[before].centre_ns - t_ns
+                near.insert(sum(t_ns - s.centre_ns <= away_ns for s in near), known[before])
+                del near[SIGHTINGS:]
+        if not near or abs(near[0].centre_ns - t_ns) > self._deadline_ns:
             return []
+        reach = self._gap_ns if self._continuous else self._deadline_ns // 2
+        near = [s for s in near if abs(s.centre_ns - t_ns) <= reach]
         return near if self._continuous else near[:1]

@@ -94,9 +94,16 @@ def carry(views: Sequence[Sequence[Sighting]], t_ns: float, scale_px_m: Float) -
         scale_px_m: (C,) pixels that a metre across the sight takes where hands are [px/m].
     """
     nothing = _nothing(len(next(view[0].marks for view in views if view)))
-    marks = np.array([[s.marks for s in view] + [nothing] * (SIGHTINGS - len(view)) for view in views])
+    places: list[Float] = []
+    doubtful: list[int] = []
+    for c, view in enumerate(views):
+        for sighting in view:
+            places.append(sighting.marks)
+            if sighting.rivals is not None and (not doubtful or doubtful[-1] != c):
+                doubtful.append(c)
+        places += [nothing] * (SIGHTINGS - len(view))
+    marks = np.concatenate(places).reshape(len(views), SIGHTINGS, *nothing.shape)
     t_sigma_s = np.array([view[0].t_sigma_ns if view else 0.0 for view in views]) * 1e-9
-    doubtful = [c for c, view in enumerate(views) if any(s.rivals is not None for s in view)]
     rivals = [_sort(views[c], marks[c], _LEAP_M_S * float(scale_px_m[c])) for c in doubtful]
     uv, sigma = _at(marks, t_ns, scale_px_m, t_sigma_s)
     if not doubtful:

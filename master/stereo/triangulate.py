@@ -21,6 +21,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.camera_model import CameraModel
+from master.stereo.together import Together, together
 
 _MIN_RELATIVE_DETERMINANT = 1e-14
 """Of a 3x3 normal matrix, against the cube of its trace; the rounding of parallel rays stays below."""
@@ -66,12 +67,14 @@ class Triangulator:
         pose: rig -> camera [R | t] (C, 1, 3, 4) [m].
         focal: fx, fy (C, 1, 2, 1) [px].
         radial: k1, k2, k3 of every camera (3, C, 1, 1).
+        all: The cameras laid out for what each does by itself.
     """
 
     cameras: tuple[CameraModel, ...]
     pose: Float
     focal: Float
     radial: Float
+    all: Together
 
     @classmethod
     def of(cls, cameras: Sequence[CameraModel]) -> "Triangulator":
@@ -87,6 +90,7 @@ class Triangulator:
             pose=np.stack([c.T_camera_rig[:3] for c in cameras])[:, None],
             focal=np.stack([c.matrix[[0, 1], [0, 1]] for c in cameras])[:, None, :, None],
             radial=np.stack([c.distortion[[0, 1, 4]] for c in cameras], axis=1)[..., None, None],
+            all=together(tuple(cameras)),
         )
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
@@ -119,7 +123,7 @@ class Triangulator:
         count = len(self.cameras)
         if uv.ndim != 3 or uv.shape[0] != count or uv.shape[2] != 2:
             raise ValueError(f"uv must be ({count}, M, 2) for these cameras, not {uv.shape}")
-        xy = np.stack([c.undistort(u) for c, u in zip(self.cameras, uv, strict=True)])
+        xy = self.all.undistort(uv)
         seen: Bool = np.isfinite(xy[..., 0] + xy[..., 1])
         # unseen ones get weight 0 and any finite value, so that they cannot spread
         xy = np.where(seen[..., None], xy, 0.0)

@@ -44,6 +44,7 @@ from common.messages import (
     WristDetections,
     decode,
     encode,
+    restamped,
 )
 
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
@@ -422,6 +423,37 @@ def test_infinity_is_refused_on_both_sides(value: float) -> None:
     wire = msgspec.msgpack.encode(as_map(sample_detections(2)) | {"area": area.tobytes()})
     with pytest.raises(MessageError, match="infinite"):
         decode(wire)
+
+
+def test_the_bytes_of_an_infinity_across_two_numbers_are_none() -> None:
+    raw = np.concatenate([np.full(3, 7, np.uint8), np.frombuffer(np.array(np.inf).tobytes(), np.uint8)])
+    area = np.frombuffer(np.concatenate([raw, np.full(5, 7, np.uint8)]).tobytes(), np.float64)
+    assert np.isfinite(area).all()
+    message = MarkerDetections(
+        "left", 1, 2, 3, 4, np.zeros((2, 2)), area, np.ones(2), np.ones(2), np.zeros((2, 2))
+    )
+    np.testing.assert_array_equal(message.area, area)
+
+
+def test_a_restamped_message_is_another_one_with_the_same_arrays() -> None:
+    before = sample_detections(6)
+    after = restamped(before, t_ns=before.t_ns + 5, t_sigma_ns=2.0)
+    assert after.t_ns == before.t_ns + 5
+    assert after.t_sigma_ns == 2.0
+    assert after.ready_t_ns == before.ready_t_ns
+    assert after.uv is before.uv
+    assert encode(restamped(after, t_ns=before.t_ns, t_sigma_ns=before.t_sigma_ns)) == encode(before)
+
+
+def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
+    rivals = np.full((6, 2), np.nan)
+    rivals[3] = [40.0, 50.0]
+    assert sample_detections(6, rivals).has_rivals
+    none = sample_detections(6)
+    assert not none.has_rivals
+    back = decode(encode(none))
+    assert isinstance(back, MarkerDetections)
+    assert not back.has_rivals
 
 
 @pytest.mark.parametrize(
