@@ -10,9 +10,14 @@ make` makes it (docs/keys.md):
 | file | what |
 |---|---|
 | `rig.key` | the rig key |
+| `devices.key` | what the secrets of devices follow from (`common.link_key`); stays on the PC |
 | `ca.pem` | who signed the certificates of this rig; `ca.key`, which signs, stays on the PC |
 | `master.pem`, `.key`; `operator.pem`, `.key` | of the master, and of every other program of the PC |
 | `devices/NAME.pem`, `.key` | of each device; on the device itself `device-NAME.pem`, or `device.pem` if it is alone |
+| `devices/NAME.secret` | of each device, for its datagrams; on the device `device-NAME.secret` or `device.secret` |
+
+Who is given the rig key alone has the secrets that follow from it. Who is given a folder needs what is in it: an older
+one, without secrets, is refused with the command that adds them, and does not make the rig weaker in silence.
 """
 
 import secrets
@@ -24,11 +29,12 @@ from pathlib import Path
 from common.certificates import MASTER, OPERATOR, shown
 from common.datagram import KEY_BYTES
 from common.errors import BusError, PhalanxError
+from common.link_key import LinkKey
 
 ENVIRONMENT = "PHALANX_RIG_KEY"
 FOLDER = "PHALANX_KEYS"
 OPEN = "PHALANX_OPEN"
-RIG_KEY, AUTHORITY, DEVICES = "rig.key", "ca.pem", "devices"
+RIG_KEY, AUTHORITY, DEVICES, DEVICES_KEY = "rig.key", "ca.pem", "devices", "devices.key"
 _CREDENTIALS = "CREDENTIALS_DIRECTORY"
 _ADVICE = f"write 64 hexadecimal digits, for example from: openssl rand -hex {KEY_BYTES}"
 
@@ -53,13 +59,55 @@ def rig_key(environment: Mapping[str, str], key_file: Path | None = None, keys: 
             f"no rig key: set {ENVIRONMENT} or give --key-file FILE; {_ADVICE}. Or make a keys folder, phalanx-master"
             f" keys make DIR, and give --keys DIR (or set {FOLDER})"
         )
-    try:
-        text = path.read_text(encoding="ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        raise PhalanxError(f"{path}: cannot read the rig key ({error}); {_ADVICE}") from error
-    if (fault := others_read(path, "the rig key", environment)) is not None:
-        raise PhalanxError(fault)
-    return _parse(text, str(path))
+    return _read(path, "the rig key", environment)
+
+
+def link_key(
+    environment: Mapping[str, str],
+    key_file: Path | None = None,
+    keys: Path | None = None,
+    device: str | None = None,
+) -> LinkKey:
+    """Return what a process seals its datagrams by: the rig key as `rig_key` finds it, and its secrets.
+
+    Args:
+        environment: As of `rig_key`.
+        key_file: File that has the rig key alone.
+        keys: Keys folder.
+        device: Name of the device that the process is; None: the master, who knows the secrets of all.
+
+    Raises:
+        PhalanxError: As `rig_key`; a keys folder without the secret, which is then named with its fix.
+    """
+    rig = rig_key(environment, key_file, keys)
+    folder = keys or (None if ENVIRONMENT in environment else keys_folder(environment))
+    if key_file is not None or folder is None:
+        return LinkKey(rig)
+    if device is None:
+        if not (path := folder / DEVICES_KEY).exists():
+            raise PhalanxError(
+                f"{path}: missing, the folder is older than the secrets of devices: phalanx-master keys make {folder}"
+                " makes them, phalanx deploy brings each device its own"
+            )
+        return LinkKey(rig, root=_read(path, "the root of the secrets of devices", environment))
+    path = secret_of(folder, device)
+    return LinkKey(rig, own=_read(path, f"the secret of {device!r}", environment))
+
+
+def secret_of(folder: Path, device: str) -> Path:
+    """Where a keys folder has the secret of a device.
+
+    Raises:
+        PhalanxError: Nowhere.
+    """
+    places = [place.with_name(f"{place.name}.secret") for place in _places(folder, device)]
+    if (found := next((path for path in places if path.exists()), None)) is not None:
+        return found
+    where = ", ".join(str(path.relative_to(folder)) for path in places)
+    raise PhalanxError(
+        f"{folder}: no secret of {device!r} ({where}); on the PC: phalanx-master keys make DIR --device {device}, then"
+        " phalanx deploy, which brings it"
+    )
 
 
 def new_key() -> str:
@@ -148,10 +196,7 @@ class Access:
 
     def _stem(self, folder: Path) -> Path:
         """Where its certificate and key are, without their endings."""
-        if self.role in (MASTER, OPERATOR):
-            places = [folder / self.role]
-        else:
-            places = [folder / DEVICES / self.role, folder / f"device-{self.role}", folder / "device"]
+        places = [folder / self.role] if self.role in (MASTER, OPERATOR) else _places(folder, self.role)
         for place in places:
             if place.with_name(f"{place.name}.pem").exists():
                 return place
@@ -172,11 +217,26 @@ def access_of(
     )
 
 
+def _places(folder: Path, device: str) -> list[Path]:
+    """Where a folder may have the files of a device, without their endings."""
+    return [folder / DEVICES / device, folder / f"device-{device}", folder / "device"]
+
+
+def _read(path: Path, what: str, environment: Mapping[str, str]) -> bytes:
+    try:
+        text = path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        raise PhalanxError(f"{path}: cannot read {what} ({error}); {_ADVICE}") from error
+    if (fault := others_read(path, what, environment)) is not None:
+        raise PhalanxError(fault)
+    return _parse(text, str(path))
+
+
 def _parse(text: str, where: str) -> bytes:
     try:
         key = bytes.fromhex(text.strip())
     except ValueError:
         key = b""
     if len(key) != KEY_BYTES:
-        raise PhalanxError(f"{where}: not a rig key; {_ADVICE}")
+        raise PhalanxError(f"{where}: not a key; {_ADVICE}")
     return key

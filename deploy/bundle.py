@@ -12,6 +12,7 @@ from deploy.targets import DeployError, RigFile
 
 ROOT = Path(__file__).resolve().parents[1]
 KEYS, CALIBRATION = "payload/keys/", "payload/calib_json/"
+_OWN = ("pem", "key", "secret")
 # Runs on the other machine: the zip is a file in memory, from which Python imports.
 _BOOT = (
     "import os,sys;f=os.memfd_create('phalanx');"
@@ -42,7 +43,7 @@ def bundle(keys: Path | None, names: Sequence[str], calibration: Path | None, ri
     """
     files = {path.relative_to(ROOT).as_posix(): path for path in _installer()}
     if keys is not None:
-        own = ["rig.key", "ca.pem", *(f"devices/{name}.{kind}" for name in names for kind in ("pem", "key"))]
+        own = ["rig.key", "ca.pem", *(f"devices/{name}.{kind}" for name in names for kind in _OWN)]
         files |= {KEYS + name: keys / name for name in own}
     if calibration is not None and rig is not None:
         files |= {CALIBRATION + name: calibration / name for name in rig.files}

@@ -35,7 +35,8 @@ def make_keys(folder: Path, names: Sequence[str], say: Say) -> None:
     Raises:
         DeployError: They cannot be made.
     """
-    wanted = [folder / "rig.key", folder / "ca.pem", *(folder / f"devices/{name}.pem" for name in names)]
+    wanted = [folder / one for one in ("rig.key", "devices.key", "ca.pem")]
+    wanted += [folder / f"devices/{name}.{kind}" for name in names for kind in ("pem", "secret")]
     if all(path.is_file() for path in wanted):
         return
     say(f"making keys in {folder}")

@@ -18,7 +18,8 @@ from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.datagram import Address
 from common.errors import BusError, PhalanxError
-from common.keys import rig_key
+from common.keys import link_key
+from common.link_key import LinkKey
 from common.messages import Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
@@ -78,7 +79,7 @@ def hear(
             connection.close()
     else:
         setup = load(calibration / "rigs" / f"{rig}.json", RigCalibration)
-        heard = here(names, setup, rig_key(os.environ, key_file), address(beacon, "--beacon"),
+        heard = here(names, setup, link_key(os.environ, key_file), address(beacon, "--beacon"),
                      address(bind, "--bind"), seconds, stop)  # fmt: skip
     if as_json:
         typer.echo(json.dumps({"heard": heard, "master": connection is not None}))
@@ -121,7 +122,7 @@ def at_master(bus: Bus, names: Sequence[str], seconds: float, stop: threading.Ev
 def here(
     names: Sequence[str],
     rig: RigCalibration,
-    key: bytes,
+    key: LinkKey | bytes,
     beacon: Address,
     bind: Address,
     seconds: float,

@@ -1,4 +1,4 @@
-"""`phalanx-master keys`: the rig key and the certificates of a rig, made and kept on the PC."""
+"""`phalanx-master keys`: rig key, secrets and certificates of a rig, made and kept on the PC."""
 
 from datetime import UTC, datetime
 from pathlib import Path
@@ -7,7 +7,8 @@ from typing import Annotated
 import typer
 
 from common.errors import PhalanxError
-from master.keys_folder import certificates_of, make, renew, renew_device
+from common.keys import DEVICES_KEY, RIG_KEY
+from master.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
 
 Folder = Annotated[Path, typer.Argument(help="Keys folder; keep it private, and out of calib_json.")]
 Devices = Annotated[
@@ -22,7 +23,7 @@ def keys_app() -> typer.Typer:
 
     @app.callback()
     def about() -> None:
-        """The secrets of a rig: one key for its datagrams, certificates for its bus. docs/keys.md says who has which.
+        """The secrets of a rig: keys for its datagrams, certificates for its bus. docs/keys.md says who has which.
 
         `phalanx deploy` makes the folder and brings each device its part.
         """
@@ -45,10 +46,14 @@ def make_command(folder: Folder, device: Devices = None) -> None:
     """
     made = make(folder, device or (), _now())
     typer.echo(f"{folder}: made {', '.join(made)}" if made else f"{folder}: everything is there")
+    if DEVICES_KEY in made and RIG_KEY not in made and (names := devices_of(folder)):
+        typer.echo(
+            f"Each device has a secret of its own now: deploy again to {', '.join(names)}; restart the master"
+        )
 
 
 def show_command(folder: Folder) -> None:
-    """Say who has a certificate, what for, and until when.
+    """Say who has a certificate, what for, until when, and which device has no secret for its datagrams.
 
     Examples:
 
@@ -60,6 +65,10 @@ def show_command(folder: Folder) -> None:
         use = "listens" if one.listens else "connects"
         late = "  ENDED: renew" if one.until < _now() else ""
         typer.echo(f"{one.name:<{wide}}  {use:<8}  until {one.until:%Y-%m-%d}  {one.fingerprint}{late}")
+    if lacking := lacks_secrets(folder):
+        typer.echo(
+            f"No secret of its own has {', '.join(lacking)}: phalanx-master keys make {folder}, then deploy again"
+        )
 
 
 def renew_command(
@@ -67,7 +76,8 @@ def renew_command(
     device: Annotated[
         str | None,
         typer.Option(
-            help="Only a new certificate for this device; its old one stays valid, so not for a lost one."
+            help="Only a new certificate for this device; its old one stays valid and its secret stays, so not for a"
+            " lost one."
         ),
     ] = None,
 ) -> None:
@@ -92,7 +102,8 @@ def revoke_command(
 ) -> None:
     """Lock devices out: all keys are made anew, and these get none.
 
-    Every device has the rig key, so nothing less keeps a lost one out.
+    A lost device reads and forges nothing of the others. But it has the rig key and a certificate, and is heard as
+    itself: nothing less keeps it out.
 
     Examples:
 

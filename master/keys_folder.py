@@ -1,7 +1,8 @@
 """The keys folder of a rig on its PC: made, shown, renewed, a device taken out of it. `common.keys` says what is in it.
 
-A certificate cannot be called back one by one: a device that is lost also has the rig key, which every device has. So
-whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx deploy` for the rest.
+A certificate cannot be called back one by one, and a device that is lost also has the rig key, which every device has.
+So whoever is taken out costs everybody else new keys; that is a second of work here, and a `phalanx deploy` for the
+rest.
 """
 
 import os
@@ -12,19 +13,24 @@ from datetime import datetime
 from pathlib import Path
 
 from common.certificates import MASTER, OPERATOR, KeyPair, Shown, issue, new_authority, shown
+from common.datagram import KEY_BYTES
 from common.errors import PhalanxError
-from common.keys import AUTHORITY, DEVICES, RIG_KEY, new_key
+from common.keys import AUTHORITY, DEVICES, DEVICES_KEY, RIG_KEY, new_key
+from common.link_key import device_secret
 
 AUTHORITY_KEY = "ca.key"
+_ENDINGS = ("pem", "key", "secret")
 _NAME = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
     """Make what is missing, and nothing else; return the files that were made, below `folder`.
 
+    A folder of before there were secrets gets them for all of its devices.
+
     Args:
         folder: Made if it is not there; nobody but its owner may enter it.
-        devices: Names on the bus that are to have a certificate.
+        devices: Names on the bus that are to have a certificate and a secret.
         now: Where the ten years begin.
 
     Raises:
@@ -46,8 +52,9 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
                 f"{folder}: others can enter it; give a folder of its own, or run: chmod 700 {folder}"
             )
         (folder / DEVICES).mkdir(mode=0o700, exist_ok=True)
-        if not (folder / RIG_KEY).exists():
-            add(folder / RIG_KEY, f"{new_key()}\n".encode(), 0o600)
+        for shared in (RIG_KEY, DEVICES_KEY):
+            if not (folder / shared).exists():
+                add(folder / shared, f"{new_key()}\n".encode(), 0o600)
         if not (folder / AUTHORITY_KEY).exists():
             if (folder / AUTHORITY).exists():
                 raise PhalanxError(
@@ -65,13 +72,15 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
             pair = issue(authority, place.name, now)
             add(key, pair.key, 0o600)
             add(certificate, pair.certificate, 0o644)
+        for name in lacks_secrets(folder):
+            add(folder / DEVICES / f"{name}.secret", _secret(folder, name), 0o600)
     except OSError as error:
         raise PhalanxError(f"{folder}: cannot make keys: {error}") from error
     return made
 
 
 def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]:
-    """Make everything anew: rig key, authority, all certificates. What was is worth nothing afterwards.
+    """Make everything anew: rig key, secrets, authority, all certificates. What was is worth nothing afterwards.
 
     All is made first, then takes the place of the old; other files in the folder stay.
 
@@ -98,7 +107,7 @@ def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]
             fresh = Path(beside)
             made = make(fresh, left, now)
             for name in gone:
-                for ending in ("pem", "key"):
+                for ending in _ENDINGS:
                     (folder / DEVICES / f"{name}.{ending}").unlink(missing_ok=True)
             for file in made:
                 (fresh / file).replace(folder / file)
@@ -108,7 +117,8 @@ def renew(folder: Path, now: datetime, without: Iterable[str] = ()) -> list[str]
 
 
 def renew_device(folder: Path, name: str, now: datetime) -> None:
-    """Make a new certificate for one device. Its old one stays valid: for one that was lost or stolen use `renew`.
+    """Make a new certificate for one device. Its old one stays valid, its secret stays: for one that was lost or stolen
+    use `renew`.
 
     Raises:
         PhalanxError: No such folder or device; it cannot be written. The old one is still there then.
@@ -139,7 +149,27 @@ def devices_of(folder: Path) -> list[str]:
 
 def files_of_device(name: str) -> tuple[str, ...]:
     """What of the folder belongs on a device, by their places in it."""
-    return RIG_KEY, AUTHORITY, f"{DEVICES}/{name}.pem", f"{DEVICES}/{name}.key"
+    return RIG_KEY, AUTHORITY, *(f"{DEVICES}/{name}.{ending}" for ending in _ENDINGS)
+
+
+def lacks_secrets(folder: Path) -> list[str]:
+    """Devices without a secret that follows from `devices.key`; all of them where there is none.
+
+    Raises:
+        PhalanxError: It is not the keys folder of a PC; a file is broken, or cannot be read.
+    """
+    names = devices_of(folder)
+    if not (folder / DEVICES_KEY).exists():
+        return names
+    try:
+        return [
+            name
+            for name in names
+            if not (path := folder / DEVICES / f"{name}.secret").exists()
+            or path.read_bytes() != _secret(folder, name)
+        ]
+    except OSError as error:
+        raise PhalanxError(f"{folder}: cannot read the secrets of devices: {error}") from error
 
 
 def certificates_of(folder: Path) -> list[Shown]:
@@ -160,6 +190,19 @@ def certificates_of(folder: Path) -> list[Shown]:
 
 def _authority(folder: Path) -> KeyPair:
     return KeyPair((folder / AUTHORITY).read_bytes(), (folder / AUTHORITY_KEY).read_bytes())
+
+
+def _secret(folder: Path, name: str) -> bytes:
+    """What `devices/NAME.secret` is to be."""
+    try:
+        root = bytes.fromhex((folder / DEVICES_KEY).read_text(encoding="ascii"))
+        if len(root) != KEY_BYTES:
+            raise ValueError(f"{len(root)} bytes, must be {KEY_BYTES}")
+    except ValueError as error:
+        raise PhalanxError(
+            f"{folder / DEVICES_KEY}: broken ({error}); phalanx-master keys renew {folder} makes all keys anew"
+        ) from error
+    return f"{device_secret(root, name).hex()}\n".encode()
 
 
 def _check_name(name: str) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from common.clock import Clock, SystemClock
+from common.link_key import LinkKey
 from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
@@ -69,7 +70,7 @@ class LiveSettings:
 
 def run_live(
     setups: Sequence[RigSetup],
-    key: bytes,
+    key: LinkKey | bytes,
     settings: LiveSettings,
     stop: threading.Event,
     say: Callable[[str], None],
@@ -78,7 +79,7 @@ def run_live(
 
     Args:
         setups: Of each hand its rigs, cameras and model.
-        key: Rig key.
+        key: Rig key, alone or with the root of the secrets of devices.
         settings: Addresses and files.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when a state changes.
@@ -190,7 +191,9 @@ def devices_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*cameras_of(setups), *imus, *trackers_of(setups))))
 
 
-def ingest_of(setups: Sequence[RigSetup], key: bytes, clock: Clock, settings: LiveSettings) -> Ingest:
+def ingest_of(
+    setups: Sequence[RigSetup], key: LinkKey | bytes, clock: Clock, settings: LiveSettings
+) -> Ingest:
     """Where all cameras, IMUs and trackers of these hands and objects are heard.
 
     Raises:

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from common.keys import rig_key
+from common.keys import link_key
 from master.live import LiveSettings, run_live
 from master.options import (
     CALIB_JSON,
@@ -87,4 +87,4 @@ def run(
         RigFiles(calibration, tuple(rig), hand),
         record,
     )
-    run_live(setups, rig_key(os.environ, key_file), settings, stop_on_signals(), say)
+    run_live(setups, link_key(os.environ, key_file), settings, stop_on_signals(), say)

@@ -14,6 +14,7 @@ from common.object_profile import ObjectProfile
 
 if TYPE_CHECKING:
     from common.keys import Access
+    from common.link_key import LinkKey
 
 BEACON_PORT = 47800
 BOTH = "grasp | both-poses | both-curl | both-travel | both-moves | gestures"  # the same motion for both kinds of rig
@@ -192,15 +193,15 @@ def skew_of(options: argparse.Namespace, true_clock: Clock) -> str:
     return skewed + (f" {options.clock_ppm:+g} ppm from {true_clock.now_ns()}" if options.clock_ppm else "")
 
 
-def secrets_of(options: argparse.Namespace) -> "tuple[bytes, Access]":
-    """The rig key, and how this device comes to the bus.
+def secrets_of(options: argparse.Namespace) -> "tuple[LinkKey, Access]":
+    """What this device seals its datagrams by, and how it comes to the bus.
 
     Raises:
-        PhalanxError: There is no rig key, or the keys folder has no certificate of this device.
+        PhalanxError: There is no rig key, or the keys folder has no certificate or no secret of this device.
     """
-    from common.keys import access_of, rig_key
+    from common.keys import access_of, link_key
 
     access = access_of(os.environ, options.name, options.keys, options.open)
     if access.folder is not None:
         access.identity()  # said now, not when a master is heard
-    return rig_key(os.environ, options.key_file, options.keys), access
+    return link_key(os.environ, options.key_file, options.keys, options.name), access

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives import serialization
 
 from common.certificates import shown
 from common.errors import PhalanxError
-from common.keys import RIG_KEY, access_of, rig_key
+from common.keys import RIG_KEY, access_of, link_key, rig_key, secret_of
 from slave.doctor.finding import Finding, fail, ok, unseen, warn
 from slave.doctor.system import System
 
@@ -51,6 +51,12 @@ def check_keys(
     if name is None:
         yield unseen("certificate", "of whom? give --name")
         return
+    try:
+        link_key(system.environment, None, folder, name)
+    except (PhalanxError, OSError) as error:
+        yield fail("secret", str(error), MAKE.format(name))
+    else:
+        yield ok("secret", str(secret_of(folder, name)))
     yield _certificate(system, folder, name, now or datetime.now(UTC))
 
 

@@ -58,10 +58,10 @@ def keys_of(folder: Path | None) -> dict[str, bytes]:
     found: dict[str, bytes] = {}
     for path in sorted([*folder.glob("*"), *folder.glob("devices/*")]):
         name = path.relative_to(folder).as_posix()
-        if name in ("rig.key", "ca.pem") or name.startswith("device"):
+        if name in ("rig.key", "ca.pem") or name.startswith(("devices/", "device-", "device.")):
             if not path.is_file():
                 continue
-            if path.suffix == ".key" and stat.S_IMODE(path.stat().st_mode) & _SHARED:
+            if path.suffix in (".key", ".secret") and stat.S_IMODE(path.stat().st_mode) & _SHARED:
                 raise InstallError(f"{path}: others can read this key; run: chmod 600 {path}")
             found[name] = path.read_bytes()
     return found

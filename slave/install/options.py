@@ -15,6 +15,7 @@ from slave.install.errors import InstallError
 STATE = "/var/lib/phalanx"  # the unit's StateDirectory
 CALIBRATION = f"{STATE}/calib_json"
 READY_S, SETTLE_S = 90.0, 2.0
+OF_DEVICE = ("pem", "key", "secret")  # endings of the keys of one device
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _UNQUOTED = re.compile(
     r"[A-Za-z0-9_@%+=:,./\[\]-]+"
@@ -62,7 +63,7 @@ class Plan:
         master: Host name or address of the machine whose master it sends to; the clock follows it.
         senders: Processes.
         calibration: Path below calib_json -> content.
-        keys: File name -> content: rig.key, ca.pem, device-NAME.pem, device-NAME.key. Empty: those that are there stay.
+        keys: File name -> content: rig.key, ca.pem, device-NAME.pem, .key, .secret. Empty: those that are there stay.
         boot: Lines of config.txt that are needed.
         picamera2: Whether a camera is opened by picamera2, which comes by apt.
     """
@@ -236,6 +237,11 @@ def _needed(calibration: Mapping[str, bytes], name: str, rig: dict[str, Any]) ->
     return {file: calibration[file] for file in files}
 
 
+def wanted_keys(names: Sequence[str]) -> list[str]:
+    """The files of keys that a machine of these senders has."""
+    return ["rig.key", "ca.pem", *(f"device-{name}.{kind}" for name in names for kind in OF_DEVICE)]
+
+
 def _of_device(keys: Mapping[str, bytes], names: Sequence[str]) -> dict[str, bytes]:
     """What of a keys folder belongs on this machine, under its names there.
 
@@ -246,13 +252,12 @@ def _of_device(keys: Mapping[str, bytes], names: Sequence[str]) -> dict[str, byt
         return {}
     found = {name: keys[name] for name in ("rig.key", "ca.pem") if name in keys}
     for name in names:
-        for kind in ("pem", "key"):
+        for kind in OF_DEVICE:
             theirs = (f"device-{name}.{kind}", f"devices/{name}.{kind}", f"device.{kind}")
             content = next((keys[one] for one in theirs if one in keys), None)
             if content is not None:
                 found[f"device-{name}.{kind}"] = content
-    wanted = ["rig.key", "ca.pem", *(f"device-{name}.{kind}" for name in names for kind in ("pem", "key"))]
-    if missing := [one for one in wanted if one not in found]:
+    if missing := [one for one in wanted_keys(names) if one not in found]:
         raise InstallError(
             f"keys: no {missing[0]}; make them on the PC: phalanx-master keys make DIR --device {names[0]}"
         )

@@ -10,7 +10,7 @@ from pathlib import Path
 from slave.install import release
 from slave.install.alone import alone
 from slave.install.errors import InstallError, NotReadyError
-from slave.install.options import Plan, Sender
+from slave.install.options import OF_DEVICE, Plan, Sender
 from slave.install.release import Source
 from slave.install.systemd import Systemd
 from slave.install.transaction import CURRENT, Transaction, changed, point, remove, write
@@ -158,7 +158,7 @@ def _difference(plan: Plan, files: dict[str, File | None], name: str, machine: M
     for sender in plan.senders:
         own = {
             f"{ETC}/{sender.name}.env",
-            *(f"{KEYS}/device-{sender.name}.{kind}" for kind in ("pem", "key")),
+            *(f"{KEYS}/device-{sender.name}.{kind}" for kind in OF_DEVICE),
         }
         if everybodys or own & set(outcome.changed) or not machine.systemd.state(sender.unit).active:
             outcome.restarted.append(sender.unit)

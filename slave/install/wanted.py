@@ -14,7 +14,7 @@ from pathlib import Path
 
 from slave.install.boot_config import with_block
 from slave.install.errors import InstallError
-from slave.install.options import Plan
+from slave.install.options import Plan, wanted_keys
 
 OPT, ETC, KEYS, CALIB = "opt/phalanx", "etc/phalanx", "etc/phalanx/keys", "var/lib/phalanx/calib_json"
 UNIT, SYSUSERS = "etc/systemd/system/phalanx-slave@.service", "etc/sysusers.d/phalanx.conf"
@@ -100,15 +100,16 @@ def own_groups() -> list[str]:
 
 
 def check_keys(keys: Mapping[str, bytes], names: tuple[str, ...]) -> None:
-    """Refuse what is no rig key, no certificate, or a key of another certificate.
+    """Refuse what is no rig key, no secret, no certificate, or a key of another certificate.
 
     Raises:
         InstallError: Names the file.
     """
-    if not re.fullmatch(rb"[0-9a-fA-F]{64}\s*", keys["rig.key"]):
-        raise InstallError(
-            "keys: rig.key is not 64 hexadecimal digits; phalanx-master keys make DIR makes one"
-        )
+    for file in ("rig.key", *(f"device-{name}.secret" for name in names)):
+        if not re.fullmatch(rb"[0-9a-fA-F]{64}\s*", keys[file]):
+            raise InstallError(
+                f"keys: {file} is not 64 hexadecimal digits; phalanx-master keys make DIR makes one"
+            )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     try:
         context.load_verify_locations(cadata=keys["ca.pem"].decode("ascii"))
@@ -145,8 +146,7 @@ def _keys(plan: Plan, root: Path) -> dict[str, File | None]:
     if plan.keys:
         check_keys(plan.keys, names)
         return {f"{KEYS}/{name}": File(content, 0o600) for name, content in plan.keys.items()}
-    wanted = ["rig.key", "ca.pem", *(f"device-{name}.{kind}" for name in names for kind in ("pem", "key"))]
-    if missing := [one for one in wanted if not (root / KEYS / one).is_file()]:
+    if missing := [one for one in wanted_keys(names) if not (root / KEYS / one).is_file()]:
         raise InstallError(
             f"/{KEYS}/{missing[0]}: missing; give --keys DIR, made by: phalanx-master keys make DIR"
         )

@@ -9,7 +9,8 @@ from cryptography import x509
 
 from common.certificates import FIRST_DAY, LIFE, MASTER, OPERATOR, issue, new_authority, shown
 from common.errors import BusError, PhalanxError
-from common.keys import access_of, new_key, rig_key
+from common.keys import access_of, link_key, new_key, rig_key
+from common.link_key import LinkKey
 from master.keys_folder import make
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -63,13 +64,44 @@ def test_the_rig_key_is_that_of_the_file_then_the_folder_then_the_environment(ke
         rig_key({})
 
 
+def test_the_secrets_are_those_of_the_folder_and_of_the_rig_key_where_that_is_alone(keys: Path) -> None:
+    rig, root, own = (
+        bytes.fromhex((keys / file).read_text()) for file in ("rig.key", "devices.key", "devices/left.secret")
+    )
+    other, text = keys.parent / "other.key", new_key()
+    other.write_text(new_key())
+    other.chmod(0o600)
+    folder = {"PHALANX_KEYS": str(keys)}
+    assert link_key(folder) == link_key({}, None, keys) == LinkKey(rig, root)
+    assert link_key(folder, device="left") == link_key({}, None, keys, "left") == LinkKey(rig, own=own)
+    assert LinkKey(rig, root).secret("left") == own
+    for device in (None, "left"):  # and whoever is told the rig key alone has no more than that
+        both = folder | {"PHALANX_RIG_KEY": text}
+        assert link_key(both, device=device) == LinkKey(bytes.fromhex(text))
+        assert link_key(both, other, keys, device) == LinkKey(bytes.fromhex(other.read_text()))
+    assert link_key(both, None, keys) == LinkKey(rig, root)
+
+
+def test_a_folder_without_secrets_makes_no_weaker_rig(keys: Path) -> None:
+    (keys / "devices.key").unlink()
+    (keys / "devices/left.secret").unlink()
+    with pytest.raises(PhalanxError, match=rf"devices\.key: missing.* keys make {keys} .*phalanx deploy"):
+        link_key({}, None, keys)
+    with pytest.raises(
+        PhalanxError, match=r"no secret of 'left' \(devices/left\.secret, device-left\.secret.*--device left"
+    ):
+        link_key({}, None, keys, "left")
+
+
 @pytest.mark.parametrize("place", ["devices/left", "device-left", "device"])
 def test_a_device_finds_its_certificate_in_every_layout(keys: Path, place: str) -> None:
     there = keys.parent / "device"
     (there / "devices").mkdir(mode=0o700, parents=True)
     shutil.copy(keys / "ca.pem", there)
-    for ending in ("pem", "key"):
+    shutil.copy(keys / "rig.key", there)
+    for ending in ("pem", "key", "secret"):
         shutil.copy(keys / "devices" / f"left.{ending}", there / f"{place}.{ending}")
+    assert link_key({}, None, there, "left") == link_key({}, None, keys, "left")
     found = access_of({"PHALANX_KEYS": str(there)}, "left").identity()
     assert found.certificate == there / f"{place}.pem"
     if place == "device":  # and there it may be of somebody else
@@ -81,7 +113,7 @@ def test_the_names_of_devices_are_known_to_the_master(keys: Path) -> None:
     assert access_of({}, MASTER, keys).identity().devices == ("left",)
 
 
-@pytest.mark.parametrize("secret", ["rig.key", "devices/left.key"])
+@pytest.mark.parametrize("secret", ["rig.key", "devices/left.key", "devices/left.secret", "devices.key"])
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660])
 def test_a_secret_that_others_can_read_is_refused_but_for_the_mask_of_a_service(
     keys: Path, secret: str, mode: int
@@ -91,6 +123,10 @@ def test_a_secret_that_others_can_read_is_refused_but_for_the_mask_of_a_service(
     def use(environment: dict[str, str]) -> object:
         if secret == "rig.key":
             return rig_key(environment, None, keys)
+        if secret == "devices.key":
+            return link_key(environment, None, keys)
+        if secret == "devices/left.secret":
+            return link_key(environment, None, keys, "left")
         return access_of(environment, "left", keys).identity()
 
     with pytest.raises(PhalanxError, match=r"others can read .*chmod 600"):

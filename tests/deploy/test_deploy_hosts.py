@@ -104,8 +104,14 @@ def test_what_is_sent_has_the_keys_of_that_machine_alone_and_runs_from_memory(tm
     sent = bundle(keys, ["left"], ROOT / "calib_json", DESK)
     names = zipfile.ZipFile(_file(tmp_path / "sent.zip", sent)).namelist()
     assert sorted(name for name in names if "keys" in name) == [
-        f"payload/keys/{name}" for name in ("ca.pem", "devices/left.key", "devices/left.pem", "rig.key")
+        f"payload/keys/{name}"
+        for name in ("ca.pem", "devices/left.key", "devices/left.pem", "devices/left.secret", "rig.key")
     ]
+    for other in ("devices.key", "devices/right.secret", "devices/right.key", "ca.key"):
+        kept = (keys / other).read_bytes()
+        assert not [name for name in names if kept in zipfile.ZipFile(tmp_path / "sent.zip").read(name)], (
+            other
+        )
     words = ["install", "--json", "--dry-run", "--bundle", BUNDLE, "--master", "10.0.0.2", "--name", "left"]
     words += [
         "--release",
@@ -128,7 +134,9 @@ def test_what_is_sent_has_the_keys_of_that_machine_alone_and_runs_from_memory(tm
     )
     result = json.loads(done.stdout.splitlines()[-1])["result"]
     assert done.returncode == 0, done.stderr.decode()
-    assert "etc/phalanx/keys/device-left.key" in result["changed"]
+    assert {f"etc/phalanx/keys/device-left.{kind}" for kind in ("pem", "key", "secret")} < {
+        *result["changed"]
+    }
     assert not list((tmp_path / "root").iterdir()), "a dry run writes nothing"
 
 
@@ -333,6 +341,12 @@ def test_missing_keys_are_made_and_what_is_there_stays(tmp_path: Path) -> None:
     assert said == [f"making keys in {keys}"]
     assert (keys / "rig.key").read_text() == rig_key
     assert (keys / "devices/left.key").stat().st_mode & 0o777 == 0o600
+    (keys / "devices.key").unlink()  # a folder from before there were secrets
+    (keys / "devices/left.secret").unlink()
+    make_keys(keys, ["left"], said.append)
+    assert said == [f"making keys in {keys}"] * 2
+    assert (keys / "devices/left.secret").stat().st_mode & 0o777 == 0o600
+    assert (keys / "rig.key").read_text() == rig_key
 
 
 def test_a_table_has_a_dash_where_nothing_is_known() -> None:

@@ -5,13 +5,26 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from common.certificates import shown
 from common.errors import PhalanxError
-from master.keys_folder import certificates_of, devices_of, make, renew, renew_device
+from common.keys import link_key, new_key
+from common.link_key import device_secret
+from master.keys_command import keys_app
+from master.keys_folder import certificates_of, devices_of, lacks_secrets, make, renew, renew_device
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
-ALL = {"rig.key", "ca.pem", "ca.key", "master.pem", "master.key", "operator.pem", "operator.key"}
+ALL = {
+    "rig.key",
+    "devices.key",
+    "ca.pem",
+    "ca.key",
+    "master.pem",
+    "master.key",
+    "operator.pem",
+    "operator.key",
+}
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -31,11 +44,13 @@ def keys(tmp_path: Path) -> Path:
 
 
 def test_it_has_everything_and_nobody_else_can_read_a_secret(keys: Path) -> None:
-    devices = {f"devices/{name}.{ending}" for name in ("left", "pi.right-2_x") for ending in ("pem", "key")}
+    devices = {
+        f"devices/{name}.{ending}" for name in ("left", "pi.right-2_x") for ending in ("pem", "key", "secret")
+    }
     assert set(files(keys)) == ALL | devices
     for path in [keys, keys / "devices"]:
         assert path.stat().st_mode & 0o777 == 0o700
-    for path in keys.rglob("*.key"):
+    for path in [*keys.rglob("*.key"), *keys.rglob("*.secret")]:
         assert path.stat().st_mode & 0o777 == 0o600
     assert {one.name: one.listens for one in certificates_of(keys)} == {
         "master": True,
@@ -49,10 +64,52 @@ def test_made_again_it_stays_as_it_is_and_only_what_is_missing_is_added(keys: Pa
     before = files(keys)
     assert make(keys, ["left"], NOW) == []
     assert files(keys) == before
-    assert make(keys, ["left", "imu"], NOW) == ["devices/imu.key", "devices/imu.pem"]
+    assert make(keys, ["left", "imu"], NOW) == [
+        "devices/imu.key",
+        "devices/imu.pem",
+        "devices/imu.secret",
+    ]
     assert {name: content for name, content in files(keys).items() if "imu" not in name} == before
     (keys / "devices" / "left.key").unlink()
     assert make(keys, ["left"], NOW) == ["devices/left.key", "devices/left.pem"]
+
+
+def test_the_secret_of_a_device_follows_from_the_root_alone(keys: Path) -> None:
+    root = bytes.fromhex((keys / "devices.key").read_text())
+    for name in devices_of(keys):
+        assert bytes.fromhex((keys / "devices" / f"{name}.secret").read_text()) == device_secret(root, name)
+        assert link_key({}, None, keys).secret(name) == link_key({}, None, keys, name).secret(name)
+    (keys / "devices" / "left.secret").write_text(new_key())  # of somewhere else
+    assert lacks_secrets(keys) == ["left"]
+    assert make(keys, [], NOW) == ["devices/left.secret"]
+    assert not lacks_secrets(keys)
+
+
+def test_a_folder_from_before_there_were_secrets_gets_them_for_all_its_devices(keys: Path) -> None:
+    old = {
+        name: content
+        for name, content in files(keys).items()
+        if not name.endswith((".secret", "devices.key"))
+    }
+    for name in files(keys).keys() - old.keys():
+        (keys / name).unlink()
+    said = CliRunner().invoke(keys_app(), ["show", str(keys)])
+    assert f"No secret of its own has left, pi.right-2_x: phalanx-master keys make {keys}" in said.output
+    said = CliRunner().invoke(keys_app(), ["make", str(keys)])
+    assert said.exit_code == 0
+    assert "made devices.key, devices/left.secret, devices/pi.right-2_x.secret" in said.output
+    assert "deploy again to left, pi.right-2_x; restart the master" in said.output
+    assert {name: content for name, content in files(keys).items() if name in old} == old
+    assert not lacks_secrets(keys)
+    for command in ("make", "show"):
+        assert "again" not in CliRunner().invoke(keys_app(), [command, str(keys)]).output
+
+
+@pytest.mark.parametrize("content", ["", "00", "z" * 64])
+def test_a_broken_root_of_the_secrets_is_named(keys: Path, content: str) -> None:
+    (keys / "devices.key").write_text(content)
+    with pytest.raises(PhalanxError, match=r"devices\.key: broken .*keys renew"):
+        make(keys, [], NOW)
 
 
 def test_a_rig_key_that_is_there_stays(tmp_path: Path) -> None:
@@ -78,6 +135,8 @@ def test_a_device_that_is_taken_out_has_nothing_that_is_still_worth_anything(key
     assert devices_of(keys) == ["pi.right-2_x"]
     after = files(keys)
     assert after["rig.key"] != before["rig.key"]
+    assert after["devices.key"] != before["devices.key"]
+    assert not [name for name in after if name.startswith("devices/left")]
     assert after["ca.pem"] != before["ca.pem"]
     with pytest.raises(PhalanxError, match=r"no device 'left'; there are: pi\.right-2_x"):
         renew(keys, NOW, ["left"])

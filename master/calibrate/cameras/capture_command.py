@@ -11,7 +11,7 @@ import typer
 from common.calibration import RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CalibrationError
-from common.keys import rig_key
+from common.keys import link_key
 from master.calibrate.cameras.capture import StillTaker, capture, new_folder
 from master.calibrate.cameras.live_views import LiveViews
 from master.calibrate.cameras.options import Dictionary, MarkerMm, Size, SquareMm, board_of, options_of
@@ -65,7 +65,7 @@ def capture_views(
     """
     ends = address(beacon, "--beacon"), address(bind, "--bind")
     live = LiveViews(board_of(board, square_mm, marker_mm, dictionary), cameras_of(calibration, rig))
-    key = rig_key(os.environ, key_file)
+    key = link_key(os.environ, key_file)
     clock = SystemClock()
     new_folder(out)
     stop = stop_on_signals()

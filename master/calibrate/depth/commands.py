@@ -10,7 +10,7 @@ from common.arrays import Float
 from common.calibration import RigCalibration
 from common.errors import CalibrationError
 from common.frame_recording import FrameRecording
-from common.keys import rig_key
+from common.keys import link_key
 from master.calibrate.depth.fit import ideal_of
 from master.calibrate.depth.live import sweep_live
 from master.calibrate.depth.report import fit_depth, report_json, report_lines
@@ -109,7 +109,7 @@ def depth(
     _refuse_idle("--live", source=live and source, detections=live and detections)
     _refuse_idle("a measurement without --live", save=not live and save_table)
     if live:
-        link = (address(beacon, "--beacon"), address(bind, "--bind"), rig_key(os.environ, key_file))
+        link = (address(beacon, "--beacon"), address(bind, "--bind"), link_key(os.environ, key_file))
         pair = load_pair(calibration, rig or "desk", fov_deg)
         measured = sweep_live(pair, marker, distances or _SWEEP, frames, seconds, link, save_table, outline)
     else:

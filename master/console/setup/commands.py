@@ -11,7 +11,7 @@ from pathlib import Path
 
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
-from common.keys import ENVIRONMENT, keys_folder
+from common.keys import ENVIRONMENT, RIG_KEY, keys_folder, rig_key
 from master.calibrate.cli import COMMANDS
 from master.console.setup.fields import Value, arguments_of, fields_of
 from master.console.setup.files import KEY_FILE, CameraPlan, Plan, key_of
@@ -46,15 +46,18 @@ class Commands:
         return self.settings.calibration.resolve()
 
     def environment(self) -> dict[str, str]:
-        """What they need and what may not stand on a command line: the rig key; of a keys folder they inherit where it
-        is, and each camera has a certificate in it from here on.
+        """What they need and what may not stand on a command line: the rig key. Where that is a keys folder's they
+        inherit where it is, and each camera has a certificate and a secret in it from here on.
 
         Raises:
             PhalanxError: There is no key.
         """
         if (keys := keys_folder(os.environ)) is not None and (keys / AUTHORITY_KEY).exists():
             make(keys, [camera.name for camera in self.plan.cameras], datetime.now(UTC))
-        return {ENVIRONMENT: key_of(self.settings.calibration, self.settings.key)}
+        key = key_of(self.settings.calibration, self.settings.key)
+        if keys is not None and (keys / RIG_KEY).exists() and key == rig_key({}, None, keys).hex():
+            return {}
+        return {ENVIRONMENT: key}
 
     def camera(self, camera: CameraPlan, view: str, epoch_ns: int) -> list[str]:
         """The slave of a camera of this machine.

@@ -9,7 +9,7 @@ import typer
 
 from common.clock import SystemClock
 from common.errors import PhalanxError
-from common.keys import rig_key
+from common.keys import link_key
 from master.calibrate.cameras.capture_command import cameras_of
 from master.ingest import Ingest
 from master.master_bus import carry_bus
@@ -47,7 +47,7 @@ def meet(
     with ExitStack() as stack:
         link = carry_bus(bus, cameras)
         stack.callback(link.close)
-        ingest = Ingest(cameras, rig_key(os.environ, key_file), SystemClock(), *ends, bus, _START_S)
+        ingest = Ingest(cameras, link_key(os.environ, key_file), SystemClock(), *ends, bus, _START_S)
         stack.callback(ingest.close)
         said: frozenset[str] | None = None
         while not stop.wait(_LOOK_S):

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from common.calibration import RigCalibration, load
 from common.errors import CalibrationError
+from common.keys import rig_key
 from master.calibrate.cli import COMMANDS, calibrate_app
 from master.console.local import LocalProcesses
 from master.console.setup.commands import VIEWS, Commands, epoch_of
@@ -225,8 +226,12 @@ def test_with_a_keys_folder_each_camera_gets_its_certificate_and_a_pi_its_part(
     monkeypatch.setenv("PHALANX_KEYS", str(keys))
     make(keys, [], datetime.now(UTC))
     assert len(Commands(ConsoleSettings(tree, key=bytes(32)), pi).environment()["PHALANX_RIG_KEY"]) == 64
+    own = ConsoleSettings(tree, key=rig_key({}, None, keys))
+    assert Commands(own, pi).environment() == {}, (
+        "they take the secrets, too, from the folder that they inherit"
+    )
     copy, run = Commands(ConsoleSettings(tree), pi).pi(pi.cameras[0])
-    files = ("rig.key", "ca.pem", "devices/left.pem", "devices/left.key")
+    files = ("rig.key", "ca.pem", *(f"devices/left.{kind}" for kind in ("pem", "key", "secret")))
     assert copy.endswith(
         f" && rsync -aR {' '.join(f'{keys}/./{file}' for file in files)} pi@left.local:keys/"
     )

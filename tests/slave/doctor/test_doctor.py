@@ -191,7 +191,8 @@ def keys_of(folder: Path, name: str, now: datetime = NOW) -> Path:
     authority = new_authority(now)
     pair = issue(authority, name, now)
     content = {"ca.pem": authority.certificate, "device.pem": pair.certificate, "device.key": pair.key}
-    for file, text in (content | {"rig.key": new_key().encode()}).items():
+    secrets = {file: new_key().encode() for file in ("rig.key", "device.secret")}
+    for file, text in (content | secrets).items():
         (folder / file).write_bytes(text)
         (folder / file).chmod(0o600)
     return folder
@@ -205,6 +206,7 @@ def test_keys_that_are_well(tmp_path: Path) -> None:
     found = verdicts(keys_of(tmp_path / "keys", "left"), "left")
     assert {one.verdict for one in found.values()} == {Verdict.OK}
     assert found["certificate"].text.startswith("of left, signed by the rig's authority, until 2036-")
+    assert found["secret"].text.endswith("device.secret")
 
 
 def test_keys_that_are_not(tmp_path: Path) -> None:
@@ -218,6 +220,8 @@ def test_keys_that_are_not(tmp_path: Path) -> None:
     assert "not signed by" in verdicts(keys, "left")["certificate"].text
     (keys / "device.key").write_bytes((other / "device.key").read_bytes())
     assert "key of another certificate" in verdicts(keys, "left")["certificate"].text
+    (keys / "device.secret").unlink()
+    assert "no secret of 'left'" in verdicts(keys, "left")["secret"].text
     (keys / "rig.key").chmod(0o644)
     assert "others can read" in verdicts(keys, "left")["rig key"].text
     keys.chmod(0o755)

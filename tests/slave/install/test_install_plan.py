@@ -89,6 +89,7 @@ def test_what_does_not_fit_is_refused_with_its_fix(words: tuple[str, ...], said:
     ("file", "content", "said"),
     [
         ("rig.key", b"0123", "rig.key is not 64 hexadecimal digits"),
+        ("devices/left.secret", b"0123", "device-left.secret is not 64 hexadecimal digits"),
         (
             "ca.pem",
             b"-----BEGIN CERTIFICATE-----\nnone\n-----END CERTIFICATE-----\n",
@@ -113,6 +114,10 @@ def test_keys_that_others_can_read_and_keys_that_are_missing_are_refused(board: 
     with pytest.raises(InstallError, match="others can read this key; run: chmod 600"):
         board.install(site)
     (board.keys / "rig.key").chmod(0o600)
+    (board.keys / "devices/left.secret").chmod(0o640)
+    with pytest.raises(InstallError, match=r"left.secret: others can read this key; run: chmod 600"):
+        board.install(site)
+    (board.keys / "devices/left.secret").chmod(0o600)
     (board.keys / "devices/left.key").unlink()
     with pytest.raises(
         InstallError, match=r"no device-left.key; make them on the PC: phalanx-master keys make"
@@ -125,7 +130,11 @@ def test_keys_that_others_can_read_and_keys_that_are_missing_are_refused(board: 
 def test_keys_stay_where_none_are_given_and_the_private_ones_of_the_pc_never_come(
     board: Board, site: Path
 ) -> None:
-    assert not {name for name in keys_of(board.keys) if name.startswith(("ca.key", "master", "operator"))}
+    assert not {
+        name
+        for name in keys_of(board.keys)
+        if name.startswith(("ca.key", "devices.key", "master", "operator"))
+    }
     board.install(site)
     assert board.install(site, keys=False).changed == []
 

@@ -34,7 +34,9 @@ def test_a_clean_machine_gets_all_of_it(board: Board, site: Path) -> None:
         in lines
     )
     modes = {p.name: p.stat().st_mode & 0o777 for p in (root / "etc/phalanx/keys").iterdir()}
-    assert modes == dict.fromkeys(("rig.key", "ca.pem", "device-left.pem", "device-left.key"), 0o600)
+    assert modes == dict.fromkeys(
+        ("rig.key", "ca.pem", "device-left.pem", "device-left.key", "device-left.secret"), 0o600
+    )
     assert (root / "etc/phalanx/keys").stat().st_mode & 0o777 == 0o700
     assert "server 10.0.0.2 " in (root / "etc/chrony/conf.d/phalanx.conf").read_text()
     assert (root / "var/lib/phalanx/calib_json/cameras/left.json").is_file()
@@ -75,11 +77,37 @@ def test_only_what_changed_is_restarted(board: Board, site: Path) -> None:
     assert board.systemd.pids[UNIT] == pids[UNIT]
 
 
+def test_a_machine_from_before_there_were_secrets_gets_its_own_by_one_installation(
+    board: Board, site: Path
+) -> None:
+    board.install(site)
+    secret, unit = (
+        board.root / "etc/phalanx/keys/device-left.secret",
+        board.root / "etc/systemd/system" / "phalanx-slave@.service",
+    )
+    after = board.files()
+    secret.unlink()
+    unit.write_text("".join(line for line in unit.read_text().splitlines(True) if ".secret:" not in line))
+    before = board.files()
+    with pytest.raises(InstallError, match=r"/etc/phalanx/keys/device-left.secret: missing; give --keys DIR"):
+        board.install(site, keys=False)
+    assert board.files() == before
+    outcome = board.install(site)
+    assert sorted(outcome.changed) == sorted(str(one.relative_to(board.root)) for one in (secret, unit))
+    assert outcome.restarted == [UNIT]
+    assert secret.read_bytes() == (board.keys / "devices/left.secret").read_bytes()
+    now = board.files()
+    assert {p: v for p, v in now.items() if not p.startswith(NOTES)} == {
+        p: v for p, v in after.items() if not p.startswith(NOTES)
+    }
+    assert (board.install(site).changed, board.install(site).restarted) == ([], [])
+
+
 def test_a_sender_that_is_served_no_more_is_removed_with_its_keys(board: Board, site: Path) -> None:
     board.install(site, "--name", "right")
     outcome = board.install(site)
     assert "etc/phalanx/right.env" in outcome.changed
-    assert not (board.root / "etc/phalanx/keys/device-right.key").exists()
+    assert not list((board.root / "etc/phalanx/keys").glob("device-right.*"))
     assert set(board.systemd.pids) == {UNIT}
 
 

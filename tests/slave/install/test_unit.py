@@ -108,8 +108,15 @@ def test_the_unit_waits_for_the_slave_and_watches_its_loop() -> None:
     assert said["RestartSec"] == "500ms"
     assert "MemoryDenyWriteExecute" not in said  # numba
     credentials = [value.split(":") for key, value in settings(UNIT.read_text()) if key == "LoadCredential"]
-    assert [name for name, _ in credentials] == ["rig.key", "ca.pem", "device.pem", "device.key"]
+    assert [name for name, _ in credentials] == [
+        "rig.key",
+        "ca.pem",
+        "device.pem",
+        "device.key",
+        "device.secret",
+    ]
     assert all(path.startswith("/etc/phalanx/keys/") for _, path in credentials)
+    assert credentials[-1][1] == "/etc/phalanx/keys/device-%i.secret"
 
 
 def test_the_files_of_the_unit_are_in_the_wheel(tmp_path: Path) -> None:
