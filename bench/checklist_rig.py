@@ -86,13 +86,20 @@ class Rig:
         lists: The checklist.
     """
 
-    def __init__(self, folder: Path, rig: str) -> None:
+    def __init__(
+        self, folder: Path, rig: str, environments: Mapping[str, Mapping[str, str]] | None = None
+    ) -> None:
         """Start a rig of the tree in `calib_json`: its cameras, its IMU if it has one, and a master.
+
+        Args:
+            folder: For its files.
+            rig: Its name.
+            environments: Process -> what it has in its environment besides.
 
         Raises:
             RehearsalError: It does not come up.
         """
-        self._folder, self._rig = folder, rig
+        self._folder, self._rig, self._environments = folder, rig, environments or {}
         self.slaves, self.master, self.system = folder / "slaves", folder / "master", folder / "system"
         folder.mkdir(parents=True)
         self._write_trees()
@@ -201,7 +208,7 @@ class Rig:
         process = subprocess.Popen(
             [sys.executable, "-m", *command],
             cwd=ROOT,
-            env={**os.environ, **self._key, **environment},
+            env={**os.environ, **self._key, **environment, **self._environments.get(name, {})},
             stdout=log,
             stderr=subprocess.STDOUT,
         )

@@ -1,6 +1,7 @@
 """Faults that take long or need root: a full disk, a million hostile datagrams, strangers at the console."""
 
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -10,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from bench import faults_wall_clock
 from bench.faults_flood import Capture, Watch, flood, hostile, memory_mb, targets
 from bench.faults_measured import false
 from bench.faults_ports import assault
@@ -54,6 +56,15 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, small_d
     finally:
         rig.close()
     assert (small_disk / "run.mcap").stat().st_size > 10_000
+
+
+def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
+    """Of a slave and of the master, ten seconds ahead and back, while the hand is tracked."""
+    if shutil.which("cc") is None:
+        pytest.skip("no cc to build bench/wall_clock.c: apt install gcc libc6-dev")
+    for runs in faults_wall_clock.measure(tmp_path, 2).values():
+        assert not any(one.rise[name] for one in runs for name in one.rise)
+        assert max(one.share for one in runs) > faults_wall_clock.LEAST_SHARE
 
 
 def test_a_million_hostile_datagrams_cost_nothing_that_lasts(tmp_path: Path) -> None:
