@@ -66,7 +66,7 @@ def test_it_writes_to_its_state_alone(host: Host) -> None:
 def test_it_reads_its_own_keys_and_not_those_of_the_machine(host: Host) -> None:
     folder = f"/run/credentials/{host.unit}"
     assert "PRIVATE KEY" in inside(host, f"cat {folder}/device.key").stdout
-    for file in ("rig.key", f"device-{host.name}.key"):
+    for file in ("rig.key", f"device-{host.name}.key", f"device-{host.name}.secret"):
         assert host.run(f"test -f /etc/phalanx/keys/{file} && echo there") == "there"
         denied = inside(host, f"cat /etc/phalanx/keys/{file}")
         assert denied.returncode != 0
