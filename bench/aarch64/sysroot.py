@@ -6,17 +6,17 @@ suite, whatever the machine has: one version counts for all, and since Debian 13
 
 import fcntl
 import gzip
-import hashlib
 import importlib.util
 import platform
 import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
+
+from bench.made_once import key_of, made_once
 
 ROOT = Path(__file__).resolve().parents[2]
 CACHE = ROOT / "out" / "aarch64"
@@ -113,22 +113,10 @@ def _prepared(say: Callable[[str], None]) -> Sysroot:
 
 def _made(name: str, inputs: str, make: Callable[[Path], None], say: Callable[[str], None]) -> Path:
     """The folder `name` of the cache, made afresh if its inputs are others than those it was made of."""
-    key = hashlib.sha256(inputs.encode()).hexdigest()[:12]
-    place = CACHE / f"{name}-{key}"
-    if place.is_dir():
-        return place
-    say(f"making {place.relative_to(ROOT)} ...")
-    CACHE.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=CACHE, prefix=f"{name}-unfinished-") as unfinished:
-        folder = Path(unfinished) / "made"
-        folder.mkdir()
-        make(folder)
-        try:
-            folder.rename(place)
-        except OSError:
-            if not place.is_dir():  # else another run was faster, and made the same
-                raise
-    return place
+    place = CACHE / f"{name}-{key_of(inputs)}"
+    if not place.is_dir():
+        say(f"making {place.relative_to(ROOT)} ...")
+    return made_once(place, make)
 
 
 def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], None]) -> Path:

@@ -2,20 +2,24 @@
 until it is switched off."""
 
 import base64
+import contextlib
 import os
 import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
+import pytest
+
 from bench.processes import cpu_s
 from tests.hosts.board_image import NETWORK, Image, board_image, pc_image, run
 from tests.hosts.fleet import Fleet
+from tests.hosts.measured import Measured
 from tests.hosts.rig import Rig
 from tests.hosts.tap import Tap
 from tests.hosts.undo import Undo
@@ -258,6 +262,30 @@ class BoardRig(Rig):
             ssh_options=board.ssh_options,
         )
         super().__init__(cast(Fleet, fleet), board.folder)
+
+
+@contextlib.contextmanager
+def switched_on(model: Model, what: str, told: Measured) -> Generator[BoardRig]:
+    """A machine that is on, with nothing of ours on it, and its rig; skipped where it cannot be.
+
+    Args:
+        model: Which kind.
+        what: How it is called where its time from power to ssh is kept.
+        told: Where that is kept.
+    """
+    if (reason := why_not()) is not None:
+        pytest.skip(reason)
+    board = Board(model)
+    board.start()
+    try:
+        told(f"{what} up, from power to ssh", board.boot_s)
+        rig = BoardRig(board)
+        try:
+            yield rig
+        finally:
+            rig.close()
+    finally:
+        board.close()
 
 
 def _base64(text: str) -> str:

@@ -8,10 +8,12 @@ import hashlib
 import os
 import shutil
 import subprocess
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
+
+from bench.made_once import key_of, made_once
+from tests.hosts.debian import cache
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
 DISK_MB = 2500
@@ -103,12 +105,6 @@ class Image(NamedTuple):
     initrd: Path | None = None
 
 
-def cache() -> Path:
-    """Folder for what is made once: PHALANX_CACHE, by default phalanx in ~/.cache or XDG_CACHE_HOME."""
-    usual = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
-    return Path(os.environ.get("PHALANX_CACHE", usual)) / "hosts"
-
-
 def board_image() -> Image:
     """That of an arm64 board, made if it is not there (a minute, 120 MB to load).
 
@@ -130,16 +126,9 @@ def pc_image() -> Image:
 
 
 def _made(name: str, make: Callable[[Path, Path], None]) -> Path:
-    recipe = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:12]
-    place = cache() / f"{name}-{SUITE}-{recipe}"
-    if not place.is_dir():
-        cache().mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache(), prefix="unfinished-") as unfinished:
-            made = Path(unfinished) / "made"
-            made.mkdir()
-            make(Path(unfinished), made)
-            made.rename(place)
-    return place
+    """The folder of an image, made by `make`, which is given a folder to work in and the one to fill."""
+    recipe = key_of(Path(__file__).read_text())
+    return made_once(cache() / f"{name}-{SUITE}-{recipe}", lambda made: make(made.parent, made))
 
 
 def _make_pc(work: Path, made: Path) -> None:

@@ -1,12 +1,12 @@
 """Debian 13 as a folder, made once by mmdebstrap: systemd, sshd, Python and rsync as Raspberry Pi OS has them."""
 
-import hashlib
 import os
 import platform
 import shutil
 import subprocess
-import tempfile
 from pathlib import Path
+
+from bench.made_once import key_of, made_once
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
 PACKAGES = (
@@ -53,30 +53,20 @@ def root_tree() -> Path:
     Raises:
         RuntimeError: mmdebstrap failed; its own words.
     """
-    usual = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
-    cache = Path(os.environ.get("PHALANX_CACHE", usual)) / "hosts"
     architecture = ARCHITECTURES[platform.machine()]
-    recipe = hashlib.sha256(f"{SUITE} {PACKAGES} {MIRROR}".encode()).hexdigest()[:12]
-    place = cache / f"{SUITE}-{architecture}-{recipe}"
-    if place.is_dir():
-        return place
-    cache.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=cache, prefix="unfinished-") as unfinished:
-        folder = Path(unfinished) / "root"
-        command = [
-            "mmdebstrap",
-            "--quiet",
-            "--variant=minbase",
-            f"--arch={architecture}",
-            "--format=directory",
-        ]
-        what = [f"--include={','.join(PACKAGES)}", "--skip=check/empty", SUITE, str(folder), MIRROR]
-        made = subprocess.run([*command, *what], capture_output=True, text=True, check=False)
-        if made.returncode != 0:
-            raise RuntimeError(f"mmdebstrap failed:\n{made.stderr[-2000:]}")
-        try:
-            folder.rename(place)
-        except OSError:
-            if not place.is_dir():  # else another run was faster, and made the same
-                raise
-    return place
+    recipe = key_of(f"{SUITE} {PACKAGES} {MIRROR}")
+    return made_once(cache() / f"{SUITE}-{architecture}-{recipe}", lambda folder: _make(architecture, folder))
+
+
+def cache() -> Path:
+    """Folder for what is made once: PHALANX_CACHE, by default phalanx in ~/.cache or XDG_CACHE_HOME."""
+    usual = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "phalanx"
+    return Path(os.environ.get("PHALANX_CACHE", usual)) / "hosts"
+
+
+def _make(architecture: str, folder: Path) -> None:
+    command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--arch={architecture}", "--format=directory"]
+    what = [f"--include={','.join(PACKAGES)}", "--skip=check/empty", SUITE, str(folder), MIRROR]
+    made = subprocess.run([*command, *what], capture_output=True, text=True, check=False)
+    if made.returncode != 0:
+        raise RuntimeError(f"mmdebstrap failed:\n{made.stderr[-2000:]}")

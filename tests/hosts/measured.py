@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -31,6 +32,13 @@ class Measured:
         bound = "" if limit is None else f"  at most {limit:g}"
         beside = f"  on a machine {strain():.1f} times overloaded" if strain() > 1.0 else ""
         self.lines.append(f"{name:<66} {value:8.2f} {unit:<3}{bound}{beside}")
+
+
+def kept(file: Path) -> Iterator[Measured]:
+    """For a fixture: numbers that go to a file, and are shown at the end."""
+    numbers = Measured(file)
+    yield numbers
+    print("\n" + "\n".join(numbers.lines))  # noqa: T201  # with -s
 
 
 def strain() -> float:

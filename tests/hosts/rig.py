@@ -107,6 +107,11 @@ class Rig:
         hosts = self.targets if targets is None else targets
         return self.program("deploy", "deploy", *hosts, *where, *what, *more, timeout_s=timeout_s)
 
+    def rollback(self, *more: str) -> Ran:
+        """Run `phalanx rollback` for both hosts."""
+        hosts = [host.login for host in self.fleet.hosts.values()]
+        return self.program("deploy", "rollback", *hosts, *more, *self.fleet.ssh_options)
+
     def uninstall(self) -> Ran:
         """Run `phalanx uninstall` for both hosts."""
         hosts = [host.login for host in self.fleet.hosts.values()]

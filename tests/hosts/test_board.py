@@ -9,8 +9,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.hosts.board import Board, BoardRig, why_not
-from tests.hosts.measured import Measured
+from tests.hosts.board import ARM64, BoardRig, switched_on
+from tests.hosts.measured import Measured, kept
 from tests.hosts.rig import ROOT, Ran
 
 PATIENCE_S = 900.0  # for a deployment on a busy machine
@@ -20,26 +20,15 @@ REBOOT_S = 60.0  # from the command to the first datagram, of a board that has t
 @pytest.fixture(scope="session")
 def told() -> Iterator[Measured]:
     """Where numbers go."""
-    numbers = Measured(ROOT / "out" / "board.json")
-    yield numbers
-    print("\n" + "\n".join(numbers.lines))  # noqa: T201  # with -s
+    yield from kept(ROOT / "out" / "board.json")
 
 
 @pytest.fixture(scope="module")
 def rig(told: Measured) -> Iterator[BoardRig]:
     """The board, on, with nothing of ours on it, and a master that waits for it."""
-    if (reason := why_not()) is not None:
-        pytest.skip(reason)
-    board = Board()
-    board.start()
-    try:
-        told("board up, from power to ssh", board.boot_s)
-        one = BoardRig(board)
+    with switched_on(ARM64, "board", told) as one:
         one.start_master()
         yield one
-        one.close()
-    finally:
-        board.close()
 
 
 @pytest.fixture(scope="module")

@@ -29,6 +29,13 @@ def main(arguments=None):
         told = "WATCHDOG=1"
         time.sleep(1.0)
 """
+HANGS = """import time
+
+
+def main(arguments=None):
+    time.sleep(1e6)
+"""
+SILENT_S, HANGS_S = 12.0, 16.0  # of stream that such a version may cost
 DEADLINE_S = 150.0  # of a host; the one that is off is given up long before
 
 
@@ -43,8 +50,8 @@ def last_line(ran: Ran) -> str:
     return ran.err.strip().splitlines()[-1]
 
 
-def refused(rig: Rig, name: str, wheelhouse: Path, measured: Measured) -> Ran:
-    """Deploy to one host a version that is no good; everything on it has to be as before."""
+def refused(rig: Rig, name: str, wheelhouse: Path, measured: Measured, gap_s: float = 60.0) -> Ran:
+    """Deploy to one host a version that is no good; everything on it has to be as before, after `gap_s` at most."""
     host, tap = rig.fleet.hosts[name], rig.fleet.tap
     streams(rig, name)
     before, files, begin = release(host), host.files(), time.monotonic()
@@ -55,7 +62,8 @@ def refused(rig: Rig, name: str, wheelhouse: Path, measured: Measured) -> Ran:
     assert changed == [], "\n".join(changed)
     streams(rig, name)
     measured(f"... refused after, of {wheelhouse.name}", ran.seconds)
-    measured(f"... longest gap, of {wheelhouse.name}", tap.longest_gap_s(host.address, begin))
+    gap = tap.longest_gap_s(host.address, begin)
+    assert measured.at_most(gap_s, f"... longest gap, of {wheelhouse.name}", gap), str(ran)
     return ran
 
 
@@ -81,8 +89,17 @@ def test_a_version_that_sends_nothing_is_taken_back(
     deployed: Deployment, rig: Rig, measured: Measured
 ) -> None:
     bad = changed_wheels(rig.cache, rig.folder / "sends nothing", "91.0", {"slave/__main__.py": SAYS_NOTHING})
-    ran = refused(rig, "right", bad, measured)
+    ran = refused(rig, "right", bad, measured, SILENT_S)
     assert "no datagram of right" in last_line(ran), str(ran)
+
+
+def test_a_version_that_hangs_before_it_is_ready_is_taken_back(
+    deployed: Deployment, rig: Rig, measured: Measured
+) -> None:
+    bad = changed_wheels(rig.cache, rig.folder / "hangs", "91.5", {"slave/__main__.py": HANGS})
+    ran = refused(rig, "left", bad, measured, HANGS_S)
+    assert "phalanx-slave@left.service is not ready after" in last_line(ran), str(ran)
+    assert "it says nothing; everything is as before" in last_line(ran), str(ran)
 
 
 def test_a_full_disk_is_told_and_nothing_stops(deployed: Deployment, rig: Rig, measured: Measured) -> None:
@@ -132,8 +149,21 @@ def test_a_good_version_comes_and_goes_back(deployed: Deployment, rig: Rig, meas
     measured("longest gap of a good new version", gap)
     assert all(release(host).startswith("releases/93.0-") for host in rig.fleet.hosts.values())
     streams(rig)
-    back = rig.deploy()  # its release is still there
+    would = rig.rollback("--dry-run")
+    assert would.code == 0, str(would)
+    assert all(
+        f"would go back to {one.replace('releases/', 'release ')}" in would.out for one in before.values()
+    )
+    assert all(release(host).startswith("releases/93.0-") for host in rig.fleet.hosts.values())
+    begin = time.monotonic()
+    back = rig.rollback()
     assert back.code == 0, str(back)
     measured("going back to the version before", back.seconds)
+    gap = max(rig.fleet.tap.longest_gap_s(host.address, begin) for host in rig.fleet.hosts.values())
+    measured("longest gap of going back", gap)
     assert {name: release(host) for name, host in rig.fleet.hosts.items()} == before, str(back)
+    streams(rig)
+    again = rig.rollback()
+    assert again.code == 1, str(again)
+    assert again.err.count("there is no earlier installation to go back to") == len(before), str(again)
     streams(rig)

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.hosts.board import AMD64, Board, BoardRig, why_not
-from tests.hosts.measured import Measured
+from tests.hosts.board import AMD64, BoardRig, switched_on
+from tests.hosts.measured import Measured, kept
 from tests.hosts.rig import ROOT
 
 RATE_HZ = 10.0  # what an emulated processor draws, copies and looks at
@@ -20,22 +20,14 @@ LOAD = "modprobe vivid n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0"
 @pytest.fixture(scope="session")
 def told() -> Iterator[Measured]:
     """Where numbers go."""
-    numbers = Measured(ROOT / "out" / "nightly.json")
-    yield numbers
-    print("\n" + "\n".join(numbers.lines))  # noqa: T201  # with -s
+    yield from kept(ROOT / "out" / "nightly.json")
 
 
 @pytest.fixture(scope="session")
 def rig(told: Measured) -> Iterator[BoardRig]:
     """The machine, on, with a camera of the kernel and the slave that `phalanx deploy` put there, and a master."""
-    if (reason := why_not()) is not None:
-        pytest.skip(reason)
-    pc = Board(AMD64)
-    pc.start()
-    try:
-        told("PC up, from power to ssh", pc.boot_s)
-        pc.run(LOAD)
-        one = BoardRig(pc)
+    with switched_on(AMD64, "PC", told) as one:
+        one.board.run(LOAD)
         file = one.calibration / "cameras/left.json"
         camera = json.loads(file.read_text())
         camera |= {"frame_rate_hz": RATE_HZ, "width_px": WIDTH_PX, "height_px": HEIGHT_PX}
@@ -45,9 +37,6 @@ def rig(told: Measured) -> Iterator[BoardRig]:
         slow = ("--ready-s", str(PATIENCE_S / 2), "--hear-s", str(PATIENCE_S / 4))
         camera = ("--camera", "left=v4l2:/dev/video0", "--options", f"left={VIVID}")
         ran = one.deploy(*camera, *slow, timeout_s=PATIENCE_S)
-        assert ran.code == 0, f"{ran}\n{pc.journal()}"
+        assert ran.code == 0, f"{ran}\n{one.board.journal()}"
         told("deploy to the PC", ran.seconds)
         yield one
-        one.close()
-    finally:
-        pc.close()

@@ -9,12 +9,13 @@ import os
 import shutil
 import stat
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 
 from bench.aarch64.sysroot import PYTHON, Sysroot
-from tests.hosts.board_image import MIRROR, SUITE, cache, run
+from bench.made_once import made_once
+from tests.hosts.board_image import MIRROR, SUITE, run
+from tests.hosts.debian import cache
 from tests.hosts.rig import ROOT
 
 BOARD = "raspi3b"
@@ -97,21 +98,20 @@ def started(
 
 def _kernel() -> tuple[Path, Path]:
     """Kernel and device tree, loaded once."""
-    place = cache() / f"raspi-{SUITE}"
-    if not place.is_dir():
-        cache().mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=cache(), prefix="unfinished-") as unfinished:
-            archive, made = Path(unfinished) / "kernel.tar", Path(unfinished) / "made"
-            made.mkdir()
-            modes = ["--mode=chrootless", "--skip=check/chrootless,check/qemu", "--variant=extract"]
-            what = ["--arch=arm64", "--include=linux-image-arm64"]
-            run("mmdebstrap", "--quiet", *modes, *what, SUITE, str(archive), MIRROR)
-            names = ["--wildcards", "./boot/vmlinuz-*", f"./usr/lib/linux-image-*/broadcom/{TREE}"]
-            run("tar", "-x", "-f", str(archive), "-C", unfinished, *names)
-            shutil.move(next(Path(unfinished).glob("boot/vmlinuz-*")), made / "kernel")
-            shutil.move(next(Path(unfinished).glob(f"usr/lib/linux-image-*/broadcom/{TREE}")), made / TREE)
-            made.rename(place)
+    place = made_once(cache() / f"raspi-{SUITE}", _load_kernel)
     return place / "kernel", place / TREE
+
+
+def _load_kernel(made: Path) -> None:
+    work = made.parent
+    archive = work / "kernel.tar"
+    modes = ["--mode=chrootless", "--skip=check/chrootless,check/qemu", "--variant=extract"]
+    what = ["--arch=arm64", "--include=linux-image-arm64"]
+    run("mmdebstrap", "--quiet", *modes, *what, SUITE, str(archive), MIRROR)
+    names = ["--wildcards", "./boot/vmlinuz-*", f"./usr/lib/linux-image-*/broadcom/{TREE}"]
+    run("tar", "-x", "-f", str(archive), "-C", str(work), *names)
+    shutil.move(next(work.glob("boot/vmlinuz-*")), made / "kernel")
+    shutil.move(next(work.glob(f"usr/lib/linux-image-*/broadcom/{TREE}")), made / TREE)
 
 
 def _write_memory_disk(made: Sysroot, file: Path, console: str) -> None:
