@@ -19,7 +19,7 @@ from master.options import HERE_BUS, BusEnd
 ANSWER_S = (
     15.0  # 60 frames of a slow camera until it shows its settings, as many to go back, and a colour table
 )
-APPEAR_S = 2.0  # whoever has just connected is not known everywhere yet
+APPEAR_S = 4.0  # whoever has just connected is not known everywhere yet
 STEP_S = 0.1
 _ALSO = ("digital_gain", "focus_dioptres", "sensor_celsius", "sync_locked", "sync_error_us", "roi_margin")
 _MORE = ("control.", "marker.", "pick.")

@@ -7,12 +7,13 @@ machine is behind is measured by how long a sleep of ours really takes.
 import statistics
 import threading
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from bench.checklist import clean, rehearse
+from bench.checklist import Shown, clean, rehearse
 from bench.checklist_faults import of_markers, of_wrist
 from bench.checklist_rig import Rig
 from bench.local_rig import until
@@ -25,6 +26,7 @@ LIVE = ("auto_mode", "colour_collision", "background_in_range", "calibration_sta
         "too_hot", "imu_silent")  # fmt: skip
 NOMINAL = 2  # reports
 STEP_S = 0.02
+BEHIND_S = 0.05  # so late a sleep is where a machine has other things to do
 BACK_S = 2.0
 AFTER_S = 1.2  # the bench waits longer
 # A machine that is behind draws fewer pictures than it should: then that is told as well, and it is true.
@@ -42,10 +44,19 @@ class Lag:
     @property
     def reports(self) -> int:
         """How many reports more than nominal are the machine's own doing."""
-        worst = statistics.quantiles(self._late or [0.0, 0.0], n=10)[-1]
+        worst = statistics.quantiles([0.0, 0.0, *self._late], n=10)[-1]
         return 1 + round(
             20.0 * worst
         )  # twenty things happen one after the other between a fault and its line
+
+    @property
+    def worst_s(self) -> float:
+        """The longest that a sleep was late since `begin`."""
+        return max(self._late, default=0.0)
+
+    def begin(self) -> None:
+        """What was before does not count any more."""
+        self._late = []
 
     def close(self) -> None:
         self._stop.set()
@@ -74,20 +85,46 @@ def lag() -> Iterator[Lag]:
     made.close()
 
 
-def test_nothing_is_told_while_nothing_is_wrong(rig: Rig) -> None:
-    assert {code for code, _ in clean(rig, 4.0)} <= BEHIND
+def wrong(shown: Shown, reports: int) -> list[str]:
+    """In what a rehearsal is not as expected, if so many reports more than nominal are the machine's own doing."""
+    told = {
+        "never shown": shown.shown_s is None,
+        "never gone": shown.cleared_s is None,
+        f"of {set(shown.subjects)}": not shown.subjects or not shown.subjects <= shown.fault.subjects,
+        f"also told: {set(shown.others)}": not {other for other, _ in shown.others} <= BEHIND,
+        f"shown after {shown.shown_reports} reports": shown.shown_reports > NOMINAL + reports,
+        f"gone after {shown.cleared_reports} reports": shown.cleared_reports > NOMINAL + reports,
+    }
+    return [what for what, holds in told.items() if holds]
+
+
+def rehearsed(rig: Rig, code: str, lag: Lag) -> Shown:
+    """Bring a fault about; once more where it was not as expected and the machine was behind."""
+    for last in (False, False, True):
+        lag.begin()
+        shown = rehearse(rig, FAULTS[code], AFTER_S)
+        found = wrong(shown, lag.reports)
+        if not found:
+            return shown
+        assert not last, found
+        assert lag.worst_s > BEHIND_S, found
+        warnings.warn(f"{code} again, {found}: this machine was {lag.worst_s:.2f} s behind", stacklevel=2)
+    raise AssertionError("unreachable")
+
+
+def test_nothing_is_told_while_nothing_is_wrong(rig: Rig, lag: Lag) -> None:
+    for last in (False, False, True):
+        lag.begin()
+        told = {code for code, _ in clean(rig, 4.0)} - BEHIND
+        if not told:
+            return
+        assert not last, told
+        assert lag.worst_s > BEHIND_S, told
 
 
 @pytest.mark.parametrize("code", LIVE)
 def test_a_fault_is_told_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
-    shown = rehearse(rig, FAULTS[code], AFTER_S)
-    assert shown.shown_s is not None
-    assert shown.cleared_s is not None
-    assert shown.subjects
-    assert shown.subjects <= shown.fault.subjects
-    assert {other for other, _ in shown.others} <= BEHIND
-    assert shown.shown_reports <= NOMINAL + lag.reports
-    assert shown.cleared_reports <= NOMINAL + lag.reports
+    rehearsed(rig, code, lag)
     for key, (sentence, fix) in rig.lists.sentences.items():
         if key[0] == code:
             assert key[1].split(".")[0].split("-")[0] in sentence
@@ -95,11 +132,7 @@ def test_a_fault_is_told_alone_and_goes(code: str, rig: Rig, lag: Lag) -> None:
 
 
 def test_a_killed_slave_is_told_alone_until_it_is_there_again(rig: Rig, lag: Lag) -> None:
-    shown = rehearse(rig, FAULTS["camera_absent"], AFTER_S)
-    assert shown.subjects == {"right"}
-    assert {other for other, _ in shown.others} <= BEHIND
-    assert shown.shown_reports <= NOMINAL + lag.reports
-    assert shown.cleared_reports <= NOMINAL + lag.reports
+    assert rehearsed(rig, "camera_absent", lag).subjects == {"right"}
 
 
 def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_plug(
@@ -107,9 +140,12 @@ def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_pl
 ) -> None:
     """The slave lives on, with the session it had; from the plug to frames of it: the longest wait of its retries."""
     until(lambda: not rig.lists.now() - {("rate_low", "left"), ("rate_low", "right")}, 10.0)
+    lag.begin()
     before, told = rig.ask("left", "report").counts, rig.ask(MASTER, "report").counts
     rig.fault("left", unplugged=True)
-    assert until(lambda: ("camera_absent", "left") in rig.lists.now(), BACK_S + lag.reports)
+    pulled = time.monotonic()
+    assert until(lambda: ("camera_absent", "left") in rig.lists.now(), 30.0)
+    assert time.monotonic() - pulled < BACK_S + lag.reports
     away = rig.ask("left", "report").counts
     assert away["camera.lost"] == before["camera.lost"] + 1
     sent = rig.ask(MASTER, "report").counts["left.received"]
@@ -119,7 +155,9 @@ def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_pl
     assert (
         time.monotonic() - plugged < BACK_S + 1.0 + lag.reports
     )  # of retries; three frames; what the machine lacks
-    assert until(lambda: ("camera_absent", "left") not in rig.lists.now(), BACK_S + lag.reports)
+    back = time.monotonic()
+    assert until(lambda: ("camera_absent", "left") not in rig.lists.now(), 30.0)
+    assert time.monotonic() - back < BACK_S + lag.reports
     after = rig.ask(MASTER, "report").counts
     assert rig.processes["left"].poll() is None
     assert after.get("left.restarts", 0) == told.get("left.restarts", 0)

@@ -73,7 +73,7 @@ def _console(tmp_path: Path, root: Path) -> Generator[tuple[str, str, Path]]:
         yield found[0], bus, tree
     finally:
         console.send_signal(signal.SIGINT)
-        code = console.wait(60)
+        code = console.wait(1e-3 * PATIENCE_MS)
         if console.stdout is not None:
             console.stdout.close()
     assert code == 0
@@ -224,7 +224,7 @@ def test_from_an_empty_folder_to_a_tracked_hand(console: tuple[str, str, Path], 
         press(page, "Next: lenses and places", page.get_by_role("heading", name="Lenses and places"))
         page.get_by_label("Views to take").fill(str(VIEWS))
         press(page, "Start taking views", page.get_by_role("button", name="Cancel", exact=True))
-        page.get_by_text(re.compile(f"view 3 of {VIEWS}")).first.wait_for()
+        page.get_by_text(re.compile(f"view [3-{VIEWS}] of {VIEWS}")).first.wait_for()
         shot(page, "setup_views")
         use = page.get_by_role("button", name="Use it", exact=True)
         use.wait_for()

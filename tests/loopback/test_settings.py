@@ -55,9 +55,16 @@ class Rig:
         return {line.split()[0]: tuple(line.split()[1:]) for line in done.stdout.splitlines()}
 
     def camera(self, *options: str) -> subprocess.CompletedProcess[str]:
-        """`phalanx-master camera …` as a person types it."""
+        """`phalanx-master camera …` as a person types it; once more where a busy master did not answer at once."""
         command = [PYTHON, "-m", "master", "camera", *options, "--bus", self.endpoint]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+        tries: list[subprocess.CompletedProcess[str]] = []
+
+        def answered() -> bool:
+            tries.append(subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False))
+            return "cannot open the bus" not in tries[-1].stderr
+
+        assert until(answered), tries[-1].stderr
+        return tries[-1]
 
 
 @contextmanager

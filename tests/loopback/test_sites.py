@@ -28,7 +28,7 @@ from master.keys_folder import make
 from tests.network_helpers import free_endpoint, until
 
 SITES = {"room-a": "star", "room-b": "hash"}  # and the key that is tapped there, to tell them apart
-READY_S, BACK_S = 60.0, 20.0
+READY_S, BACK_S = 60.0, 60.0
 
 
 def tap(key: str) -> Gesture:

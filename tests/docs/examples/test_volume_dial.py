@@ -1,5 +1,6 @@
 """The volume dial of docs/examples: by itself, and as a process beside a bus."""
 
+import itertools
 import math
 import os
 import signal
@@ -20,6 +21,7 @@ from common.messages import Gesture
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
 from tests.docs.examples.loading import example, wait_for
+from tests.network_helpers import until
 
 STEP_NS = 16_666_667
 
@@ -200,14 +202,20 @@ def test_as_a_process_it_waits_for_the_master_and_follows_it(root: Path) -> None
         master = ZenohBus(endpoint, None)
         master.announce(MASTER)
         assert app.stderr.readline() == "waiting for a dial grip ...\n"
-        for one in turn([0.0, 5.0, 13.0, 19.0]):
-            master.publish("gesture", one.hand, one)
-        lines = ""
-        while "56 %" not in lines:
-            lines += (line := app.stdout.readline())
-            assert line
+        lines, output = list[str](), app.stdout
+        reader = threading.Thread(target=lambda: lines.extend(output), daemon=True)
+        reader.start()
+        grips = itertools.count(1)
+
+        def followed() -> bool:  # what is told before the master has heard of who listens is told to nobody
+            for one in turn([0.0, 5.0, 13.0, 19.0], next(grips) * 10**9):
+                master.publish("gesture", one.hand, one)
+            return until(lambda: any("56 %" in line for line in lines), 5.0)
+
+        assert until(followed)
         app.send_signal(signal.SIGINT)
         assert app.wait(60.0) == 0
+        reader.join(60.0)
         master.close()
     finally:
         app.kill()

@@ -5,6 +5,7 @@ import json
 import socket
 import ssl
 import stat
+import time
 from datetime import UTC, datetime, timedelta
 from http.cookies import SimpleCookie
 from pathlib import Path
@@ -22,7 +23,7 @@ from master.send.outputs import who_reads
 from master.send.web import KEY_FILE, WebSink, address_of, guard_of
 from tests.master.send.hands import hand_pose
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 EVERYWHERE = WebOutput(host="0.0.0.0", port=0)
 
 
@@ -75,7 +76,7 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
             connect(f"wss://127.0.0.1:{port}/hands", ssl=tls, open_timeout=WAIT_S)
         with connect(f"wss://127.0.0.1:{port}/hands?key={key}", ssl=tls, open_timeout=WAIT_S) as client:
             while sink.server.clients == 0:
-                pass
+                time.sleep(0.005)
             sink.write(hand_pose("right"))
             assert json.loads(client.recv(WAIT_S))["hand"] == "my-right"
         with socket.create_connection(("127.0.0.1", port), timeout=WAIT_S) as plain:

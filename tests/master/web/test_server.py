@@ -23,7 +23,7 @@ from master.web import static_dir, three_js_path
 from master.web.server import SEND_BUFFER_BYTES, WebServer, foreign
 from tests.master.send.hands import hand_pose
 
-WAIT_S = 30.0
+WAIT_S = 60.0
 
 
 def until(true: Callable[[], bool]) -> None:
