@@ -33,6 +33,7 @@ SeenT = TypeVar("SeenT", bound=Detections)
 SeenT_co = TypeVar("SeenT_co", bound=Detections, covariant=True)
 SeenT_contra = TypeVar("SeenT_contra", bound=Detections, contravariant=True)
 Beside: TypeAlias = TagDetections | ImuSample | TrackerPose  # what comes beside the frames of cameras
+_BESIDE = (TagDetections, ImuSample, TrackerPose)
 
 
 class SolvedT(Protocol):
@@ -135,7 +136,7 @@ def run(
         message = source.get(timeout_s=0.1)
         if message is None:
             continue
-        beside = isinstance(message, TagDetections | ImuSample | TrackerPose)
+        beside = isinstance(message, _BESIDE)
         if not beside:
             figures.rates.push(message)
         for solved in world.push(message):

@@ -9,7 +9,7 @@ taken is of the same stretch of time.
 import os
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
 
@@ -18,7 +18,7 @@ from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
 from common.link_key import LinkKey
-from common.messages import ImuSample, TagDetections, TrackerPose
+from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.session import Random
 from common.udp import UdpSocket
 from master.link import MasterLink, Taken
@@ -26,6 +26,7 @@ from master.sequence import CameraCounts
 from master.turned_away import Away
 
 AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
+DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
 QUEUE = 64  # frames, or triples, that may wait, of one or two cameras
 QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
 ROOM = {
@@ -34,6 +35,14 @@ ROOM = {
     "imu": 16 * QUEUE,
     "tracker": 16 * QUEUE,
 }  # what comes while so many frames do
+# Whose room in the queue a message takes.
+_KIND: dict[type[Taken], str] = {
+    MarkerDetections: "frame",
+    WristDetections: "frame",
+    TagDetections: "tags",
+    ImuSample: "imu",
+    TrackerPose: "tracker",
+}
 
 
 class Ingest:
@@ -184,11 +193,12 @@ class Ingest:
     def get(self, timeout_s: float) -> Taken | None:
         """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
         with self._changed:
-            self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
             if not self._queue:
-                return None
+                self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
+                if not self._queue:
+                    return None
             message = self._queue.popleft()
-            self._waiting[_kind(message)] -= 1
+            self._waiting[_KIND[type(message)]] -= 1
             return message
 
     def close(self) -> None:
@@ -200,19 +210,25 @@ class Ingest:
         self._socket.close()
 
     def _run(self) -> None:
+        due_ns = self._clock.now_ns()
         while not self._closing.is_set():
             first = self._socket.receive()
             taken: list[Taken] = []
+            outbox: list[tuple[bytes, Address]] = []
+            come = 0
             with self._lock:
                 for datagram, address in self._come(first):
+                    come += 1
                     message = self._link.receive(datagram, address, self._clock.now_ns())
                     if message is not None:
                         taken.append(message)
-                outbox = self._link.due()
+                now_ns = self._clock.now_ns()
+                if come != len(taken) or come == 0 or now_ns >= due_ns:
+                    outbox, due_ns = self._link.due(), now_ns + DUE_NS
             for datagram, address in outbox:
                 self._socket.send(datagram, address)
-            for message in taken:
-                self._put(message)
+            if taken:
+                self._put(taken)
 
     def _come(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
         """What has come, at most `AT_ONCE`: under a flood it is not for each that all that is due is seen to."""
@@ -224,15 +240,17 @@ class Ingest:
                 return
             yield arrived
 
-    def _put(self, message: Taken) -> None:
-        kind = _kind(message)
+    def _put(self, messages: Sequence[Taken]) -> None:
+        """Let them wait, and wake who waits for them: once for all that came together."""
         with self._changed:
-            self._queue.append(message)
-            self._waiting[kind] += 1
-            if self._waiting[kind] > self._room[kind]:
-                self._overflowed += 1
-                self._waiting[kind] -= 1
-                del self._queue[next(k for k, one in enumerate(self._queue) if _kind(one) == kind)]
+            for message in messages:
+                kind = _KIND[type(message)]
+                self._queue.append(message)
+                self._waiting[kind] += 1
+                if self._waiting[kind] > self._room[kind]:
+                    self._overflowed += 1
+                    self._waiting[kind] -= 1
+                    del self._queue[next(k for k, one in enumerate(self._queue) if _KIND[type(one)] == kind)]
             self._changed.notify()
 
 
@@ -240,15 +258,6 @@ def room(cameras: int) -> dict[str, int]:
     """How many messages of each kind may wait."""
     frames = max(QUEUE, QUEUE_PER_CAMERA * cameras)
     return ROOM | {"frame": frames, "tags": frames}
-
-
-def _kind(message: Taken) -> str:
-    """Whose room in the queue a message takes, a key of `ROOM`."""
-    if isinstance(message, ImuSample):
-        return "imu"
-    if isinstance(message, TrackerPose):
-        return "tracker"
-    return "tags" if isinstance(message, TagDetections) else "frame"
 
 
 def _check_address(host: str) -> None:
