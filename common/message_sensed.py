@@ -1,0 +1,232 @@
+"""What senders send: markers, fingers before a wrist device and tags that a camera saw, samples of an IMU, poses of a
+tracker."""
+
+from functools import cache
+from math import isinf, nan
+from typing import Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+from msgspec import Meta
+
+from common.arrays import Float, Ids
+from common.message_parts import FINGER_COUNT, MAX_MARKERS, MAX_TAGS, Count, Message, Name, TimeNs, freeze
+
+
+class MarkerDetections(Message, frozen=True, eq=False, tag=True):
+    """What one camera saw in one frame.
+
+    Attributes:
+        camera: Camera name, a member of the rig's `cameras`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of this camera; a gap is a dropped frame.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the frame was handed to the slave [ns], same clock as `t_ns`.
+        uv: Marker centroids (M, 2) [px], distorted image, (0, 0) = centre of the top-left pixel.
+        area: Blob areas (M,) [px^2].
+        quality: Confidence (M,) in 0..1: 1 is a whole, unambiguous, well exposed marker.
+        sigma_px: Standard deviation per axis (M,) [px] of `uv` as the centroid of all that the camera would see of
+            the whole marker: noise, doubt of occlusion, size. Positive where `uv` is seen, NaN elsewhere.
+        rival_uv: (M, 2) [px], as `uv`: a second place of the same colour, where the slave could not exclude that
+            this is the marker. NaN: none, the usual case. Only where `uv` is seen.
+            A row that is NaN in all was not seen.
+        t_sigma_ns: Standard deviation of `t_ns` [ns]: of the sender's stamp until `ingest`, with that of the clock
+            conversion afterwards. 0: exact, or not known (a recording).
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    uv: Float
+    area: Float
+    quality: Float
+    sigma_px: Float
+    rival_uv: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+
+    def __post_init__(self) -> None:
+        m = len(self.area)
+        if m > MAX_MARKERS:
+            raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
+        freeze(self, "uv", np.float64, (m, 2))
+        freeze(self, "area", np.float64, (m,))
+        freeze(self, "quality", np.float64, (m,))
+        freeze(self, "sigma_px", np.float64, (m,))
+        # A list is faster than numpy for so few.
+        for u, sigma in zip(self.uv[:, 0].tolist(), self.sigma_px.tolist(), strict=True):
+            if (u != u) != (sigma != sigma) or sigma <= 0.0:
+                raise ValueError("sigma_px: must be positive where uv is seen and NaN elsewhere")
+        if self.rival_uv.size == 0:
+            msgspec.structs.force_setattr(self, "rival_uv", nowhere(m))
+            return
+        freeze(self, "rival_uv", np.float64, (m, 2))
+        if not np.isnan(self.rival_uv[np.isnan(self.uv[:, 0])]).all():
+            raise ValueError("rival_uv: a rival of a marker that is not seen")
+
+    @property
+    def has_rivals(self) -> bool:
+        """Whether a marker has a rival."""
+        return self.rival_uv is not nowhere(len(self.area)) and not bool(np.isnan(self.rival_uv).all())
+
+
+class WristDetections(Message, frozen=True, eq=False, tag=True):
+    """What the camera of a wrist device saw in one strobed triple (ambient, laser, LED), fingers thumb ... little.
+
+    Pixels are of the distorted image, (0, 0) = centre of the top-left pixel; NaN: not seen.
+
+    Attributes:
+        camera: Camera name, the rig's only one.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of the laser frame. It rises by more than one from triple to triple.
+        t_ns: Middle of the exposure of row 0 of the laser frame [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the last frame of the triple was handed to the slave [ns], same clock as `t_ns`.
+        laser_uv: (5, 2) centroids of the part of the laser line that lies on each finger and is seen.
+        laser_sigma_px: (5,) their standard deviation per axis; positive where `laser_uv` is seen, NaN elsewhere.
+        laser_px: (5,) length of that part in the image.
+        tip_uv: (5, 2) fingertips.
+        tip_sigma_px: (5,) their standard deviation per axis; positive where `tip_uv` is seen, NaN elsewhere.
+        tip_depth: (5,) distance of the fingertips by the fall-off of the LED light, relative: the unit is the rig's
+            own and constant, not the metre.
+        t_sigma_ns: Standard deviation of `t_ns` [ns], as in `MarkerDetections`.
+        exposure_us: Exposure time [us] of the frames; 0: not known.
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    laser_uv: Float
+    laser_sigma_px: Float
+    laser_px: Float
+    tip_uv: Float
+    tip_sigma_px: Float
+    tip_depth: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+    exposure_us: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("laser_uv", "tip_uv"):
+            freeze(self, name, np.float64, (FINGER_COUNT, 2))
+        for name in ("laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth"):
+            freeze(self, name, np.float64, (FINGER_COUNT,))
+        for what, uv, sigma in (
+            ("laser", self.laser_uv, self.laser_sigma_px),
+            ("tip", self.tip_uv, self.tip_sigma_px),
+        ):
+            unseen = np.isnan(uv).any(axis=1)
+            if (np.isnan(sigma) != unseen).any() or (sigma <= 0.0).any():
+                raise ValueError(
+                    f"{what}_sigma_px: must be positive where {what}_uv is seen and NaN elsewhere"
+                )
+
+
+class TagDetections(Message, frozen=True, eq=False, tag=True):
+    """The fiducial tags (AprilTag, ArUco) that one camera found in one frame. Not every frame needs to be searched.
+
+    Attributes:
+        camera: Camera name, a member of the rig's `cameras`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Frame counter of this camera; it may rise by more than one.
+        t_ns: Middle of the exposure of row 0 [ns], sender's clock until `ingest`, then the master's.
+        ready_t_ns: When the frame was handed to the slave [ns], same clock as `t_ns`.
+        ids: (N,) their numbers in the family, rising.
+        uv: (N, 4, 2) corners [px], distorted image, (0, 0) = centre of the top-left pixel; of the tag as printed top
+            left, top right, bottom right, bottom left.
+        sigma_px: (N,) standard deviation per axis of the corners.
+        t_sigma_ns: Standard deviation of `t_ns` [ns], as in `MarkerDetections`.
+    """
+
+    camera: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    ready_t_ns: TimeNs
+    ids: Ids
+    uv: Float
+    sigma_px: Float
+    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+
+    def __post_init__(self) -> None:
+        n = len(self.ids)
+        if n > MAX_TAGS:
+            raise ValueError(f"{n} tags, at most {MAX_TAGS}")
+        freeze(self, "ids", np.uint16, (n,))
+        freeze(self, "uv", np.float64, (n, 4, 2))
+        freeze(self, "sigma_px", np.float64, (n,))
+        if (self.ids[1:] <= self.ids[:-1]).any():
+            raise ValueError("ids: must rise, each once")
+        if np.isnan(self.uv).any() or not (self.sigma_px > 0.0).all():
+            raise ValueError("uv, sigma_px: a tag that was found has corners and a positive sigma")
+
+
+class TrackerPose(Message, frozen=True, eq=False, tag=True):
+    """Where a device that tracks itself (a Vive tracker under Lighthouse) says it is, in its system's own frame.
+
+    Attributes:
+        source: Name of the device, the `tracker` of an object file.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Pose counter of this device; a gap is a dropped pose.
+        t_ns: When the pose holds [ns], sender's clock until `ingest`, then the master's.
+        position_m: (3,) of the device [m], frame of its system. NaN: it has lost itself.
+        orientation_wxyz: (4,) quaternion, device axes -> its system's. NaN: it has lost itself.
+    """
+
+    source: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+
+    def __post_init__(self) -> None:
+        freeze(self, "position_m", np.float64, (3,))
+        freeze(self, "orientation_wxyz", np.float64, (4,))
+
+
+class ImuSample(Message, frozen=True, eq=False, tag=True):
+    """What one inertial sensor measured at one instant, in its own axes. NaN: it has no such sensor, or no value.
+
+    Attributes:
+        source: Name of the sensor, that of the rig's `imu`.
+        session: Random id of the sending process; a restart is a new session.
+        seq: Sample counter of this sensor; a gap is a dropped sample.
+        t_ns: When it was measured [ns], sender's clock until `ingest`, then the master's.
+        gyro_rad_s: Angular velocity (3,) [rad/s].
+        accel_m_s2: Specific force (3,) [m/s^2]: at rest it points up, 9.81 long.
+        mag_ut: Magnetic field (3,) [uT].
+        orientation_wxyz: (4,) quaternion, sensor axes -> the sensor's world, whose z axis is vertical.
+        heading_sigma_rad: Standard deviation of what its turn about the vertical has drifted since its beginning,
+            which was anywhere [rad]. NaN: who made the orientation does not say.
+    """
+
+    source: Name
+    session: Count
+    seq: Count
+    t_ns: TimeNs
+    gyro_rad_s: Float
+    accel_m_s2: Float
+    mag_ut: Float
+    orientation_wxyz: Float
+    heading_sigma_rad: float = nan
+
+    def __post_init__(self) -> None:
+        freeze(self, "gyro_rad_s", np.float64, (3,))
+        freeze(self, "accel_m_s2", np.float64, (3,))
+        freeze(self, "mag_ut", np.float64, (3,))
+        freeze(self, "orientation_wxyz", np.float64, (4,))
+        if self.heading_sigma_rad < 0.0 or isinf(self.heading_sigma_rad):
+            raise ValueError(f"heading_sigma_rad: {self.heading_sigma_rad}: must be 0 or more, or NaN")
+
+
+Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera sends, of either kind
+
+
+@cache
+def nowhere(markers: int) -> Float:
+    """The rivals of so many markers of which none has one, (M, 2), read-only; at most 49 are ever made."""
+    nowhere = np.full((markers, 2), np.nan)
+    nowhere.flags.writeable = False
+    return nowhere

@@ -1,0 +1,256 @@
+"""What a master makes of it: poses of hands and objects, contact of both, gestures."""
+
+from enum import IntEnum
+from math import isinf, nan
+from typing import Annotated, Literal, TypeAlias
+
+import numpy as np
+from msgspec import Meta, field
+
+from common.arrays import Bool, Code, Float
+from common.message_parts import FINGER_COUNT, JOINT_COUNT, MAX_MARKERS, Message, Name, TimeNs, freeze
+
+GestureKind = Literal["pose", "pinch", "dial", "tap", "point"]
+Phase = Literal["begin", "update", "end"]
+_NO_LASER = np.full((FINGER_COUNT, 3), np.nan)
+_NO_LEVEL = np.zeros(FINGER_COUNT, dtype=np.uint8)
+_NOT_AMBIGUOUS = np.zeros(FINGER_COUNT, dtype=np.bool_)
+_NO_ROTATION, _NO_SIGMA, _NO_POINT = np.full(4, np.nan), np.full(2, np.nan), np.full(3, np.nan)
+for _nothing in (_NO_LASER, _NO_LEVEL, _NOT_AMBIGUOUS, _NO_ROTATION, _NO_SIGMA, _NO_POINT):
+    _nothing.flags.writeable = False
+
+
+class Source(IntEnum):
+    """Where the pose of one joint comes from."""
+
+    NONE = 0
+    MEASURED = 1
+    SOLVED = 2
+    HELD = 3
+    WRIST = 4
+
+
+class Level(IntEnum):
+    """What a wrist device solved a finger from (Digits, UIST 2012: two levels)."""
+
+    NONE = 0
+    FK = 1
+    IK = 2
+
+
+class ObjectSource(IntEnum):
+    """What the pose of an object comes from."""
+
+    NONE = 0
+    MARKERS = 1
+    TAGS = 2
+    TRACKER = 3
+    HELD = 4
+
+
+class HandPose(Message, frozen=True, eq=False, tag=True):
+    """One hand at one instant, in the joint order of XR_EXT_hand_tracking (26 joints).
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: The instant at which the pose holds [ns], master's clock.
+        position_m: Joint positions (26, 3) [m], rig frame.
+        orientation_wxyz: Joint orientations (26, 4), unit quaternions, joint -> rig frame,
+            OpenXR axes (-z along the bone to the tip, +y dorsal).
+        radius_m: Joint radii (26,) [m].
+        valid: (26,) the pose of the joint may be used.
+        tracked: (26,) the joint is observed now, not inferred. Tracked implies valid.
+        cov_m2: Position covariance (26, 3, 3) [m^2], rig frame. NaN: unknown.
+        source: (26,) `Source` codes.
+        angles_rad: (5, 4) [rad]: abduction, flexion (MCP; thumb CMC), PIP (thumb MCP),
+            DIP (thumb IP), zero in the profile's rest pose.
+        markers_m: Filtered cap centroids (M, 3) [m], rig frame. NaN: not seen.
+        markers_raw_m: The same before the filter.
+        markers_cov_m2: Covariances (M, 3, 3) [m^2] of `markers_raw_m`, rig frame. NaN: not seen.
+        inside_volume: (26,) the joint lies in the volume that the rig states; all True where it states none. Outside,
+            accuracy is not known; that alone does not clear `valid`.
+        latency_ns: From the hand-over of the last contributing frame to its slave, to
+            the publication of this pose [ns]; 0 in an offline run.
+        laser_m: (5, 3) where the laser of a wrist device meets thumb ... little [m], frame of its camera. NaN: not
+            seen, or no such device.
+        level: (5,) `Level` codes: what a wrist device solved each finger from.
+        ambiguous: (5,) another pose of the finger explains what the wrist device saw as well; this is the one that
+            fits the past, or habit.
+        palm_world_wxyz: (4,) quaternion, palm axes -> the world of the IMU on a wrist device, whose z axis is
+            vertical. NaN: not known, or no such device.
+        palm_world_sigma_rad: (2,) its standard deviations: tilt against the vertical per axis, heading about it.
+        wrist_bend_rad: (2,) flexion and deviation of the wrist between a device on the forearm and the palm
+            (`common.wrist_bend`). NaN: no such device, or nothing tells.
+        wrist_bend_sigma_rad: (2,) their standard deviations.
+    """
+
+    hand: Name
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+    radius_m: Float
+    valid: Bool
+    tracked: Bool
+    cov_m2: Float
+    source: Code
+    angles_rad: Float
+    markers_m: Float
+    markers_raw_m: Float
+    markers_cov_m2: Float
+    inside_volume: Bool
+    latency_ns: TimeNs = 0
+    laser_m: Float = field(default_factory=lambda: _NO_LASER)
+    level: Code = field(default_factory=lambda: _NO_LEVEL)
+    ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
+    palm_world_wxyz: Float = field(default_factory=lambda: _NO_ROTATION)
+    palm_world_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+
+    def __post_init__(self) -> None:
+        j = JOINT_COUNT
+        m = self.markers_m.size // 3
+        if m > MAX_MARKERS:
+            raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
+        freeze(self, "position_m", np.float64, (j, 3))
+        freeze(self, "orientation_wxyz", np.float64, (j, 4))
+        freeze(self, "radius_m", np.float64, (j,))
+        freeze(self, "valid", np.bool_, (j,))
+        freeze(self, "tracked", np.bool_, (j,))
+        freeze(self, "cov_m2", np.float64, (j, 3, 3))
+        freeze(self, "source", np.uint8, (j,))
+        if self.source.max() > max(Source):
+            raise ValueError(f"source: {self.source.max()} is no Source code")
+        freeze(self, "angles_rad", np.float64, (FINGER_COUNT, 4))
+        freeze(self, "markers_m", np.float64, (m, 3))
+        freeze(self, "markers_raw_m", np.float64, (m, 3))
+        freeze(self, "markers_cov_m2", np.float64, (m, 3, 3))
+        freeze(self, "inside_volume", np.bool_, (j,))
+        freeze(self, "laser_m", np.float64, (FINGER_COUNT, 3))
+        freeze(self, "level", np.uint8, (FINGER_COUNT,))
+        if self.level.max() > max(Level):
+            raise ValueError(f"level: {self.level.max()} is no Level code")
+        freeze(self, "ambiguous", np.bool_, (FINGER_COUNT,))
+        freeze(self, "palm_world_wxyz", np.float64, (4,))
+        freeze(self, "palm_world_sigma_rad", np.float64, (2,))
+        freeze(self, "wrist_bend_rad", np.float64, (2,))
+        freeze(self, "wrist_bend_sigma_rad", np.float64, (2,))
+
+
+class ObjectPose(Message, frozen=True, eq=False, tag=True):
+    """One rigid object at one instant.
+
+    Attributes:
+        object: Name of the object file.
+        t_ns: The instant at which the pose holds [ns], master's clock.
+        position_m: (3,) of the object's own frame [m], rig frame. NaN: never seen yet, or not for long.
+        orientation_wxyz: (4,) unit quaternion, object axes -> rig frame. NaN with the position.
+        cov: (6, 6) of position [m] and of a small turn about the rig's axes [rad]. NaN: unknown.
+        residual_m: Root mean square by which what was measured misses the object in this pose [m]. NaN: not measured.
+        source: `ObjectSource` code.
+        tracked: The pose is measured now, not held.
+        seen: How many of its features (markers, tags) the pose rests on.
+        expected: How many would be seen by some camera, as it is turned, with nothing before it.
+        occluded: Something hides a part of it: fewer are seen than expected.
+        latency_ns: From the hand-over of the last contributing frame to its slave, to the publication of this pose
+            [ns]; 0 in an offline run.
+    """
+
+    object: Name
+    t_ns: TimeNs
+    position_m: Float
+    orientation_wxyz: Float
+    cov: Float
+    residual_m: float
+    source: Annotated[int, Meta(ge=0, le=int(max(ObjectSource)))]
+    tracked: bool
+    seen: Annotated[int, Meta(ge=0, le=MAX_MARKERS)]
+    expected: Annotated[int, Meta(ge=0, le=MAX_MARKERS)]
+    occluded: bool
+    latency_ns: TimeNs = 0
+
+    def __post_init__(self) -> None:
+        freeze(self, "position_m", np.float64, (3,))
+        freeze(self, "orientation_wxyz", np.float64, (4,))
+        freeze(self, "cov", np.float64, (6, 6))
+        if self.residual_m < 0.0 or isinf(self.residual_m):
+            raise ValueError(f"residual_m: {self.residual_m}: must be 0 or more, or NaN")
+
+
+class Contact(Message, frozen=True, eq=False, tag=True):
+    """How near a hand is to an object, and where it touches it.
+
+    Attributes:
+        hand: Name of the hand profile.
+        object: Name of the object file.
+        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        distance_m: (5,) from the skin of the last segment of thumb ... little to the surface of the object [m],
+            negative inside. NaN: finger or object is not known.
+        sigma_m: (5,) standard deviations of these.
+        point_m: (5, 3) the point of the object's surface that is nearest to each [m], rig frame.
+        touching: (5,) the finger touches: with hysteresis, so that it does not flicker.
+        palm_distance_m: From the palm's skin to the surface [m].
+        held: The hand has a grip of it: the thumb or the palm, and a finger against them.
+    """
+
+    hand: Name
+    object: Name
+    t_ns: TimeNs
+    distance_m: Float
+    sigma_m: Float
+    point_m: Float
+    touching: Bool
+    palm_distance_m: float
+    held: bool
+
+    def __post_init__(self) -> None:
+        freeze(self, "distance_m", np.float64, (FINGER_COUNT,))
+        freeze(self, "sigma_m", np.float64, (FINGER_COUNT,))
+        freeze(self, "point_m", np.float64, (FINGER_COUNT, 3))
+        freeze(self, "touching", np.bool_, (FINGER_COUNT,))
+        if isinf(self.palm_distance_m):
+            raise ValueError("palm_distance_m: infinite value")
+
+
+class Gesture(Message, frozen=True, eq=False, tag=True):
+    """What a hand says. One that lasts begins, is repeated with every pose of the hand, and ends.
+
+    Attributes:
+        hand: Name of the hand profile.
+        t_ns: The instant [ns], that of the hand's pose, master's clock.
+        kind: `pose` (the hand is held in a shape), `pinch` (thumb and a finger), `dial` (a grip that turns), `tap`
+            (the thumb on a part of a finger; begins and ends in one message of phase `end`), `point` (a ray).
+        name: Which one: the pose (open_palm, counting_two, pointing, small_grasp, large_grasp, pinch, or one that was
+            taught); of a pinch the finger; of a tap the key (0 ... 9, star, hash); else the kind again.
+        phase: begin, update, end.
+        began_t_ns: When it began [ns], same clock as `t_ns`.
+        confidence: 0..1.
+        distance_m: Of a pinch: between the skin of thumb and finger [m].
+        strength: Of a pinch: 0 (open) .. 1 (closed).
+        angle_rad: Of a dial: by how much it was turned since it began, clockwise as the user sees the back of the hand.
+        origin_m: (3,) of a pointing ray [m], rig frame; of a pinch the middle between the two; of a dial its centre.
+        direction: (3,) unit vector of a pointing ray, rig frame; of a dial its axis.
+    """
+
+    hand: Name
+    t_ns: TimeNs
+    kind: GestureKind
+    name: Name
+    phase: Phase
+    began_t_ns: TimeNs
+    confidence: Annotated[float, Meta(ge=0.0, le=1.0)]
+    distance_m: float = nan
+    strength: float = nan
+    angle_rad: float = nan
+    origin_m: Float = field(default_factory=lambda: _NO_POINT)
+    direction: Float = field(default_factory=lambda: _NO_POINT)
+
+    def __post_init__(self) -> None:
+        freeze(self, "origin_m", np.float64, (3,))
+        freeze(self, "direction", np.float64, (3,))
+        for name in ("distance_m", "strength", "angle_rad"):
+            if isinf(getattr(self, name)):
+                raise ValueError(f"{name}: infinite value")
+
+
+Told: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it
