@@ -302,7 +302,7 @@ def test_at_overload_each_kind_of_message_keeps_its_newest(stack: ExitStack) -> 
     count = ROOM["tracker"] + 5
     for seq in range(count):
         for message in (detections("left", 1, seq), tags("left", 1, seq), tracker("puck", 1, seq)):
-            ingest._put(message)
+            ingest._put([message])
     taken = [ingest.get(0.0) for _ in range(sum(ROOM[kind] for kind in ("frame", "tags", "tracker")))]
     for kind, room in ((MarkerDetections, "frame"), (TagDetections, "tags"), (TrackerPose, "tracker")):
         newest = list(range(count - ROOM[room], count))
