@@ -95,9 +95,7 @@ def who_reads(name: str, settings: OutputSettings) -> str | None:
         case "ros2":
             leaves = not loopback(settings.ros2.router)
         case "lsl":
-            if settings.lsl.scope == "machine":
-                return "found on this machine alone; but liblsl listens on every network, TCP 16572 and up: firewall"
-            leaves = True
+            leaves = settings.lsl.scope != "machine"
         case _:
             if is_loopback(settings.web.host):
                 return None
