@@ -28,13 +28,13 @@ _FORMS, _FORMS_OFFSET = _shepperd(), np.eye(4).ravel()
 def quaternion_to_matrix(q_wxyz: Float) -> Float:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4), normalised first."""
     q = np.asarray(q_wxyz, dtype=np.float64)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    q = q / np.sqrt((q * q).sum(axis=-1, keepdims=True))
+    w, x, y, z = (q[..., k] for k in range(4))
+    xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
+    wx, wy, wz = w * x, w * y, w * z
+    out = 2 * np.array((yy + zz, xy - wz, xz + wy, xy + wz, xx + zz, yz - wx, xz - wy, yz + wx, xx + yy))
+    out[::4] = 1 - out[::4]  # the diagonal
+    return np.moveaxis(out.reshape(3, 3, *w.shape), (0, 1), (-2, -1))
 
 
 def matrix_to_quaternion(rotation: Float) -> Float:
@@ -43,13 +43,13 @@ def matrix_to_quaternion(rotation: Float) -> Float:
     Takes the numerically largest of the four classic forms (Shepperd, 1978), so it is
     exact also near half turns.
     """
-    m = np.asarray(rotation, dtype=np.float64).reshape(*np.shape(rotation)[:-2], 9)
+    m = np.asarray(rotation, dtype=np.float64).reshape(-1, 9)
     # A quarter of each of the four forms is a row of a symmetric matrix that is linear in the rotation's elements.
-    forms = (m @ _FORMS + _FORMS_OFFSET).reshape(*m.shape[:-1], 4, 4)
-    best = np.argmax(np.diagonal(forms, axis1=-2, axis2=-1), axis=-1)[..., None, None]
-    q: Float = np.take_along_axis(forms, best, axis=-2)[..., 0, :]
-    q = q / np.sqrt(np.vecdot(q, q))[..., None]
-    return np.where(q[..., :1] < 0, -q, q)
+    forms = m @ _FORMS + _FORMS_OFFSET
+    best = np.argmax(forms[:, ::5], axis=1)  # of the diagonals
+    q: Float = forms.reshape(-1, 4, 4)[np.arange(len(best)), best]
+    q = q / np.sqrt(np.vecdot(q, q))[:, None]
+    return np.where(q[:, :1] < 0, -q, q).reshape(*np.shape(rotation)[:-2], 4)
 
 
 def rotation_vector_to_matrix(vector: Float) -> Float:

@@ -52,6 +52,7 @@ FINGER_JOINTS = (
 )
 PALM_FRAME = "palm_frame"
 TIPS = CHAINS[:, 3]
+_ROOTS = CHAINS[:, 0].copy()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,7 +206,7 @@ class HandModel:
         rotation[..., 2, :, :] = frame = frame @ local[..., 3, :, :]
         rotation[..., 3, :, :] = frame @ self.turn[:, 2]
         position = np.empty((*local.shape[:-2], 3))
-        position[..., 0, :] = self.rest_position_m[CHAINS[:, 0]]
+        position[..., 0, :] = self.rest_position_m[_ROOTS]
         np.matmul(rotation[..., :3, :, :], self.bone_m[..., None], out=position[..., 1:, :, None])
         return Chains(position.cumsum(axis=-2), rotation)
 
@@ -241,7 +242,7 @@ class HandModel:
     def abduction_limits_rad(self, flexion_rad: Float) -> tuple[Float, Float]:
         """Low and high (..., 5) [rad] of the abduction at flexions (..., 5) [rad]; NaN where the flexion is."""
         most = self.limits_rad[:, FLEXION, 1]
-        flexed = np.clip(flexion_rad, 0.0, most) / np.where(most > 0.0, most, 1.0)
+        flexed = np.minimum(np.maximum(flexion_rad, 0.0), most) / np.where(most > 0.0, most, 1.0)
         left = spread_left(np.maximum(flexed, 0.0), self.spread_at_full_flexion)
         return left * self.limits_rad[:, ABDUCTION, 0], left * self.limits_rad[:, ABDUCTION, 1]
 
@@ -259,8 +260,10 @@ class HandModel:
 
     def clamp(self, angles_rad: Float) -> Float:
         """Angles (..., 5, 4) cut at their limits, the abduction at those of the flexion that is left."""
-        flexion = np.clip(angles_rad[..., FLEXION], *self.limits_rad[:, FLEXION].T)
-        return np.clip(angles_rad, *self.limits_at(flexion))
+        legal = np.minimum(np.maximum(angles_rad, self.limits_rad[..., 0]), self.limits_rad[..., 1])
+        low, high = self.abduction_limits_rad(legal[..., FLEXION])
+        legal[..., ABDUCTION] = np.minimum(np.maximum(angles_rad[..., ABDUCTION], low), high)
+        return legal
 
 
 def _swing(root: Float, turn: Float, side_sign: float) -> Float:

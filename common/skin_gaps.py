@@ -74,11 +74,12 @@ def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
     square = np.vecdot(apart, apart)
     on_a = _Foot.of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, _lean(a.growth_m, uu))
     on_b = _Foot.of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, _lean(b.growth_m, vv))
-    t = np.full(apart.shape[:-1], 0.5)
-    s = t
+    s = t = np.full(apart.shape[:-1], 0.5)
     for _ in range(_ROUNDS):
-        s = on_a.nearest(t)
+        s, before = on_a.nearest(t), t
         t = on_b.nearest(s)
+        if (t == before).all():  # as where the nearest are ends of bones: more rounds change nothing
+            break
     from_a = a.start_m + s[..., None] * a.along_m
     between = b.start_m + t[..., None] * b.along_m - from_a
     length = np.sqrt(np.vecdot(between, between))

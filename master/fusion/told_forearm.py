@@ -20,7 +20,6 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
-from master.ik.certainty import anywhere
 from master.ik.hand import HandSolution
 from master.ik.parameters import HandParameters
 from master.ik.sensed_hand import SensedHand
@@ -85,7 +84,7 @@ def told_forearm(hand: HandSolution, bend_rad: Float, parameters: HandParameters
         added, gradient = np.zeros((size, size)), np.zeros(size)
         belief.add_to(R, hand.x, gradient, added)
         without = normal[:size, :size] - added / hand.scale
-        normal[:size, :size] = _at_least(without, anywhere(parameters) / hand.scale)
+        normal[:size, :size] = _at_least(without, parameters.anywhere / hand.scale)
         pull[:size] = gradient / hand.scale
         by = np.zeros((_SIGHTS, size + 2))
         by[:_ANGLES, _PALM:size], by[_ANGLES:, size:] = belief.by_free, np.eye(2)

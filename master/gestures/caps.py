@@ -7,7 +7,6 @@ by way of the hand, and is some millimetres off where the palm is known from the
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import quaternion_to_matrix
 from common.hand_model import FINGERS, TIPS, HandModel
 from common.messages import HandPose
 
@@ -24,14 +23,14 @@ class Caps:
             if mount is not None and mount.joint is not None:
                 self._joint[finger], self._offset[finger] = mount.joint, mount.offset_m
 
-    def of(self, pose: HandPose) -> Float:
-        """(5, 3) [m], rig frame."""
-        rotation = quaternion_to_matrix(pose.orientation_wxyz[self._joint])
-        caps = pose.position_m[self._joint] + (rotation @ self._offset[..., None])[..., 0]
+    def of(self, pose: HandPose, rotation: Float) -> Float:
+        """(5, 3) [m], rig frame, of a pose whose joints have the rotations (26, 3, 3), joint frame -> rig frame."""
+        caps = pose.position_m[self._joint] + (rotation[self._joint] @ self._offset[..., None])[..., 0]
         seen = pose.markers_m[np.isfinite(pose.markers_m[:, 0])]
         if not len(seen):
             return caps
-        apart = np.linalg.norm(caps[:, None] - seen[None], axis=-1)
+        off = caps[:, None] - seen[None]
+        apart = np.sqrt(np.vecdot(off, off))
         own = apart.argmin(axis=1)
         # The nearest to this cap, and this cap the nearest to it.
         mutual = (apart.argmin(axis=0)[own] == np.arange(5)) & (apart.min(axis=1) <= _OWN_M)

@@ -212,7 +212,7 @@ def _tips_of(seen: HandFeatures, caps_m: Float, turn: Float, across_m: float, si
     return Tips(
         place_m=caps_m @ turn.T,
         sigma_m=seen.sigma_m,
-        inwards=(pads / np.linalg.norm(pads, axis=1, keepdims=True)) @ turn.T,
+        inwards=(pads / np.sqrt(np.vecdot(pads, pads))[:, None]) @ turn.T,
         palmar=turn @ seen.palmar,
         across_m=across_m,
         curl=float(seen.curl[1:].mean()),

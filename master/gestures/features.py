@@ -6,6 +6,7 @@ that of the MCP between the palm's plane and the first bone; positive is towards
 """
 
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -19,6 +20,7 @@ KNOWN_SIGMA_M = 0.015  # a tip that may be farther off is anywhere between strai
 _CURLED_RAD = np.radians([90.0, 230.0, 230.0, 230.0, 230.0])
 # Of fingers that nothing is known of [rad]: a thumb at rest, fingers half bent.
 LIKELY_RAD = np.radians([[8.0, 15.0, 15.0, 15.0], *([[0.0, 55.0, 75.0, 50.0]] * 4)])
+_TIPS_AND_WRIST = np.append(TIPS, WRIST)
 _PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad is thickest
 
 
@@ -41,6 +43,7 @@ class HandFeatures:
         pads_m: (5, 3) middle of the pad's skin [m], rig frame.
         radius_m: (5,) of the round end [m].
         joints_m: (26, 3) [m], rig frame.
+        rotation: (26, 3, 3) joint frame -> rig frame.
         joints_cov_m2: (26, 3, 3) [m^2], rig frame; where nothing is known, a metre each way.
         T_rig_palm: (4, 4) palm -> rig frame.
         dorsal, palmar, forward: (3,) unit vectors, rig frame: out of the back of the hand, out of the palm, along the
@@ -63,6 +66,7 @@ class HandFeatures:
     pads_m: Float
     radius_m: Float
     joints_m: Float
+    rotation: Float
     joints_cov_m2: Float
     T_rig_palm: Float
     dorsal: Float
@@ -80,22 +84,21 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
     are likely to be.
     """
     joints, wxyz = pose.position_m, pose.orientation_wxyz
-    if not (pose.valid[WRIST] and np.isfinite(joints[WRIST]).all() and np.isfinite(wxyz[WRIST]).all()):
+    there: Float = joints.sum(axis=1) + wxyz.sum(axis=1)
+    if not (pose.valid[WRIST] and isfinite(there[WRIST])):
         return None
-    palm = quaternion_to_matrix(wxyz[WRIST]) @ model.rest_rotation[WRIST].T
+    rotation, lacking = quaternion_to_matrix(wxyz), np.isnan(there)
+    palm = rotation[WRIST] @ model.rest_rotation[WRIST].T
     T_rig_palm = rigid(palm, joints[WRIST] - palm @ model.rest_position_m[WRIST])
-    lacking: Bool = np.asarray(np.isnan(joints).any(axis=1) | np.isnan(wxyz).any(axis=1), np.bool_)
     if lacking.any():
         likely = model.forward(T_rig_palm, LIKELY_RAD)
         joints = np.where(lacking[:, None], likely.position_m, joints)
-        rotation = quaternion_to_matrix(np.where(lacking[:, None], 0.5, wxyz))
         rotation = np.where(lacking[:, None, None], likely.rotation, rotation)
-    else:
-        rotation = quaternion_to_matrix(wxyz)
     bend = _bends(joints[CHAINS], rotation[CHAINS], palm)
     total = bend.sum(axis=1)
     total[0] -= bend[0, 0]
-    sigma, wrist = _sigma_m(pose)
+    told: Bool = np.asarray(np.isfinite(pose.cov_m2.sum(axis=(1, 2))), np.bool_)
+    sigma, wrist = _sigma_m(pose, told)
     sigma = np.where(lacking[CHAINS].any(axis=1), np.inf, sigma)
     known = pose.valid[TIPS] & (sigma <= KNOWN_SIGMA_M)
     last = CHAINS[:, 2]
@@ -110,12 +113,13 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
         shape_sigma_m=np.sqrt(np.maximum(sigma**2 - wrist**2, 0.0)),
         angles_rad=pose.angles_rad,
         bend_rad=bend,
-        curl=np.clip(total / _CURLED_RAD, 0.0, 1.0),
+        curl=np.minimum(np.maximum(total / _CURLED_RAD, 0.0), 1.0),
         tips_m=joints[TIPS],
         pads_m=along - radius[:, None] * rotation[TIPS][..., 1],
         radius_m=pose.radius_m[TIPS],
         joints_m=joints,
-        joints_cov_m2=_cov_m2(pose, lacking),
+        rotation=rotation,
+        joints_cov_m2=_cov_m2(pose, told & ~lacking),
         T_rig_palm=T_rig_palm,
         dorsal=palm[:, 1],
         palmar=-palm[:, 1],
@@ -126,24 +130,22 @@ def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
     )
 
 
-def _cov_m2(pose: HandPose, lacking: Bool) -> Float:
-    told = np.isfinite(pose.cov_m2).all(axis=(1, 2)) & ~lacking
-    return np.where(told[:, None, None], pose.cov_m2, np.eye(3))
+def _cov_m2(pose: HandPose, known: Bool) -> Float:
+    return pose.cov_m2 if known.all() else np.where(known[:, None, None], pose.cov_m2, np.eye(3))
 
 
-def _sigma_m(pose: HandPose) -> tuple[Float, float]:
+def _sigma_m(pose: HandPose, told: Bool) -> tuple[Float, float]:
     """Standard deviations (5,) [m] of the tips along their worst axis, inf where not known; and that of the wrist along
-    its best, 0 where not known."""
-    which = np.append(TIPS, WRIST)
-    cov = pose.cov_m2[which]
-    told = np.isfinite(cov).all(axis=(1, 2)) & pose.valid[which]
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.where(told[:, None, None], cov, 0.0)), 0.0))
+    its best, 0 where not known. `told` (26,) says which covariances are finite."""
+    told = (told & pose.valid)[_TIPS_AND_WRIST]
+    cov = np.where(told[:, None, None], pose.cov_m2[_TIPS_AND_WRIST], 0.0)
+    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(cov), 0.0))
     return np.where(told[:5], spread[:5, 2], np.inf), float(spread[5, 0])
 
 
 def _bends(chain: Float, rotation: Float, palm: Float) -> Float:
     """`HandFeatures.bend_rad` of joints (5, 4, 3), their frames (5, 4, 3, 3) and the palm's (3, 3)."""
-    bone = np.diff(chain, axis=1)
+    bone = chain[:, 1:] - chain[:, :-1]
     out = np.empty((5, 3))
     first = bone[:, 0] @ palm
     out[1:, 0] = np.arctan2(-first[1:, 1], first[1:, 2])

@@ -109,5 +109,6 @@ def spread_m(tips: Tips, then: Tips) -> Float:
     known = tips.known & then.known
     if known.sum() < 3:
         return np.full(5, np.nan)
-    away = [np.linalg.norm(one.place_m - one.place_m[known].mean(axis=0), axis=1) for one in (tips, then)]
+    off = np.array([one.place_m - one.place_m[known].mean(axis=0) for one in (tips, then)])
+    away = np.sqrt(np.vecdot(off, off))
     return np.where(known, away[0] - away[1], np.nan)

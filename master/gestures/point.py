@@ -14,6 +14,8 @@ Nothing is smoothed here: the markers are already, by the 1 EUR filter with a cu
 hand at rest is held still by the hand's own filter. A second filter would only add its lag.
 """
 
+from math import sqrt
+
 import numpy as np
 
 from common.arrays import Bool, Float
@@ -23,6 +25,7 @@ from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting
 
+_EYE = np.eye(3)
 _LASTING = 1.5  # the doubt of a ray that is told already may be larger by this
 _KNUCKLE, _TIP = CHAINS[1, 0], CHAINS[1, 3]
 
@@ -120,7 +123,7 @@ def _bends(seen: HandFeatures) -> Float:
 def _ray_sigma_rad(seen: HandFeatures) -> float:
     """Standard deviation [rad] of the ray, about the axis where it is worst."""
     way = seen.joints_m[_TIP] - seen.joints_m[_KNUCKLE]
-    length = float(np.linalg.norm(way))
-    across = np.eye(3) - np.outer(way, way) / length**2
+    length = sqrt(float(way @ way))
+    across = _EYE - way[:, None] * way / length**2
     cov = across @ (seen.joints_cov_m2[_TIP] + seen.joints_cov_m2[_KNUCKLE]) @ across
     return float(np.sqrt(max(np.linalg.eigvalsh(cov)[2], 0.0))) / length

@@ -70,12 +70,11 @@ class PoseTable:
         self._share = settings.hold.known_share
         for row, pose in enumerate(poses):
             self._fill(row, pose)
+        self._vague, self._count = _VAGUE * self._soft, np.maximum(self._asked.sum(axis=1), 1)
 
     def misfit(self, quantities: Quantities) -> Float:
         """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
-        value = np.where(np.isfinite(quantities.value), quantities.value, 0.0)
-        outside = np.maximum(np.maximum(self._low - value, value - self._high), 0.0)
-        return np.where(self._asked, outside / np.hypot(self._soft, self._doubt(quantities)), 0.0)
+        return self._misfit(quantities, _doubt(quantities))
 
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
         """How well each pose fits.
@@ -84,19 +83,19 @@ class PoseTable:
             quantities: Of the hand.
             known: (5,) which fingers are.
         """
-        score = np.exp(-0.5 * (self.misfit(quantities) ** 2).sum(axis=1))
-        weight = np.where(
-            self._asked, 1.0 / (1.0 + (self._doubt(quantities) / (_VAGUE * self._soft)) ** 2), 0.0
-        )
-        share = weight.sum(axis=1) / np.maximum(self._asked.sum(axis=1), 1)
+        doubt = _doubt(quantities)
+        score = np.exp(-0.5 * np.square(self._misfit(quantities, doubt)).sum(axis=1))
+        weight = np.where(self._asked, 1.0 / (1.0 + np.square(doubt / self._vague)), 0.0)
+        share = weight.sum(axis=1) / self._count
         weighed = self._weight * score
         total = float(weighed.sum())
         confidence = score * weighed / total if total > 0.0 else score
         return Fit(score, confidence, (share >= self._share) & (known | ~self._needs).all(axis=1))
 
-    def _doubt(self, quantities: Quantities) -> Float:
-        told = np.isfinite(quantities.value) & np.isfinite(quantities.sigma)
-        return np.where(told, quantities.sigma, 1e9)
+    def _misfit(self, quantities: Quantities, doubt: Float) -> Float:
+        value = np.where(np.isfinite(quantities.value), quantities.value, 0.0)
+        outside = np.maximum(np.maximum(self._low - value, value - self._high), 0.0)
+        return np.where(self._asked, outside / np.hypot(self._soft, doubt), 0.0)
 
     def _fill(self, row: int, pose: PoseShape) -> None:
         for name, span in pose.ranges.items():
@@ -104,6 +103,11 @@ class PoseTable:
             self._asked[row, column] = True
             self._low[row, column], self._high[row, column] = span.low, span.high
             self._soft[row, column] = span.soft
+
+
+def _doubt(quantities: Quantities) -> Float:
+    """Standard deviations (Q,); what is not known is as good as anything."""
+    return np.where(np.isfinite(quantities.value + quantities.sigma), quantities.sigma, 1e9)
 
 
 class FingerSpeed:

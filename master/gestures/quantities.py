@@ -44,17 +44,20 @@ class Quantities:
         value, sigma = np.empty(_COUNT), np.empty(_COUNT)
         chain, doubt = features.joints_m[CHAINS], features.shape_sigma_m
         bend = np.degrees(features.bend_rad)
-        lever = np.linalg.norm(np.diff(chain[:, 1:], axis=1), axis=2).sum(axis=1)
+        bone = chain[:, 2:] - chain[:, 1:-1]
+        lever = np.sqrt(np.vecdot(bone, bone)).sum(axis=1)
         turned = np.degrees(doubt / lever)
         bend[1:, :2], turned[1:] = _hidden(bend[1:, :2], turned[1:], features.seen[1:])
         both = bend[1:, :2].sum(axis=1)
-        value[_BENDS] = np.column_stack([bend[1:, :2], both]).ravel()
-        sigma[_BENDS] = np.repeat(turned[1:], 3)
+        each = value[_BENDS].reshape(4, 3)  # a view
+        each[:, :2], each[:, 2] = bend[1:, :2], both
+        sigma[_BENDS] = turned[1:].repeat(3)
         value[_THUMB_BEND], sigma[_THUMB_BEND] = bend[0, 1:].sum(), turned[0]
         place = (features.tips_m[0] - features.T_rig_palm[:3, 3]) @ features.T_rig_palm[:3, :3]
         value[_THUMB_PLACE] = place * [features.side_sign, -1.0, 1.0] / features.size_m
         sigma[_THUMB_PLACE] = doubt[0] / features.size_m
-        apart = np.linalg.norm(features.tips_m[1:] - features.tips_m[0], axis=1)
+        off = features.tips_m[1:] - features.tips_m[0]
+        apart = np.sqrt(np.vecdot(off, off))
         value[_GAPS] = 1e3 * (apart - features.radius_m[1:] - features.radius_m[0])
         sigma[_GAPS] = 1e3 * np.hypot(doubt[1:], doubt[0])
         value[_AHEAD] = both[0] - both[1:].mean()
@@ -83,8 +86,8 @@ def _spreads(chain: Float, features: HandFeatures) -> Float:
     Fingers that stand up from that plane have no heading in it: their angle fades with what is left.
     """
     first = (chain[1:, 1] - chain[1:, 0]) @ features.T_rig_palm[:3, :3]
-    level = np.hypot(first[:, 0], first[:, 2]) / np.linalg.norm(first, axis=1)
-    heading = features.side_sign * np.arctan2(first[:, 0], first[:, 2]) * np.clip(level / 0.6, 0.0, 1.0)
+    level = np.hypot(first[:, 0], first[:, 2]) / np.sqrt(np.vecdot(first, first))
+    heading = features.side_sign * np.arctan2(first[:, 0], first[:, 2]) * np.minimum(level / 0.6, 1.0)
     return np.degrees(heading[:-1] - heading[1:])
 
 

@@ -25,5 +25,5 @@ class GestureRecogniser:
         seen = features_of(pose, self._model)
         if seen is None:
             return self._poses.lose(pose.hand, pose.t_ns) + self._actions.lost(pose.t_ns)
-        worn_only = len(pose.markers_m) == 0
-        return self._poses.push(seen) + self._actions.push(seen, self._caps.of(pose), worn_only=worn_only)
+        worn_only, caps_m = len(pose.markers_m) == 0, self._caps.of(pose, seen.rotation)
+        return self._poses.push(seen) + self._actions.push(seen, caps_m, worn_only=worn_only)

@@ -57,8 +57,8 @@ class _Instant:
         """That of a hand."""
         gap = touch.key_gap_m.min(axis=1)
         chain = seen.joints_m[CHAINS[1:]]
-        bone = np.diff(chain, axis=1)
-        bone = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+        bone = chain[:, 1:] - chain[:, :-1]
+        bone = bone / np.sqrt(np.vecdot(bone, bone))[..., None]
         tip, finger = seen.tips_m[0], int(gap.argmin())
         return cls(
             gap_m=gap,

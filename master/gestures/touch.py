@@ -54,7 +54,7 @@ def thumb_touch(features: HandFeatures, radius_m: Float) -> ThumbTouch:
     return ThumbTouch(
         gap_m=found.gap_m[:, 2],
         middle_m=found.middle_m[:, 2],
-        apart_rad=np.arccos(np.clip(face, -1.0, 1.0)),
+        apart_rad=np.arccos(np.minimum(np.maximum(face, -1.0), 1.0)),
         apart_sigma_rad=np.hypot(turned[0], turned[1:]),
         key_gap_m=found.gap_m,
         key_on=found.on_b,
@@ -67,8 +67,8 @@ def _turned_rad(features: HandFeatures) -> Float:
     """Standard deviations (5,) [rad] of the directions of the last bones: of their ends, over their length."""
     ends = features.joints_cov_m2[CHAINS[:, 2:]]
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(ends[:, 0] + ends[:, 1])[:, 2], 0.0))
-    bone = np.diff(features.joints_m[CHAINS[:, 2:]], axis=1)[:, 0]
-    return spread / np.linalg.norm(bone, axis=1)
+    bone = features.joints_m[CHAINS[:, 3]] - features.joints_m[CHAINS[:, 2]]
+    return spread / np.sqrt(np.vecdot(bone, bone))
 
 
 def _sigma_m(features: HandFeatures, found: Gaps) -> Float:
@@ -91,12 +91,9 @@ def _palmar(features: HandFeatures) -> Float:
     The pad says it for the last one; the others are turned back by the bends between.
     """
     chain = features.joints_m[CHAINS]
-    bone = np.diff(chain, axis=1)
-    bone = bone / np.linalg.norm(bone, axis=-1, keepdims=True)
+    bone = chain[:, 1:] - chain[:, :-1]
     out = np.empty((5, 3, 3))
-    pad = features.pads_m - (chain[:, 2] + _PAD_SHARE * (chain[:, 3] - chain[:, 2]))
-    out[:, 2] = pad / np.linalg.norm(pad, axis=1, keepdims=True)
+    out[:, 2] = features.pads_m - (chain[:, 2] + _PAD_SHARE * bone[:, 2])
     hinge = cross(bone[:, 2], out[:, 2])  # across the finger, the same for all its segments but for twist
-    across = cross(hinge[:, None], bone[:, :2])
-    out[:, :2] = across / np.linalg.norm(across, axis=-1, keepdims=True)
-    return out
+    out[:, :2] = cross(hinge[:, None], bone[:, :2])
+    return out / np.sqrt(np.vecdot(out, out))[..., None]

@@ -22,7 +22,7 @@ and the palm turns about the marker on its back.
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Bool, Float, Int
 from common.geometry import skew
 from common.hand_model import CHAINS, HandModel
 from master.ik.attached import Attached
@@ -33,26 +33,34 @@ _STRAIGHT_RAD = np.radians(3.0)  # a turn by less is straight: 0.2 mm off the ta
 _ANYWHERE_RAD = 1.0  # a turn that is less sure than this leads nowhere farther
 _PALM_POINTS = np.setdiff1d(np.arange(26), CHAINS)
 _CHAIN_BONES = CHAINS.size
+_EYE, _ROOT_2 = np.eye(3), float(np.sqrt(2.0))
 
 
 class Arcs:
-    """Second order of the joints of one hand with its markers. Holds tables of how bones add up to points."""
+    """Second order of the joints of one hand with its markers. Holds tables: how bones turn and add up to points."""
 
     def __init__(self, model: HandModel, parameters: HandParameters, markers: tuple[str, ...]) -> None:
         """Bones: four of each chain, the first from the palm's origin; one to each point of the palm; each marker."""
         self._parameters = parameters
-        self._marker = Attached.markers(model, parameters, markers)
-        self._joint_of = CHAINS[self._marker.finger, self._marker.level]
-        self._turns = parameters.complete.reshape(5, 4, 1, -1)
-        bones = _CHAIN_BONES + len(_PALM_POINTS) + len(markers)
+        self._marker = marker = Attached.markers(model, parameters, markers)
+        palm = len(_PALM_POINTS)
+        bones = _CHAIN_BONES + palm + len(markers)
         self._sums = np.zeros((26 + len(markers), bones))
         self._sums[CHAINS, :_CHAIN_BONES] = (
             np.eye(5)[:, None, :, None] * np.tri(4)[None, :, None, :]
         ).reshape(5, 4, -1)
-        self._sums[_PALM_POINTS, _CHAIN_BONES + np.arange(len(_PALM_POINTS))] = 1.0
-        on_finger = self._marker.on_finger
-        self._sums[26:] = np.where(on_finger, self._sums[self._joint_of], 0.0)
+        self._sums[_PALM_POINTS, _CHAIN_BONES + np.arange(palm)] = 1.0
+        self._sums[26:] = np.where(marker.on_finger, self._sums[CHAINS[marker.finger, marker.level]], 0.0)
         self._sums[26:, bones - len(markers) :] += np.eye(len(markers))
+        # The bone to a joint is turned by the axes of the joints before it; that to a knuckle, and the palm's, by none.
+        self._finger = np.concatenate([np.repeat(np.arange(5), 4), np.zeros(palm, np.int64), marker.finger])
+        self._moves = np.zeros((bones, 4, len(parameters.free)))
+        for f in range(5):
+            for k in range(1, 4):
+                self._moves[4 * f + k, : k + 1] = parameters.complete[4 * f : 4 * f + k + 1]
+        self._moves[_CHAIN_BONES + palm :] = marker.moves
+        self._turning = np.concatenate([np.arange(3), np.arange(6, 6 + len(parameters.free))])
+        self._pairs = [_pairs(count) for count in range(len(self._turning) + 1)]
 
     def covariance(self, found: HandSolution, cov: Float, markers_cov_m2: Float, seen: Bool) -> Float:
         """(26, 3, 3) [m^2] that the linear covariances of the joints leave out.
@@ -60,63 +68,73 @@ class Arcs:
         Args:
             found: The hand.
             cov: (6 + n, 6 + n) of the palm's turn and shift and of the free angles.
-            markers_cov_m2: (M, 3, 3) [m^2] of the markers, with the model's own error.
-            seen: (M,) which of them are seen.
+            markers_cov_m2: (N, 3, 3) [m^2] of the markers that are seen, with the model's own error.
+            seen: (M,) which these are.
         """
-        turning = np.concatenate([np.arange(3), np.arange(6, len(cov))])
-        variance, axes = np.linalg.eigh(cov[np.ix_(turning, turning)])
+        variance, axes = np.linalg.eigh(cov[self._turning[:, None], self._turning])
         bent = variance > _STRAIGHT_RAD**2
         if not bent.any():
             return np.zeros((26, 3, 3))
         bone, turned = self._bones(found)
         size = np.minimum(np.sqrt(variance[bent]), _ANYWHERE_RAD)
-        w = np.moveaxis(turned @ (axes[:, bent] * size), -1, 0)  # (K, S, 3)
-        h = self._second_order(bone, w)
-        joints = h[:, :26].reshape(len(h), 78)
+        h = self._second_order(bone, turned @ (axes[:, bent] * size))
+        joints = h[:26].reshape(78, -1)
         if seen.any():
             use = 26 + np.flatnonzero(seen)
-            Jm = np.zeros((len(use), 3, len(cov)))
-            Jm[..., turning] = np.einsum("ps,sin->pin", self._sums[use], skew(-bone) @ turned)
-            Jm[..., 3:6] = np.eye(3)
-            whiten = np.linalg.inv(np.linalg.cholesky(markers_cov_m2[seen]))
+            whiten = np.linalg.inv(np.linalg.cholesky(markers_cov_m2))
+            by_turns = (self._sums[use] @ (skew(-bone) @ turned).reshape(len(bone), -1)).reshape(
+                len(use), 3, -1
+            )
+            Jm = np.empty((len(use), 3, len(cov)))
+            Jm[..., :3], Jm[..., 3:6], Jm[..., 6:] = by_turns[..., :3], _EYE, by_turns[..., 3:]
             Jm = (whiten @ Jm).reshape(-1, len(cov))
             told = cov @ Jm.T
             wide, ways = np.linalg.eigh(Jm @ told)
             gain = told @ (ways / np.maximum(wide, 1.0)) @ ways.T
             back = found.moved.reshape(78, -1) @ gain
-            marker = (whiten @ h[:, use, :, None]).reshape(len(h), -1)
-            joints = joints - marker @ back.T
-        at = np.moveaxis(joints.reshape(-1, 26, 3), 0, -1)  # (26, 3, pairs)
-        mean = at[..., : len(w)].sum(axis=-1)
-        at[..., len(w) :] *= np.sqrt(2.0)  # they count twice, k and l exchanged
-        return 0.25 * mean[:, :, None] * mean[:, None, :] + 0.5 * at @ np.swapaxes(at, 1, 2)
+            joints = joints - back @ (whiten @ h[use]).reshape(back.shape[1], -1)
+        at, same = joints.reshape(26, 3, -1), len(size)
+        mean = at[..., :same].sum(axis=-1)
+        at[..., same:] *= _ROOT_2  # they count twice, k and l exchanged
+        return 0.25 * mean[:, :, None] * mean[:, None, :] + 0.5 * (at @ at.swapaxes(1, 2))
 
     def _bones(self, found: HandSolution) -> tuple[Float, Float]:
         """Bones (S, 3) [m], and how turn of the palm and free angles turn them (S, 3, 3 + n), rig frame."""
         T, place, rotation = found.T_rig_palm, found.joints.position_m, found.joints.rotation
-        chain = np.diff(place[CHAINS], axis=1, prepend=np.broadcast_to(T[:3, 3], (5, 1, 3)))
-        marker = np.where(self._marker.on_finger[..., None], rotation[self._joint_of], T[:3, :3])
-        offset = (marker @ self._marker.offset_m[..., None])[..., 0]
-        bone = np.concatenate([chain.reshape(-1, 3), place[_PALM_POINTS] - T[:3, 3], offset])
-        axes = np.empty((5, 4, 3))
-        axes[:, 0] = self._marker.abduction_axis[:, 0] @ T[:3, :3].T
-        axes[:, 1:] = -rotation[CHAINS[:, :3], :, 0]
-        by_angles = np.cumsum(axes[..., None] * self._turns, axis=1)  # (5, 4, 3, n)
-        turned = np.zeros((len(bone), 3, 3 + by_angles.shape[-1]))
-        turned[:, :, :3] = np.eye(3)
-        chains = turned[:_CHAIN_BONES].reshape(5, 4, 3, -1)  # a view
-        chains[:, 1:, :, 3:] = by_angles[:, 1:]
-        level = np.minimum(self._marker.level, 2) + 1
-        turned[len(bone) - len(offset) :, :, 3:] = np.where(
-            self._marker.on_finger[..., None], by_angles[self._marker.finger, level], 0.0
-        )
+        bone = np.empty((len(self._moves), 3))
+        chain = bone[:_CHAIN_BONES].reshape(5, 4, 3)  # a view
+        chain[...] = ends = place[CHAINS]
+        chain[:, 1:] -= ends[:, :-1]
+        chain[:, 0] -= T[:3, 3]
+        bone[_CHAIN_BONES : len(bone) - len(self._marker.finger)] = place[_PALM_POINTS] - T[:3, 3]
+        on_finger, joint = self._marker.on_finger[..., None], CHAINS[self._marker.finger, self._marker.level]
+        frame = np.where(on_finger, rotation[joint], T[:3, :3])
+        bone[len(bone) - len(joint) :] = (frame @ self._marker.offset_m[..., None])[..., 0]
+        axes = np.empty((5, 3, 4))
+        axes[..., 0] = self._marker.abduction_axis[:, 0] @ T[:3, :3].T
+        np.negative(rotation[CHAINS[:, :3], :, 0].swapaxes(1, 2), out=axes[..., 1:])
+        turned = np.empty((len(bone), 3, 3 + self._moves.shape[-1]))
+        turned[:, :, :3] = _EYE
+        np.matmul(axes[self._finger], self._moves, out=turned[..., 3:])
         x = self._parameters.of_angles(found.angles_rad)
-        self._parameters.by_parameters(turned[:, :, 3:], x)
+        self._parameters.by_parameters(turned[..., 3:], x)
         return bone, turned
 
     def _second_order(self, bone: Float, w: Float) -> Float:
-        """h of all points (pairs, 26 + M, 3) [m] for bones (S, 3) turned by w (K, S, 3); pairs k = m, then k < m."""
-        k, m = (np.concatenate([np.arange(len(w)), one]) for one in np.triu_indices(len(w), 1))
-        along = np.vecdot(w, bone)[..., None]
-        h = 0.5 * (w[k] * along[m] + w[m] * along[k]) - np.vecdot(w[k], w[m])[..., None] * bone
-        return self._sums @ h
+        """h of all points (26 + M, 3, pairs) [m] for bones (S, 3) turned by w (S, 3, K); pairs k = m, then k < m."""
+        k, m = self._pairs[w.shape[-1]]
+        bone = bone[:, :, None]
+        half = 0.5 * (w * bone).sum(axis=1, keepdims=True)
+        one, other = w.take(k, axis=2), w.take(m, axis=2)
+        h = one * half.take(m, axis=2)
+        h += other * half.take(k, axis=2)
+        one *= other
+        h -= one.sum(axis=1, keepdims=True) * bone
+        return (self._sums @ h.reshape(len(h), -1)).reshape(-1, *h.shape[1:])
+
+
+def _pairs(count: int) -> tuple[Int, Int]:
+    """Of so many directions each with itself, then each with each of those behind it."""
+    same: Int = np.arange(count)
+    above: Int = np.argwhere(np.tri(count, k=-1).T > 0.0)  # row by row
+    return np.concatenate([same, above[:, 0]]), np.concatenate([same, above[:, 1]])

@@ -11,7 +11,7 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import skew
-from common.hand_model import CHAINS, Chains, HandModel
+from common.hand_model import CHAINS, Chains, HandJoints, HandModel
 from master.ik.parameters import HandParameters
 
 _AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abduction, flexion, PIP, DIP turn
@@ -87,6 +87,8 @@ class Attached:
 
     def only(self, use: Bool) -> "Attached":
         """The points where `use` (P,) is true."""
+        if use.all():
+            return self
         return Attached(
             self.finger[use],
             self.level[use],
@@ -103,6 +105,13 @@ class Attached:
         p = chains.position_m[..., self.finger, self.level, :]
         return np.where(self.on_finger, p + (R @ self.offset_m[..., None])[..., 0], self.offset_m)
 
+    def on(self, joints: HandJoints) -> Float:
+        """Where the points are (P, 3) [m], rig frame, on a hand whose joints are there."""
+        T, at = joints.T_rig_palm, CHAINS[self.finger, self.level]
+        R = np.where(self.on_finger[..., None], joints.rotation[at], T[:3, :3])
+        p = np.where(self.on_finger, joints.position_m[at], T[:3, 3])
+        return p + (R @ self.offset_m[..., None])[..., 0]
+
     def jacobian(self, chains: Chains, points_m: Float, x: Float) -> Float:
         """Derivatives (..., P, 3, n) [m/rad] of points (..., P, 3), palm frame, by the parameters, at x (..., n)."""
         axes = np.empty((*chains.position_m.shape[:-3], 5, 4, 3))
@@ -110,4 +119,4 @@ class Attached:
         np.negative(chains.rotation[..., :3, :, 0], out=axes[..., 1:, :])
         arm = points_m[..., None, :] - chains.position_m[..., self.finger[:, None], _AXIS_JOINT, :]
         turned = skew(axes)[..., self.finger, :, :, :] @ arm[..., None]  # (..., P, 4, 3, 1)
-        return self.parameters.by_parameters(np.swapaxes(turned[..., 0], -1, -2) @ self.moves, x)
+        return self.parameters.by_parameters(turned[..., 0].swapaxes(-1, -2) @ self.moves, x)

@@ -24,42 +24,38 @@ import numpy as np
 
 from common.arrays import Float
 from master.ik.hand_problem import HandProblem, Minimum
-from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior
 
 _CLAIMED = 1.0  # observations that the claimed widths of habits count as
-_PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
-_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
 
-def covariance_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> tuple[Float, float]:
+def covariance_alone(
+    problem: HandProblem, believed: AnglePrior, habits: AnglePrior, found: Minimum
+) -> tuple[Float, float]:
     """Covariance (6 + n, 6 + n) of the palm's turn [rad] and shift [m] and of the free angles [rad], of one instant.
 
     And by how much the misfit has scaled it.
 
     Args:
         problem: The fit, which may believe in the last pose as well.
-        habits: What it believes of angles without the last pose.
+        believed: What it believes of angles under the hypothesis of the solution.
+        habits: The same without the last pose.
         found: Its solution.
     """
-    normal = found.linear.normal - problem.believed
-    normal.flat[:: len(normal) + 1] += anywhere(problem.parameters)
-    normal[6:, 6:] += habits.normal
+    normal = found.linear.normal.copy()
+    normal[6:, 6:] += habits.normal - believed.normal
+    diagonal = normal.reshape(-1)[:: len(normal) + 1]  # a view
+    diagonal += problem.parameters.anywhere
+    if problem.palm is not None:
+        diagonal[:6] -= problem.palm.weight * problem.palm.weight
     told = 0 if problem.others is None else len(problem.others.belief.fingers)
     free = max(3 * (len(problem.points_m) + told) - 6 + (0 if problem.facing is None else 2), 0)
-    scale = max((_CLAIMED + chi_square_alone(problem, habits, found)) / (_CLAIMED + free), 1.0)
+    scale = max((_CLAIMED + chi_square_alone(problem, believed, habits, found)) / (_CLAIMED + free), 1.0)
     return np.asarray(scale * np.linalg.inv(normal), np.float64), scale
 
 
-def chi_square_alone(problem: HandProblem, habits: AnglePrior, found: Minimum) -> float:
+def chi_square_alone(problem: HandProblem, believed: AnglePrior, habits: AnglePrior, found: Minimum) -> float:
     """Squared misfit of markers and habits, without the last pose and what habits cost anyway."""
-    past = problem.palm_cost(found.T_rig_palm) + float(problem.prior.cost_and_gradient(found.x)[0])
+    past = problem.palm_cost(found.T_rig_palm) + float(believed.cost_and_gradient(found.x)[0])
     habit = float(habits.cost_and_gradient(found.x)[0]) - float(habits.least())
     return max(2.0 * (float(found.linear.cost) - past + habit), 0.0)
-
-
-def anywhere(parameters: HandParameters) -> Float:
-    """(6 + n,) inverse variances of a hand of which nothing is known but its limits."""
-    turn, shift = _PALM
-    span = np.maximum(parameters.high - parameters.low, _NARROWEST_RAD)
-    return np.concatenate([np.repeat([turn**-2.0, shift**-2.0], 3), 12.0 / (span * span)])

@@ -24,7 +24,6 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.hand_model import PALM
 from master.ik.arcs import Arcs
-from master.ik.certainty import anywhere
 from master.ik.hand import HandSolution
 from master.ik.hidden import HiddenFingers, strayed_rad2
 from master.ik.parameters import HandParameters
@@ -46,7 +45,8 @@ class JointDoubt:
     def __init__(self, parameters: HandParameters, priors: Priors, arcs: Arcs) -> None:
         self._finger, self._priors, self._arcs = parameters.free // 4, priors, arcs
         self._parameters = parameters
-        self._anywhere = 1.0 / anywhere(parameters)
+        self._model_m2 = priors.model_m**2 * np.eye(3)
+        self._anywhere = 1.0 / parameters.anywhere
         self.cov: Float | None = None
         self._lost_s = 0.0
         self._speed_m_s = 0.0
@@ -80,9 +80,10 @@ class JointDoubt:
         else:
             self._lost_s = self._speed_m_s = 0.0
         self.cov = now
-        moved = found.moved
-        linear = (moved.reshape(-1, len(now)) @ now).reshape(moved.shape) @ np.swapaxes(moved, 1, 2)
-        fitted = markers_cov_m2 + self._priors.model_m**2 * np.eye(3)
+        linear, moved = found.cov_m2, found.moved
+        if now is not found.alone:
+            linear = (moved.reshape(-1, len(now)) @ now).reshape(moved.shape) @ moved.swapaxes(1, 2)
+        fitted = markers_cov_m2[seen] + self._model_m2
         return linear + self._arcs.covariance(found, now, fitted, seen)
 
     def _without(self, found: HandSolution, hidden: HiddenFingers) -> Float:

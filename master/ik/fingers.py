@@ -15,12 +15,15 @@ import numpy as np
 from common.arrays import Float
 from common.geometry import invert, transform
 from common.hand_model import HandModel
+from master.ik.attached import Attached
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
 from master.ik.hand import EXPLAINED, HandSolution
 from master.ik.joints import Vector
+from master.ik.parameters import HandParameters
 
 MODEL_M = 1e-3  # bones and caps are known to about this
+_MODEL_M2 = MODEL_M**2 * np.eye(3)
 _ON_CAP_M = 1e-4  # residual below which a finger is on its cap
 _ITERATIONS = 10  # the seed is the answer; what it cannot reach, iterations improve little
 
@@ -34,7 +37,7 @@ class FingerRefiner:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._markers = model, markers
+        self._model, self._attached = model, Attached.markers(model, HandParameters.of(model), markers)
         self._fingers: dict[int, tuple[int, FingerSolver, Fabrik]] = {}
         for index, name in enumerate(markers):
             mount = model.mount(name)
@@ -57,10 +60,12 @@ class FingerRefiner:
             cov_m2: (M, 3, 3) [m^2].
             told: Fingers whose angles another sensor tells: the search begins from these, not from the closed form.
         """
-        surprise = surprise_of(points_m - self._model.marker_points(hand.joints, self._markers), cov_m2)
+        surprised = surprise_of(points_m - self._attached.on(hand.joints), cov_m2) >= EXPLAINED
+        if not surprised.any():  # NaN is not: not seen
+            return hand
         T_palm_rig, angles = invert(hand.T_rig_palm), hand.angles_rad.copy()
         for finger, (marker, closed_form, fabrik) in self._fingers.items():
-            if not surprise[marker] >= EXPLAINED:  # NaN: not seen
+            if not surprised[marker]:
                 continue
             x, y, z = (float(value) for value in transform(T_palm_rig, points_m[marker]))
             determined = closed_form.chain.coupling is not None and finger not in told
@@ -71,13 +76,13 @@ class FingerRefiner:
             return hand
         angles = self._model.clamp(angles)
         joints = self._model.forward(hand.T_rig_palm, angles)
-        residual = np.linalg.norm(self._model.marker_points(joints, self._markers) - points_m, axis=1)
+        residual = np.linalg.norm(self._attached.on(joints) - points_m, axis=1)
         return replace(hand, angles_rad=angles, joints=joints, residual_m=residual)
 
 
 def surprise_of(off_m: Float, cov_m2: Float) -> Float:
     """Chi square (M,) of markers that are off their places by (M, 3) [m], of covariances (M, 3, 3); NaN: not seen."""
-    solved = np.linalg.solve(cov_m2 + MODEL_M**2 * np.eye(3), off_m[..., None])
+    solved = np.linalg.solve(cov_m2 + _MODEL_M2, off_m[..., None])
     return np.asarray(np.vecdot(off_m, solved[..., 0]), np.float64)
 
 

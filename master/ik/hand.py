@@ -32,6 +32,7 @@ _BENDS = (0.1, 0.7, 1.3)  # [rad] of the PIP, from which a search afresh begins:
 _SHOWS_RAD = np.radians(45.0)  # a finger bent by less in all its joints shows its end from behind
 _PIP = 2  # of a finger's four angles
 _MIND_S = 0.3  # how fast a hand may change from habits to none
+_EYE = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,6 +119,7 @@ class HandSolver:
         self._shapes_m = self._attached.place(model.chains(self.parameters.angles(self._postures)))
         walks = (self.priors.palm_walk_rad_s, 0.0, self.priors.walk_rad_s)  # a shift turns nothing
         self._walk_2 = np.repeat(walks, (3, 3, len(self.parameters.free))) ** 2
+        self._model_m2 = self.priors.model_m**2 * np.eye(3)
 
     def solve(
         self,
@@ -226,7 +228,7 @@ class HandSolver:
             self.parameters,
             self._attached.only(seen),
             told.points_m[seen],
-            _whitening(told.cov_m2[seen], self.priors.model_m),
+            np.asarray(np.linalg.inv(np.linalg.cholesky(told.cov_m2[seen] + self._model_m2)), np.float64),
             self._and_last(habits, last, told.age_s[:5]),
             None
             if last is None
@@ -238,12 +240,14 @@ class HandSolver:
 
     def _explains(self, found: HandSolution, problem: HandProblem, told: _Told) -> bool:
         """Whether every seen marker is where the hand has it, within its noise."""
-        off = (self.model.marker_points(found.joints, self.markers) - told.points_m)[told.seen]
+        off = (self._attached.on(found.joints) - told.points_m)[told.seen]
         whitened = (problem.whiten @ off[..., None])[..., 0]
         return bool((np.vecdot(whitened, whitened) < EXPLAINED).all())
 
     def _habits(self, told: _Told, like: frozenset[int]) -> AnglePrior:
         """Habits, with what is believed of fingers that are not shown."""
+        if told.hidden is not None and len(told.shown) == 5:
+            return self._priors[frozenset()]
         if told.hidden is not None:
             belief = hidden_belief(self.parameters, self.priors, told.shown, told.hidden)
             return self._priors[frozenset()].and_single(*belief)
@@ -317,20 +321,22 @@ class HandSolver:
         count, n = len(local), 6 + len(found.x)
         J = np.empty((count, 3, n))
         J[:, :, :3] = skew(-local @ T[:3, :3].T)
-        J[:, :, 3:6] = np.eye(3)
-        J[:, :, 6:] = T[:3, :3] @ self._joints.jacobian(chains, local, found.x)
+        J[:, :, 3:6] = _EYE
+        np.matmul(T[:3, :3], self._joints.jacobian(chains, local, found.x), out=J[:, :, 6:])
         cov = (J.reshape(3 * count, n) @ found.alone).reshape(count, 3, n)
         ends, starts = CHAINS[:, 3], CHAINS[:, 2]
-        length = np.sqrt(np.vecdot(local[ends] - local[starts], local[ends] - local[starts]))
-        turn = (J[ends] - J[starts]) / length[:, None, None]  # of the last phalanges' directions (5, 3, n)
+        bone = local[ends] - local[starts]
+        # How the last phalanges' directions turn (5, 3, n).
+        turn = (J[ends] - J[starts]) / np.sqrt(np.vecdot(bone, bone))[:, None, None]
+        turn_t, off = turn.swapaxes(1, 2), marker - points_m
         return HandSolution(
             T_rig_palm=T,
             angles_rad=angles,
             joints=joints,
-            cov_m2=cov @ np.swapaxes(J, 1, 2),
-            tilt_cov_rad2=turn @ found.alone @ np.swapaxes(turn, 1, 2),
-            tilt_walk_rad2_s2=(turn * self._walk_2) @ np.swapaxes(turn, 1, 2),
-            residual_m=np.sqrt(np.vecdot(marker - points_m, marker - points_m)),
+            cov_m2=cov @ J.swapaxes(1, 2),
+            tilt_cov_rad2=turn @ found.alone @ turn_t,
+            tilt_walk_rad2_s2=(turn * self._walk_2) @ turn_t,
+            residual_m=np.sqrt(np.vecdot(off, off)),
             cost=found.cost,
             iterations=minima[0].iterations,
             natural=found.natural,
@@ -344,12 +350,7 @@ class HandSolver:
 
 def seen_markers(points_m: Float, cov_m2: Float) -> Bool:
     """(M,) which markers can be used: points (M, 3) and covariances (M, 3, 3) without a gap."""
-    return np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.sum(axis=(1, 2))))
-
-
-def _whitening(cov_m2: Float, model_m: float) -> Float:
-    """Inverse square roots (N, 3, 3) of covariances (N, 3, 3), the model's own error added."""
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(cov_m2 + model_m**2 * np.eye(3))), np.float64)
+    return np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.reshape(-1, 9).sum(axis=1)))
 
 
 def _determined(points: Float, facing: Float | None, orientation: Orientation | None) -> bool:

@@ -73,7 +73,8 @@ class HandProblem:
         facing: Belief about the side it shows, or None.
         orientation: The palm's orientation as measured otherwise, or None.
         others: What other sensors say of palm and fingers, or None.
-        believed: (..., 6 + n, 6 + n) normal matrix of what is believed of angles and palm; axes as those of `prior`.
+        _rows: (3 N + 3 if facing + 6 if palm, 6 + n) what is the same everywhere of the residuals' Jacobian: by the
+            shift, and that of the belief about the palm.
     """
 
     model: HandModel
@@ -86,15 +87,16 @@ class HandProblem:
     facing: Facing | None
     orientation: Orientation | None = None
     others: SensedFree | None = None
-    believed: Float = field(init=False)
+    _rows: Float = field(init=False)
 
     def __post_init__(self) -> None:
-        normal = self.prior.normal
-        believed = np.zeros((*normal.shape[:-2], 6 + normal.shape[-1], 6 + normal.shape[-1]))
-        believed[..., 6:, 6:] = normal
+        markers = 3 * len(self.points_m)
+        rows = np.zeros((markers + (0 if self.facing is None else 3), 6 + len(self.parameters.free)))
+        rows[:markers, 3:6] = self.whiten.reshape(-1, 3)
         if self.palm is not None:
-            np.einsum("...ii->...i", believed)[..., :6] = self.palm.weight * self.palm.weight
-        object.__setattr__(self, "believed", believed)
+            rows = np.concatenate([rows, np.zeros((6, rows.shape[1]))])
+            np.fill_diagonal(rows[-6:], self.palm.weight)
+        object.__setattr__(self, "_rows", rows)
 
     def of_hypothesis(self, which: Int | int) -> "HandProblem":
         """The problem under one hypothesis, or under one for each of several searches (S,)."""
@@ -129,7 +131,7 @@ class HandProblem:
         return here + (self.place(*moved(found.T_rig_palm, found.x, _LITTLE * step)) - here) / _LITTLE
 
     def minimise(self, T_rig_palm: Float, x: Float, enough: float = ENOUGH) -> list[Minimum]:
-        """For each of H hypotheses the end of a way downhill from the best of seeds (S, 4, 4), (S, n) in the bounds.
+        """For each hypothesis the end of a way downhill from the best of seeds (S, 4, 4), (S, n) in the bounds.
 
         Which seed is the best is found roughly, under the widest hypothesis, which is the last. A way ends where a
         step gains less than `enough`, and a ten-thousandth of the cost.
@@ -140,9 +142,11 @@ class HandProblem:
             T_rig_palm, x, here, before = rough._descend(T_rig_palm, x, max(enough, _ROUGH), rivals=True)
             lowest = int(np.argmin(here.cost))
             T_rig_palm, x = T_rig_palm[lowest], x[lowest]
-        search = self.of_hypothesis(np.arange(hypotheses))
-        T, x = np.tile(T_rig_palm, (hypotheses, 1, 1)), np.tile(x, (hypotheses, 1))
-        T, x, here, iterations = search._descend(T, x, enough, rivals=False)
+        T, x = (
+            T_rig_palm.reshape(1, 4, 4).repeat(hypotheses, axis=0),
+            x.reshape(1, -1).repeat(hypotheses, axis=0),
+        )
+        T, x, here, iterations = self._descend(T, x, enough, rivals=False)
         return [Minimum(T[h], x[h], here.of(h), before + iterations) for h in range(hypotheses)]
 
     def _descend(
@@ -172,33 +176,36 @@ class HandProblem:
 
     def linearise(self, T_rig_palm: Float, x: Float) -> Linear:
         """Cost, gradient and normal matrix at poses (..., 4, 4) and free angles (..., n); leading axes as `prior`."""
-        R, origin = T_rig_palm[..., :3, :3], T_rig_palm[..., None, :3, 3]
+        R, lead, count = T_rig_palm[..., :3, :3], x.shape[:-1], len(self.points_m)
         chains = self.model.chains(self.parameters.angles(x))
         local = self.markers.place(chains)
-        arm = local @ np.swapaxes(R, -1, -2)
-        rows, size = (*x.shape[:-1], 3 * arm.shape[-2]), 6 + x.shape[-1]
-        J = np.empty((*arm.shape, size))  # the whitened markers by turn, shift and angles
-        np.matmul(self.whiten, skew(-arm), out=J[..., :3])
-        J[..., 3:6] = self.whiten
+        arm = local @ R.swapaxes(-1, -2)
+        J = np.empty(
+            (*lead, *self._rows.shape)
+        )  # the whitened markers, then the palm, by turn, shift and angles
+        J[...] = self._rows
+        marker = J[..., : 3 * count, :].reshape(*lead, count, 3, 6 + x.shape[-1])  # a view
+        np.matmul(self.whiten, skew(-arm), out=marker[..., :3])
         turned = self.whiten @ R[..., None, :, :]
-        np.matmul(turned, self.markers.jacobian(chains, local, x), out=J[..., 6:])
-        J = J.reshape(*rows, size)
-        off = arm + (origin - self.points_m)
-        residual = (self.whiten @ off[..., None]).reshape(rows)
+        np.matmul(turned, self.markers.jacobian(chains, local, x), out=marker[..., 6:])
+        residual = np.empty(J.shape[:-1])
+        off = arm + (T_rig_palm[..., None, :3, 3] - self.points_m)
+        np.matmul(self.whiten, off[..., None], out=residual[..., : 3 * count].reshape(*lead, count, 3, 1))
+        if self.facing is not None:
+            at = slice(3 * count, 3 * count + 3)
+            residual[..., at], J[..., at, :3] = self.facing.rows(R)
+        if self.palm is not None:
+            residual[..., -6:] = self.palm.off(T_rig_palm)
         J_t = J.swapaxes(-1, -2)
         gradient, normal = (J_t @ residual[..., None])[..., 0], J_t @ J
-        normal += self.believed
+        normal[..., 6:, 6:] += self.prior.normal
         cost, prior_gradient = self.prior.cost_and_gradient(x)
         gradient[..., 6:] += prior_gradient
         cost = cost + 0.5 * np.vecdot(residual, residual)
-        if self.facing is not None:
-            cost = cost + self.facing.add_to(R, gradient, normal)
         if self.orientation is not None:
             cost = cost + self.orientation.add_to(R, gradient, normal)
         if self.others is not None:
             cost = cost + self.others.add_to(R, x, gradient, normal)
-        if self.palm is not None:
-            cost = cost + self.palm.add_to(T_rig_palm, gradient)
         return Linear(cost, gradient, normal)
 
     def palm_cost(self, T_rig_palm: Float) -> float:

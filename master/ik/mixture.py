@@ -67,11 +67,11 @@ class Mixture:
         steps = np.zeros_like(off)
         alone, scale = np.zeros((off.shape[1], off.shape[1])), 0.0
         for k, h in enumerate(kept.tolist()):
-            found, one = minima[h], problem.of_hypothesis(h)
-            cov, scaled = covariance_alone(one, habits.of_hypothesis(h), found)
+            found, believed = minima[h], problem.prior.of_hypothesis(h)
+            cov, scaled = covariance_alone(problem, believed, habits.of_hypothesis(h), found)
             alone, scale = alone + share[k] * cov, scale + share[k] * scaled
             if h > 0 and share[k] > _NOTICED:
-                steps[k] = one.mean_step(found)
+                steps[k] = problem.mean_step(found)
         off += steps
         mean: Float = share @ off
         alone += (off - mean).T * share @ (off - mean)

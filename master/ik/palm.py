@@ -1,7 +1,8 @@
 """What is believed of the palm as a whole: the side it shows, its orientation by a sensor, and where it was.
 
-Each belief adds its cost, gradient and Gauss-Newton normal matrix by a small turn of the palm in rig axes and, for
-the last, a shift (`master.ik.hand_problem`).
+Beliefs about the side and the past are rows of the least-squares problem (`master.ik.hand_problem`): residuals, and
+their derivatives by a small turn of the palm in rig axes and, for the last, a shift. What a sensor says of the
+orientation adds its cost, gradient and Gauss-Newton normal matrix.
 """
 
 from dataclasses import dataclass, field
@@ -23,13 +24,10 @@ class Facing:
     direction: Float
     weight: float
 
-    def add_to(self, R: Float, gradient: Float, normal: Float) -> Float:
-        """The cost (...) of rotations (..., 3, 3); adds to gradients (..., 6 + n) and normals (..., 6 + n, 6 + n)."""
-        dorsal, weight = R[..., :, 1], self.weight**2
-        off = dorsal - self.direction
-        gradient[..., :3] += weight * (dorsal @ skew(-self.direction))
-        normal[..., :3, :3] += weight * (_EYE - dorsal[..., :, None] * dorsal[..., None, :])
-        return 0.5 * weight * np.vecdot(off, off)
+    def rows(self, R: Float) -> tuple[Float, Float]:
+        """Residuals (..., 3) of rotations (..., 3, 3), and their derivatives (..., 3, 3) by a turn."""
+        dorsal = self.weight * R[..., :, 1]
+        return dorsal - self.weight * self.direction, skew(-dorsal)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +54,7 @@ class Orientation:
         return float(np.linalg.eigvalsh(self.cov_rad2)[-1]) < _SURE_RAD**2
 
     def add_to(self, R: Float, gradient: Float, normal: Float) -> Float:
-        """As `Facing.add_to`."""
+        """The cost (...) of rotations (..., 3, 3); adds to gradients (..., 6 + n) and normals (..., 6 + n, 6 + n)."""
         off = matrix_to_rotation_vector(R @ self.rotation.T)
         J = turn_of_vector(off)
         weighed = off @ self.information
@@ -72,21 +70,21 @@ class PalmPrior:
     T_rig_palm: Float
     weight: Float
 
-    def add_to(self, T_rig_palm: Float, gradient: Float) -> Float:
-        """The cost (...) of poses (..., 4, 4); adds to gradients (..., 6 + n). Its normal matrix is constant."""
-        off = self._off(T_rig_palm)
-        gradient[..., :6] += self.weight * off
-        return 0.5 * np.vecdot(off, off)
-
     def cost(self, T_rig_palm: Float) -> float:
         """That of one pose (4, 4)."""
-        off = self._off(T_rig_palm)
+        off = self.off(T_rig_palm)
         return 0.5 * float(off @ off)
 
-    def _off(self, T: Float) -> Float:
-        """Turn (sine of the angle times the axis) and shift from the belief to poses (..., 4, 4): (..., 6), sigmas."""
-        turned = unskew(T[..., :3, :3] @ self.T_rig_palm[:3, :3].T)
-        return self.weight * np.concatenate([turned, T[..., :3, 3] - self.T_rig_palm[:3, 3]], axis=-1)
+    def off(self, T: Float) -> Float:
+        """Turn (sine of the angle times the axis) and shift from the belief to poses (..., 4, 4): (..., 6), sigmas.
+
+        Their derivatives by turn and shift are taken as the weights.
+        """
+        out = np.empty((*T.shape[:-2], 6))
+        out[..., :3] = unskew(T[..., :3, :3] @ self.T_rig_palm[:3, :3].T)
+        out[..., 3:] = T[..., :3, 3] - self.T_rig_palm[:3, 3]
+        out *= self.weight
+        return out
 
 
 def turn_of_vector(vector: Float) -> Float:

@@ -18,6 +18,8 @@ from common.hand_limits import ABDUCTION, FLEXION, spread_left
 from common.hand_model import HandModel
 
 _LEAST_SHARE = 1e-6  # an abduction that is narrowed to nothing may come from any
+_PALM = (1.0, 0.1)  # [rad], [m]: a hand in front of cameras, before anything is seen of it
+_NARROWEST_RAD = 1e-3  # limits that leave an angle no room
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,9 +31,12 @@ class HandParameters:
         complete: (20, n) all angles = complete @ free ones, couplings included; abductions before they narrow.
         low, high: (n,) [rad] bounds that keep coupled angles inside their limits, too.
         rests: (n,) whether it often stands at its low bound: that of a straight finger.
-        abduction, flexion: (K,) columns of the free angles of the K fingers whose abduction narrows.
+        abduction, flexion: Columns of the free angles of the K fingers whose abduction narrows; slices where they are
+            evenly spaced, as they mostly are: those are views.
         most: (K,) [rad] their highest flexion.
         left: (K,) share of the abduction left there.
+        anywhere: (6 + n,) inverse variances of the palm's turn and shift and of the angles, of a hand of which nothing
+            is known but its limits.
     """
 
     free: Int
@@ -39,10 +44,11 @@ class HandParameters:
     low: Float
     high: Float
     rests: Bool
-    abduction: Int
-    flexion: Int
+    abduction: Int | slice
+    flexion: Int | slice
     most: Float
     left: Float
+    anywhere: Float
 
     @classmethod
     def of(cls, model: HandModel) -> "HandParameters":
@@ -58,23 +64,26 @@ class HandParameters:
             if ratio > 0:
                 low[1:, 2] = np.maximum(low[1:, 2], low[1:, 3] / ratio)
                 high[1:, 2] = np.minimum(high[1:, 2], high[1:, 3] / ratio)
+        low, high = low.reshape(20), high.reshape(20)
+        span = np.maximum(high - low, _NARROWEST_RAD)[free]
         most = model.limits_rad[:, FLEXION, 1]
         narrows = np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0))
         return cls(
             free,
             complete,
-            low.reshape(20)[free],
-            high.reshape(20)[free],
+            low[free],
+            high[free],
             (free >= 4) & (free % 4 != ABDUCTION),
-            np.searchsorted(free, 4 * narrows + ABDUCTION),
-            np.searchsorted(free, 4 * narrows + FLEXION),
+            _evenly(np.searchsorted(free, 4 * narrows + ABDUCTION)),
+            _evenly(np.searchsorted(free, 4 * narrows + FLEXION)),
             most[narrows],
             model.spread_at_full_flexion[narrows],
+            np.concatenate([np.repeat(np.array(_PALM) ** -2.0, 3), 12.0 / (span * span)]),
         )
 
     def angles(self, x: Float) -> Float:
         """Angles (..., 5, 4) of the free ones (..., n)."""
-        if len(self.abduction):
+        if len(self.most):
             x = x.copy()
             x[..., self.abduction] *= self._share(self._flexed(x))
         return (x @ self.complete.T).reshape(*x.shape[:-1], 5, 4)
@@ -85,7 +94,7 @@ class HandParameters:
 
     def by_parameters(self, J: Float, x: Float) -> Float:
         """Derivatives (..., P, 3, n) by the free angles as they are -> by the parameters at x (..., n); in place."""
-        if len(self.abduction):
+        if len(self.most):
             flexed = self._flexed(x)
             slope = -2.0 * (1.0 - self.left) * flexed / self.most * x[..., self.abduction]
             spread = J[..., self.abduction]
@@ -100,7 +109,7 @@ class HandParameters:
     def of_angles(self, angles_rad: Float) -> Float:
         """The parameters (n,) of legal angles (5, 4)."""
         x = self.free_of(angles_rad)
-        if len(self.abduction):
+        if len(self.most):
             x[self.abduction] /= np.maximum(self._share(self._flexed(x)), _LEAST_SHARE)
         return np.minimum(np.maximum(x, self.low), self.high)
 
@@ -110,3 +119,11 @@ class HandParameters:
 
     def _share(self, flexed: Float) -> Float:
         return spread_left(flexed, self.left)
+
+
+def _evenly(columns: Int) -> Int | slice:
+    """The same columns (K,) as a slice, if there is one."""
+    step = np.diff(columns)
+    if len(step) == 0 or step[0] < 1 or (step != step[0]).any():
+        return columns
+    return slice(int(columns[0]), int(columns[-1]) + 1, int(step[0]))

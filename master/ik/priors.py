@@ -90,12 +90,14 @@ class AnglePrior:
         pull: (..., n).
         constant: (...) so that the cost is that of the squares.
         log_density: (...) logarithm of the density of the habits at cost 0, but for what hypotheses have in common.
+        known_least: `least` where it is asked for in every frame; None: not reckoned yet.
     """
 
     normal: Float
     pull: Float
     constant: Float
     log_density: Float
+    known_least: Float | None = None
 
     @classmethod
     def of(
@@ -126,12 +128,15 @@ class AnglePrior:
         # The highest density of a normal distribution of this width is that of any angle within the span.
         volume[1:, flexion, flexion] += 2.0 * np.pi / span**2
         share = np.log([priors.natural_share, 1.0 - priors.natural_share][: len(tables)])
-        return replace(habits, log_density=share + habits.least() + 0.5 * np.linalg.slogdet(volume)[1])
+        least = habits.least()
+        log_density = share + least + 0.5 * np.linalg.slogdet(volume)[1]
+        return replace(habits, log_density=log_density, known_least=least)
 
     def and_single(self, weight: Float, mean: Float) -> "AnglePrior":
         """With a belief about single angles added: inverse standard deviations and means (n,)."""
         normal, squared = self.normal.copy(), weight * weight
-        np.einsum("...ii->...i", normal)[...] += squared
+        size = len(weight)
+        normal.reshape(*normal.shape[:-2], size * size)[..., :: size + 1] += squared  # a view
         pull = squared * mean
         constant = self.constant + 0.5 * float(pull @ mean)
         return AnglePrior(normal, self.pull + pull, constant, self.log_density)
@@ -146,7 +151,10 @@ class AnglePrior:
 
     def of_hypothesis(self, which: Int | int) -> "AnglePrior":
         """That of one hypothesis, or of several (S,), one for each search."""
-        return AnglePrior(self.normal[which], self.pull[which], self.constant[which], self.log_density[which])
+        least = None if self.known_least is None else self.known_least[which]
+        return AnglePrior(
+            self.normal[which], self.pull[which], self.constant[which], self.log_density[which], least
+        )
 
     def cost_and_gradient(self, x: Float) -> tuple[Float, Float]:
         """Half the sum of squares (...) at x (..., n), and its derivative (..., n)."""
@@ -155,6 +163,8 @@ class AnglePrior:
 
     def least(self) -> Float:
         """The cost (...) where it is least: beliefs that contradict each other."""
+        if self.known_least is not None:
+            return self.known_least
         natural = np.linalg.solve(self.normal, self.pull[..., None])[..., 0]
         return self.constant - 0.5 * np.vecdot(self.pull, natural)
 

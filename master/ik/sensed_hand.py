@@ -23,7 +23,8 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float
 from common.geometry import matrix_to_rotation_vector
-from common.hand_model import CHAINS, HandModel
+from common.hand_model import HandModel
+from master.ik.attached import Attached
 from master.ik.palm import Orientation, turn_of_vector
 from master.ik.parameters import HandParameters
 
@@ -31,6 +32,7 @@ _ANGLES, _TURN = 4, 3
 _FREEDOM = 4.0
 _SURPRISED = 9.5  # chi square of four numbers, 1 in 20: below it nothing is weighed down
 _BEND = 2
+_AXES_AT = np.array([0, 0, 1, 2])  # joint of the chain at which abduction, flexion, PIP, DIP turn
 _ALL = _TURN + 5 * _ANGLES
 _PALM_AND_BEND = np.array([0, 1, 2, _ALL, _ALL + 1])
 _ELSEWHERE = 9.0  # three standard deviations, of all axes together
@@ -146,7 +148,7 @@ class MarkerCheck:
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._markers = model, markers
+        self._model, self._attached = model, Attached.markers(model, HandParameters.of(model), markers)
         fingers = [model.mount(name).finger for name in markers]
         self._of_finger = np.array([fingers.index(f) if f in fingers else -1 for f in range(5)])
 
@@ -158,14 +160,16 @@ class MarkerCheck:
             T_rig_palm: (4, 4) where the palm is about now.
             points_m, cov_m2: Markers (M, 3) [m] and their covariances (M, 3, 3); NaN: not seen.
         """
-        chains = self._model.chains(self._model.clamp(np.nan_to_num(sensed.angles_rad)))
-        joints = self._model.joints(T_rig_palm, chains)
-        at, tip = self._of_finger, self._model.marker_points(joints, self._markers)
-        off = points_m[at] - tip[at]
-        arms = tip[at][:, None] - joints.position_m[CHAINS[:, [0, 0, 1, 2]]]
+        told = np.where(np.isfinite(sensed.angles_rad), sensed.angles_rad, 0.0)
+        chains = self._model.chains(self._model.clamp(told))
+        R, at = T_rig_palm[:3, :3], self._of_finger
+        tip = self._attached.place(chains)[at] @ R.T + T_rig_palm[:3, 3]
+        off = points_m[at] - tip
+        arms = tip[:, None] - (chains.position_m[:, _AXES_AT] @ R.T + T_rig_palm[:3, 3])
         cov = np.asarray(np.linalg.inv(sensed.alone + np.eye(_ANGLES) / _MOST_RAD**2), np.float64)
         variance = np.diagonal(cov, axis1=1, axis2=2)
-        spread = (variance * np.vecdot(arms, arms)).sum(axis=1) + _PALM_M**2 + np.trace(cov_m2[at].T) / 3.0
+        noise = cov_m2.reshape(-1, 9)[at, ::4].sum(axis=1) / 3.0
+        spread = (variance * np.vecdot(arms, arms)).sum(axis=1) + _PALM_M**2 + noise
         wrong = np.vecdot(off, off) > _ELSEWHERE * spread  # NaN is not
         return sensed.known & (at >= 0) & wrong
 
@@ -177,6 +181,13 @@ class SensedFree:
     belief: SensedHand
     by_free: Float
     means: Float
+    _of_fingers: Float = field(init=False)  # (n, n) information of the free angles alone
+    _crossed: Float = field(init=False)  # (3, n) and of the turn with them
+
+    def __post_init__(self) -> None:
+        by_angles = self.belief.information[:, _TURN:] @ self.by_free
+        object.__setattr__(self, "_of_fingers", self.by_free.T @ by_angles[_TURN:])
+        object.__setattr__(self, "_crossed", by_angles[:_TURN])
 
     def add_to(self, R: Float, x: Float, gradient: Float, normal: Float) -> Float:
         """The cost (...) of rotations (..., 3, 3) and free angles (..., n).
@@ -186,17 +197,16 @@ class SensedFree:
         W, by_free, palm = self.belief.information, self.by_free, self.belief.palm
         r = np.zeros((*x.shape[:-1], _ALL))
         r[..., _TURN:] = x @ by_free.T - self.means
-        fingers = by_free.T @ W[_TURN:, _TURN:] @ by_free
-        normal[..., 6:, 6:] += fingers
+        normal[..., 6:, 6:] += self._of_fingers
         if palm is not None:
             off = matrix_to_rotation_vector(R @ palm.rotation.T)
             J = turn_of_vector(off)
             r[..., :_TURN] = off
-            turned = np.swapaxes(J, -1, -2)
+            turned = J.swapaxes(-1, -2)
             normal[..., :3, :3] += turned @ W[:_TURN, :_TURN] @ J
-            crossed = turned @ (W[:_TURN, _TURN:] @ by_free)
+            crossed = turned @ self._crossed
             normal[..., :3, 6:] += crossed
-            normal[..., 6:, :3] += np.swapaxes(crossed, -1, -2)
+            normal[..., 6:, :3] += crossed.swapaxes(-1, -2)
             weighed = r @ W
             gradient[..., :3] += (weighed[..., None, :_TURN] @ J)[..., 0, :]
         else:

@@ -17,9 +17,10 @@ import numpy as np
 from common.arrays import Bool, Code, Float, Int
 from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
-from common.hand_model import CHAINS, METACARPALS, TIPS, HandModel
+from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import HandPose, Source
 from master.ik.arcs import Arcs
+from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
 from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
@@ -34,6 +35,7 @@ _NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
+_PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_BY_MARKERS = 3
 _OBSERVED_M = 0.010  # standard deviation, all axes together
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
@@ -89,8 +91,11 @@ class HandTracker:
         self._elsewhere = MarkerCheck(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
+        self._attached = Attached.markers(model, self.parameters, markers)
         self._finger = np.array([-1 if m.finger is None else m.finger for m in mounts])
+        self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
         self._on_palm = np.array([m.joint is None for m in mounts])
+        self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + len(markers))
         self.last: HandSolution | None = None
         self._last_ns = 0
         self._seen_ns: int | None = None
@@ -149,7 +154,8 @@ class HandTracker:
             self._forget()
         before = None if last is None else self._turned(last, orientation)
         self._oriented = orientation
-        told = np.append(np.isin(np.arange(5), self._finger[seen]), tells_palm)
+        told = np.empty(6, np.bool_)
+        told[:5], told[5] = (self._carries & seen).any(axis=1), tells_palm
         if others is not None:
             if before is not None and seen.any():
                 wrong = self._elsewhere(others, before.T_rig_palm, points_m, cov_m2)
@@ -263,7 +269,7 @@ class HandTracker:
         far = np.flatnonzero(solution.residual_m > _BAD_FIT_M)
         if not len(far):
             return 0.0
-        off = points_m[far] - self.model.marker_points(solution.joints, self.markers)[far]
+        off = points_m[far] - self._attached.on(solution.joints)[far]
         surprise = surprise_of(off, cov_m2[far])
         return float(np.max(solution.residual_m[far], where=surprise > EXPLAINED, initial=0.0))
 
@@ -298,9 +304,7 @@ class HandTracker:
         *,
         held: bool,
     ) -> TrackedHand:
-        valid = np.zeros(26, dtype=bool)
-        tracked = np.zeros(26, dtype=bool)
-        source = np.zeros(26, dtype=np.uint8)
+        valid, tracked, source = np.zeros(26, np.bool_), np.zeros(26, np.bool_), np.zeros(26, np.uint8)
         recent = self._seen_ns is not None and (t_ns - self._seen_ns) * 1e-9 <= _FORGET_S
         rests, tells_palm = np.zeros(6, np.int64), palm_rests > 0
         if solution is None:
@@ -309,26 +313,23 @@ class HandTracker:
         unseen = Source.HELD if held else Source.SOLVED
         source[:] = unseen
         if tells_palm:
-            palm = [0, 1, *METACARPALS]
-            tracked[palm] = True
-            source[palm] = Source.SOLVED
-        on_finger = self._finger >= 0
+            tracked[_PALM_JOINTS] = True
+            source[_PALM_JOINTS] = Source.SOLVED
+        by_seen, by_placed = (self._carries & seen).any(axis=1), (self._carries & placed).any(axis=1)
         if tells_palm:
             rests[5] = palm_rests | (BY_MARKERS if palm_rests == ON_MARKERS else 0)
-            rests[5] += int((seen << np.arange(_FIRST_MARKER, _FIRST_MARKER + len(seen))).sum())
+            rests[5] += int(seen @ self._bit)
         if others is not None:
             # Where a finger is rests on where the palm is; how it is bent does not.
             rests[:5] += ON_OTHERS * np.where(others.told, others.level, 0)
             chains = CHAINS[others.told]
             source[chains] = Source.WRIST
             tracked[chains] = tells_palm
-        for f in self._finger[seen & on_finger]:
-            told = CHAINS[f] if tells_palm else TIPS[f]
-            tracked[told] = True
-            source[told] = Source.SOLVED
-        rests[self._finger[seen & on_finger]] += ON_MARKERS
-        rests[self._finger[placed & on_finger]] += BY_MARKERS
-        source[TIPS[self._finger[placed & on_finger]]] = Source.MEASURED
+        told = (CHAINS if tells_palm else TIPS)[by_seen]
+        tracked[told] = True
+        source[told] = Source.SOLVED
+        rests[:5] += ON_MARKERS * by_seen + BY_MARKERS * by_placed
+        source[TIPS[by_placed]] = Source.MEASURED
         if others is not None:
             # Sights through a wrist that bends may leave a joint anywhere: that is not to observe it.
             tracked &= np.trace(solution.cov_m2, axis1=1, axis2=2) < _OBSERVED_M**2

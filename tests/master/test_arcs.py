@@ -27,7 +27,7 @@ def solution(model: HandModel = RIGHT) -> HandSolution:
 
 
 def arcs(found: HandSolution, cov: Float, seen: Bool, model: HandModel = RIGHT) -> Float:
-    return Arcs(model, HandParameters.of(model), MARKERS).covariance(found, cov, small_cov(), seen)
+    return Arcs(model, HandParameters.of(model), MARKERS).covariance(found, cov, small_cov()[seen], seen)
 
 
 def drawn(found: HandSolution, step: Float, model: HandModel = RIGHT) -> Float:

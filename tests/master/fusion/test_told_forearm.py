@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix
 from master.fusion.told_forearm import ToldForearm, told_forearm
-from master.ik.certainty import anywhere
 from master.ik.hand import HandSolution
 from master.ik.palm import Orientation
 from master.ik.parameters import HandParameters
@@ -31,7 +30,7 @@ class Instant:
     def __init__(self, seed: int, fingers: int = 5) -> None:
         rng = np.random.default_rng(seed)
         root = rng.normal(size=(SIZE, SIZE)) / np.repeat([0.05, 1e-3, 0.1], [3, 3, N])
-        self.markers = root.T @ root + np.diag(anywhere(PARAMETERS))
+        self.markers = root.T @ root + np.diag(PARAMETERS.anywhere)
         self.R = any_rotation(rng)
         angles = natural_angles(rng)
         angles[fingers:] = np.nan
