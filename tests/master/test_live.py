@@ -41,8 +41,8 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
     left, right = (Uplink(name, key, clock, beacon, "127.0.0.1") for name in ("left", "right"))
     asker = ZenohBus(None, bus)
     try:
-        assert left.wait_for_start(10.0)
-        assert right.wait_for_start(10.0)
+        assert left.wait_for_start(60.0)
+        assert right.wait_for_start(60.0)
         for seq in range(40):
             t_ns = clock.now_ns()
             left.send(detections("left", left.session, seq, t_ns))
@@ -55,11 +55,11 @@ def test_a_master_tracks_answers_refuses_and_ends(tmp_path: Path, root: Path) ->
             asker.ask(Command("master", "dance"), 5.0)
         assert not stop.is_set()
         asker.ask(Command("master", "stop"), 5.0)
-        master.join(10.0)
+        master.join(60.0)
         assert not master.is_alive()
     finally:
         stop.set()
-        master.join(10.0)
+        master.join(60.0)
         for end in (left, right, asker):
             end.close()
     summary = json.loads(summary_file.read_text())
@@ -89,7 +89,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
     asker = ZenohBus(None, bus)
     published = asker.subscribe("hand")
     try:
-        assert all(end.wait_for_start(10.0) for end in ends.values())
+        assert all(end.wait_for_start(60.0) for end in ends.values())
         asker.ask(Command("master", "report"), 5.0)  # who is answered is subscribed
         for seq in range(20):
             t_ns = clock.now_ns()
@@ -107,7 +107,7 @@ def test_a_master_of_two_hands_publishes_each_under_its_name(tmp_path: Path, roo
         assert until(lambda: "cameras: left, right, wrist" in lines)  # said once a second
     finally:
         stop.set()
-        master.join(10.0)
+        master.join(60.0)
         poses = [published.get(0.0) for _ in range(64)]
         for end in (*ends.values(), asker):
             end.close()

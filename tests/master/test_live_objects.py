@@ -85,7 +85,7 @@ class Master:
         self.ends = {name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in names}
         for end in self.ends.values():
             stack.callback(end.close)
-            assert end.wait_for_start(20.0)
+            assert end.wait_for_start(60.0)
         self.bus.ask(Command("master", "report"), 5.0)  # who is answered is subscribed
 
     def counts(self) -> dict[str, int]:
@@ -93,7 +93,7 @@ class Master:
 
     def end(self) -> None:
         self.stop.set()
-        self.thread.join(20.0)
+        self.thread.join(60.0)
 
 
 @pytest.fixture

@@ -247,12 +247,12 @@ class Viewing:
 
     def __enter__(self) -> "Viewing":
         self._thread.start()
-        assert self.ready.wait(20.0)
+        assert self.ready.wait(60.0)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop.set()
-        self._thread.join(20.0)
+        self._thread.join(60.0)
         assert not self._thread.is_alive()
 
 
@@ -290,7 +290,7 @@ def test_the_cameras_are_asked_and_show_themselves_in_the_recording(tmp_path: Pa
     bus.serve("left", answer)  # the right camera is not there, which keeps nothing waiting
     pose = moving_hand(1)[0]
     with Viewing(bus, path):
-        assert asked.wait(5.0)
+        assert asked.wait(60.0)
         bus.publish("hand", pose.hand, pose)
         for i in range(4):  # 20 Hz, on the slave's own clock
             bus.publish("preview", "left", Preview("left", 7 + i * 50_000_000, small_jpeg(320, 240)))

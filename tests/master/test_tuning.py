@@ -284,7 +284,7 @@ class Master:
         self.slaves = {
             name: Uplink(name, key, SystemClock(), beacon, "127.0.0.1") for name in ("left", "right")
         }
-        assert all(slave.wait_for_start(20.0) for slave in self.slaves.values())
+        assert all(slave.wait_for_start(60.0) for slave in self.slaves.values())
         self.sender = threading.Thread(target=self._send, args=(setup, stop))
         self.sender.start()
 
@@ -311,7 +311,7 @@ class Master:
                 and abs(palm_x(pose) - x_m) < 0.01
             )
 
-        return until(near, 20.0)
+        return until(near)
 
 
 @contextmanager
@@ -323,7 +323,7 @@ def master(folder: Path) -> Generator[Master, None, None]:
     finally:
         stop.set()
         running.sender.join()
-        running.thread.join(10.0)
+        running.thread.join(60.0)
         running.bus.close()
         for slave in running.slaves.values():
             slave.close()

@@ -88,11 +88,11 @@ def running(setup: RigSetup, out: Path, files: RigFiles | None = None) -> Genera
     camera = Uplink("wrist", key, SystemClock(), beacon, "127.0.0.1")
     asker = ZenohBus(None, bus)
     try:
-        assert camera.wait_for_start(10.0)
+        assert camera.wait_for_start(60.0)
         yield Running(setup, camera, asker, stop, lines)
     finally:
         stop.set()
-        master.join(20.0)
+        master.join(60.0)
         for end in (camera, asker):
             end.close()
     assert not master.is_alive()

@@ -98,7 +98,7 @@ def test_laser_points_and_tips_of_a_wrist_device_are_crossed_in_colour() -> None
 def shown(previews: Previews, bus: LoopbackBus, t_ns: int) -> Image:
     feed = bus.subscribe("preview")
     previews.offer(replace_time(t_ns))
-    message = feed.get(5.0)
+    message = feed.get(60.0)
     assert isinstance(message, Preview)
     image = cv2.imdecode(np.frombuffer(message.jpeg, np.uint8), cv2.IMREAD_COLOR)
     assert image is not None

@@ -175,10 +175,10 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(
         left.begin("wave")
         left.read(frames(4))
         left.raw.offer(frames(1, 4)[0])
-        assert until(lambda: left.ask("report").counts["raw.frames"] == 4, 20.0)
+        assert until(lambda: left.ask("report").counts["raw.frames"] == 4)
         left.free = 1500
         left.read(frames(6, 4))
-        assert until(lambda: left.ask("report").counts["raw.ended"] == 1, 20.0)
+        assert until(lambda: left.ask("report").counts["raw.ended"] == 1)
         assert "raw frames ended" in caplog.text
         assert "--raw-reserve-mb" in caplog.text
         left.free = PLENTY
@@ -187,7 +187,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(
         left.begin("wave-2")
         small = Frame(20, 10**13, 10**13, np.zeros((24, 32, 3), np.uint8))
         left.read([*frames(2, 10), small, *frames(2, 21)])
-        assert until(lambda: left.ask("report").counts["raw.ended"] == 2, 20.0)
+        assert until(lambda: left.ask("report").counts["raw.ended"] == 2)
         assert left.tally.counts()["frames"] == 15, "the loop has seen all of them"
     assert check_whole(tmp_path / "wave") == 4
     assert check_whole(tmp_path / "wave-2") == 2
@@ -200,7 +200,7 @@ def test_it_ends_when_nobody_is_left_who_could_end_it(
     with slave(calibration, tmp_path) as left:
 
         def ends(name: str) -> bool:
-            over = until(lambda: left.raw.figures()["raw.on"] == 0.0, 20.0)
+            over = until(lambda: left.raw.figures()["raw.on"] == 0.0)
             left.ask("raw_stop")
             return over and check_whole(tmp_path / name) == 6
 

@@ -60,11 +60,11 @@ def test_slaves_keep_raw_frames_for_as_long_as_messages_are_recorded(
     settings = RecordSettings(path, RigFiles(root / "calib_json", ("desk",)), reserve_bytes=0, raw=True)
     stop, thread, out = recording(settings, lambda _stop: hub.join(), said)
     try:
-        assert until(lambda: left.on and any("right" in line for line in said), 20.0)
-        assert until(lambda: len(said) == 3, 20.0)
+        assert until(lambda: left.on and any("right" in line for line in said))
+        assert until(lambda: len(said) == 3)
     finally:
         stop.set()
-        thread.join(20.0)
+        thread.join(60.0)
         master.tap.close()
     assert isinstance(out[0], Progress), "a camera that refuses does not end it"
     assert not left.on

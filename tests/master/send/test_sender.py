@@ -240,7 +240,7 @@ def test_the_process_obeys_follows_its_file_and_reports(sinks: dict[str, Kept], 
         assert asker.ask(Command(NAME, "off", '{"output": "osc"}'), 1.0).gauges["on.osc"] == 0.0
         path.write_text("{")
         eventually(lambda: any("the settings stay as they were" in line for line in said))
-        report = reports.get(10.0)
+        report = reports.get(60.0)
         assert isinstance(report, Health)
         assert report.source == NAME
         health = asker.ask(Command(NAME, "report"), 1.0)

@@ -157,7 +157,7 @@ class Desk:
     def _send(self) -> None:
         rng = np.random.default_rng(5)
         for uplink in self.uplinks.values():
-            uplink.wait_for_start(10.0)
+            uplink.wait_for_start(60.0)
         seq = 0
         while not self.stop.is_set():
             for name, uplink in self.uplinks.items():
