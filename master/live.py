@@ -1,7 +1,6 @@
 """A live master: opens bus, ingest and sinks, runs the loop, reports once a second, writes the summary."""
 
 import gc
-import secrets
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -10,14 +9,13 @@ from pathlib import Path
 
 from common.clock import Clock, SystemClock
 from common.link_key import LinkKey
-from common.messages import Command, Health
-from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
-from master.app import RunFigures, health, run
+from master.app import RunFigures, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
 from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
+from master.live_report import Reporter, cameras_line, unplaced_line
 from master.master_bus import carry_bus
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
@@ -33,7 +31,8 @@ from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
 from master.world import World
 
-_REPORT_S = 1.0
+__all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
+
 _JOIN_S = 2.0  # a report that hangs on the bus does not keep the run from ending
 
 
@@ -110,24 +109,19 @@ def run_live(
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
         hurry.waiting = lambda: ingest.waiting
-        sinks: list[Sink] = [BusSink(bus)]
-        if settings.poses is not None:
-            counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
-            objects = [one.name for setup in setups for one in setup.objects]
-            sinks.append(RunFiles(settings.poses, counts, objects))
+        sinks = _sinks(setups, settings, bus)
         for sink in sinks:
             stack.callback(sink.close)
         watch = TimeWatch(setups)
         odd = [OddWatch(setup.rig.cameras) for setup in setups]
-        watched = list(zip(odd, pipelines, strict=True))
-        reporter = _Reporter(
+        reporter = Reporter(
             cameras_of(setups),
             trackers_of(setups),
             clock,
             bus,
             ingest,
             world,
-            watched,
+            list(zip(odd, pipelines, strict=True)),
             tuning,
             watch,
             figures,
@@ -135,20 +129,18 @@ def run_live(
             stop,
             say,
         )
-        watched_files = (
-            None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
-        )
+        files = None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
-        checklist = ChecklistFeed(
-            bus, clock, ingest, setups, pipelines, watched_files, reporter.session, writes_to
-        )
-        thread = threading.Thread(target=reporter.work, name="master health", daemon=True)
-        thread.start()
+        checklist = ChecklistFeed(bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to)
         in_use = None if tuning is None else lambda: tuning.setups
-        checking = threading.Thread(
-            target=checklist.work, args=(stop, in_use), name="master checklist", daemon=True
+        threads = (
+            threading.Thread(target=reporter.work, name="master health", daemon=True),
+            threading.Thread(
+                target=checklist.work, args=(stop, in_use), name="master checklist", daemon=True
+            ),
         )
-        checking.start()
+        for thread in threads:
+            thread.start()
         for one in world.unplaced:
             say(unplaced_line(one.name, one.tracker or ""))
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
@@ -159,8 +151,8 @@ def run_live(
         source.flush()
         tap.drain()
         stop.set()
-        thread.join(_JOIN_S)
-        checking.join(_JOIN_S)
+        for thread in threads:
+            thread.join(_JOIN_S)
         summary: dict[str, object] = {
             **figures.summary(),
             "camera_hz": figures.rates.camera_hz,
@@ -173,6 +165,16 @@ def run_live(
     if settings.summary is not None:
         write_summary(settings.summary, summary)
     return summary
+
+
+def _sinks(setups: Sequence[RigSetup], settings: LiveSettings, bus: ZenohBus) -> list[Sink]:
+    """Where what is told goes: to the bus, and to files where that is asked for."""
+    sinks: list[Sink] = [BusSink(bus)]
+    if settings.poses is not None:
+        counts = {setup.hand.profile.name: len(setup.markers) for setup in setups}
+        objects = [one.name for setup in setups for one in setup.objects]
+        sinks.append(RunFiles(settings.poses, counts, objects))
+    return sinks
 
 
 def cameras_of(setups: Sequence[RigSetup]) -> tuple[str, ...]:
@@ -210,110 +212,4 @@ def ingest_of(
         imus=tuple(name for setup in setups for name in setup.imus),
         wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
         trackers=trackers_of(setups),
-    )
-
-
-class _Reporter:
-    """Tells how the master is: on the bus, to whoever asks there, and a line for each change.
-
-    Holds the id of this run, and what it reports on.
-    """
-
-    def __init__(
-        self,
-        cameras: tuple[str, ...],
-        trackers: tuple[str, ...],
-        clock: Clock,
-        bus: ZenohBus,
-        ingest: Ingest,
-        world: World,
-        odd: Sequence[tuple[OddWatch, LivePipeline]],
-        tuning: RigTuning | None,
-        watch: TimeWatch,
-        figures: RunFigures,
-        tap: Tap,
-        stop: threading.Event,
-        say: Callable[[str], None],
-    ) -> None:
-        """Be there on the bus from now on; `work` belongs to a thread."""
-        self.session = secrets.randbits(63)
-        self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
-        self._ingest, self._world, self._figures = ingest, world, figures
-        self._tuning, self._watch, self._odd = tuning, watch, odd
-        self._tap, self._stop, self._say = tap, stop, say
-        bus.announce(MASTER)
-        bus.serve(MASTER, self.answer)
-
-    def health(self) -> Health:
-        """The report of this moment; of what never happened only `received` is told, to keep it short."""
-        events = self._ingest.counts.items()
-        told = {name: number for name, number in events if number or name.endswith("received")}
-        changes = {} if self._tuning is None else self._tuning.counts()
-        counts = dict(self._world.counts) | told | changes | self._tap.counts
-        times = dict(self._watch.gauges(self._ingest.clock_of)) | (
-            {"open_bus": 1.0} if self._bus.open else {}
-        )
-        return health(self.session, self._clock, self._figures, counts, times)
-
-    def answer(self, command: Command) -> Health:
-        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "filter"
-        another 1 € filter for one rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
-
-        Raises:
-            CalibrationError: The files cannot be used; the old ones still are.
-            ValueError: Another verb; the asker reads which ones there are.
-        """
-        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._tap.lease}
-        if self._tuning is not None:
-            tuning = self._tuning
-            verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
-        if command.verb not in verbs:
-            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
-        verbs[command.verb]()
-        return self.health()
-
-    def work(self) -> None:
-        """Once a second until the stop: health on the bus and the rate; and a line whenever something changes."""
-        connected: frozenset[str] | None = None
-        started = False
-        poses = 0
-        while not self._stop.wait(_REPORT_S):
-            if self._tuning is not None:
-                self._tuning.look()
-                self._watch.follow(self._tuning.setups)
-            lines = self._watch.look()
-            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
-            self._bus.publish("health", MASTER, self.health())
-            heard = self._ingest.connected
-            if heard != connected:
-                connected = heard
-                self._say(cameras_line(self._cameras, connected, self._trackers))
-            if self._ingest.started and not started:
-                started = True
-                self._say("started")
-            if self._figures.poses and not poses:
-                self._say("tracking")
-            if started:
-                self._say(f"rate {self._figures.poses - poses} poses/s")
-            for line in lines:
-                self._say(line)
-            poses = self._figures.poses
-
-
-def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
-    """What a person is told when a sender comes or goes: who is there, and which cameras are waited for."""
-    here = ", ".join(name for name in cameras if name in connected) or "none yet"
-    absent = ", ".join(name for name in cameras if name not in connected)
-    line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
-    others = connected.difference(cameras)
-    for kind, names in (("IMU", others.difference(trackers)), ("tracker", others.intersection(trackers))):
-        line += f"; {kind}: {', '.join(sorted(names))}" if names else ""
-    return line
-
-
-def unplaced_line(name: str, tracker: str) -> str:
-    """What a person is told of a tracker whose poses mean nothing in the rig."""
-    return (
-        f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
-        f" `phalanx-master calibrate tracker {name}`"
     )

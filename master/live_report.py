@@ -1,0 +1,125 @@
+"""How a live master is: its health on the bus, answers to who asks there, and a line for each change."""
+
+import secrets
+import threading
+from collections.abc import Callable, Sequence
+
+from common.clock import Clock
+from common.messages import Command, Health
+from common.streams import MASTER
+from common.zenoh_bus import ZenohBus
+from master.app import RunFigures, health
+from master.ingest import Ingest
+from master.odd_watch import OddWatch
+from master.recording.tap import Tap
+from master.time_watch import TimeWatch
+from master.tuning import LivePipeline, RigTuning
+from master.world import World
+
+_REPORT_S = 1.0
+
+
+class Reporter:
+    """Tells how the master is: on the bus, to whoever asks there, and a line for each change.
+
+    Holds the id of this run, and what it reports on.
+    """
+
+    def __init__(
+        self,
+        cameras: tuple[str, ...],
+        trackers: tuple[str, ...],
+        clock: Clock,
+        bus: ZenohBus,
+        ingest: Ingest,
+        world: World,
+        odd: Sequence[tuple[OddWatch, LivePipeline]],
+        tuning: RigTuning | None,
+        watch: TimeWatch,
+        figures: RunFigures,
+        tap: Tap,
+        stop: threading.Event,
+        say: Callable[[str], None],
+    ) -> None:
+        """Be there on the bus from now on; `work` belongs to a thread."""
+        self.session = secrets.randbits(63)
+        self._cameras, self._trackers, self._clock, self._bus = cameras, trackers, clock, bus
+        self._ingest, self._world, self._figures = ingest, world, figures
+        self._tuning, self._watch, self._odd = tuning, watch, odd
+        self._tap, self._stop, self._say = tap, stop, say
+        bus.announce(MASTER)
+        bus.serve(MASTER, self.answer)
+
+    def health(self) -> Health:
+        """The report of this moment; of what never happened only `received` is told, to keep it short."""
+        events = self._ingest.counts.items()
+        told = {name: number for name, number in events if number or name.endswith("received")}
+        changes = {} if self._tuning is None else self._tuning.counts()
+        counts = dict(self._world.counts) | told | changes | self._tap.counts
+        times = dict(self._watch.gauges(self._ingest.clock_of)) | (
+            {"open_bus": 1.0} if self._bus.open else {}
+        )
+        return health(self.session, self._clock, self._figures, counts, times)
+
+    def answer(self, command: Command) -> Health:
+        """Obey a command: "report" says how it is, "reload" uses the files as they are now, "filter"
+        another 1 € filter for one rig, "tap" shows what is taken on the bus for three seconds, "stop" ends the master.
+
+        Raises:
+            CalibrationError: The files cannot be used; the old ones still are.
+            ValueError: Another verb; the asker reads which ones there are.
+        """
+        verbs = {"report": lambda: None, "stop": self._stop.set, "tap": self._tap.lease}
+        if self._tuning is not None:
+            tuning = self._tuning
+            verbs |= {"reload": tuning.reload, "filter": lambda: tuning.try_filter(command.body)}
+        if command.verb not in verbs:
+            raise ValueError(f"{MASTER}: no command {command.verb!r}; there are {', '.join(verbs)}")
+        verbs[command.verb]()
+        return self.health()
+
+    def work(self) -> None:
+        """Once a second until the stop: health on the bus and the rate; and a line whenever something changes."""
+        connected: frozenset[str] | None = None
+        started = False
+        poses = 0
+        while not self._stop.wait(_REPORT_S):
+            if self._tuning is not None:
+                self._tuning.look()
+                self._watch.follow(self._tuning.setups)
+            lines = self._watch.look()
+            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
+            self._bus.publish("health", MASTER, self.health())
+            heard = self._ingest.connected
+            if heard != connected:
+                connected = heard
+                self._say(cameras_line(self._cameras, connected, self._trackers))
+            if self._ingest.started and not started:
+                started = True
+                self._say("started")
+            if self._figures.poses and not poses:
+                self._say("tracking")
+            if started:
+                self._say(f"rate {self._figures.poses - poses} poses/s")
+            for line in lines:
+                self._say(line)
+            poses = self._figures.poses
+
+
+def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:
+    """What a person is told when a sender comes or goes: who is there, and which cameras are waited for."""
+    here = ", ".join(name for name in cameras if name in connected) or "none yet"
+    absent = ", ".join(name for name in cameras if name not in connected)
+    line = f"cameras: {here}; waiting for {absent}" if absent else f"cameras: {here}"
+    others = connected.difference(cameras)
+    for kind, names in (("IMU", others.difference(trackers)), ("tracker", others.intersection(trackers))):
+        line += f"; {kind}: {', '.join(sorted(names))}" if names else ""
+    return line
+
+
+def unplaced_line(name: str, tracker: str) -> str:
+    """What a person is told of a tracker whose poses mean nothing in the rig."""
+    return (
+        f"object {name}: its tracker {tracker} is not registered to the rig, what it says is not used:"
+        f" `phalanx-master calibrate tracker {name}`"
+    )
