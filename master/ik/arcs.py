@@ -122,7 +122,8 @@ class Arcs:
 
     def _second_order(self, bone: Float, w: Float) -> Float:
         """h of all points (26 + M, 3, pairs) [m] for bones (S, 3) turned by w (S, 3, K); pairs k = m, then k < m."""
-        k, m = self._pairs[w.shape[-1]]
+        count: int = w.shape[-1]
+        k, m = self._pairs[count]
         bone = bone[:, :, None]
         half = 0.5 * (w * bone).sum(axis=1, keepdims=True)
         one, other = w.take(k, axis=2), w.take(m, axis=2)
