@@ -140,17 +140,21 @@ class Systemd:
                 return
             if late := [u for u in limits if u not in steady and self._now() > ends[u]]:
                 passed_s = self._now() - began
-                why = self._why(late[0], self.state(late[0]), since)
+                state = self.state(late[0])
+                why = self._why(
+                    late[0], state, since, state.pid
+                )  # the words of the one before are not its own
                 raise NotReadyError(f"{late[0]} is not ready after {passed_s:.0f} s: {why}")
             if stayed and self._now() > max(ends.values()) + settle_s:
                 raise NotReadyError(f"{next(iter(limits))} does not stay ready for {settle_s:g} s")
             self.sleep(_STEP_S)
 
-    def _why(self, unit: str, state: UnitState, since: float) -> str:
-        """Its last words since then [s since 1970], or how systemd ended it."""
+    def _why(self, unit: str, state: UnitState, since: float, pid: int = 0) -> str:
+        """Its last words since then [s since 1970], of process `pid` if one is given, or how systemd ended it."""
         if state.status in _STATUS:
             return f"status {_STATUS[state.status]}"
         words = ["journalctl", f"_SYSTEMD_UNIT={unit}", f"--since=@{since:.0f}"]
+        words += [f"_PID={pid}"] if pid else []
         try:
             text = self.run([*words, "-n", "40", "-o", "cat", "--no-pager", "-q"])
         except InstallError:
