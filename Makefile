@@ -89,6 +89,7 @@ scale: $(STAMP) ## what 2 to 16 simulated cameras cost, what is lost, how late p
 faults: $(STAMP) ## every fault on real processes: what is expected, what is measured; FAULTS_ARGS='--runs 1'
 	@$(BIN)/python -m bench.faults $(FAULTS_ARGS)
 	@$(BIN)/python -m bench.faults_unplugged $(FAULTS_ARGS)
+	@$(BIN)/python -m bench.faults_wall_clock $(FAULTS_ARGS)
 
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
 	@$(BIN)/python -m bench.audit $(AUDIT_ARGS)

@@ -28,6 +28,7 @@ SECTIONS = {
     "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",
     "joint_certainty": "95 % regions of joints: how often they hold the truth, seen, hidden, gone; goal 95",
     "hidden_fingers": "Flexion and PIP of a finger without a marker, with its neighbours; baseline: alone",
+    "pose_cost": "What a pose costs the master, stage by stage: two cameras, sixteen, fused; processor time",
     "fusion": "Markers and wrist device as one hand, against each alone; either cut off and back; exact truth",
     "fusion_cost": "Processor time of the fused line, message by message; baseline: each sensor alone",
     "orientation": "Palm and joints with one and three markers on the back, without and with an IMU; exact truth",
