@@ -5,7 +5,7 @@ nonsense. A step is what a buffer makes that comes late, or memory that is freed
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,16 @@ class Step:
     """A rise of resident memory: minute in which it came, and how much [MB = 1e6 bytes]."""
 
     minute: int
+    mb: float
+
+
+@dataclass(frozen=True, slots=True)
+class Mapping:
+    """Addresses from `start` to before `end`, `ADDRESS NAME`, and how much of it is resident [MB]."""
+
+    start: int
+    end: int
+    name: str
     mb: float
 
 
@@ -57,26 +67,33 @@ def steps_of(times_s: Sequence[float] | Float, mb: Sequence[float] | Float) -> l
     return found
 
 
-def mapped(pid: int) -> dict[str, float]:
-    """Mapping of a process, `ADDRESS NAME` -> resident memory [MB].
+def mapped(pid: int) -> list[Mapping]:
+    """What a process has mapped, and how much of each is resident.
 
     Raises:
         OSError: There is no such process, or it belongs to somebody else.
     """
-    found: dict[str, float] = {}
-    name = ""
+    found: list[Mapping] = []
     for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
         first, _, rest = line.partition(" ")
         if not first.endswith(":"):  # a mapping begins: addresses, rights, offset, device, inode, name
+            start, _, end = first.partition("-")
             fields = rest.split(maxsplit=4)
-            name = f"{first.partition('-')[0]} {Path(fields[4]).name if len(fields) > 4 else 'anonymous'}"
+            name = Path(fields[4]).name if len(fields) > 4 else "anonymous"
+            found.append(Mapping(int(start, 16), int(end, 16), f"{start} {name}", 0.0))
         elif first == "Rss:":
-            found[name] = float(rest.split()[0]) * _KIB * 1e-6
+            found[-1] = replace(found[-1], mb=float(rest.split()[0]) * _KIB * 1e-6)
     return found
 
 
-def grown(before: dict[str, float], after: dict[str, float]) -> dict[str, float]:
-    """Mapping -> by how much it has grown [MB], the largest first; those that grew by little are left out."""
-    more = {name: mb - before.get(name, 0.0) for name, mb in after.items()}
+def grown(before: Sequence[Mapping], after: Sequence[Mapping]) -> dict[str, float]:
+    """Mapping -> by how much it has grown [MB], the largest first; those that grew by little are left out.
+
+    The kernel joins neighbours and grows them at either end: a mapping is held against all that lay where it lies.
+    """
+    more = {
+        one.name: one.mb - sum(old.mb for old in before if old.start < one.end and one.start < old.end)
+        for one in after
+    }
     kept = sorted((one for one in more.items() if one[1] > _SHOWN_MB), key=lambda one: -one[1])
     return dict(kept[:_MOST_SHOWN])

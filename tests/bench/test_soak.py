@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.processes import Footprint, footprint
-from bench.soak_steps import grown, mapped, steps_of
+from bench.soak_steps import Mapping, grown, mapped, steps_of
 from bench.soak_verdict import judge, latency_slope, memory_slope, slope
 from bench.soak_watch import Course, Minute, judged
 from common.messages import Health
@@ -143,6 +143,13 @@ def test_the_mapping_that_grew_is_told_by_the_kernel() -> None:
         more = grown(before, mapped(os.getpid()))
     assert max(more.values()) == pytest.approx(32.0, abs=3.0)
     assert next(iter(more)).endswith("anonymous")
+
+
+def test_a_mapping_that_joined_its_neighbour_has_grown_by_what_is_new() -> None:
+    heap = Mapping(0x1000, 0x2000, "1000 [heap]", 5.0)
+    before = [heap, Mapping(0x9000, 0xA000, "9000 anonymous", 20.0)]
+    after = [heap, Mapping(0x7000, 0xA000, "7000 anonymous", 52.0)]
+    assert grown(before, after) == {"7000 anonymous": 32.0}
 
 
 def test_memory_of_a_process_is_read_as_the_kernel_has_it() -> None:
