@@ -51,16 +51,17 @@ def make(folder: Path, devices: Iterable[str], now: datetime) -> list[str]:
             raise PhalanxError(
                 f"{folder}: others can enter it; give a folder of its own, or run: chmod 700 {folder}"
             )
+        signs = (folder / AUTHORITY_KEY).exists()
+        if not signs and (folder / AUTHORITY).exists():  # before anything is made: other keys than the rig's
+            raise PhalanxError(
+                f"{folder}: has {AUTHORITY} but not {AUTHORITY_KEY}: it is the folder of a device, or a copy for"
+                " one; make certificates where the key is"
+            )
         (folder / DEVICES).mkdir(mode=0o700, exist_ok=True)
         for shared in (RIG_KEY, DEVICES_KEY):
             if not (folder / shared).exists():
                 add(folder / shared, f"{new_key()}\n".encode(), 0o600)
-        if not (folder / AUTHORITY_KEY).exists():
-            if (folder / AUTHORITY).exists():
-                raise PhalanxError(
-                    f"{folder}: has {AUTHORITY} but not {AUTHORITY_KEY}: it is the folder of a device, or a copy for"
-                    " one; make certificates where the key is"
-                )
+        if not signs:
             authority = new_authority(now)
             add(folder / AUTHORITY, authority.certificate, 0o644)
             add(folder / AUTHORITY_KEY, authority.key, 0o600)

@@ -171,9 +171,12 @@ def test_folders_that_are_not_ours_are_left_alone(tmp_path: Path, keys: Path) ->
             use(shared)
     with pytest.raises(PhalanxError, match="no keys folder"):
         renew(shared, NOW)
-    (keys / "ca.key").unlink()  # as on a device
+    for file in ("ca.key", "devices.key"):  # as on a device
+        (keys / file).unlink()
+    before = files(keys)
     with pytest.raises(PhalanxError, match=r"has ca\.pem but not ca\.key"):
         make(keys, ["late"], NOW)
+    assert files(keys) == before
 
 
 def test_a_device_keeps_its_certificate_where_none_can_be_made(keys: Path) -> None:
