@@ -44,11 +44,16 @@ class BoundedHttp(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Parse what came, unless it is the head of a request that grows without an end."""
-        if self._deadline is None and getattr(self.cycle, "response_complete", True):
+        if not self._in_head and getattr(self.cycle, "response_complete", True):
             self._await_head()
-        if self._deadline is not None:
-            self._head_bytes += len(data)
-            if self._head_bytes > MOST_HEAD_BYTES:
+        if self._in_head:  # what comes behind the head, together with it, counts as none of it
+            room = MOST_HEAD_BYTES - self._head_bytes
+            head, data = data[:room], data[room:]
+            self._head_bytes += len(head)
+            super().data_received(head)
+            if not data or self.transport.is_closing():
+                return
+            if self._in_head:
                 self.transport.abort()
                 return
         super().data_received(data)
@@ -57,6 +62,10 @@ class BoundedHttp(HttpToolsProtocol):
         """A whole head came: all that follows is for who answers it."""
         self._head_came()
         super().on_headers_complete()
+
+    @property
+    def _in_head(self) -> bool:
+        return self._deadline is not None
 
     def _await_head(self) -> None:
         self._head_bytes = 0

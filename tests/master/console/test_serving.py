@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
-from fastapi import FastAPI
+from fastapi import FastAPI, Request
 
 from master.console import serving
 from master.console.serving import MOST_CONNECTIONS, MOST_HEAD_BYTES, MOST_OF_ONE, console_server
@@ -23,6 +23,11 @@ def hello() -> FastAPI:
     """A console with one word."""
     app = FastAPI(openapi_url=None)
     app.add_api_route("/", lambda: "hello")
+
+    async def length(request: Request) -> int:
+        return len(await request.body())
+
+    app.add_api_route("/length", length, methods=["POST"])
     return app
 
 
@@ -111,6 +116,14 @@ def test_headers_do_not_grow_without_an_end(
     with plain.connect() as one:
         one.sendall(b"GET /" + (b" HTTP/1.1\r\n" if line.endswith(b"\n") else b""))
         assert said(one, line, most) < most
+
+
+def test_what_comes_together_with_the_headers_is_no_part_of_them(plain: Console) -> None:
+    size = 2 * MOST_HEAD_BYTES
+    asked = b"POST /length HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length: %d\r\n\r\n" % size
+    with plain.connect() as one:
+        one.sendall(asked + bytes(size))
+        assert one.makefile("rb").read().endswith(b"\r\n\r\n%d" % size)
 
 
 def test_one_address_takes_half_of_all_places_at_most(
