@@ -7,27 +7,29 @@ a machine says to itself, under each of its addresses, and nothing else.
 import os
 import socket
 import sys
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
 _LOOPBACK = b"lo\0"
 _ANYWHERE = frozenset({"0.0.0.0", "::"})
 _FOLDER = Path("/proc/self/fd")
+Socket = tuple[int, str]
 
 
-def sockets() -> frozenset[int]:
-    """Descriptors of all sockets of this process; none where the system does not tell."""
-    found: set[int] = set()
+def sockets() -> frozenset[Socket]:
+    """Descriptors of all sockets of this process, each with its own name in the kernel, as another one may have the
+    number later; none where the system does not tell."""
+    found: set[Socket] = set()
     if _FOLDER.is_dir():
         for entry in _FOLDER.iterdir():
             with suppress(OSError):  # closed meanwhile
-                if str(entry.readlink()).startswith("socket:"):
-                    found.add(int(entry.name))
+                if (name := str(entry.readlink())).startswith("socket:"):
+                    found.add((int(entry.name), name))
     return frozenset(found)
 
 
-def keep_here(before: Collection[int], ports: range) -> bool:
+def keep_here(before: Collection[Socket], ports: range) -> bool:
     """Bind to the loopback device what listens everywhere at one of the ports, and was not there before.
 
     Args:
@@ -37,11 +39,13 @@ def keep_here(before: Collection[int], ports: range) -> bool:
     Returns:
         Whether each is bound; False: there is one that is not, or the system cannot tell, or do it.
     """
-    bound = [_bound(one) for one in _listening(sockets() - frozenset(before), ports)]
+    bound = [
+        _bound(one) for one in _listening((number for number, _ in sockets() - frozenset(before)), ports)
+    ]
     return bool(bound) and all(bound)
 
 
-def _listening(descriptors: Collection[int], ports: range) -> Iterator[socket.socket]:
+def _listening(descriptors: Iterable[int], ports: range) -> Iterator[socket.socket]:
     """Copies of those sockets that listen everywhere at one of the ports."""
     for descriptor in descriptors:
         with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as one:

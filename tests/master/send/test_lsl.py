@@ -76,7 +76,7 @@ def sockets_and_groups() -> tuple[set[str], bool]:
 def _is_kept_to_this_machine() -> None:
     """The library itself listens on every network, whatever it is told."""
     devices: list[bytes] = []
-    for descriptor in sockets():
+    for descriptor, _ in sockets():
         with socket.socket(fileno=os.dup(descriptor)) as one:
             if one.family == socket.AF_INET and one.getsockname()[1] in PORTS:
                 assert one.getsockname()[0] == "0.0.0.0"
