@@ -24,6 +24,7 @@ from slave.link import SlaveLink
 ANYWHERE = "0.0.0.0"
 LOOPBACK_BROADCAST = "127.255.255.255"
 BEACON_TIMEOUT_S = 0.1
+SAY_NS = 1_000_000_000
 _LOG = logging.getLogger(__name__)
 
 
@@ -147,7 +148,7 @@ class Uplink:
         self._data.close()
 
     def _hear(self, source: UdpSocket, take: Callable[[bytes, Address, int], None]) -> None:
-        said: str | None = None
+        news = News()
         while not self._closing.is_set():
             arrived = source.receive()
             t_ns = self._clock.now_ns()
@@ -160,9 +161,30 @@ class Uplink:
                 changed = self._link.zenoh_endpoint != endpoint
             if changed:
                 _LOG.info("session with the master whose bus is %s", self._link.zenoh_endpoint)
-            if source is self._beacons and wrong != said and wrong is not None:
+            if source is self._beacons and news.is_new(wrong, t_ns):
                 _LOG.warning("%s", wrong)
-            said = wrong
+
+
+class News:
+    """What of the lines that are told again and again is worth saying: another one, `SAY_NS` after the last at least.
+
+    Whoever has the rig key can have this slave told something else with each datagram; its log is not filled by that.
+    """
+
+    def __init__(self) -> None:
+        """Nothing was said yet."""
+        self._line: str | None = None
+        self._said_ns: int | None = None
+
+    def is_new(self, line: str | None, t_ns: int) -> bool:
+        """Whether to say `line` at `t_ns` [ns]; None: there is nothing to say, and whatever comes next is new."""
+        if line is None or line == self._line:
+            self._line = line
+            return False
+        if self._said_ns is not None and 0 <= t_ns - self._said_ns < SAY_NS:
+            return False
+        self._line, self._said_ns = line, t_ns
+        return True
 
 
 def _hosts(bind: str) -> tuple[str, str]:

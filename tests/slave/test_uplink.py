@@ -10,7 +10,7 @@ import pytest
 from common.clock import SystemClock
 from common.errors import BusError
 from common.messages import Health, MarkerDetections
-from slave.uplink import Uplink
+from slave.uplink import SAY_NS, News, Uplink
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))
@@ -92,3 +92,21 @@ def test_messages_of_any_type_may_be_sent(uplink: Uplink) -> None:
     uv = empty.reshape(0, 2)
     uplink.send(MarkerDetections("left", 1, 0, 0, 0, uv, empty, empty, empty, uv))
     assert uplink.counts["unsent"] == 2
+
+
+def test_a_line_is_said_once_and_who_alternates_two_does_not_fill_the_log() -> None:
+    news = News()
+    assert [news.is_new(line, t) for t, line in enumerate((None, "a", "a", None))] == [
+        False,
+        True,
+        False,
+        False,
+    ]
+    said = [
+        t
+        for t in range(0, 10 * SAY_NS, SAY_NS // 100)
+        if news.is_new("ab"[t * 100 // SAY_NS % 2], SAY_NS + t)
+    ]
+    assert 1 < len(said) <= 10
+    assert not news.is_new("c", 10 * SAY_NS + SAY_NS // 2)
+    assert news.is_new("c", 0)  # a clock that was set back makes it no quieter
