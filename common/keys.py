@@ -120,7 +120,7 @@ def keys_folder(environment: Mapping[str, str]) -> Path | None:
     return Path(environment[FOLDER]) if environment.get(FOLDER) else None
 
 
-def others_read(path: Path, what: str, environment: Mapping[str, str]) -> str | None:
+def _others_read(path: Path, what: str, environment: Mapping[str, str]) -> str | None:
     """Why a private file, which has `what`, is none: others than its owner can read it; None: all is well.
 
     In the folder of a service's credentials the mask of an access-control list stands where the group's bits are.
@@ -185,7 +185,7 @@ class Access:
         try:
             name = shown(identity.certificate.read_bytes()).name
             shown(identity.authority.read_bytes())
-            fault = others_read(identity.key, f"the key of {self.role!r}", self.environment)
+            fault = _others_read(identity.key, f"the key of {self.role!r}", self.environment)
         except (OSError, ValueError) as error:
             raise BusError(f"{self.folder}: keys of {self.role!r}: {error}") from error
         if fault is not None:
@@ -227,7 +227,7 @@ def _read(path: Path, what: str, environment: Mapping[str, str]) -> bytes:
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise PhalanxError(f"{path}: cannot read {what} ({error}); {_ADVICE}") from error
-    if (fault := others_read(path, what, environment)) is not None:
+    if (fault := _others_read(path, what, environment)) is not None:
         raise PhalanxError(fault)
     return _parse(text, str(path))
 

@@ -17,7 +17,7 @@ BEACON_PORT, DATA_PORT, BUS_PORT = 47800, 47801, 47802
 AddParser = Callable[..., argparse.ArgumentParser]  # of the command line
 _EVERYWHERE = "255.255.255.255"  # of the network that --master is in
 
-DEPLOY_EXAMPLES = """examples:
+_DEPLOY_EXAMPLES = """examples:
   phalanx deploy pi-left.local pi-right.local --master 192.168.1.2
         the cameras of rig desk in their order: left, then right; the second run changes nothing
   phalanx deploy left=pi@10.0.0.11 right=pi@10.0.0.12 --master 10.0.0.2 --options 'left=--sync server' \\
@@ -30,22 +30,22 @@ DEPLOY_EXAMPLES = """examples:
   phalanx deploy pi-left.local pi-right.local --master 192.168.1.2 --dry-run
         what would be done; nothing is written, here or there
 """
-ROLLBACK_EXAMPLES = """examples:
+_ROLLBACK_EXAMPLES = """examples:
   phalanx rollback pi-left.local pi-right.local
         programs, options, keys and calibration as they were before the last deployment that changed something
   phalanx rollback pi-left.local --dry-run
 """
-UNINSTALL_EXAMPLES = """examples:
+_UNINSTALL_EXAMPLES = """examples:
   phalanx uninstall pi-left.local pi-right.local
         services, programs, keys and calibration are gone; what apt brought stays
   phalanx uninstall pi-left.local --dry-run
 """
-WHEELS_EXAMPLES = """examples:
+_WHEELS_EXAMPLES = """examples:
   phalanx wheels wheels                   for Raspberry Pi OS Trixie; then phalanx-slave install --wheelhouse wheels
   phalanx wheels wheels --python 3.11 --with simplejpeg           for Bookworm, whose own was built for numpy 1
   phalanx deploy HOST --master HOST --wheelhouse wheels           on a PC that has no network then
 """
-FLEET_EXAMPLES = """examples:
+_FLEET_EXAMPLES = """examples:
   phalanx fleet                           once, as a table
   phalanx fleet --watch                   again each second
   phalanx fleet --bus tls/192.168.1.2:47802 --keys ~/.config/phalanx/keys
@@ -60,7 +60,7 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
         "rollback",
         "machines back to what they had before the last deployment",
         "One step back. It waits until what was before is ready; the release that is left is removed.",
-        ROLLBACK_EXAMPLES,
+        _ROLLBACK_EXAMPLES,
     )
     rollback.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
     _reach(rollback)
@@ -69,7 +69,7 @@ def add_commands(add_parser: AddParser, calibration: Path) -> None:
         "uninstall",
         "slaves from their machines again",
         "Leaves nothing of ours there.",
-        UNINSTALL_EXAMPLES,
+        _UNINSTALL_EXAMPLES,
     )
     uninstall.add_argument("hosts", nargs="+", metavar="HOST", help="by ssh")
     _reach(uninstall)
@@ -84,7 +84,7 @@ def _add_deploy(add_parser: AddParser, calibration: Path) -> None:
         "slaves to their machines by ssh",
         "Installs a slave for each camera as a service of its machine, and waits until it streams.\nGoes back to what "
         "was before where it does not. Needs ssh and rsync here, ssh, Python 3.11\nand systemd there.",
-        DEPLOY_EXAMPLES,
+        _DEPLOY_EXAMPLES,
     )
     deploy.add_argument(
         "hosts",
@@ -139,7 +139,7 @@ def _add_fleet(add_parser: AddParser) -> None:
         "fleet",
         "how all machines of a rig are",
         "A row for each camera and IMU that has keys or reports itself: machine, version,\ntemperature, clock, rate.",
-        FLEET_EXAMPLES,
+        _FLEET_EXAMPLES,
     )
     _keys(fleet, "keys folder")
     fleet.add_argument("--bus", metavar="ENDPOINT", help="of the master (default: of this machine)")
@@ -153,7 +153,7 @@ def _add_wheels(add_parser: AddParser) -> None:
         "wheels",
         "all that a slave needs, as files, for machines without a network",
         "Downloads for another machine what a slave needs, and adds Phalanx itself.",
-        WHEELS_EXAMPLES,
+        _WHEELS_EXAMPLES,
     )
     wheels.add_argument("folder", type=Path, metavar="DIR", help="new or empty")
     wheels.add_argument(

@@ -29,7 +29,8 @@ class Device:
 
     Attributes:
         name: Camera, IMU, tracker, or the master.
-        state: streaming, waiting (it reports, and sends nothing), silent (no report any more) or unknown (never one).
+        state: streaming, waiting (it reports, and sends nothing), silent (no report any more) or unknown (never one);
+            running: the master, and what is no sender of it and has no keys of a device, as a recorder.
         host: Machine that it runs on.
         version: Of its program.
         temperature_c: Of that machine [degrees C].
@@ -87,7 +88,7 @@ class Roll:
             "silent"
             if silent and not rate
             else "running"
-            if name == MASTER
+            if name == MASTER or self._is_program(name)
             else "streaming"
             if rate
             else "waiting"
@@ -104,6 +105,11 @@ class Roll:
             rate,
             *clock,
         )
+
+    def _is_program(self, name: str) -> bool:
+        """Whether it is nothing that a master takes measurements from, as a recorder."""
+        last = self._last.get(MASTER)
+        return name not in self._expected and last is not None and f"{name}.received" not in last.counts
 
     def _rate(self, name: str) -> float | None:
         """Messages a second that the master took from it since its report before; None: the master does not know it."""

@@ -32,8 +32,6 @@ def view(
 
       phalanx-master view --rig desk --rig wrist
 
-      phalanx-master view --rig desk --rig wrist
-
       phalanx-master view --rig desk --keys DIR --bus tls/192.168.1.2:47802 --web
 
       phalanx-master view --rig desk --keys DIR --bus tls/192.168.2.1:47810 --site room-a

@@ -17,6 +17,7 @@ import msgspec
 from common.bus import Bus
 from common.clock import SystemClock, now_ns
 from common.errors import PhalanxError, RecordingError
+from common.machine import program
 from common.messages import WIRE_VERSION, Command, Health, Message
 from common.recording import MessageRecording, open_messages
 from common.streams import MASTER
@@ -189,7 +190,7 @@ class _Host:
             "poses_per_s": round(self._rate, 2),
         }
         counts = {"poses": self._player.poses} | ({} if self._tap is None else self._tap.counts)
-        return Health(MASTER, self._session, now_ns(), counts, gauges)
+        return Health(MASTER, self._session, now_ns(), counts, gauges, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey "report", "pause", "resume", "seek" {"t_s": 12.5}, "speed" {"factor": 2.0}, "tap" or "stop".

@@ -14,6 +14,7 @@ from pathlib import Path
 from common.bus import Bus
 from common.clock import now_ns
 from common.errors import BusError
+from common.machine import program
 from common.messages import Command, Health
 from common.recording import MessageWriter
 from master.outputs.previews import PictureAsker
@@ -190,7 +191,7 @@ class _Run:
             "recorder.megabytes_per_s": round(now.bytes_per_s * 1e-6, 3),
             "recorder.free_gb": round(now.free_bytes * 1e-9, 3),
         }
-        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges)
+        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges, *program())
 
     def answer(self, command: Command) -> Health:
         """Obey "report" or "stop".

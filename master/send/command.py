@@ -8,7 +8,7 @@ from common.errors import BusError
 from common.zenoh_bus import ZenohBus
 from master.master_bus import bus_of_master
 from master.options import CALIB_JSON, HERE_BUS, BusEnd, Calibration, Site
-from master.send.sender import NAME, run_sender, settings_of
+from master.send.sender import NAME, refuse_unknown, run_sender, settings_of
 from master.stopping import stop_on_signals
 
 
@@ -37,6 +37,7 @@ def send(
     path = calibration / "outputs" / f"{outputs}.json"
     settings = settings_of(path)
     names = [] if only is None else [name.strip() for name in only.split(",") if name.strip()]
+    refuse_unknown(names)  # now, not when a master is there
     stop = stop_on_signals()
     connection = bus_of_master(bus, stop, lambda error: _say(f"waiting for a master: {error}"), site)
     if connection is None:

@@ -16,6 +16,7 @@ from common.bus import Bus, Subscription
 from common.calibration import load
 from common.clock import Clock, SystemClock
 from common.errors import BusError, PhalanxError
+from common.machine import program
 from common.messages import Command, Health, Message, Told
 from common.output_settings import OutputSettings, default_outputs
 from common.streams import MASTER
@@ -62,8 +63,7 @@ class Sender:
         Raises:
             PhalanxError: `only` names an output that there is not.
         """
-        for name in only:
-            _known(name)
+        refuse_unknown(only)
         self._settings, self._say = settings, say
         self._clock: Clock = SystemClock() if clock is None else clock
         self._only = frozenset(only)
@@ -149,7 +149,7 @@ class Sender:
                 counts[f"dropped.{name}"] = tally.dropped
                 gauges[f"on.{name}"] = float(line is not None)
                 gauges[f"open.{name}"] = float(line is not None and line.open)
-        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges)
+        return Health(NAME, self._session, self._clock.now_ns(), counts, gauges, *program())
 
     def obey(self, command: Command) -> None:
         """Do what a command says, but for `stop`.
@@ -282,6 +282,16 @@ def _drain(feeds: list[Subscription], sender: Sender) -> None:
 def _push(sender: Sender, message: Message) -> None:
     if isinstance(message, Told):
         sender.push(message)
+
+
+def refuse_unknown(names: Collection[str]) -> None:
+    """Refuse names of outputs that there are not.
+
+    Raises:
+        PhalanxError: With what there is.
+    """
+    for name in names:
+        _known(name)
 
 
 def _known(name: str) -> None:

@@ -161,8 +161,8 @@ def main(arguments: list[str], say: Say, systemd: Systemd | None = None) -> int:
         say(json.dumps({"result": {}}))
         return 0
     if action != "install":
-        sys.stderr.write("python3 -m slave.install install|probe|packages ...\n")
-        return 2
+        sys.stderr.write("python3 -m slave.install install|probe|packages ...; `install --help` says more\n")
+        return 0 if action in ("-h", "--help") else 2
     parser = argparse.ArgumentParser("slave.install", description=PURPOSE)
     add_install(parser)
     return run(parser.parse_args(rest), say, systemd)

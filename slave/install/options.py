@@ -132,7 +132,8 @@ def plan_of(options: argparse.Namespace, calibration: Mapping[str, bytes], keys:
         InstallError: They do not fit to each other, or to the rig.
     """
     if options.master is None or not _HOST.fullmatch(options.master):
-        raise InstallError(f"--master {options.master or ''}: give the host name or the address of the PC")
+        given = f" {options.master}" if options.master else ""
+        raise InstallError(f"--master{given}: give the host name or the address of the PC")
     rig = _rig(calibration, options.rig)
     names = tuple(options.names) or _only(rig, options.rig)
     senders = tuple(_sender(name, rig, options) for name in names)

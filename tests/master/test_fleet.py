@@ -52,6 +52,18 @@ def test_who_reports_and_sends_nothing_waits_and_who_stops_reporting_is_silent()
     assert roll.devices(9.0)[0].state == "silent"
 
 
+def test_a_program_that_sends_no_measurements_runs_and_a_camera_without_keys_waits() -> None:
+    roll = Roll([])
+    roll.push(of_master(1, left=0), 0.0)
+    roll.push(of_slave("left"), 0.5)
+    roll.push(Health("recorder", 4, 1, {"taken": 9}, {}, "pc", "0.1.0"), 0.5)
+    assert {one.name: one.state for one in roll.devices(1.0)} == {
+        "left": "waiting",
+        "master": "running",
+        "recorder": "running",
+    }
+
+
 def test_a_master_that_began_anew_gives_no_rate_of_two_lives() -> None:
     roll = Roll(["left"])
     roll.push(of_master(1, session=1, left=1000), 0.0)
