@@ -4,7 +4,8 @@ Rules that must stay in step with `master.link` and docs/wire.md:
 - While the master of the session is heard, beacons of any other life are ignored: an old one
   replayed cannot end a live session, and two masters do not tear a slave apart.
 - An offer (one slave nonce) lasts until a welcome that carries it, with the proof that the master has the secret of
-  this device; the session changes only then. Who only has the rig key ends none.
+  this device; the session changes only then. Who only has the rig key ends none. Unanswered for `NONCE_NS` it goes on
+  with another nonce: the master takes none twice, and may have given that one up for a twin or a replay.
 - A session that the master's beacons do not list for a second is lost to it: say hello again.
 - Whoever is not welcomed though the beacons list its name has a twin. It goes on saying hello: the master takes it as
   soon as the other one is silent.
@@ -43,6 +44,7 @@ VANISHED_NS = 2_000_000_000  # a master silent for so long is gone
 UNLISTED_NS = 1_000_000_000
 HELLO_AGAIN_NS = 50_000_000
 OFFER_NS = 1_000_000_000  # how long hello is repeated after the last beacon
+NONCE_NS = 2_000_000_000
 TWIN_NS = 1_000_000_000  # unanswered for so long while the beacons list the name: another process has it
 STRANGE_NS = 1_000_000_000  # between two hellos to a master of another wire version
 LATELY_NS = 2_500_000_000  # so long after it was last seen something is told to be wrong
@@ -74,6 +76,7 @@ class _Offer:
     heard_ns: int
     next_ns: int
     since_ns: int
+    drawn_ns: int  # its nonce
 
 
 @dataclass(slots=True)
@@ -227,8 +230,11 @@ class SlaveLink:
             and t_ns - old.heard_ns < OFFER_NS
         ):
             since_ns = old.since_ns
-        nonce = self._random(NONCE_BYTES) if old is None else old.slave_nonce
-        self._offer = _Offer(nonce, beacon, counter, address, heard_ns=t_ns, next_ns=t_ns, since_ns=since_ns)
+        if old is not None and 0 <= t_ns - old.drawn_ns < NONCE_NS:
+            nonce, drawn_ns = old.slave_nonce, old.drawn_ns
+        else:
+            nonce, drawn_ns = self._random(NONCE_BYTES), t_ns
+        self._offer = _Offer(nonce, beacon, counter, address, t_ns, t_ns, since_ns, drawn_ns)
         self._say_hello(self._offer, t_ns)
 
     def _has_twin(self, beacon: Beacon, t_ns: int) -> Refusal | None:

@@ -74,6 +74,18 @@ def test_two_that_come_at_once_never_take_turns(seed: int) -> None:
     assert len(set(taken)) == 1
 
 
+@pytest.mark.parametrize("seed", range(20))
+def test_of_two_that_came_at_once_the_other_is_taken_when_the_first_is_gone(seed: int) -> None:
+    wires = Wires(loss=0.3, seed=seed)
+    master = wires.new_master(("left",))
+    pair = wires.new_slave("left"), wires.new_slave("left")
+    assert wires.run(5.0, lambda: any(slave.started for slave in pair))
+    taken = stream(wires, *pair, seconds=2.0)
+    first = next(slave for slave in pair if slave.process == taken[-1])
+    wires.remove(first)
+    assert wires.run(6.0, lambda: master.restarts_of("left") > 0)
+
+
 class Versions:
     """A master of today beside a slave of another wire version, in one process."""
 
