@@ -132,7 +132,11 @@ def _spread(values: Any) -> str:
 
 def main() -> None:
     """Run by the command line."""
-    parser = argparse.ArgumentParser(prog="python -m bench.pose_cost", description=__doc__)
+    parser = argparse.ArgumentParser(
+        "python -m bench.pose_cost",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--functions", choices=RIGS)
     parser.add_argument("--against", type=Path, metavar="DIR")
     parser.add_argument("--turns", choices=RIGS, help=argparse.SUPPRESS)
