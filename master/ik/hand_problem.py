@@ -66,15 +66,15 @@ class HandProblem:
         model: The hand.
         parameters: Its free angles and their bounds.
         markers: The N seen markers.
-        points_m: (N, 3) [m] where they were seen, rig frame.
-        whiten: (N, 3, 3) inverse square roots of their covariances.
+        points_m: (..., N, 3) [m] where they were seen, rig frame; with leading axes, those of the hands asked about.
+        whiten: (..., N, 3, 3) inverse square roots of their covariances.
         prior: Beliefs about the angles, of one hypothesis or several.
         palm: Belief about the palm, or None.
         facing: Belief about the side it shows, or None.
         orientation: The palm's orientation as measured otherwise, or None.
         others: What other sensors say of palm and fingers, or None.
-        _rows: (3 N + 3 if facing + 6 if palm, 6 + n) what is the same everywhere of the residuals' Jacobian: by the
-            shift, and that of the belief about the palm.
+        _rows: (..., 3 N + 3 if facing + 6 if palm, 6 + n) what is the same everywhere of the residuals' Jacobian: by
+            the shift, and that of the belief about the palm.
     """
 
     model: HandModel
@@ -90,12 +90,12 @@ class HandProblem:
     _rows: Float = field(init=False)
 
     def __post_init__(self) -> None:
-        markers = 3 * len(self.points_m)
-        rows = np.zeros((markers + (0 if self.facing is None else 3), 6 + len(self.parameters.free)))
-        rows[:markers, 3:6] = self.whiten.reshape(-1, 3)
+        *lead, count, _ = self.points_m.shape
+        believed = (0 if self.facing is None else 3) + (0 if self.palm is None else 6)
+        rows = np.zeros((*lead, 3 * count + believed, 6 + len(self.parameters.free)))
+        rows[..., : 3 * count, 3:6] = self.whiten.reshape(*lead, 3 * count, 3)
         if self.palm is not None:
-            rows = np.concatenate([rows, np.zeros((6, rows.shape[1]))])
-            np.fill_diagonal(rows[-6:], self.palm.weight)
+            np.einsum("...ii->...i", rows[..., -6:, :6])[...] = self.palm.weight
         object.__setattr__(self, "_rows", rows)
 
     def of_hypothesis(self, which: Int | int) -> "HandProblem":
@@ -176,13 +176,12 @@ class HandProblem:
 
     def linearise(self, T_rig_palm: Float, x: Float) -> Linear:
         """Cost, gradient and normal matrix at poses (..., 4, 4) and free angles (..., n); leading axes as `prior`."""
-        R, lead, count = T_rig_palm[..., :3, :3], x.shape[:-1], len(self.points_m)
+        R, lead, count = T_rig_palm[..., :3, :3], x.shape[:-1], self.points_m.shape[-2]
         chains = self.model.chains(self.parameters.angles(x))
         local = self.markers.place(chains)
         arm = local @ R.swapaxes(-1, -2)
-        J = np.empty(
-            (*lead, *self._rows.shape)
-        )  # the whitened markers, then the palm, by turn, shift and angles
+        # The whitened markers, then the palm, by turn, shift and angles.
+        J = np.empty((*lead, *self._rows.shape[-2:]))
         J[...] = self._rows
         marker = J[..., : 3 * count, :].reshape(*lead, count, 3, 6 + x.shape[-1])  # a view
         np.matmul(self.whiten, skew(-arm), out=marker[..., :3])
