@@ -13,6 +13,7 @@ import argparse
 import math
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -135,14 +136,13 @@ def main() -> None:
     parser.add_argument("--detent-deg", type=float, default=6.0, help="its turn (default: %(default)s)")
     parser.add_argument("--percent", type=int, default=2, help="of each detent (default: %(default)s)")
     options = parser.parse_args()
+    stop = threading.Event()
+    signal.signal(signal.SIGINT, lambda number, frame: stop.set())
     try:
         output = Printed() if options.output == "print" else Program(options.output)
-        dial, stop = Dial(options.detent_deg), threading.Event()
-        run(ZenohBus(None, options.bus), dial, output, options.percent, stop)
+        run(ZenohBus(None, options.bus), Dial(options.detent_deg), output, options.percent, stop)
     except (PhalanxError, subprocess.CalledProcessError) as error:
         sys.exit(f"volume_dial: {error}")
-    except KeyboardInterrupt:
-        return
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
 from common.errors import PhalanxError
@@ -59,6 +59,7 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
             "/page.js",
             "/three.js",
             "/nowhere",
+            "/hands",
             "/?key=",
             "/?key=0",
             f"/?key={key[:-1]}",
@@ -72,7 +73,8 @@ def test_who_shows_the_key_is_served_by_tls_and_nobody_else(tmp_path: Path) -> N
         ((name, morsel),) = SimpleCookie(said).items()
         assert got("/page.js", f"a=b; {name}={morsel.value}").status == 200
         assert got("/page.js", f"{name}=x").status == 401
-        with pytest.raises(InvalidStatus, match="401"):
+        # The server hangs up behind its 401, which a client that is slow to read may lose.
+        with pytest.raises((InvalidStatus, InvalidMessage), match=r"401|did not receive"):
             connect(f"wss://127.0.0.1:{port}/hands", ssl=tls, open_timeout=WAIT_S)
         with connect(f"wss://127.0.0.1:{port}/hands?key={key}", ssl=tls, open_timeout=WAIT_S) as client:
             while sink.server.clients == 0:
