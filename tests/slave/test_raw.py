@@ -174,7 +174,6 @@ def test_a_full_disk_ends_the_recording_and_not_the_loop(
     with slave(calibration, tmp_path) as left:
         left.begin("wave")
         left.read(frames(4))
-        left.raw.offer(frames(1, 4)[0])
         assert until(lambda: left.ask("report").counts["raw.frames"] == 4)
         left.free = 1500
         left.read(frames(6, 4))
