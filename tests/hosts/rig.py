@@ -14,6 +14,7 @@ from pathlib import Path
 from tests.hosts.fleet import MASTER_PORT, Fleet
 
 ROOT = Path(__file__).resolve().parents[2]
+UP_S = 60.0  # for a master to start on a busy machine
 SCALE, RATE_HZ = 0.5, 30.0  # two cameras are rendered on the processor that also has master and deployment
 BEACON_PORT, BUS_PORT = 47800, 47802
 
@@ -53,7 +54,7 @@ class Rig:
         assert made.code == 0, f"no keys: {made}"
 
     def start_master(self) -> None:
-        """Start the master; it waits for its cameras."""
+        """Start the master, and wait until it listens: `deploy` takes the place of one that is not there yet."""
         bind = f"{self.fleet.address}:{MASTER_PORT}"
         beacon = f"{self.fleet.broadcast}:{BEACON_PORT}"
         command = [
@@ -69,6 +70,7 @@ class Rig:
         where = ["--keys", str(self.keys), "--beacon", beacon, "--bind", bind, "--bus", self.bus]
         files = ["--summary", str(self.folder / "summary.json")]
         log = (self.folder / "master.log").open("a")
+        began = log.tell()
         self._master = subprocess.Popen(
             [*command, *where, *files],
             text=True,
@@ -78,6 +80,11 @@ class Rig:
             env=self._environment(),
         )
         self.fleet.undo.later("kill process", str(self._master.pid))
+        said, end = self.folder / "master.log", time.monotonic() + UP_S
+        while "listening on" not in said.read_text()[began:]:
+            assert self._master.poll() is None, said.read_text()[-2000:]
+            assert time.monotonic() < end, "the master does not listen"
+            time.sleep(0.1)
 
     def stop_master(self) -> dict[str, object]:
         """End it as Ctrl-C does; return its summary."""
