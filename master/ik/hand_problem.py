@@ -142,10 +142,8 @@ class HandProblem:
             T_rig_palm, x, here, before = rough._descend(T_rig_palm, x, max(enough, _ROUGH), rivals=True)
             lowest = int(np.argmin(here.cost))
             T_rig_palm, x = T_rig_palm[lowest], x[lowest]
-        T, x = (
-            T_rig_palm.reshape(1, 4, 4).repeat(hypotheses, axis=0),
-            x.reshape(1, -1).repeat(hypotheses, axis=0),
-        )
+        T = T_rig_palm.reshape(1, 4, 4).repeat(hypotheses, axis=0)
+        x = x.reshape(1, -1).repeat(hypotheses, axis=0)
         T, x, here, iterations = self._descend(T, x, enough, rivals=False)
         return [Minimum(T[h], x[h], here.of(h), before + iterations) for h in range(hypotheses)]
 

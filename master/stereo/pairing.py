@@ -90,10 +90,8 @@ class Pairing:
         self._policy, self._continuous = policy, continuous
         self.outdated = 0
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
-        self._frames, self._last = (
-            0,
-            [0] * len(self._names),
-        )  # of all cameras; how many those were at each one's last
+        self._frames = 0  # of all cameras
+        self._last = [0] * len(self._names)  # how many those were at each one's last
         self._awaited = 0  # the camera that was waited for when somebody asked last
         self._pending: deque[int] = deque()
         self._origin_ns: int | None = None
