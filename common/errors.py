@@ -9,6 +9,7 @@
     │   └── TrackerChoiceError  several are there, and nobody said which
     ├── LightsError        laser or LEDs cannot be switched, or would be on for longer than is safe
     ├── MessageError       bytes that are not a message of ours
+    │   └── BoundsError    a message with a number that cannot be
     ├── BusError           the bus cannot be opened, or nobody answers
     └── FitError           observations do not determine the value asked for
 
@@ -51,6 +52,10 @@ class LightsError(PhalanxError):
 
 class MessageError(PhalanxError):
     """Bytes that do not decode to one of our messages."""
+
+
+class BoundsError(MessageError):
+    """A message of ours with a number that is beyond what its field can be."""
 
 
 class BusError(PhalanxError):

@@ -2,7 +2,7 @@
 tracker."""
 
 from functools import cache
-from math import isinf, nan
+from math import nan
 from typing import Annotated, TypeAlias
 
 import msgspec
@@ -10,7 +10,25 @@ import numpy as np
 from msgspec import Meta
 
 from common.arrays import Float, Ids
-from common.message_parts import FINGER_COUNT, MAX_MARKERS, MAX_TAGS, Count, Message, Name, TimeNs, freeze
+from common.message_parts import (
+    FINGER_COUNT,
+    MAX_MARKERS,
+    MAX_PICTURE,
+    MAX_TAGS,
+    Count,
+    Message,
+    Metres,
+    Name,
+    Pixels,
+    SigmaPx,
+    TimeNs,
+    TimeSigmaNs,
+    Turn,
+    freeze,
+    refuse_beyond,
+    refuse_no_turn,
+    within,
+)
 
 
 class MarkerDetections(Message, frozen=True, eq=False, tag=True):
@@ -39,29 +57,29 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
     seq: Count
     t_ns: TimeNs
     ready_t_ns: TimeNs
-    uv: Float
-    area: Float
-    quality: Float
-    sigma_px: Float
-    rival_uv: Float
-    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+    uv: Pixels
+    area: Annotated[Float, within(0.0, MAX_PICTURE**2)]
+    quality: Annotated[Float, within(0.0, 1.0)]
+    sigma_px: SigmaPx
+    rival_uv: Pixels
+    t_sigma_ns: TimeSigmaNs = 0.0
 
     def __post_init__(self) -> None:
         m = len(self.area)
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
-        freeze(self, "uv", np.float64, (m, 2))
+        freeze(self, "uv", np.float64, (m, 2), whole=True)
         freeze(self, "area", np.float64, (m,))
         freeze(self, "quality", np.float64, (m,))
         freeze(self, "sigma_px", np.float64, (m,))
         # A list is faster than numpy for so few.
         for u, sigma in zip(self.uv[:, 0].tolist(), self.sigma_px.tolist(), strict=True):
-            if (u != u) != (sigma != sigma) or sigma <= 0.0:
+            if (u != u) != (sigma != sigma):
                 raise ValueError("sigma_px: must be positive where uv is seen and NaN elsewhere")
         if self.rival_uv.size == 0:
             msgspec.structs.force_setattr(self, "rival_uv", nowhere(m))
             return
-        freeze(self, "rival_uv", np.float64, (m, 2))
+        freeze(self, "rival_uv", np.float64, (m, 2), whole=True)
         if not np.isnan(self.rival_uv[np.isnan(self.uv[:, 0])]).all():
             raise ValueError("rival_uv: a rival of a marker that is not seen")
 
@@ -98,26 +116,25 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     seq: Count
     t_ns: TimeNs
     ready_t_ns: TimeNs
-    laser_uv: Float
-    laser_sigma_px: Float
-    laser_px: Float
-    tip_uv: Float
-    tip_sigma_px: Float
-    tip_depth: Float
-    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
-    exposure_us: Annotated[float, Meta(ge=0.0, le=1e9)] = 0.0
+    laser_uv: Pixels
+    laser_sigma_px: SigmaPx
+    laser_px: Annotated[Float, within(0.0, 2 * MAX_PICTURE)]
+    tip_uv: Pixels
+    tip_sigma_px: SigmaPx
+    tip_depth: Annotated[Float, within(0.0, 1e6)]
+    t_sigma_ns: TimeSigmaNs = 0.0
+    exposure_us: Annotated[float, Meta(ge=0.0, le=1e7)] = 0.0
 
     def __post_init__(self) -> None:
         for name in ("laser_uv", "tip_uv"):
-            freeze(self, name, np.float64, (FINGER_COUNT, 2))
+            freeze(self, name, np.float64, (FINGER_COUNT, 2), whole=True)
         for name in ("laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth"):
             freeze(self, name, np.float64, (FINGER_COUNT,))
         for what, uv, sigma in (
             ("laser", self.laser_uv, self.laser_sigma_px),
             ("tip", self.tip_uv, self.tip_sigma_px),
         ):
-            unseen = np.isnan(uv).any(axis=1)
-            if (np.isnan(sigma) != unseen).any() or (sigma <= 0.0).any():
+            if (np.isnan(sigma) != np.isnan(uv[:, 0])).any():
                 raise ValueError(
                     f"{what}_sigma_px: must be positive where {what}_uv is seen and NaN elsewhere"
                 )
@@ -145,9 +162,9 @@ class TagDetections(Message, frozen=True, eq=False, tag=True):
     t_ns: TimeNs
     ready_t_ns: TimeNs
     ids: Ids
-    uv: Float
-    sigma_px: Float
-    t_sigma_ns: Annotated[float, Meta(ge=0.0, le=1e18)] = 0.0
+    uv: Pixels
+    sigma_px: SigmaPx
+    t_sigma_ns: TimeSigmaNs = 0.0
 
     def __post_init__(self) -> None:
         n = len(self.ids)
@@ -158,7 +175,7 @@ class TagDetections(Message, frozen=True, eq=False, tag=True):
         freeze(self, "sigma_px", np.float64, (n,))
         if (self.ids[1:] <= self.ids[:-1]).any():
             raise ValueError("ids: must rise, each once")
-        if np.isnan(self.uv).any() or not (self.sigma_px > 0.0).all():
+        if np.isnan(self.uv).any() or np.isnan(self.sigma_px).any():
             raise ValueError("uv, sigma_px: a tag that was found has corners and a positive sigma")
 
 
@@ -178,12 +195,13 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
     session: Count
     seq: Count
     t_ns: TimeNs
-    position_m: Float
-    orientation_wxyz: Float
+    position_m: Metres
+    orientation_wxyz: Turn
 
     def __post_init__(self) -> None:
-        freeze(self, "position_m", np.float64, (3,))
-        freeze(self, "orientation_wxyz", np.float64, (4,))
+        freeze(self, "position_m", np.float64, (3,), whole=True)
+        freeze(self, "orientation_wxyz", np.float64, (4,), whole=True)
+        refuse_no_turn(self, "orientation_wxyz")
 
 
 class ImuSample(Message, frozen=True, eq=False, tag=True):
@@ -206,19 +224,17 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
     session: Count
     seq: Count
     t_ns: TimeNs
-    gyro_rad_s: Float
-    accel_m_s2: Float
-    mag_ut: Float
-    orientation_wxyz: Float
-    heading_sigma_rad: float = nan
+    gyro_rad_s: Annotated[Float, within(-200.0, 200.0)]
+    accel_m_s2: Annotated[Float, within(-5000.0, 5000.0)]
+    mag_ut: Annotated[Float, within(-1e5, 1e5)]
+    orientation_wxyz: Turn
+    heading_sigma_rad: Annotated[float, within(0.0, 1e3)] = nan
 
     def __post_init__(self) -> None:
-        freeze(self, "gyro_rad_s", np.float64, (3,))
-        freeze(self, "accel_m_s2", np.float64, (3,))
-        freeze(self, "mag_ut", np.float64, (3,))
-        freeze(self, "orientation_wxyz", np.float64, (4,))
-        if self.heading_sigma_rad < 0.0 or isinf(self.heading_sigma_rad):
-            raise ValueError(f"heading_sigma_rad: {self.heading_sigma_rad}: must be 0 or more, or NaN")
+        for field, size in (("gyro_rad_s", 3), ("accel_m_s2", 3), ("mag_ut", 3), ("orientation_wxyz", 4)):
+            freeze(self, field, np.float64, (size,), whole=True)
+        refuse_no_turn(self, "orientation_wxyz")
+        refuse_beyond(self, "heading_sigma_rad")
 
 
 Detections: TypeAlias = MarkerDetections | WristDetections  # what a camera sends, of either kind

@@ -1,15 +1,30 @@
 """How processes are and what they are asked: health, checklist, commands, and pictures for people."""
 
+from math import isfinite
 from typing import Annotated, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import force_setattr
 
-from common.message_parts import Count, Finite, Message, Name, TimeNs
+from common.message_parts import (
+    MAX_COUNT,
+    MAX_NUMBER,
+    Count,
+    Finite,
+    Message,
+    Name,
+    Sentence,
+    Text,
+    TimeNs,
+    printable,
+)
 
 MAX_PREVIEW_BYTES = 256 * 1024
 MAX_STILL_BYTES = 900 * 1024
 MAX_BODY_CHARACTERS = 64 * 1024
 MAX_CHECKS = 64
+MAX_NUMBERS = 512
+_NAME = 64
 _JPEG_START = b"\xff\xd8\xff"
 
 CheckCode = Literal[
@@ -32,11 +47,15 @@ CheckCode = Literal[
     "twin_sender",
     "version_mismatch",
     "secret_mismatch",
+    "marker_mismatch",
 ]
 
 
 class Health(Message, frozen=True, eq=False, tag=True):
     """What a process counted since it started.
+
+    Whatever is counted, the report can be read: counts stay at their largest value, gauges that are no number are left
+    out, texts lose what cannot be printed.
 
     Attributes:
         source: Process name: a camera, or "master".
@@ -51,10 +70,19 @@ class Health(Message, frozen=True, eq=False, tag=True):
     source: Name
     session: Count
     t_ns: TimeNs
-    counts: Annotated[dict[Name, Count], Meta(max_length=512)]
-    gauges: Annotated[dict[Name, Finite], Meta(max_length=512)]
-    host: Annotated[str, Meta(max_length=64)] = ""
-    version: Annotated[str, Meta(max_length=64)] = ""
+    counts: Annotated[dict[Name, Count], Meta(max_length=MAX_NUMBERS)]
+    gauges: Annotated[dict[Name, Finite], Meta(max_length=MAX_NUMBERS)]
+    host: Text = ""
+    version: Text = ""
+
+    def __post_init__(self) -> None:
+        counts = list(self.counts.items())[:MAX_NUMBERS]
+        gauges = [(name, value) for name, value in self.gauges.items() if isfinite(value)][:MAX_NUMBERS]
+        force_setattr(self, "counts", {name[:_NAME]: max(0, min(n, MAX_COUNT)) for name, n in counts})
+        clamped = {name[:_NAME]: max(-MAX_NUMBER, min(value, MAX_NUMBER)) for name, value in gauges}
+        force_setattr(self, "gauges", clamped)
+        force_setattr(self, "host", printable(self.host)[:_NAME])
+        force_setattr(self, "version", printable(self.version)[:_NAME])
 
 
 class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):
@@ -69,8 +97,8 @@ class CheckItem(Struct, frozen=True, forbid_unknown_fields=True):
 
     code: CheckCode
     subject: Name
-    sentence: Annotated[str, Meta(min_length=1, max_length=500)]
-    fix: Annotated[str, Meta(min_length=1, max_length=500)]
+    sentence: Sentence
+    fix: Sentence
 
 
 class Checklist(Message, frozen=True, eq=False, tag=True):

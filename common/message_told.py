@@ -1,14 +1,27 @@
 """What a master makes of it: poses of hands and objects, contact of both, gestures."""
 
 from enum import IntEnum
-from math import isinf, nan
+from math import nan
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, field
 
 from common.arrays import Bool, Code, Float
-from common.message_parts import FINGER_COUNT, JOINT_COUNT, MAX_MARKERS, Message, Name, TimeNs, freeze
+from common.message_parts import (
+    FINGER_COUNT,
+    JOINT_COUNT,
+    MAX_MARKERS,
+    Message,
+    Metres,
+    Name,
+    Numbers,
+    TimeNs,
+    Turn,
+    freeze,
+    refuse_beyond,
+    within,
+)
 
 GestureKind = Literal["pose", "pinch", "dial", "tap", "point"]
 Phase = Literal["begin", "update", "end"]
@@ -86,26 +99,26 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
 
     hand: Name
     t_ns: TimeNs
-    position_m: Float
-    orientation_wxyz: Float
-    radius_m: Float
+    position_m: Metres
+    orientation_wxyz: Turn
+    radius_m: Annotated[Float, within(0.0, 1.0)]
     valid: Bool
     tracked: Bool
-    cov_m2: Float
+    cov_m2: Numbers
     source: Code
-    angles_rad: Float
-    markers_m: Float
-    markers_raw_m: Float
-    markers_cov_m2: Float
+    angles_rad: Annotated[Float, within(-10.0, 10.0)]
+    markers_m: Metres
+    markers_raw_m: Metres
+    markers_cov_m2: Numbers
     inside_volume: Bool
     latency_ns: TimeNs = 0
-    laser_m: Float = field(default_factory=lambda: _NO_LASER)
+    laser_m: Metres = field(default_factory=lambda: _NO_LASER)
     level: Code = field(default_factory=lambda: _NO_LEVEL)
     ambiguous: Bool = field(default_factory=lambda: _NOT_AMBIGUOUS)
-    palm_world_wxyz: Float = field(default_factory=lambda: _NO_ROTATION)
-    palm_world_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_rad: Float = field(default_factory=lambda: _NO_SIGMA)
-    wrist_bend_sigma_rad: Float = field(default_factory=lambda: _NO_SIGMA)
+    palm_world_wxyz: Turn = field(default_factory=lambda: _NO_ROTATION)
+    palm_world_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_rad: Annotated[Float, within(-10.0, 10.0)] = field(default_factory=lambda: _NO_SIGMA)
+    wrist_bend_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
         j = JOINT_COUNT
@@ -158,10 +171,10 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
 
     object: Name
     t_ns: TimeNs
-    position_m: Float
-    orientation_wxyz: Float
-    cov: Float
-    residual_m: float
+    position_m: Metres
+    orientation_wxyz: Turn
+    cov: Numbers
+    residual_m: Annotated[float, within(0.0, 1e4)]
     source: Annotated[int, Meta(ge=0, le=int(max(ObjectSource)))]
     tracked: bool
     seen: Annotated[int, Meta(ge=0, le=MAX_MARKERS)]
@@ -173,8 +186,7 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
         freeze(self, "position_m", np.float64, (3,))
         freeze(self, "orientation_wxyz", np.float64, (4,))
         freeze(self, "cov", np.float64, (6, 6))
-        if self.residual_m < 0.0 or isinf(self.residual_m):
-            raise ValueError(f"residual_m: {self.residual_m}: must be 0 or more, or NaN")
+        refuse_beyond(self, "residual_m")
 
 
 class Contact(Message, frozen=True, eq=False, tag=True):
@@ -196,11 +208,11 @@ class Contact(Message, frozen=True, eq=False, tag=True):
     hand: Name
     object: Name
     t_ns: TimeNs
-    distance_m: Float
-    sigma_m: Float
-    point_m: Float
+    distance_m: Metres
+    sigma_m: Numbers
+    point_m: Metres
     touching: Bool
-    palm_distance_m: float
+    palm_distance_m: Annotated[float, within(-1e4, 1e4)]
     held: bool
 
     def __post_init__(self) -> None:
@@ -208,8 +220,7 @@ class Contact(Message, frozen=True, eq=False, tag=True):
         freeze(self, "sigma_m", np.float64, (FINGER_COUNT,))
         freeze(self, "point_m", np.float64, (FINGER_COUNT, 3))
         freeze(self, "touching", np.bool_, (FINGER_COUNT,))
-        if isinf(self.palm_distance_m):
-            raise ValueError("palm_distance_m: infinite value")
+        refuse_beyond(self, "palm_distance_m")
 
 
 class Gesture(Message, frozen=True, eq=False, tag=True):
@@ -239,18 +250,17 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
     phase: Phase
     began_t_ns: TimeNs
     confidence: Annotated[float, Meta(ge=0.0, le=1.0)]
-    distance_m: float = nan
-    strength: float = nan
-    angle_rad: float = nan
-    origin_m: Float = field(default_factory=lambda: _NO_POINT)
-    direction: Float = field(default_factory=lambda: _NO_POINT)
+    distance_m: Annotated[float, within(-1e4, 1e4)] = nan
+    strength: Annotated[float, within(0.0, 1.0)] = nan
+    angle_rad: Annotated[float, within(-1e4, 1e4)] = nan
+    origin_m: Metres = field(default_factory=lambda: _NO_POINT)
+    direction: Turn = field(default_factory=lambda: _NO_POINT)
 
     def __post_init__(self) -> None:
         freeze(self, "origin_m", np.float64, (3,))
         freeze(self, "direction", np.float64, (3,))
         for name in ("distance_m", "strength", "angle_rad"):
-            if isinf(getattr(self, name)):
-                raise ValueError(f"{name}: infinite value")
+            refuse_beyond(self, name)
 
 
 Told: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it

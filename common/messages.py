@@ -3,8 +3,8 @@
 On the wire a message is one msgpack map; an array is its little-endian bytes, so that NaN
 travels as itself and a message costs no Python loop. Rivals of markers are rare, and none at
 all travel as no bytes: so the detections of 24 markers fit one Ethernet packet. `decode` is
-the only way in: whatever it returns has the right shapes and no infinity. Every field is
-described in docs/wire.md.
+the only way in: whatever it returns has the right shapes, and each number is within the
+bounds of its field. Every field is described in docs/wire.md.
 """
 
 from copy import copy
@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Ids
-from common.errors import MessageError
+from common.errors import BoundsError, MessageError
 from common.message_parts import (
     FINGER_COUNT,
     JOINT_COUNT,
@@ -24,6 +24,7 @@ from common.message_parts import (
     Finite,
     Message,
     Name,
+    OutOfBoundsError,
     TimeNs,
 )
 from common.message_sensed import (
@@ -107,7 +108,7 @@ __all__ = [
     "restamped",
 ]
 
-WIRE_VERSION = 11
+WIRE_VERSION = 12
 
 AnyMessage: TypeAlias = (
     MarkerDetections
@@ -129,6 +130,8 @@ AnyMessage: TypeAlias = (
 
 MessageT = TypeVar("MessageT", bound=Message)
 
+# How msgspec begins to say that a number is beyond the `ge` or `le` of its field.
+_BEYOND = tuple(f"Expected `{kind}` {sign}=" for kind in ("int", "float") for sign in "<>")
 _NONE = np.empty((0, 2))
 _ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
 _DECODER = msgspec.msgpack.Decoder(AnyMessage, dec_hook=lambda kind, raw: _from_bytes(kind, raw))
@@ -146,12 +149,15 @@ def decode(data: bytes | memoryview) -> AnyMessage:
     """Return the message in `data`.
 
     Raises:
+        BoundsError: It is a message, but a number in it is out of bounds.
         MessageError: The bytes are not exactly one message of ours: broken msgpack,
-            unknown type or field, wrong shape, an infinity, a number out of range.
+            unknown type or field, wrong shape.
     """
     try:
         return cast(AnyMessage, _DECODER.decode(data))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        if isinstance(error.__cause__, OutOfBoundsError) or str(error).startswith(_BEYOND):
+            raise BoundsError(f"out of bounds: {error}") from error
         raise MessageError(f"not a message: {error}") from error
 
 

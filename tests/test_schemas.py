@@ -5,10 +5,11 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from common.arrays import Float
 from common.calibration import CameraCalibration, HandProfile, RigCalibration, schema
 from common.frame_recording import Manifest
 from common.gesture_settings import GestureSettings
-from common.message_schema import bus_schema
+from common.message_schema import bounds_table, bus_schema
 from common.messages import HandPose, Message
 from common.object_profile import ObjectProfile
 from common.output_settings import OutputSettings
@@ -27,6 +28,14 @@ KINDS: dict[str, type[msgspec.Struct]] = {
 
 
 ALL = (*KINDS, MESSAGES)
+WIRE = FOLDER.parent / "wire.md"
+BEGIN, END = "<!-- bounds: `make schema` writes this table -->\n\n", "\n<!-- end of bounds -->"
+
+
+def with_bounds(page: str) -> str:
+    """The page of the wire with its table of bounds as the types have it."""
+    before, rest = page.split(BEGIN)
+    return before + BEGIN + bounds_table() + END + rest.split(END)[1]
 
 
 def text_of(name: str) -> str:
@@ -39,6 +48,13 @@ def test_the_schema_equals_the_type(name: str) -> None:
     path = FOLDER / name
     assert path.is_file(), f"{path} is missing: run `make schema`"
     assert path.read_text() == text_of(name), f"{path} is out of date: run `make schema`"
+
+
+def test_the_page_of_the_wire_lists_the_bounds_of_every_message() -> None:
+    assert with_bounds(WIRE.read_text()) == WIRE.read_text(), f"{WIRE} is out of date: run `make schema`"
+    for kind in Message.__subclasses__():
+        numbers = {field.name for field in msgspec.structs.fields(kind) if field.type in (float, int, Float)}
+        assert not numbers, f"{kind.__name__}: {', '.join(numbers)}: a number without bounds"
 
 
 def test_no_schema_is_left_over() -> None:
@@ -71,3 +87,4 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for file in ALL:
         (FOLDER / file).write_text(text_of(file))
+    WIRE.write_text(with_bounds(WIRE.read_text()))
