@@ -112,6 +112,11 @@ class Inbox:
         self.dropped = 0
         self.refused = 0
 
+    @property
+    def closed(self) -> bool:
+        """Whether nothing is received any more."""
+        return self._on_close is None
+
     def put(self, name: str, payload: bytes) -> None:
         """Append one encoded message that came under `name`; the oldest makes room."""
         with self._changed:

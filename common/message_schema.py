@@ -130,4 +130,9 @@ def _bounds_text(rule: dict[str, Any]) -> str:
 
 
 _LIMITS = ("minimum", "x-minimum", "maximum", "x-maximum")
-_POWERS: dict[float, str] = {MAX_COUNT: "2⁶³ − 1", MAX_TIME_NS: "2⁶¹", MAX_NUMBER: "10¹⁸", MAX_PICTURE**2: "16,384²"}
+_POWERS: dict[float, str] = {
+    MAX_COUNT: "2⁶³ − 1",
+    MAX_TIME_NS: "2⁶¹",
+    MAX_NUMBER: "10¹⁸",
+    MAX_PICTURE**2: "16,384²",
+}

@@ -48,7 +48,7 @@ class Beacon(Handshake, frozen=True):
     """
 
     master_nonce: Nonce
-    zenoh_endpoint: Annotated[str, Meta(max_length=256)]
+    zenoh_endpoint: Annotated[str, Meta(max_length=256, pattern=r"^[!-~]*(?!\n)$")]
     sessions: Annotated[dict[Name, Count], Meta(max_length=MAX_CAMERAS)]
 
 

@@ -18,6 +18,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 import zenoh
@@ -29,12 +30,15 @@ from common.certificates import MASTER, OPERATOR
 from common.endpoints import check, encrypted, loopback
 from common.errors import BusError, PhalanxError
 from common.keys import Access, access_of
+from common.message_parts import printable
 from common.messages import Command, Health, Message, encode
 from common.streams import ALIVE_KEY, key_of
+from common.supervisor import until
 
 ASK_AGAIN_S = 0.05  # a target that has just connected is not known everywhere yet
 JOIN_S = 1.0  # a thread that zenoh does not release is left to the end of the process
 LIVELINESS_TIMEOUT_S = 0.5
+MAX_REFUSAL = 2000  # characters of why a device refused a command
 FIFO_DEPTH = 64  # between zenoh and the thread that empties it at once
 # Nothing of these is dropped: who publishes them does so on a thread of its own.
 WAITING = frozenset({"taken"})
@@ -164,7 +168,7 @@ class ZenohBus:
             sample = handler.recv()
             inbox.put(str(sample.key_expr).rpartition("/")[2], sample.payload.to_bytes())
 
-        thread = _start(f"bus {key}", take_next)
+        thread = _start(f"bus {key}", take_next, lambda: self._closed or inbox.closed)
         with self._lock:
             self._threads = [alive for alive in self._threads if alive.is_alive()] + [thread]
             self._inboxes.append(inbox)
@@ -180,10 +184,10 @@ class ZenohBus:
 
         def answer_next() -> None:
             # A query is finished, and the asker told so, when it is left: never keep one while waiting.
-            with queries.recv() as query:
-                _answer(query, handler)
+            with queries.recv() as query, suppress(zenoh.ZError):  # who asked may be gone
+                _answer(query, name, handler)
 
-        thread = _start(f"bus command {name}", answer_next)
+        thread = _start(f"bus command {name}", answer_next, lambda: self._closed)
         with self._lock:
             self._threads.append(thread)
             self._undeclare.append(_quietly(queryable))
@@ -209,7 +213,9 @@ class ZenohBus:
                 text = reply.err.payload.to_bytes().decode(errors="replace") if reply.err is not None else ""
                 if text == "Timeout":  # zenoh's own word for a target that took the query and kept silent
                     break
-                raise BusError(f"{command.target!r} refused {command.verb!r}: {text}")
+                raise BusError(
+                    f"{command.target!r} refused {command.verb!r}: {printable(text[:MAX_REFUSAL])}"
+                )
             # Nobody there yet looks the same as nothing to say: ask again, it costs nothing.
             time.sleep(max(0.0, min(ASK_AGAIN_S, deadline - time.monotonic())))
         raise BusError(self._silence(command, timeout_s))
@@ -234,7 +240,7 @@ class ZenohBus:
         except zenoh.ZError:  # closed by another thread meanwhile
             return frozenset()
         keys = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
-        return frozenset(key.rsplit("/", 1)[-1] for key in keys)
+        return frozenset(printable(key.rsplit("/", 1)[-1]) for key in keys)
 
     def close(self) -> None:
         """Leave the bus: every thread ends, every declaration goes. Safe to call twice."""
@@ -287,8 +293,8 @@ def _plain(error: zenoh.ZError) -> str:
     return re.sub(r"Unable to connect to any of .*Timeout!", "nobody answers there", text)
 
 
-def _start(name: str, step: Callable[[], None]) -> threading.Thread:
-    """Repeat `step` on a thread until zenoh closes what it reads from."""
+def _start(name: str, step: Callable[[], None], ended: Callable[[], bool]) -> threading.Thread:
+    """Repeat `step` on a thread until zenoh closes what it reads from; before `ended` that is a failure."""
 
     def run() -> None:
         try:
@@ -297,16 +303,19 @@ def _start(name: str, step: Callable[[], None]) -> threading.Thread:
         except zenoh.ZError:
             return
 
-    thread = threading.Thread(target=run, name=name, daemon=True)
+    thread = threading.Thread(target=until(ended, run), name=name, daemon=True)
     thread.start()
     return thread
 
 
-def _answer(query: zenoh.Query, handler: Handler) -> None:
+def _answer(query: zenoh.Query, name: str, handler: Handler) -> None:
     payload = query.payload
     command = decoded(payload.to_bytes(), Command) if payload is not None else None
     if not isinstance(command, Command):
         query.reply_err(b"not a command")
+        return
+    if command.target != name:  # who may ask whom is decided by the key, which must be the target's
+        query.reply_err(f"a command for {command.target!r}, asked of {name!r}".encode())
         return
     try:
         query.reply(query.key_expr, encode(handler(command)))

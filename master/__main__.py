@@ -11,6 +11,7 @@ except ModuleNotFoundError as error:  # a slave's machine has the scripts of bot
     ) from error
 
 from common.errors import PhalanxError
+from common.supervisor import supervised_threads
 from master.calibrate.cli import calibrate_app
 from master.camera_command import camera
 from master.checklist.command import check
@@ -57,14 +58,15 @@ def phalanx_master() -> None:
 
 
 def main() -> None:
-    """Run one command; the process ends with 0, 1 (something the user can mend) or 2 (wrong usage)."""
+    """Run one command; the process ends with 0, 1 (something the user can mend), 2 (wrong usage) or 70 (a fault)."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
-    try:
-        program(command_line())()
-    except PhalanxError as error:
-        print(f"phalanx-master: {error}", file=sys.stderr)
-        sys.exit(1)
+    with supervised_threads():
+        try:
+            program(command_line())()
+        except PhalanxError as error:
+            print(f"phalanx-master: {error}", file=sys.stderr)
+            sys.exit(1)
 
 
 if __name__ == "__main__":

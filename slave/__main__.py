@@ -9,18 +9,24 @@ from collections.abc import Callable, Sequence
 import cv2
 
 from common.errors import PhalanxError
+from common.supervisor import supervised_threads
 from slave.arguments import parser
 from slave.commands import colours, detect, imu, join, lights, record, run, tracker
 from slave.service import Service
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage."""
+    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage.
+
+    Raises:
+        SystemExit: With code 70, if a thread failed.
+    """
     options = parser().parse_args(arguments)
     cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
     try:
-        return COMMANDS[options.command](options)
+        with supervised_threads():
+            return COMMANDS[options.command](options)
     except PhalanxError as error:
         _aside(f"phalanx-slave: {error}")
         Service(os.environ).failed(str(error))

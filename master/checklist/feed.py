@@ -105,7 +105,9 @@ class ChecklistFeed:
             try:
                 self.look(None if setups is None else setups())
             except BusError:
-                return  # the run has ended
+                if stop.is_set():
+                    return  # the run has ended
+                raise
 
     def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
         """Look once, and publish where it is due; `setups` that are in use now, None: as before.
