@@ -65,6 +65,19 @@ class Refusal(StrEnum):
     DUPLICATE = "duplicate"  # this counter was taken already
     REPLAYED = "replayed"  # so old that it can only be a replay; a handshake of an earlier life
     UNDECODABLE = "undecodable"  # sealed rightly, but not a message of its kind
+    OUT_OF_BOUNDS = "out_of_bounds"  # a message with a number that no sensor can measure
+    OUTSIDE_PICTURE = (
+        "outside_picture"  # a point that is further outside the picture than the picture is large
+    )
+    READY_TIME = "ready_time"  # a frame that the slave had long before or after it was exposed
+    UNASKED_ECHO = "unasked_echo"  # an answer to an echo that was not asked, or was answered
+    FOREIGN_SESSION = "foreign_session"  # a message of another process than the one that said hello
+    SEQUENCE = "sequence"  # a frame number that no camera can have reached since the last
+    MARKER_COUNT = "marker_count"  # of a slave whose rig file names more or fewer markers
+    RATE = "rate"  # more messages than the sender's rate by its files
+    FAULTY = (
+        "faulty"  # a message that could not be used, and those that its sender sends while it is silenced
+    )
     IMPOSTOR = "impostor"  # speaks for a camera that it is not
     UNKNOWN = "unknown_camera"  # a slave that this rig does not have
     RIVAL = "rival"  # a beacon of another master while ours is well

@@ -66,6 +66,7 @@ Pixels = Annotated[
 ]  # the largest picture, and one beside each edge
 SigmaPx = Annotated[Float, within(1e-6, MAX_PICTURE)]
 Metres = Annotated[Float, within(-1e4, 1e4)]
+SensedMetres = Annotated[Float, within(-1e3, 1e3)]  # of a device: what is made of it stays within `Metres`
 Turn = Annotated[Float, within(-_TURN, _TURN)]  # a quaternion
 
 

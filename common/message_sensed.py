@@ -17,9 +17,9 @@ from common.message_parts import (
     MAX_TAGS,
     Count,
     Message,
-    Metres,
     Name,
     Pixels,
+    SensedMetres,
     SigmaPx,
     TimeNs,
     TimeSigmaNs,
@@ -195,7 +195,7 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
     session: Count
     seq: Count
     t_ns: TimeNs
-    position_m: Metres
+    position_m: SensedMetres
     orientation_wxyz: Turn
 
     def __post_init__(self) -> None:

@@ -2,8 +2,8 @@
 
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol, TypeAlias, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Generic, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -122,31 +122,41 @@ class RunFigures:
         return out
 
 
+class Observed(Generic[SeenT]):
+    """A solver with what is measured of the cameras' messages: rates before it, `watch` once all is out."""
+
+    def __init__(self, solver: Solver[SeenT], rates: CameraRates, watch: Callable[[SeenT], None]) -> None:
+        self._solver, self._rates, self._watch = solver, rates, watch
+
+    def push(self, message: SeenT | Beside) -> Iterator[Solved]:
+        """Take one message; give what it completes."""
+        if isinstance(message, _BESIDE):
+            yield from self._solver.push(message)
+            return
+        self._rates.push(message)
+        yield from self._solver.push(message)
+        self._watch(message)
+
+
 def run(
     source: Source[SeenT],
-    world: Solver[SeenT],
+    solver: Solver[SeenT],
     sinks: Sequence[Sink],
     clock: Clock,
     figures: RunFigures,
     stop: threading.Event,
-    watch: Callable[[SeenT], None] = lambda _message: None,
 ) -> None:
-    """Solve and publish until `stop` is set; `watch` is shown every camera's message once all that it tells is out."""
+    """Solve and publish until `stop` is set."""
     while not stop.is_set():
         message = source.get(timeout_s=0.1)
         if message is None:
             continue
-        beside = isinstance(message, _BESIDE)
-        if not beside:
-            figures.rates.push(message)
-        for solved in world.push(message):
+        for solved in solver.push(message):
             now = clock.now_ns()
             told = told_at(solved, now)
             for sink in sinks:
                 sink.write(told)
             figures.count(now, told)
-        if not beside:
-            watch(message)
 
 
 def told_at(solved: Solved, t_ns: int) -> Told:

@@ -8,10 +8,11 @@ taken is of the same stretch of time.
 
 import os
 import threading
-from collections import deque
-from collections.abc import Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
+from types import MappingProxyType
 
 from common.clock import Clock
 from common.clock_offset import ClockEstimate
@@ -20,10 +21,15 @@ from common.errors import BusError
 from common.link_key import LinkKey
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.session import Random
+from common.streams import sender_of
+from common.supervisor import until
 from common.udp import UdpSocket
-from master.link import MasterLink, Taken
+from master.admission import SenderLimits
+from master.link import MasterLink
+from master.link_senders import Taken
+from master.quarantine import Quarantine
 from master.sequence import CameraCounts
-from master.turned_away import Away
+from master.turned_away import Away, MarkerCounts
 
 AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
 DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
@@ -64,6 +70,7 @@ class Ingest:
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
         trackers: tuple[str, ...] = (),
+        limits: Mapping[str, SenderLimits] = MappingProxyType({}),
     ) -> None:
         """Begin to call the slaves.
 
@@ -79,6 +86,7 @@ class Ingest:
             imus: Names of IMUs that may take part.
             wrists: Those of `cameras` that belong to a wrist device.
             trackers: Names of devices that track themselves and may take part.
+            limits: What the files say of each sender (`admission.limits_of`); without, only what its messages can be.
 
         Raises:
             BusError: The address cannot be bound, or `beacon` is not an IPv4 address.
@@ -89,7 +97,7 @@ class Ingest:
         self._clock = clock
         timeout_ns = round(start_timeout_s * 1e9)
         self._link = MasterLink(
-            cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists, trackers
+            cameras, key, clock, beacon, zenoh_endpoint, timeout_ns, random, imus, wrists, trackers, limits
         )
         self._cameras, self._senders = cameras, (*cameras, *imus, *trackers)
         self._socket = UdpSocket(bind, broadcast=True)
@@ -97,16 +105,24 @@ class Ingest:
         self._queue: deque[Taken] = deque()
         self._room = room(len(cameras))
         self._waiting = dict.fromkeys(ROOM, 0)
+        self._waiting_of: Counter[tuple[str, str]] = Counter()  # kind and sender
         self._changed = threading.Condition()
         self._overflowed = 0
         self._closing = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
+        self._thread = threading.Thread(
+            target=until(self._closing.is_set, self._run), name="ingest", daemon=True
+        )
         self._thread.start()
 
     @property
     def address(self) -> Address:
         """Own address and port."""
         return self._socket.address
+
+    @property
+    def quarantine(self) -> Quarantine:
+        """Senders that are silenced, as their messages made something fail."""
+        return self._link.quarantine
 
     @property
     def started(self) -> bool:
@@ -143,7 +159,7 @@ class Ingest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, queue.*
+        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, fault.<sender>, queue.*
 
         Of tags <camera>.tags_received and <camera>.tags_late, once there were any.
         """
@@ -159,9 +175,11 @@ class Ingest:
             with self._lock:
                 counts[f"{sender}.clock_steps"] = self._link.clock_steps_of(sender)
                 counts[f"{sender}.restarts"] = self._link.restarts_of(sender)
+                counts[f"{sender}.refused"] = self._link.refused_of(sender)
                 tags = self._link.tag_counts_of(sender)
             if tags is not None and tags.received:
                 counts |= {f"{sender}.tags_received": tags.received, f"{sender}.tags_late": tags.late}
+        counts |= {f"fault.{sender}": n for sender, n in dict(self.quarantine.faults).items()}
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
     def counts_of(self, sender: str) -> CameraCounts:
@@ -181,6 +199,12 @@ class Ingest:
             away = self._link.turned_away
             return away.twins(t_ns), away.versions(t_ns), away.secrets(t_ns)
 
+    def marker_counts(self) -> dict[str, MarkerCounts]:
+        """Camera -> how many markers its slave sends lately, where its rig has another number here."""
+        t_ns = self._clock.now_ns()
+        with self._lock:
+            return self._link.turned_away.marker_counts(t_ns)
+
     def clock_of(self, camera: str) -> ClockEstimate | None:
         """Return how the clock of `camera` runs against this one; None while unknown.
 
@@ -198,7 +222,7 @@ class Ingest:
                 if not self._queue:
                     return None
             message = self._queue.popleft()
-            self._waiting[_KIND[type(message)]] -= 1
+            self._left(message)
             return message
 
     def close(self) -> None:
@@ -241,17 +265,35 @@ class Ingest:
             yield arrived
 
     def _put(self, messages: Sequence[Taken]) -> None:
-        """Let them wait, and wake who waits for them: once for all that came together."""
+        """Let them wait, and wake who waits for them: once for all that came together.
+
+        Where there is no more room for a kind, the oldest of the sender goes of which most wait: who sends too much
+        loses his own.
+        """
         with self._changed:
             for message in messages:
                 kind = _KIND[type(message)]
                 self._queue.append(message)
                 self._waiting[kind] += 1
+                self._waiting_of[kind, sender_of(message)] += 1
                 if self._waiting[kind] > self._room[kind]:
                     self._overflowed += 1
-                    self._waiting[kind] -= 1
-                    del self._queue[next(k for k, one in enumerate(self._queue) if _KIND[type(one)] == kind)]
+                    self._drop_oldest(kind)
             self._changed.notify()
+
+    def _drop_oldest(self, kind: str) -> None:
+        _, most = max((n, sender) for (of, sender), n in self._waiting_of.items() if of == kind)
+        for k, message in enumerate(self._queue):
+            if _KIND[type(message)] == kind and sender_of(message) == most:
+                del self._queue[k]
+                self._left(message)
+                return
+
+    def _left(self, message: Taken) -> None:
+        """It waits no more."""
+        kind = _KIND[type(message)]
+        self._waiting[kind] -= 1
+        self._waiting_of[kind, sender_of(message)] -= 1
 
 
 def room(cameras: int) -> dict[str, int]:

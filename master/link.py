@@ -7,7 +7,10 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
   session in another's name, and takes no room of it.
 - A second process under one name is refused while the first one is well (`WELL_NS`): two do not take turns. Who was
   silent for longer is replaced by whoever says hello.
-- A message whose time is yet to come is not taken: the slave's clock was stepped, and the echoes will tell how far.
+- A message whose time is yet to come, older than a second, or not after the last is not taken: the slave's clock was
+  stepped, and the echoes will tell how far.
+- A message counts in the session of the process that said hello, within the bounds of its type and of the sender's
+  files (`master.admission`). One that makes something fail costs its sender a pause (`master.quarantine`).
 - The clock is asked in pending and live sessions alike: the answer is what confirms a session.
 - The start is sent when every camera is in a session whose clock is known, or a timeout after the
   first one; then to each sender that joins, again and again until acknowledged. Nobody waits for an IMU or a tracker.
@@ -16,26 +19,24 @@ Rules that must stay in step with `slave.link` and docs/wire.md:
 - Everything held is bounded: two sessions and 64 old nonces per sender of the rig.
 """
 
-from collections import Counter, deque
-from dataclasses import dataclass, field, replace
-from math import hypot
-from typing import TypeAlias
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
 
 from common.clock import Clock
-from common.clock_offset import ClockEstimate, OffsetEstimator
-from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, Sealer, parse
-from common.errors import MessageError
+from common.clock_offset import ClockEstimate
+from common.datagram import Address, Header, Kind, Opened, Opener, Refusal, parse
+from common.errors import BoundsError, MessageError
 from common.link_key import LinkKey
 from common.messages import (
     WIRE_VERSION,
-    Detections,
     ImuSample,
     MarkerDetections,
     TagDetections,
     TrackerPose,
     WristDetections,
     decode,
-    restamped,
 )
 from common.session import (
     MAX_CAMERAS,
@@ -54,7 +55,10 @@ from common.session import (
     read,
     seal,
 )
-from master.sequence import TRIPLE, CameraCounts, Counted, Sequence
+from master.admission import SenderLimits
+from master.link_senders import ASKED, Sender, Session, Taken, not_admitted, on_master_clock
+from master.quarantine import Quarantine
+from master.sequence import TRIPLE, CameraCounts
 from master.turned_away import TurnedAway
 
 BEACON_NS = 100_000_000
@@ -66,55 +70,8 @@ EARLY_NS = 5_000_000_000
 PENDING_NS = 1_000_000_000  # a hello whose slave never confirms is forgotten
 SILENT_NS = 1_000_000_000
 WELL_NS = 500_000_000  # a slave heard this recently is well, and twins are refused
-AHEAD_NS = 50_000_000  # no time that a slave tells is further ahead than that and the doubt of its clock
 START_LEAD_NS = 100_000_000  # room for two repetitions of the start before it is due
 START_AGAIN_NS = 50_000_000
-OLD_NONCES = 64
-
-Taken: TypeAlias = Detections | TagDetections | ImuSample | TrackerPose
-
-
-@dataclass(slots=True)
-class _Session:
-    """One session of one slave, pending or live."""
-
-    name: str
-    hello: Hello
-    session_nonce: bytes
-    proof: bytes
-    key_id: int
-    address: Address
-    sealer: Sealer
-    opener: Opener
-    since_ns: int
-    heard_ns: int
-    next_echo_ns: int
-    next_start_ns: int
-    started: bool = False
-    clock: OffsetEstimator = field(default_factory=OffsetEstimator)
-
-
-@dataclass(slots=True)
-class _Sender:
-    """What is kept of one camera, IMU or tracker, and the kinds of message that it sends, the main one first."""
-
-    kinds: dict[type[Taken], Counted]
-    live: _Session | None = None
-    pending: _Session | None = None
-    old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
-    steps_before: int = 0  # of the clock in sessions that are over
-    restarts: int = 0
-
-    @property
-    def main(self) -> Counted:
-        """What it sends all the time."""
-        return next(iter(self.kinds.values()))
-
-    def fill(self, counter: int, own: Counted | None = None) -> None:
-        """A datagram came late, of kind `own` or of none: in the gaps of other kinds it is no loss."""
-        for kind in self.kinds.values():
-            if kind is not own:
-                kind.losses.late(counter, 0)
 
 
 class MasterLink:
@@ -135,11 +92,13 @@ class MasterLink:
         imus: tuple[str, ...] = (),
         wrists: tuple[str, ...] = (),
         trackers: tuple[str, ...] = (),
+        limits: Mapping[str, SenderLimits] = MappingProxyType({}),
     ) -> None:
         """Begin a new life of the master, with a nonce from `random`.
 
         `imus` and `trackers` may take part, and nobody waits for them. `wrists` are those of `cameras` that belong to a
-        wrist device: they send strobed triples, the others markers and tags.
+        wrist device: they send strobed triples, the others markers and tags. `limits` is what the files say of each
+        sender; one that is not in it has the bounds of its messages alone.
 
         Raises:
             ValueError: Key of wrong length, no camera, more than 32 senders, one name for two kinds of sender, or a
@@ -165,24 +124,29 @@ class MasterLink:
         self._start_timeout_ns = start_timeout_ns
         self._nonce = random(NONCE_BYTES)
         self._sealer = self._keys.sealer(new_process_id(random(8)))
+        kinds: tuple[tuple[tuple[str, ...], dict[type[Taken], int | None]], ...] = (
+            (cameras, {MarkerDetections: 1, TagDetections: None}),
+            (wrists, {WristDetections: TRIPLE}),
+            (imus, {ImuSample: 1}),
+            (trackers, {TrackerPose: 1}),
+        )
         self._senders = {
-            name: _Sender({MarkerDetections: Counted(Sequence()), TagDetections: Counted(Sequence(None))})
-            for name in cameras
+            name: Sender.of(steps, limits.get(name, SenderLimits()))
+            for names, steps in kinds
+            for name in names
         }
-        self._senders |= {name: _Sender({WristDetections: Counted(Sequence(TRIPLE))}) for name in wrists}
-        self._senders |= {name: _Sender({ImuSample: Counted(Sequence())}) for name in imus}
-        self._senders |= {name: _Sender({TrackerPose: Counted(Sequence())}) for name in trackers}
         self._awaited, self._extra = (
             tuple(self._senders[name] for name in cameras),
             frozenset((*imus, *trackers)),
         )
-        self._sessions: dict[int, _Session] = {}
+        self._sessions: dict[int, Session] = {}
         self._first_ns: int | None = None
         self._start_ns: int | None = None
         self._next_beacon_ns = clock.now_ns()
         self._outbox: list[tuple[bytes, Address]] = []
         self.refused: Counter[Refusal] = Counter()
         self.unsynchronised = 0
+        self.quarantine = Quarantine()
         self.turned_away = TurnedAway(self._keys, self._senders)
 
     def receive(self, datagram: bytes, address: Address, t_ns: int) -> Taken | None:
@@ -249,6 +213,10 @@ class MasterLink:
         """Return how often another process took over as `sender` since this master began."""
         return self._senders[sender].restarts
 
+    def refused_of(self, sender: str) -> int:
+        """Return how many datagrams that `sender` sealed in its sessions were refused."""
+        return self._senders[sender].refused
+
     def counts_of(self, sender: str) -> CameraCounts:
         """Return what was counted of `sender` since this master began."""
         kind = self._senders[sender].main
@@ -297,16 +265,16 @@ class MasterLink:
         self._welcome(sender.pending)
         return None
 
-    def _new_session(self, hello: Hello, address: Address, t_ns: int) -> _Session:
+    def _new_session(self, hello: Hello, address: Address, t_ns: int) -> Session:
         session_nonce = self._random(NONCE_BYTES)
         keys = self._keys.session(hello, session_nonce)
         sealer = self._keys.session_sealer(keys.to_slave, keys.key_id)
-        return _Session(
+        return Session(
             hello.name, hello, session_nonce, keys.proof, keys.key_id, address, sealer, Opener(keys.to_master),
             since_ns=t_ns, heard_ns=t_ns, next_echo_ns=t_ns, next_start_ns=t_ns,
         )  # fmt: skip
 
-    def _welcome(self, session: _Session) -> None:
+    def _welcome(self, session: Session) -> None:
         welcome = Welcome(self._nonce, session.hello.slave_nonce, session.session_nonce, session.proof)
         self._outbox.append((seal(self._sealer, welcome), session.address))
 
@@ -315,6 +283,18 @@ class MasterLink:
         if session is None:
             return Refusal.STALE
         sender = self._senders[session.name]
+        try:
+            result = self._opened(session, sender, header, datagram, t_ns)
+        except Exception as error:  # noqa: BLE001
+            # Whatever a device says costs this device a pause, and never the thread that hears all others.
+            self.quarantine.fault(session.name, error, t_ns)
+            result = Refusal.FAULTY
+        sender.refused += isinstance(result, Refusal)
+        return result
+
+    def _opened(
+        self, session: Session, sender: Sender, header: Header, datagram: bytes, t_ns: int
+    ) -> Taken | Refusal | None:
         opened = session.opener.open(header, datagram)
         if isinstance(opened, Refusal):
             if opened is Refusal.DUPLICATE:
@@ -331,6 +311,9 @@ class MasterLink:
             sender.fill(header.counter)
         message = read(header.kind, opened.body)
         if isinstance(message, EchoAnswer):
+            if message.t1_ns not in session.asked:
+                return Refusal.UNASKED_ECHO
+            del session.asked[message.t1_ns]
             session.clock.push(message.t1_ns, message.t2_ns, message.t3_ns, t_ns)
         elif isinstance(message, Started):
             session.started = True
@@ -338,7 +321,7 @@ class MasterLink:
             return Refusal.UNDECODABLE
         return None
 
-    def _confirm(self, sender: _Sender, session: _Session, t_ns: int) -> None:
+    def _confirm(self, sender: Sender, session: Session, t_ns: int) -> None:
         if sender.live is not None:
             sender.restarts += sender.live.hello.process != session.hello.process
             sender.steps_before += sender.live.clock.steps
@@ -351,10 +334,14 @@ class MasterLink:
             self._first_ns = t_ns
 
     def _take_data(
-        self, session: _Session, sender: _Sender, opened: Opened, counter: int, now_ns: int
+        self, session: Session, sender: Sender, opened: Opened, counter: int, now_ns: int
     ) -> Taken | Refusal | None:
+        if self.quarantine.holds(session.name, now_ns):
+            return Refusal.FAULTY
         try:
             message = decode(opened.body)
+        except BoundsError:
+            return Refusal.OUT_OF_BOUNDS
         except MessageError:
             return Refusal.UNDECODABLE
         if not isinstance(message, Taken):
@@ -363,29 +350,20 @@ class MasterLink:
         kind = sender.kinds.get(type(message))
         if name != session.name or kind is None:
             return Refusal.IMPOSTOR
+        if (why := not_admitted(message, session, sender, now_ns)) is not None:
+            if why is Refusal.MARKER_COUNT and isinstance(message, MarkerDetections):
+                self.turned_away.marker_count(name, len(message.area), sender.limits.markers or 0, now_ns)
+            return why
         session.started = True
         if opened.reordered:
             sender.fill(counter, kind)
         if not kind.take(message.session, message.seq, counter, session.opener.missing_between):
             return None
-        clock = session.clock.estimate()
-        if clock is None:  # data before the start, of a slave that did not wait for it
-            self.unsynchronised += 1
-            return None
-        t_ns = clock.to_local(message.t_ns)
-        if t_ns - now_ns > AHEAD_NS + clock.bound_ns:
-            self.unsynchronised += 1
-            return None
-        if isinstance(message, ImuSample | TrackerPose):
-            return restamped(message, t_ns=t_ns)
-        return restamped(
-            message,
-            t_ns=t_ns,
-            ready_t_ns=clock.to_local(message.ready_t_ns),
-            t_sigma_ns=hypot(message.t_sigma_ns, clock.sigma_at(t_ns)),
-        )
+        timed = on_master_clock(message, session.clock.estimate(), kind, now_ns)
+        self.unsynchronised += timed is None
+        return timed
 
-    def _ask_clock(self, session: _Session) -> None:
+    def _ask_clock(self, session: Session) -> None:
         t_ns = self._clock.now_ns()  # asked for each: it is the time stamp itself
         if t_ns < session.next_echo_ns:
             return
@@ -397,6 +375,9 @@ class MasterLink:
             period = ECHO_EARLY_NS if t_ns - session.since_ns < EARLY_NS else ECHO_NS
         # On the grid, so that the rate is kept by a thread that wakes late, too.
         session.next_echo_ns = max(session.next_echo_ns + period, t_ns + period // 2)
+        session.asked[t_ns] = None
+        if len(session.asked) > ASKED:
+            del session.asked[next(iter(session.asked))]
         self._outbox.append((seal(session.sealer, EchoAsk(t_ns)), session.address))
 
     def _open_barrier(self, t_ns: int) -> None:
@@ -406,7 +387,7 @@ class MasterLink:
         if ready or t_ns - self._first_ns > self._start_timeout_ns:
             self._start_ns = t_ns + START_LEAD_NS
 
-    def _send_start(self, sender: _Sender, t_ns: int) -> None:
+    def _send_start(self, sender: Sender, t_ns: int) -> None:
         session = sender.live
         if self._start_ns is None or session is None or session.started or t_ns < session.next_start_ns:
             return

@@ -9,10 +9,13 @@ from pathlib import Path
 
 from common.clock import Clock, SystemClock
 from common.link_key import LinkKey
+from common.supervisor import until
 from common.zenoh_bus import ZenohBus
-from master.app import RunFigures, run
+from master.admission import limits_of
+from master.app import Observed, RunFigures, run
 from master.checklist.feed import ChecklistFeed
 from master.checklist.files import FileWatch
+from master.guard import SolverGuard
 from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
 from master.live_report import Reporter, cameras_line, unplaced_line
@@ -29,7 +32,7 @@ from master.stages import StageTimes
 from master.summary import write_summary
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
-from master.world import World
+from master.world import World, fresh_world
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
 
@@ -132,13 +135,30 @@ def run_live(
         files = None if settings.files is None else FileWatch(settings.files.calibration, settings.files.rigs)
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
         checklist = ChecklistFeed(bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to)
-        in_use = None if tuning is None else lambda: tuning.setups
+        in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
+
+        def renew(sender: str) -> None:
+            for setup, pipeline in zip(in_use(), pipelines, strict=True):
+                if sender in setup.senders:
+                    pipeline.renew()
+            world.prepare(in_use())()
+
+        guard = SolverGuard(
+            Observed(world, figures.rates, watch.push),
+            ingest.quarantine,
+            clock,
+            renew,
+            lambda sender: fresh_world([setup for setup in in_use() if sender in setup.senders]),
+        )
         threads = (
-            threading.Thread(target=reporter.work, name="master health", daemon=True),
+            threading.Thread(target=until(stop.is_set, reporter.work), name="master health", daemon=True),
             threading.Thread(
-                target=checklist.work, args=(stop, in_use), name="master checklist", daemon=True
+                target=until(stop.is_set, lambda: checklist.work(stop, in_use)),
+                name="master checklist",
+                daemon=True,
             ),
         )
+        stack.callback(stop.set)  # before anything is closed that a thread uses
         for thread in threads:
             thread.start()
         for one in world.unplaced:
@@ -147,7 +167,7 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         source = Tapped(DevicePoses(ingest, bus), tap, hurry)
-        run(source, world, sinks, clock, figures, stop, watch.push)
+        run(source, guard, sinks, clock, figures, stop)
         source.flush()
         tap.drain()
         stop.set()
@@ -212,4 +232,5 @@ def ingest_of(
         imus=tuple(name for setup in setups for name in setup.imus),
         wrists=tuple(name for setup in setups for name in setup.wrist_cameras),
         trackers=trackers_of(setups),
+        limits=limits_of(setups),
     )

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from common.clock import Clock
+from common.errors import BusError
 from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
@@ -14,6 +15,7 @@ from master.odd_watch import OddWatch
 from master.recording.tap import Tap
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigTuning
+from master.turned_away import MarkerCounts
 from master.world import World
 
 _REPORT_S = 1.0
@@ -47,6 +49,7 @@ class Reporter:
         self._ingest, self._world, self._figures = ingest, world, figures
         self._tuning, self._watch, self._odd = tuning, watch, odd
         self._tap, self._stop, self._say = tap, stop, say
+        self._mismatched: frozenset[str] = frozenset()
         bus.announce(MASTER)
         bus.serve(MASTER, self.answer)
 
@@ -84,12 +87,13 @@ class Reporter:
         started = False
         poses = 0
         while not self._stop.wait(_REPORT_S):
-            if self._tuning is not None:
-                self._tuning.look()
-                self._watch.follow(self._tuning.setups)
-            lines = self._watch.look()
-            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
-            self._bus.publish("health", MASTER, self.health())
+            lines = self._looked()
+            try:
+                self._bus.publish("health", MASTER, self.health())
+            except BusError:
+                if self._stop.is_set():
+                    return  # the run has ended
+                raise
             heard = self._ingest.connected
             if heard != connected:
                 connected = heard
@@ -104,6 +108,32 @@ class Reporter:
             for line in lines:
                 self._say(line)
             poses = self._figures.poses
+
+    def _looked(self) -> list[str]:
+        """What the monitors of this second found; what senders say may make one fail, but not the report."""
+        try:
+            if self._tuning is not None:
+                self._tuning.look()
+                self._watch.follow(self._tuning.setups)
+            lines = self._watch.look()
+            lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
+        except Exception as error:  # noqa: BLE001
+            self._ingest.quarantine.note(MASTER, error)
+            lines = []
+        mismatched = self._ingest.marker_counts()
+        lines += [
+            marker_line(name, counts) for name, counts in mismatched.items() if name not in self._mismatched
+        ]
+        self._mismatched = frozenset(mismatched)
+        return lines
+
+
+def marker_line(name: str, counts: MarkerCounts) -> str:
+    """What a person is told of a slave whose rig file is another than the master's."""
+    return (
+        f"camera {name}: its slave sends {counts.sent} markers, the rig here has {counts.expected}: nothing of it is"
+        " used. Deploy the rig to it again (phalanx deploy), then restart this master if its own file has changed"
+    )
 
 
 def cameras_line(cameras: tuple[str, ...], connected: frozenset[str], trackers: tuple[str, ...] = ()) -> str:

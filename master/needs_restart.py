@@ -6,7 +6,7 @@ from common.errors import CalibrationError
 from master.rig import RigSetup
 
 _OF_CAMERA = ("width_px", "height_px")
-_ALL = "restart all processes of the rig"
+_ALL = "give all processes of the rig the same files, then restart them"
 _MASTER = "restart the master"
 
 

@@ -80,6 +80,11 @@ class RigSetup:
         """The devices that track themselves and sit on its objects."""
         return tuple(one.tracker for one in self.objects if one.tracker is not None)
 
+    @property
+    def senders(self) -> frozenset[str]:
+        """All whose messages are of it."""
+        return frozenset((*self.camera_names, *self.imus, *self.trackers))
+
     def own(self, message: Detections) -> Detections:
         """The message with the markers of this hand alone."""
         rows = self.rows.get(message.camera)

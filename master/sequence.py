@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 REMEMBERED = 1024
+SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and with time
 TRIPLE = 3  # frames that become one message of a wrist device
 
 
@@ -44,6 +45,7 @@ class Sequence:
 
     Attributes:
         lost: Numbers that have not come so far.
+        last: The newest number; -1: none came.
     """
 
     def __init__(self, step: int | None = 1) -> None:
@@ -56,7 +58,7 @@ class Sequence:
         self._regular, self._step = step is not None, step or 1
         self._slip = self._step // 2
         self._session: int | None = None
-        self._last = -1
+        self.last = -1
         self._missing: dict[int, None] = {}
 
     @property
@@ -70,12 +72,16 @@ class Sequence:
             reordered=self._reordered,
         )
 
+    def follows(self, session: int) -> bool:
+        """Whether the last message was of the same slave process."""
+        return session == self._session
+
     def take(self, session: int, seq: int) -> bool:
         """Count frame `seq` of the slave process `session`; whether it is to be used."""
         if session != self._session:
             self._session = session
             self._missing.clear()
-        elif seq <= self._last:
+        elif seq <= self.last:
             near = range(seq - self._slip, seq + self._slip + 1)
             found = next((number for number in near if number in self._missing), None)
             if found is not None:
@@ -83,13 +89,13 @@ class Sequence:
                 self.lost -= 1
             self._late += 1
             return False
-        elif self._regular and seq != self._last + self._step:
-            skipped = range(self._last + self._step, seq - self._slip, self._step)
+        elif self._regular and seq != self.last + self._step:
+            skipped = range(self.last + self._step, seq - self._slip, self._step)
             self.lost += len(skipped)
             self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
             while len(self._missing) > REMEMBERED:
                 del self._missing[next(iter(self._missing))]
-        self._last = seq
+        self.last = seq
         self._received += 1
         return True
 
@@ -150,11 +156,27 @@ class Losses:
 
 
 class Counted:
-    """One kind of message of a sender: its `sequence`, and its `losses`. Holds the counter of the newest datagram."""
+    """One kind of message of a sender: its `sequence`, and its `losses`.
+
+    Holds the counter of the newest datagram, and when the last message came.
+
+    Attributes:
+        newest_ns: Time of the newest message that is used in this session of the link [ns], master's clock.
+    """
 
     def __init__(self, sequence: Sequence) -> None:
         self.sequence, self.losses = sequence, Losses()
+        self.newest_ns: int | None = None
         self._counter = 0
+        self._came_ns = 0
+
+    def plausible(self, session: int, seq: int, t_ns: int) -> bool:
+        """Whether a sender can have got to message `seq` when it came at `t_ns` [ns]."""
+        most = SEQ_JUMP + SEQ_PER_S * (t_ns - self._came_ns) * 1e-9
+        if self.sequence.follows(session) and seq - self.sequence.last > most:
+            return False
+        self._came_ns = t_ns
+        return True
 
     def take(self, session: int, seq: int, counter: int, missing: Callable[[int, int], int]) -> bool:
         """Count message `seq` of the process `session`, which came in datagram `counter`; whether it is to be used.
@@ -180,3 +202,4 @@ class Counted:
         """The counters of the datagrams begin again."""
         self.losses.begin_session()
         self._counter = 0
+        self.newest_ns = None

@@ -147,6 +147,12 @@ class LivePipeline:
         """Nothing comes any more: the poses that still wait for something."""
         return self._now.flush()
 
+    def renew(self) -> None:
+        """Let a new pipeline of the same setup take over, which has seen nothing of what came until now."""
+        take = self.prepare(self._setup)
+        self._recent.clear()
+        take()
+
     def change(self, setup: RigSetup) -> None:
         """Let a pipeline of `setup` take over. From any thread but the loop's; takes as long as it takes to build one.
 

@@ -1,12 +1,12 @@
-"""Who was turned away lately, by name: second processes under one name, slaves of another wire version, and slaves
-whose secret is not the one that the master has for their name.
+"""Who was turned away lately, by name: second processes under one name, slaves of another wire version, slaves
+whose secret is not the one that the master has for their name, and slaves whose rig has other markers.
 
 A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
 the rig, and forgotten `LATELY_NS` after the last time.
 """
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from common.datagram import HEADER, MAGIC, Header, Kind
 from common.session import RigKeys
@@ -15,11 +15,21 @@ LATELY_NS = 1_500_000_000  # both say hello again within a second
 _LOOK_NS = 100_000_000  # a flood of hellos of another version costs one unsealing in so long
 
 
+SeenT = TypeVar("SeenT")
+
+
 class Away(NamedTuple):
     """Where somebody who was turned away speaks from: host, and what wire version."""
 
     host: str
     version: int
+
+
+class MarkerCounts(NamedTuple):
+    """How many markers a slave sends, and how many the master's rig has."""
+
+    sent: int
+    expected: int
 
 
 class TurnedAway:
@@ -31,6 +41,7 @@ class TurnedAway:
         self._twins: dict[str, tuple[int, Away]] = {}
         self._versions: dict[str, tuple[int, Away]] = {}
         self._unproven: dict[str, tuple[int, Away]] = {}
+        self._markers: dict[str, tuple[int, MarkerCounts]] = {}
         self._next_ns: int | None = None
 
     def twin(self, name: str, host: str, version: int, t_ns: int) -> None:
@@ -40,6 +51,10 @@ class TurnedAway:
     def unproven(self, name: str, host: str, version: int, t_ns: int) -> None:
         """Somebody at `host` said hello at `t_ns` [ns] as `name`, without that device's secret."""
         self._unproven[name] = t_ns, Away(host, version)
+
+    def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
+        """The slave `name` sent so many markers at `t_ns` [ns], and its rig has another number here."""
+        self._markers[name] = t_ns, MarkerCounts(sent, expected)
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
         """Take a datagram of another wire version; what is no hello of this rig, rightly sealed, is left."""
@@ -65,6 +80,10 @@ class TurnedAway:
         """Name -> where somebody says hello without its secret, as of `t_ns` [ns]."""
         return _lately(self._unproven, t_ns)
 
+    def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:
+        """Name -> how many markers its slave sends, where the rig has another number, as of `t_ns` [ns]."""
+        return _lately(self._markers, t_ns)
 
-def _lately(seen: dict[str, tuple[int, Away]], t_ns: int) -> dict[str, Away]:
-    return {name: away for name, (seen_ns, away) in seen.items() if t_ns - seen_ns < LATELY_NS}
+
+def _lately(seen: dict[str, tuple[int, SeenT]], t_ns: int) -> dict[str, SeenT]:
+    return {name: what for name, (seen_ns, what) in seen.items() if t_ns - seen_ns < LATELY_NS}

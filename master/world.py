@@ -26,10 +26,11 @@ from common.messages import (
 from master.app import Solved
 from master.gestures.recogniser import GestureRecogniser
 from master.hands import Hands, Line
-from master.link import Taken
+from master.link_senders import Taken
 from master.objects.contact import ContactWatch
 from master.objects.line import SolvedObject
-from master.rig import RigSetup
+from master.rig import RigSetup, pipeline_of
+from master.stages import StageTimes
 from master.stereo.pipeline import SolvedPose, Stage
 from master.tracked_object import TrackedObject
 
@@ -207,3 +208,13 @@ class World:
             self._begun.pop(key, None)
         else:
             self._begun[key] = gesture
+
+
+def fresh_world(setups: Sequence[RigSetup]) -> World:
+    """A world of these hands in its first state, of which nothing is measured.
+
+    Raises:
+        CalibrationError: As `World`.
+    """
+    stages = StageTimes()
+    return World(setups, [pipeline_of(setup, stages) for setup in setups], stages)

@@ -37,6 +37,7 @@ from common.watching import WatchedFiles
 from slave.cameras.settings import Tunable
 from slave.colours_in_use import in_use
 
+_ALL = "give all processes of the rig the same files, then restart them"
 _LOG = logging.getLogger(__name__)
 NEEDS_RESTART = ("name", "width_px", "height_px", "focus_m")
 # What "set" sets, and the colours.
@@ -316,13 +317,11 @@ def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
         )
     if old.rig.kind != new.rig.kind:
         raise CalibrationError(
-            f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: restart all "
-            "processes of the rig"
+            f"rig {new.rig.name!r}: kind: {old.rig.kind} cannot become {new.rig.kind} while it runs: {_ALL}"
         )
     if old.hand_path is not None and old.rig.hand != new.rig.hand:
         raise CalibrationError(
-            f"rig {new.rig.name!r}: hand: {old.rig.hand} cannot become {new.rig.hand} while it runs: restart all "
-            "processes of the rig"
+            f"rig {new.rig.name!r}: hand: {old.rig.hand} cannot become {new.rig.hand} while it runs: {_ALL}"
         )
     if old.rig.strobe != new.rig.strobe:
         raise CalibrationError(
@@ -332,5 +331,5 @@ def _refuse_restart(old: CameraFiles, new: CameraFiles) -> None:
     if old.rig.markers != new.rig.markers:
         raise CalibrationError(
             f"rig {new.rig.name!r}: markers: {', '.join(old.rig.markers)} cannot become "
-            f"{', '.join(new.rig.markers)} while it runs: restart all processes of the rig"
+            f"{', '.join(new.rig.markers)} while it runs: {_ALL}"
         )

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from common.messages import CheckCode, CheckItem
 from master.rig import RigSetup
-from master.turned_away import Away
+from master.turned_away import Away, MarkerCounts
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +53,7 @@ class SenderNow:
         twin: Where a second process under its name was turned away lately; None: there was none.
         stranger: Where it speaks another wire version, and which; None: it does not.
         unproven: Where somebody says that he is it, without its secret; None: nobody does.
+        markers: How many markers it sends where its rig has another number; None: as many as the rig has.
     """
 
     connected: bool
@@ -62,6 +63,7 @@ class SenderNow:
     twin: Away | None = None
     stranger: Away | None = None
     unproven: Away | None = None
+    markers: MarkerCounts | None = None
 
 
 @dataclass(frozen=True, slots=True)

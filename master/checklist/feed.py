@@ -16,9 +16,10 @@ from common.streams import MASTER
 from master.checklist.facts import MasterNow, SenderNow, plan_of
 from master.checklist.files import FileWatch
 from master.checklist.watch import ChecklistWatch
+from master.quarantine import Quarantine
 from master.rig import RigSetup
 from master.sequence import CameraCounts
-from master.turned_away import Away
+from master.turned_away import Away, MarkerCounts
 
 LOOK_S = 0.2
 EVERY_NS = 1_000_000_000  # and at once where it changes
@@ -27,6 +28,11 @@ DEPTH = 64  # reports of slaves that may wait for a look: 32 senders, twice a se
 
 class Heard(Protocol):
     """What the master hears; an `Ingest`."""
+
+    @property
+    def quarantine(self) -> Quarantine:
+        """Where faults are counted and logged."""
+        ...
 
     @property
     def started(self) -> bool:
@@ -49,6 +55,10 @@ class Heard(Protocol):
     def turned_away(self) -> tuple[Mapping[str, Away], Mapping[str, Away], Mapping[str, Away]]:
         """Sender -> where a second process of its name was turned away lately; where it speaks another version; where
         somebody says hello without its secret."""
+        ...
+
+    def marker_counts(self) -> Mapping[str, MarkerCounts]:
+        """Camera -> how many markers its slave sends lately, where its rig has another number here."""
         ...
 
 
@@ -108,6 +118,9 @@ class ChecklistFeed:
                 if stop.is_set():
                     return  # the run has ended
                 raise
+            except Exception as error:  # noqa: BLE001
+                # What a device reports may make a rule fail; the list goes on with the next report.
+                self._heard.quarantine.note(MASTER, error)
 
     def look(self, setups: Sequence[RigSetup] | None = None) -> tuple[CheckItem, ...]:
         """Look once, and publish where it is due; `setups` that are in use now, None: as before.
@@ -133,15 +146,16 @@ class ChecklistFeed:
 
     def _now(self, t_ns: int) -> MasterNow:
         connected = self._heard.connected
-        turned_away = self._heard.turned_away()
+        turned_away, markers = self._heard.turned_away(), self._heard.marker_counts()
         names = (*(camera.name for camera in self._plan.cameras), *self._plan.imus)
         senders: dict[str, SenderNow] = {}
         for name in names:
             counts, clock = self._heard.counts_of(name), self._heard.clock_of(name)
             sigma_ns = None if clock is None else clock.sigma_at(t_ns)
             missed = counts.lost + counts.late
-            away = (of.get(name) for of in turned_away)
-            senders[name] = SenderNow(name in connected, counts.received, missed, sigma_ns, *away)
+            twin, stranger, unproven = (of.get(name) for of in turned_away)
+            links = name in connected, counts.received, missed, sigma_ns, twin, stranger, unproven
+            senders[name] = SenderNow(*links, markers.get(name))
         groups = [
             line.counts
             for setup, line in zip(self._setups, self._pipelines, strict=True)

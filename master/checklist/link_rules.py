@@ -118,6 +118,16 @@ class LinkRules:
             " that machine is not yours: phalanx-master keys revoke.",
         )
 
+        yield Verdict(
+            "marker_mismatch",
+            name,
+            sender.markers is not None,
+            f"{name} sends {sender.markers and sender.markers.sent} markers, the rig of this master has"
+            f" {sender.markers and sender.markers.expected}: nothing of it is used.",
+            "Give both the same rig file: phalanx deploy brings this one's to the slave; then restart the master if the"
+            " file here has changed since it began.",
+        )
+
     def _away(self, name: str, sender: SenderNow, t_ns: int) -> bool | None:
         """Whether it is not heard: at once where it was there, after a grace where it never was."""
         assert self._first_ns is not None

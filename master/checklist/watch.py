@@ -33,7 +33,7 @@ _COLOURS: frozenset[CheckCode] = frozenset(("marker_unseen", "background_in_rang
 _LIGHT: frozenset[CheckCode] = frozenset(("exposure_drift",))
 _MOVED: frozenset[CheckCode] = frozenset(("camera_moved",))
 _NOT_TAKEN: frozenset[CheckCode] = frozenset(("twin_sender", "version_mismatch", "secret_mismatch"))
-_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN
+_OF_SENDER: frozenset[CheckCode] = frozenset(CODES) - _ABSENT - _NOT_TAKEN - {"marker_mismatch"}
 # Cause -> what is not told of the same camera, its markers, or a group with it in it.
 _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "camera_absent": _OF_SENDER,
@@ -48,6 +48,7 @@ _FOLLOWS: dict[CheckCode, frozenset[CheckCode]] = {
     "too_hot": frozenset[CheckCode](("rate_low",)),
     "version_mismatch": _ABSENT,
     "secret_mismatch": _ABSENT,
+    "marker_mismatch": _ABSENT | _COLOURS | frozenset[CheckCode](("rate_low", "packet_loss", "camera_moved")),
 }
 
 

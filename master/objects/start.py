@@ -76,8 +76,16 @@ def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
     v = H[:2, 2]
     J = H[:2, :2] - v[:, None] * H[2, :2]
     turn = _turn_to(np.array([v[0], v[1], 1.0]))
-    A = np.asarray(np.linalg.solve(turn[:2, :2] - v[:, None] * turn[2, :2], J), np.float64)
-    A /= float(np.linalg.norm(A, 2))
+    try:
+        A = np.asarray(np.linalg.solve(turn[:2, :2] - v[:, None] * turn[2, :2], J), np.float64)
+        A /= float(np.linalg.norm(A, 2))
+        return _ways(A, turn, corners, flat, xy)
+    except np.linalg.LinAlgError:  # corners that no tag can have
+        return []
+
+
+def _ways(A: Float, turn: Float, corners: Float, flat: Float, xy: Float) -> list[tuple[float, Float]]:
+    """The two turns of a tag of which `A` (2, 2) is the upper left part, as `two_poses` returns them."""
     left = np.eye(2) - A.T @ A
     b = np.sqrt(np.maximum(np.diagonal(left), 0.0)) * [1.0, 1.0 if left[0, 1] >= 0.0 else -1.0]
     out: list[tuple[float, Float]] = []

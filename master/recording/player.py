@@ -16,7 +16,7 @@ from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
 from master.hurry import Hurry, Shedding
-from master.link import Taken
+from master.link_senders import Taken
 from master.outputs.sink import Sink
 from master.recording.clock import ReplayClock
 from master.recording.digest import ToldDigest

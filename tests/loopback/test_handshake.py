@@ -7,6 +7,7 @@ keep and replay it. So every rule of docs/wire.md is a plain call, and a loss pa
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeAlias, TypeVar
 
 import pytest
 
@@ -20,6 +21,7 @@ from common.messages import (
     TagDetections,
     TrackerPose,
     encode,
+    restamped,
 )
 from common.session import Hello, RigKeys, seal
 from master.link import MasterLink
@@ -30,6 +32,8 @@ KEY = bytes(range(32))
 S = 1_000_000_000
 STEP_NS = 5_000_000
 HOP_NS = 300_000
+Sent: TypeAlias = Detections | TagDetections | ImuSample | TrackerPose | Command
+SentT = TypeVar("SentT", bound=Sent)
 MASTER = ("10.0.0.1", 47801)
 BROADCAST = ("10.0.0.255", 47800)
 
@@ -126,10 +130,17 @@ class Wires:
     def all_started(self) -> bool:
         return all(slave.started for slave in self.slaves.values())
 
-    def send(
-        self, slave: SlaveLink, message: Detections | TagDetections | ImuSample | TrackerPose | Command
-    ) -> bytes | None:
-        sealed = slave.seal(message)
+    def stamped(self, slave: SlaveLink, message: SentT) -> SentT:
+        """The message as of now, if it says no time: the later its number, the later."""
+        if isinstance(message, Command) or message.t_ns != 0:
+            return message
+        t_ns = slave._clock.now_ns() + 1000 * (message.seq % 1000)
+        if isinstance(message, ImuSample | TrackerPose):
+            return restamped(message, t_ns=t_ns)
+        return restamped(message, t_ns=t_ns, ready_t_ns=t_ns + 1000)
+
+    def send(self, slave: SlaveLink, message: Sent) -> bytes | None:
+        sealed = slave.seal(self.stamped(slave, message))
         if sealed is None:
             return None
         address = next(address for address, other in self.slaves.items() if other is slave)
@@ -389,7 +400,8 @@ def test_duplicates_and_late_frames_are_dropped_and_counted() -> None:
     wires = Wires()
     master, left, _ = started_pair(wires)
     address = next(address for address, slave in wires.slaves.items() if slave is left)
-    sealed = [left.seal(detections("left", left.process, seq)) for seq in range(6)]
+    frames = [wires.stamped(left, detections("left", left.process, seq)) for seq in range(6)]
+    sealed = [left.seal(frame) for frame in frames]
     datagrams = [item[0] for item in sealed if item is not None]
     for i in (0, 1, 1, 4, 3, 0, 5):  # 2 is lost, 3 late, 1 and 0 come twice
         wires.carry(datagrams[i], address, MASTER)

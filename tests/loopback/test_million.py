@@ -156,5 +156,14 @@ def test_sealed_rubbish_of_a_slave_gone_mad(wires: Wires) -> None:
         datagram = session.sealer.seal(kinds[i % 4], bytes(body))
         master.receive(datagram, MASTER, wires.clock.now_ns())
     assert master.refused[Refusal.UNDECODABLE] > 20_000
-    assert set(master.refused) <= {Refusal.UNDECODABLE, Refusal.IMPOSTOR}
+    assert set(master.refused) <= {
+        Refusal.UNDECODABLE,
+        Refusal.IMPOSTOR,
+        Refusal.OUT_OF_BOUNDS,
+        Refusal.FOREIGN_SESSION,
+        Refusal.READY_TIME,
+        Refusal.SEQUENCE,
+        Refusal.RATE,
+    }
+    assert not master.quarantine.faults
     assert len(master._sessions) == 2

@@ -193,7 +193,7 @@ def test_more_tags_than_a_frame_may_have_are_refused_whoever_seals_them() -> Non
     master, left, _, _ = started(wires)
     session = left._session
     assert session is not None
-    whole = encode(tags("left", left.process, 0, count=16))
+    whole = encode(wires.stamped(left, tags("left", left.process, 0, count=16)))
     wires.carry(session.sealer.seal(Kind.DATA, whole), ("10.0.1.1", 5), MASTER, keep=False)
     assert len(wires.tags) == 1
     one = encode(tags("left", left.process, 1, count=1))
@@ -235,8 +235,12 @@ def test_mutated_ones_are_counted_and_have_no_effect() -> None:
                 else:
                     del broken[at : at + chance.randint(1, 8)]
             wires.carry(session.sealer.seal(Kind.DATA, bytes(broken)), ("10.0.1.9", 5), MASTER, keep=False)
-    assert set(master.refused) == {Refusal.UNDECODABLE, Refusal.IMPOSTOR}
+    assert set(master.refused) <= {
+        *(Refusal.UNDECODABLE, Refusal.IMPOSTOR, Refusal.OUT_OF_BOUNDS, Refusal.FOREIGN_SESSION),
+        *(Refusal.SEQUENCE, Refusal.READY_TIME),
+    }
     assert sum(master.refused.values()) > 1500
+    assert not master.quarantine.faults
     for seen in wires.tags:  # what came through is a message, only with another number in it
         assert np.isfinite(seen.uv).all()
         assert (seen.sigma_px > 0.0).all()

@@ -12,7 +12,7 @@ from common.calibration import ImuCalibration
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
 from common.hand_model import WRIST
 from common.messages import HandPose, ImuSample, MarkerDetections, Told
-from master.app import Beside, RunFigures, health, run
+from master.app import Beside, Observed, RunFigures, health, run
 from master.live import cameras_line
 from master.rig import RigSetup, pipeline_of
 from master.stages import StageTimes
@@ -101,7 +101,8 @@ def test_samples_of_an_imu_turn_the_palm_and_are_no_frames(short_run: SyntheticR
     script = sorted([*short_run.messages, *samples], key=lambda message: message.t_ns)
     stop, sink, figures = threading.Event(), Collector(), RunFigures()
     hands, watched = world_of(setup), list[MarkerDetections]()
-    run(ScriptedSource([*script], stop), hands, [sink], ScriptedClock(), figures, stop, watched.append)
+    observed = Observed(hands, figures.rates, watched.append)
+    run(ScriptedSource([*script], stop), observed, [sink], ScriptedClock(), figures, stop)
     assert watched == short_run.messages
     assert set(figures.rates.camera_hz) == {"left", "right"}
     assert hands.counts["orientation.used"] == len(sink.poses) >= 5

@@ -11,7 +11,7 @@ from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose
 from master.ingest import QUEUE, Ingest
-from master.link import Taken
+from master.link_senders import Taken
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))

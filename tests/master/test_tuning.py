@@ -237,7 +237,7 @@ def test_another_rate_of_a_camera_is_followed(told: Told) -> None:
             "cameras/left.json",
             "width_px",
             800,
-            "'left': width_px: 640 cannot become 800 .*: restart all processes",
+            "'left': width_px: 640 cannot become 800 .*: give all processes of the rig the same files, then restart",
         ),
         (
             "hands/made-right.json",

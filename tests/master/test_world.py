@@ -25,7 +25,7 @@ from common.messages import (
     Told,
     TrackerPose,
 )
-from master.app import RunFigures, health, run
+from master.app import Observed, RunFigures, health, run
 from master.object_score import ObjectTruth, errors
 from master.outputs.told_files import ObjectPoses
 from master.rig import RigSetup, load_setups, pipeline_of, setups_of
@@ -172,12 +172,11 @@ def test_the_loop_says_how_long_an_object_took_and_counts_it(wand: ObjectRun) ->
     watched: list[MarkerDetections] = []
     run(
         ScriptedSource([*wand.messages], stop),
-        world_of(wand.setup),
+        Observed(world_of(wand.setup), figures.rates, watched.append),
         [sink],
         clock,
         figures,
         stop,
-        watched.append,
     )
     poses = [one for one in sink.others if isinstance(one, ObjectPose)]
     assert all(one.latency_ns > 0 for one in poses)

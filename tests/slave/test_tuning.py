@@ -184,7 +184,7 @@ def test_a_changed_file_is_used_and_a_broken_one_is_counted_once(
     save(files.rig_path, msgspec.structs.replace(RIG, markers=RIG.markers[:-1]))
     save(files.camera_path, changed(exposure_us=7000.0))
     tuning.look()
-    assert "restart all processes of the rig" in caplog.text
+    assert "give all processes of the rig the same files, then restart them" in caplog.text
     save(files.rig_path, RIG)
     tuning.look()
     counts = tuning.counts()

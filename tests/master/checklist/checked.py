@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from common.messages import CheckItem, Health
 from master.checklist.facts import CameraPlan, MasterNow, Plan, SenderNow
 from master.checklist.watch import ChecklistWatch
-from master.turned_away import Away
+from master.turned_away import Away, MarkerCounts
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 CAMERAS = (
@@ -31,6 +31,7 @@ class Bench:
     twin: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
     stranger: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
     unproven: dict[str, Away | None] = field(default_factory=dict[str, Away | None])
+    markers: dict[str, MarkerCounts] = field(default_factory=dict[str, MarkerCounts])
     sigma_ns: dict[str, float | None] = field(default_factory=dict[str, float | None])
     disk_mb: float = 9000.0
     apart: float = 0.0
@@ -102,6 +103,7 @@ class Bench:
                 self.twin.get(name),
                 self.stranger.get(name),
                 self.unproven.get(name),
+                self.markers.get(name),
             )
             for name in NAMES
         }

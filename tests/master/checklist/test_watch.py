@@ -9,7 +9,7 @@ from common.messages import CheckItem
 from master.checklist.facts import Verdict
 from master.checklist.moved_rule import MovedRule
 from master.checklist.watch import CODES
-from master.turned_away import Away
+from master.turned_away import Away, MarkerCounts
 from tests.master.checklist.checked import MARKERS, Bench
 
 WITHIN_S = 2.0
@@ -67,6 +67,16 @@ def _stranger(bench: Bench) -> None:
 def _unproven(bench: Bench) -> None:
     bench.unproven["right"] = Away("10.0.0.9", 11)
     bench.away.add("right")
+
+
+def _other_rig(bench: Bench) -> None:
+    bench.markers["left"] = MarkerCounts(8, 6)
+    bench.away.add("left")  # the link is there, and nothing of it counts
+
+
+def _same_rig(bench: Bench) -> None:
+    bench.markers.clear()
+    bench.away.clear()
 
 
 def _as_ours(bench: Bench) -> None:
@@ -256,6 +266,14 @@ CASES = [
         _as_ours,
         "10.0.0.9 says that he is right",
         "device-right.secret",
+    ),
+    Case(
+        "marker_mismatch",
+        "left",
+        _other_rig,
+        _same_rig,
+        "left sends 8 markers, the rig of this master has 6",
+        "phalanx deploy",
     ),
 ]
 

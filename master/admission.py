@@ -1,0 +1,111 @@
+"""What a sender may say, given the files of its rig: bounds that the message alone does not know.
+
+`common.messages` refuses what no sensor can measure. Here the picture's size, the number of markers and the rate are
+those of the sender's own files, and times are compared with the clock.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Float
+from common.datagram import Refusal
+from common.messages import (
+    Detections,
+    ImuSample,
+    MarkerDetections,
+    TagDetections,
+    TrackerPose,
+    WristDetections,
+)
+from master.rig_setup import RigSetup
+
+READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
+OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
+_FASTER = 2.0  # than the rate of the file: settings can be tried live
+_ANY_HZ = 10_000.0  # where no file says a rate
+_LEAST_HZ = 60.0
+_SAMPLES_HZ = 1000.0  # of IMUs and trackers, whatever their files say: they cost little
+_BURST_S = 1.0  # of its rate may come at once: a network that halted
+
+Sensed = Detections | TagDetections | ImuSample | TrackerPose
+
+
+@dataclass(frozen=True, slots=True)
+class SenderLimits:
+    """What the files say of one camera, IMU or tracker; what is None is not known and not checked.
+
+    Attributes:
+        picture_px: Width and height.
+        markers: How many markers its rig names.
+        rate_hz: Messages per second and kind.
+    """
+
+    picture_px: tuple[int, int] | None = None
+    markers: int | None = None
+    rate_hz: float | None = None
+
+
+class Pace:
+    """Token bucket: how many messages of a sender are taken. Holds what is left and when it was last filled."""
+
+    def __init__(self, rate_hz: float | None) -> None:
+        """Of a sender of this rate by its files; None: they say none."""
+        self._per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
+        self._most = self._left = self._per_s * _BURST_S
+        self._t_ns: int | None = None
+
+    def take(self, t_ns: int) -> bool:
+        """Whether a message that came at `t_ns` [ns] is within the rate."""
+        elapsed_ns = 0 if self._t_ns is None else max(t_ns - self._t_ns, 0)
+        self._t_ns = t_ns
+        self._left = min(self._left + self._per_s * elapsed_ns * 1e-9, self._most)
+        if self._left < 1.0:
+            return False
+        self._left -= 1.0
+        return True
+
+
+def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
+    """Why a message cannot be of a sender with these files; None: it can."""
+    if isinstance(message, ImuSample | TrackerPose):
+        return None
+    if abs(message.ready_t_ns - message.t_ns) > READY_NS:
+        return Refusal.READY_TIME
+    if isinstance(message, MarkerDetections) and limits.markers not in (None, len(message.area)):
+        return Refusal.MARKER_COUNT
+    if limits.picture_px is not None and any(_outside(uv, limits.picture_px) for uv in _points(message)):
+        return Refusal.OUTSIDE_PICTURE
+    return None
+
+
+def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
+    """Sender -> what its files say, of all cameras, IMUs and trackers of these rigs."""
+    limits: dict[str, SenderLimits] = {}
+    for setup in setups:
+        for name, camera in setup.cameras.items():
+            size = camera.width_px, camera.height_px
+            own = None if name in setup.wrist_cameras else len(setup.rows.get(name, setup.markers))
+            before = limits[name].markers if name in limits else None  # of a rig that watches several hands
+            markers = own if before is None or own is None else own + before
+            limits[name] = SenderLimits(size, markers, camera.frame_rate_hz)
+        for rig in (setup.rig, setup.wrist_rig):
+            if rig is not None and rig.imu is not None:
+                limits[rig.imu.name] = SenderLimits(rate_hz=max(rig.imu.rate_hz, _SAMPLES_HZ))
+        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=_SAMPLES_HZ))
+    return limits
+
+
+def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
+    if isinstance(message, WristDetections):
+        return message.laser_uv, message.tip_uv
+    if isinstance(message, MarkerDetections) and message.has_rivals:
+        return message.uv, message.rival_uv
+    return (message.uv,)
+
+
+def _outside(uv: Float, size: tuple[int, int]) -> bool:
+    """Whether a point (..., 2) is further outside than one picture's size; NaN is not."""
+    far = np.abs(uv - (0.5 * size[0], 0.5 * size[1])) > (1.5 * size[0], 1.5 * size[1])
+    return bool(far.any())

@@ -1,0 +1,111 @@
+"""Sessions and senders as the master's link keeps them, and whether it takes a message of one."""
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import hypot
+from typing import TypeAlias
+
+from common.clock_offset import ClockEstimate, OffsetEstimator
+from common.datagram import Address, Opener, Refusal, Sealer
+from common.messages import ImuSample, TrackerPose, restamped
+from common.session import Hello
+from master.admission import OLD_NS, Pace, SenderLimits, Sensed, refused
+from master.sequence import Counted, Sequence
+
+OLD_NONCES = 64
+ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
+AHEAD_NS = 50_000_000  # no time that a slave tells is further ahead than that and the doubt of its clock
+_MAX_SIGMA_NS = 1e10
+
+Taken: TypeAlias = Sensed
+
+
+@dataclass(slots=True)
+class Session:
+    """One session of one slave, pending or live."""
+
+    name: str
+    hello: Hello
+    session_nonce: bytes
+    proof: bytes
+    key_id: int
+    address: Address
+    sealer: Sealer
+    opener: Opener
+    since_ns: int
+    heard_ns: int
+    next_echo_ns: int
+    next_start_ns: int
+    started: bool = False
+    asked: dict[int, None] = field(default_factory=dict[int, None])
+    clock: OffsetEstimator = field(default_factory=OffsetEstimator)
+
+
+@dataclass(slots=True)
+class Sender:
+    """What is kept of one camera, IMU or tracker, and the kinds of message that it sends, the main one first."""
+
+    kinds: dict[type[Taken], Counted]
+    limits: SenderLimits
+    paces: dict[type[Taken], Pace]
+    live: Session | None = None
+    pending: Session | None = None
+    old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
+    steps_before: int = 0  # of the clock in sessions that are over
+    restarts: int = 0
+    refused: int = 0  # of what it sealed in a session
+
+    @classmethod
+    def of(cls, steps: Mapping[type[Taken], int | None], limits: SenderLimits) -> "Sender":
+        """One that sends these kinds of message; the number of each rises by so much from one to the next."""
+        kinds = {kind: Counted(Sequence(step)) for kind, step in steps.items()}
+        return cls(kinds, limits, {kind: Pace(limits.rate_hz) for kind in kinds})
+
+    @property
+    def main(self) -> Counted:
+        """What it sends all the time."""
+        return next(iter(self.kinds.values()))
+
+    def fill(self, counter: int, own: Counted | None = None) -> None:
+        """A datagram came late, of kind `own` or of none: in the gaps of other kinds it is no loss."""
+        for kind in self.kinds.values():
+            if kind is not own:
+                kind.losses.late(counter, 0)
+
+
+def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) -> Refusal | None:
+    """Why a message that came at `now_ns` [ns] is not taken of this sender; None: it is."""
+    kind = type(message)
+    if message.session != session.hello.process:
+        return Refusal.FOREIGN_SESSION
+    if not sender.paces[kind].take(now_ns):
+        return Refusal.RATE
+    if (why := refused(message, sender.limits)) is not None:
+        return why
+    return None if sender.kinds[kind].plausible(message.session, message.seq, now_ns) else Refusal.SEQUENCE
+
+
+def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, now_ns: int) -> Taken | None:
+    """The message with its times on the master's clock; None where they cannot be.
+
+    They cannot while the clock is not known (data before the start), nor where the time is yet to come, is older than
+    `OLD_NS`, or is not after the last of its kind.
+    """
+    if clock is None:
+        return None
+    t_ns = clock.to_local(message.t_ns)
+    ahead_ns = AHEAD_NS + min(clock.bound_ns, OLD_NS)
+    if not now_ns - OLD_NS <= t_ns <= now_ns + ahead_ns or (
+        kind.newest_ns is not None and t_ns <= kind.newest_ns
+    ):
+        return None
+    kind.newest_ns = t_ns
+    if isinstance(message, ImuSample | TrackerPose):
+        return restamped(message, t_ns=t_ns)
+    return restamped(
+        message,
+        t_ns=t_ns,
+        ready_t_ns=clock.to_local(message.ready_t_ns),
+        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns)), _MAX_SIGMA_NS),
+    )
