@@ -20,13 +20,15 @@ from common.messages import (
     WristDetections,
 )
 from master.rig_setup import RigSetup
+from master.sequence import TRIPLE
 
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
 _FASTER = 2.0  # than the rate of the file: settings can be tried live
 _ANY_HZ = 10_000.0  # where no file says a rate
 _LEAST_HZ = 60.0
-_SAMPLES_HZ = 1000.0  # of IMUs and trackers, whatever their files say: they cost little
+_IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
+_TRACKER_HZ = 500.0
 _BURST_S = 1.0  # of its rate may come at once: a network that halted
 
 Sensed = Detections | TagDetections | ImuSample | TrackerPose
@@ -89,11 +91,12 @@ def limits_of(setups: Iterable[RigSetup]) -> dict[str, SenderLimits]:
             own = None if name in setup.wrist_cameras else len(setup.rows.get(name, setup.markers))
             before = limits[name].markers if name in limits else None  # of a rig that watches several hands
             markers = own if before is None or own is None else own + before
-            limits[name] = SenderLimits(size, markers, camera.frame_rate_hz)
+            rate_hz = camera.frame_rate_hz / (TRIPLE if name in setup.wrist_cameras else 1)
+            limits[name] = SenderLimits(size, markers, rate_hz)
         for rig in (setup.rig, setup.wrist_rig):
             if rig is not None and rig.imu is not None:
-                limits[rig.imu.name] = SenderLimits(rate_hz=max(rig.imu.rate_hz, _SAMPLES_HZ))
-        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=_SAMPLES_HZ))
+                limits[rig.imu.name] = SenderLimits(rate_hz=_IMU_FASTER * rig.imu.rate_hz)
+        limits |= dict.fromkeys(setup.trackers, SenderLimits(rate_hz=_TRACKER_HZ))
     return limits
 
 

@@ -196,7 +196,8 @@ def test_tags_and_poses_of_trackers_are_no_frames(cube: ObjectRun) -> None:
     setup = with_tracker(cube.setup)
     script = [*cube.messages, tracker_pose("puck", cube.pose("cube", START_NS), 0, START_NS)]
     world = world_of(setup)
-    run(ScriptedSource([*script], stop), world, [], ScriptedClock(), figures, stop)
+    observed = Observed(world, figures.rates, lambda _frame: None)
+    run(ScriptedSource([*script], stop), observed, [], ScriptedClock(), figures, stop)
     assert figures.rates.camera_hz == pytest.approx({"left": 60.0, "right": 60.0}, rel=1e-3)
 
 
@@ -352,14 +353,17 @@ def test_nonsense_that_is_sealed_rightly_ends_nothing(which: str, request: pytes
     for k in range(60):
         base = shown.messages[int(rng.integers(len(shown.messages)))]
         t_ns = int(base.t_ns + rng.integers(-(10**9), 10**9))
-        count, far = int(rng.integers(0, 6)), 10.0 ** rng.integers(-3, 17)
+        count, far = int(rng.integers(0, 6)), 10.0 ** rng.integers(-300, 5)
         ids = np.sort(rng.choice(8, count, replace=False)).astype(np.uint16)
-        uv, sigma = rng.normal(size=(count, 4, 2)) * far, 10.0 ** rng.uniform(-3.0, 3.0, count)
-        turn = rng.normal(size=4) * 10.0 ** rng.integers(-160, 160)
+        uv, sigma = rng.normal(size=(count, 4, 2)) * far, 10.0 ** rng.uniform(-5.0, 4.0, count)
+        uv, place = np.clip(uv, -16384.0, 32768.0), np.clip(rng.normal(size=3) * far, -1e3, 1e3)
+        turn = rng.normal(size=4)
+        turn *= rng.uniform(0.95, 1.04) / np.linalg.norm(turn)
+        turn = np.clip(turn, -1.0, 1.0)
         for message in (
             TagDetections("left", 1, k, t_ns, t_ns, ids, uv, sigma),
-            TrackerPose("puck", 1, k, t_ns, rng.normal(size=3) * far, turn),
-            msgspec.structs.replace(base, t_ns=int(rng.integers(-(2**62), 2**62))),
+            TrackerPose("puck", 1, k, t_ns, place, turn),
+            msgspec.structs.replace(base, t_ns=int(rng.integers(-(2**61), 2**61))),
             base,
         ):
             for one in world.push(message):
