@@ -83,6 +83,7 @@ hands = st.builds(
 )
 
 IDENTITY = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+BESIDE = ((1.0, 0.0, 0.0, 0.075), *IDENTITY[1:])
 CAMERA: dict[str, Any] = {
     "version": 1,
     "name": "left",
@@ -108,7 +109,7 @@ RIG: dict[str, Any] = {
     "kind": "markers",
     "cameras": ["left", "right"],
     "markers": ["thumb", "index"],
-    "T_rig_camera": {"left": IDENTITY, "right": IDENTITY},
+    "T_rig_camera": {"left": IDENTITY, "right": BESIDE},
     "depth_model": "power_law",
     "power_law": {"k_m": 45.433, "z": -1.035},
     "hand": "default-right",
@@ -175,7 +176,7 @@ def test_a_rig_is_loaded_equal(x0: float, k: float, z: float, imu: ImuCalibratio
         kind="markers",
         cameras=("left", "right"),
         hand="me",
-        T_rig_camera={"left": IDENTITY, "right": IDENTITY},
+        T_rig_camera={"left": IDENTITY, "right": BESIDE},
         depth_model="affine_disparity",
         power_law=PowerLawCalibration(k_m=k, z=z),
         affine_disparity=AffineDisparityCalibration(a_m_px=k, x0_px=x0),

@@ -134,9 +134,10 @@ def test_a_rig_that_is_there_keeps_everything_but_the_places(tmp_path: Path) -> 
     (out / "rigs").mkdir()
     law = PowerLawCalibration(k_m=45.4, z=-1.03)
     T_rig_right = ((1.0, 0.0, 0.0, 0.5), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    T_rig_left = ((1.0, 0.0, 0.0, 0.6), *T_rig_right[1:])
     kept = RigCalibration(
         version=1, name="pair", kind="markers", cameras=("right", "left"), hand="mine",
-        T_rig_camera={"right": T_rig_right, "left": T_rig_right}, power_law=law, depth_model="power_law",
+        T_rig_camera={"right": T_rig_right, "left": T_rig_left}, power_law=law, depth_model="power_law",
     )  # fmt: skip
     save(out / "rigs" / "pair.json", kept)
     said = run(
