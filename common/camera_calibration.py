@@ -6,7 +6,7 @@ from msgspec import Meta
 
 from common.calibration_parts import Part, Provenance
 from common.errors import CalibrationError
-from common.lens_fold import Lens, fold_of
+from common.lens import Lens, fold_of
 from common.messages import Name
 
 Hsv = tuple[

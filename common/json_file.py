@@ -120,7 +120,12 @@ def _with_keys(text: str, raw: bytes, kind: type[object]) -> str:
     """The error of msgspec with the keys of a map, where it has `[...]`."""
     if (place := text.rfind("`$")) < 0 or "[...]" not in text[place:]:
         return text
-    root = holder = [msgspec.json.decode(raw)]
+    try:
+        root = holder = [msgspec.json.decode(raw)]
+    except msgspec.MsgspecError:  # malformed further on
+        return text
+    if _error_of(root[0], kind) != text:  # of a key that stands twice
+        return text
     at: object = 0
     path = "$"
     for step in _STEP.finditer(text, place):
