@@ -85,7 +85,7 @@ def check_camera(camera: CameraCalibration, where: str) -> None:
             `where` and the key.
     """
     if camera.intrinsics is not None:
-        _check_lens(camera, camera.intrinsics, where)
+        check_lens(camera.intrinsics, (camera.width_px, camera.height_px), where)
     for name, colour in (camera.markers or {}).items():
         for i, letter in ((1, "S"), (2, "V")):
             if colour.hsv_low[i] > colour.hsv_high[i]:
@@ -94,26 +94,32 @@ def check_camera(camera: CameraCalibration, where: str) -> None:
                 )
 
 
-def _check_lens(camera: CameraCalibration, lens: Intrinsics, where: str) -> None:
-    size = camera.width_px, camera.height_px
-    for key, focal, principal, length, side in (
-        ("x", lens.fx_px, lens.cx_px, size[0], "width_px"),
-        ("y", lens.fy_px, lens.cy_px, size[1], "height_px"),
+def check_lens(lens: Intrinsics, size_px: tuple[int, int], where: str) -> None:
+    """Refuse a lens that cannot be that of a picture of this size.
+
+    Raises:
+        CalibrationError: Focal length or principal point do not fit the picture, or the lens folds inside it; with
+            `where` and the key.
+    """
+    width = size_px[0]
+    low, high = MIN_FOCAL_PER_WIDTH * width, MAX_FOCAL_PER_WIDTH * width
+    for axis, focal, principal, side in (
+        ("x", lens.fx_px, lens.cx_px, width),
+        ("y", lens.fy_px, lens.cy_px, size_px[1]),
     ):
-        low, high = MIN_FOCAL_PER_WIDTH * size[0], MAX_FOCAL_PER_WIDTH * size[0]
         if not low <= focal <= high:
             raise CalibrationError(
-                f"{where}: intrinsics.f{key}_px: {focal:g}, of a picture {size[0]} px wide it is {low:g} ... {high:g}"
+                f"{where}: intrinsics.f{axis}_px: {focal:g}, of a picture {width} px wide it is {low:g} ... {high:g}"
             )
-        if not -length <= principal <= 2 * length:
+        if not -side <= principal <= 2 * side:
             raise CalibrationError(
-                f"{where}: intrinsics.c{key}_px: {principal:g}, more than one picture outside of it"
-                f" ({side} is {length}); it is {-length} ... {2 * length}"
+                f"{where}: intrinsics.c{axis}_px: {principal:g}, more than one picture outside of it;"
+                f" it is {-side} ... {2 * side}"
             )
-    fold = fold_of(Lens(size, (lens.fx_px, lens.fy_px), (lens.cx_px, lens.cy_px), lens.distortion))
+    fold = fold_of(Lens(size_px, (lens.fx_px, lens.fy_px), (lens.cx_px, lens.cy_px), lens.distortion))
     if fold is not None:
         raise CalibrationError(
-            f"{where}: intrinsics.distortion: camera {camera.name!r}: the lens folds {fold.radius_px:.0f} px from its"
-            f" principal point, inside the picture, at pixel ({fold.u:.0f}, {fold.v:.0f}): the distortion is not"
-            " monotone there, so no ray belongs to a pixel; calibrate with views that reach the picture's corners"
+            f"{where}: intrinsics.distortion: the lens folds {fold.radius_px:.0f} px from its principal point, inside"
+            f" the picture, at pixel ({fold.u:.0f}, {fold.v:.0f}): the distortion is not monotone there, and no ray"
+            " belongs to a pixel beyond; calibrate with views that reach the corners of the picture"
         )

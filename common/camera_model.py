@@ -13,7 +13,7 @@ from common.errors import CalibrationError
 from common.geometry import invert
 from common.lens import Lens, contraction, undistorted
 
-_CONVERGES = 0.7  # 30 steps of the iteration then leave 2e-5 of what the lens bends, a thousandth of a pixel
+_CONVERGES = 0.5  # 30 steps of the iteration then leave a billionth of what the lens bends
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
 
 

@@ -83,17 +83,18 @@ def undistorted(lens: Lens, seen: Float) -> Float:
     r, shown, _ = _radial(lens)
     rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
     length = np.hypot(seen[:, 0], seen[:, 1])
+    enough = 1e-10 * _reach(lens)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        ratio = (
-            np.interp(length, shown[:rising], r[:rising]) / length
-        )  # without tangential terms: to begin with
+        ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
         xy = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
         for _ in range(_STEPS):
-            off_x, off_y = (seen - distorted(lens, xy)).T
+            off_x, off_y = off = (seen - distorted(lens, xy)).T
+            if not (np.abs(off) > enough).any():
+                break
             xx, yy, mixed = _jacobian(lens, xy)
             det = xx * yy - mixed * mixed
             xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
-        settled = (np.abs(seen - distorted(lens, xy)) < 1e-9 * _reach(lens)).all(axis=1)
+        settled = (np.abs(seen - distorted(lens, xy)) <= enough).all(axis=1)
         settled &= _least_eigenvalue(lens, xy) > 0.0
     return np.where(settled[:, None], xy, np.nan)
 
