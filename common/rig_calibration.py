@@ -207,15 +207,19 @@ def check_rig(rig: RigCalibration, where: str) -> None:
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
         check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
-    _check_places(rig, where)
+    check_places(rig, where)
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
         )
 
 
-def _check_places(rig: RigCalibration, where: str) -> None:
-    """Refuse two cameras in one place: rays from one point have no intersection that tells a depth."""
+def check_places(rig: RigCalibration, where: str) -> None:
+    """Refuse two cameras in one place: rays from one point have no intersection that tells a depth.
+
+    Raises:
+        CalibrationError: With `where` and both cameras.
+    """
     centres = [(name, rig.camera_pose(name)[:3, 3]) for name in rig.cameras if name in rig.T_rig_camera]
     for (one, a), (other, b) in combinations(centres, 2):
         if (apart := math.dist(a, b)) < MIN_BASELINE_M:
