@@ -1,7 +1,7 @@
 """The one way in for JSON files: bounded in size and nesting, no key twice, no NaN, every value of its type.
 
-msgspec decodes and checks the types. Of two equal keys it keeps the last without a word, and a file of a million
-brackets exhausts its stack: both are looked for here, the first beside it, the second before it.
+msgspec decodes and checks the types. Of two equal keys it keeps the last, and a file of a million brackets ends in a
+RecursionError: the first is looked for after it by a second, untyped pass, the second before it.
 """
 
 import json
@@ -143,7 +143,7 @@ def _with_keys(text: str, raw: bytes, kind: type[object]) -> str:
 
 
 def _culprit(root: list[object], holder: list[object], at: object, kind: type[object], text: str) -> str:
-    """Key of the map at `holder[at]` that makes msgspec say `text`, by halving; the map is left with it alone."""
+    """Key of the map at `holder[at]` whose value gives the error `text`, by halving; the map is left with it alone."""
     parts = cast(dict[object, dict[str, object]], holder)
     value = parts[at]
     keys = list(value)

@@ -109,14 +109,14 @@ TABLE: list[tuple[str, tuple[str | int, ...], object, str]] = [
 
 
 @pytest.mark.parametrize(
-    ("name", "path", "value", "said"),
+    ("name", "path", "value", "expected"),
     TABLE,
     ids=[f"{t[0]}-{'.'.join(map(str, t[1]))}-{t[2]}"[:80] for t in TABLE],
 )
 def test_a_file_that_cannot_be_is_refused_with_file_and_key(
-    name: str, path: tuple[str | int, ...], value: object, said: str
+    name: str, path: tuple[str | int, ...], value: object, expected: str
 ) -> None:
-    assert re.search(said, refused(name, edited(DOCUMENTS[name], path, value)))
+    assert re.search(expected, refused(name, edited(DOCUMENTS[name], path, value)))
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -184,7 +184,7 @@ def test_values_at_the_bounds_can_be_computed_with(name: str) -> None:
                 )
                 loaded += 1
             except CalibrationError:
-                pass  # that bound, and what else the file says, do not fit together
+                pass  # that bound contradicts another value of the file
     assert loaded
 
 
@@ -195,18 +195,18 @@ def test_files_inside_the_manifest_of_a_recording_are_checked_too() -> None:
     one_place = edited(good, ("rig", "T_rig_camera", "right"), rig["T_rig_camera"]["left"])
     clicked = edited(good, ("clicks",), {"left": {"thumb": [1e300, 0]}})
     check_manifest(msgspec.convert(good, Manifest), "recording.json")
-    for bad, said in (
+    for bad, expected in (
         (folded, r"cameras\.right: intrinsics\.distortion"),
         (one_place, "T_rig_camera.right: 0 mm"),
     ):
-        with pytest.raises(CalibrationError, match=f"recording.json: .*{said}"):
+        with pytest.raises(CalibrationError, match=f"recording.json: .*{expected}"):
             check_manifest(msgspec.convert(bad, Manifest), "recording.json")
     with pytest.raises(CalibrationError, match=r"recording\.json: .*\$\.clicks\.left\.thumb\[0\]"):
         calibration.parse(msgspec.json.encode(clicked), Manifest, "recording.json")
 
 
 @pytest.mark.parametrize(
-    ("name", "old", "new", "said"),
+    ("name", "old", "new", "expected"),
     [
         ("rigs/desk.json", '"version": 1,', '"version": 1, "kind": "markers",', "duplicate key - at `$.kind`"),
         ("rigs/desk.json", "0.075]", "0.0]", "T_rig_camera.right: 0.72 mm from camera 'left'"),
@@ -216,8 +216,8 @@ def test_files_inside_the_manifest_of_a_recording_are_checked_too() -> None:
         ("cameras/left.json", "{", " " * (4 << 20) + "{", "larger than 4 MiB"),
     ],
 )  # fmt: skip
-def test_a_master_says_which_file_is_wrong_and_ends(
-    name: str, old: str, new: str, said: str, tmp_path: Path
+def test_a_master_names_the_wrong_file_and_ends(
+    name: str, old: str, new: str, expected: str, tmp_path: Path
 ) -> None:
     for file in TREE.glob("*/*.json"):
         (tmp_path / file.relative_to(TREE)).parent.mkdir(exist_ok=True)
@@ -228,7 +228,7 @@ def test_a_master_says_which_file_is_wrong_and_ends(
     command = [sys.executable, "-m", "master", "run", "--calibration", str(tmp_path), "--rig", "desk"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
-    said_all = done.stdout + done.stderr
-    assert "Traceback" not in said_all
-    assert f"{tmp_path / name}: " in said_all
-    assert said in said_all
+    output = done.stdout + done.stderr
+    assert "Traceback" not in output
+    assert f"{tmp_path / name}: " in output
+    assert expected in output

@@ -102,7 +102,7 @@ def test_the_size_is_looked_at_before_anything_is_read(
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "expected"),
     [
         (b'{"a": NaN}', "malformed"),
         (b"[Infinity]", "malformed"),
@@ -119,8 +119,8 @@ def test_the_size_is_looked_at_before_anything_is_read(
     ],
     ids=str,
 )
-def test_what_is_no_json_is_refused(text: bytes, said: str) -> None:
-    assert re.search(said, refused(text))
+def test_what_is_no_json_is_refused(text: bytes, expected: str) -> None:
+    assert re.search(expected, refused(text))
 
 
 def test_keys_with_escape_sequences_do_not_reach_a_terminal() -> None:

@@ -56,7 +56,7 @@ def test_lenses_that_fold_and_lenses_that_do_not(
 def test_a_fold_between_the_axis_and_a_picture_beside_it_counts() -> None:
     assert fold_of(lens(-0.3, 0, 0, 0, 0, centre=(-600.0, 240.0))) is not None
     assert fold_of(lens(-0.01, 0, 0, 0, 0, centre=(-600.0, 240.0))) is None
-    # Behind the axis, away from the picture, it does not.
+    # On the other side of the axis it does not.
     assert fold_of(lens(0, 0, 0, -0.14, 0, centre=(-2.0, 240.0))) is not None
     assert fold_of(lens(0, 0, 0, 0.14, 0, centre=(-2.0, 240.0))) is None
 
