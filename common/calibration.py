@@ -26,7 +26,9 @@ from common.hand_calibration import (
     PalmarScale,
     Preset,
     RestJoint,
+    check_hand,
 )
+from common.json_file import decode_json, read_bytes
 from common.object_profile import ObjectProfile, check_object
 from common.output_settings import OutputSettings, check_outputs
 from common.replacing import replacing
@@ -84,14 +86,10 @@ def load(path: Path, kind: type[StructT]) -> StructT:
     """Read one calibration file.
 
     Raises:
-        CalibrationError: Missing, not JSON, a key unknown, missing or out of range, or parts that
-            contradict each other. The text names the file and the key.
+        CalibrationError: Missing, too large, not JSON, a key unknown, missing, there twice or out of range, or parts
+            that contradict each other. The text names the file and the key.
     """
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise CalibrationError(f"{path}: cannot read: {error.strerror}") from error
-    return parse(raw, kind, str(path))
+    return parse(read_bytes(path), kind, str(path))
 
 
 def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
@@ -100,10 +98,7 @@ def parse(raw: bytes, kind: type[StructT], where: str) -> StructT:
     Raises:
         CalibrationError: As `load`.
     """
-    try:
-        value = msgspec.json.decode(raw, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise CalibrationError(f"{where}: {error}") from error
+    value = decode_json(raw, kind, where)
     check(value, where)
     return value
 
@@ -124,6 +119,8 @@ def check(value: Struct, where: str) -> None:
         check_outputs(value, where)
     elif isinstance(value, CameraCalibration):
         check_camera(value, where)
+    elif isinstance(value, HandProfile):
+        check_hand(value, where)
 
 
 def save(path: Path, value: Struct) -> None:

@@ -5,12 +5,28 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-Positive = Annotated[float, Meta(gt=0.0, le=1e9)]
-NonNegative = Annotated[float, Meta(ge=0.0, le=1e9)]
-Number = Annotated[float, Meta(ge=-1e9, le=1e9)]
-Vector3 = tuple[Number, Number, Number]
-Quaternion = tuple[Number, Number, Number, Number]
-Row4 = tuple[Number, Number, Number, Number]
+# Bounds are generous, from a phone to machine vision: they stop numbers that cannot be (1e-300, 1e300), and with them
+# divisions by nothing and overflows, not hardware that nobody thought of.
+Number = Annotated[float, Meta(ge=-1e9, le=1e9)]  # without unit, or of several: residuals
+Positive = Annotated[float, Meta(ge=1e-6, le=1e6)]  # a factor
+NonNegative = Annotated[float, Meta(ge=0.0, le=1e6)]  # a factor that may be nothing
+Coordinate = Annotated[float, Meta(ge=-100.0, le=100.0)]  # [m] a rig stands in one hall
+Length = Annotated[float, Meta(ge=1e-6, le=100.0)]  # [m] from noise under a macro lens to a hall
+Distance = Annotated[float, Meta(ge=0.0, le=100.0)]  # [m] a length that may be nothing
+Angle = Annotated[float, Meta(ge=1e-6, le=6.2832)]  # [rad] up to a turn
+Rate = Annotated[float, Meta(ge=0.1, le=1e5)]  # [Hz] of samples: an IMU gives up to 32 kHz
+Frequency = Annotated[
+    float, Meta(ge=1e-3, le=1e6)
+]  # [Hz] cut-off of a filter; above the rate it does nothing
+Duration = Annotated[float, Meta(ge=0.0, le=3600.0)]  # [s]
+StampOffset = Annotated[float, Meta(ge=-1e6, le=1e6)]  # [us] a second: more is another frame, not its stamp
+UnitComponent = Annotated[
+    float, Meta(ge=-1.01, le=1.01)
+]  # of a unit vector or quaternion, as rounding leaves it
+Vector3 = tuple[Coordinate, Coordinate, Coordinate]
+Direction = tuple[UnitComponent, UnitComponent, UnitComponent]
+Quaternion = tuple[UnitComponent, UnitComponent, UnitComponent, UnitComponent]
+Row4 = tuple[Coordinate, Coordinate, Coordinate, Coordinate]  # of a rotation, checked, and a translation [m]
 Matrix4 = tuple[Row4, Row4, Row4, Row4]
 
 

@@ -11,7 +11,9 @@ from common.arrays import Float
 from common.calibration import CameraCalibration
 from common.errors import CalibrationError
 from common.geometry import invert
+from common.lens import Lens, contraction, undistorted
 
+_CONVERGES = 0.5  # 30 steps of the iteration then leave a billionth of what the lens bends
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 1e-10)
 
 
@@ -26,6 +28,8 @@ class CameraModel:
         width_px, height_px: Image size.
         row_time_ns: Time from one row to the next [ns] (rolling shutter; 0: global).
         T_camera_rig: The inverse of `T_rig_camera`.
+        steep: The lens, where OpenCV's iteration does not find the way back from all of the picture (it does not
+            converge where the distortion rises steeply, as at the corners of some wide-angle lenses); else None.
     """
 
     matrix: Float
@@ -35,9 +39,15 @@ class CameraModel:
     height_px: int
     row_time_ns: float
     T_camera_rig: Float = field(init=False)
+    steep: Lens | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_camera_rig", invert(self.T_rig_camera))
+        (fx, _, cx), (_, fy, cy), _ = self.matrix.tolist()
+        k1, k2, p1, p2, k3 = self.distortion.tolist()
+        lens = Lens((self.width_px, self.height_px), (fx, fy), (cx, cy), (k1, k2, p1, p2, k3))
+        if contraction(lens) > _CONVERGES:
+            object.__setattr__(self, "steep", lens)
 
     @classmethod
     def of(cls, camera: CameraCalibration, T_rig_camera: Float) -> "CameraModel":
@@ -93,6 +103,9 @@ class CameraModel:
         uv = np.asarray(uv, dtype=np.float64)
         if uv.size == 0:
             return uv.copy()
+        if self.steep is not None:
+            seen = (uv.reshape(-1, 2) - self.matrix[:2, 2]) / self.matrix[[0, 1], [0, 1]]
+            return undistorted(self.steep, seen).reshape(uv.shape)
         points = _undistort(np.ascontiguousarray(uv.reshape(-1, 1, 2)), self.matrix, self.distortion)
         return np.where(np.isnan(uv), np.nan, points.reshape(uv.shape))
 

@@ -6,18 +6,17 @@ in use, by `range_figures`.
 """
 
 from collections.abc import Iterable
-from typing import Annotated
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 
-from common.calibration import CameraCalibration, HsvRange, Positive, RoiMargin, check
+from common.calibration import CameraCalibration, HsvRange, RoiMargin, check
+from common.camera_calibration import AnalogueGain, ColourGain, Exposure, FrameRate, Pixel
 from common.errors import CalibrationError
 from common.messages import Name
 
 WANTED = "wanted."
 ROI_LEAST, ROI_MOST = 0.01, 0.5  # of `roi_margin`
-Pixel = Annotated[float, Meta(ge=-0.5, le=16384.0)]
 _OF_CAMERA = ("exposure_us", "analogue_gain", "colour_gains", "frame_rate_hz", "row_time_us")
 
 
@@ -28,10 +27,10 @@ class CameraSettings(Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     the one that the marker has.
     """
 
-    exposure_us: Positive | None = None
-    analogue_gain: Positive | None = None
-    colour_gains: tuple[Positive, Positive] | None = None
-    frame_rate_hz: Positive | None = None
+    exposure_us: Exposure | None = None
+    analogue_gain: AnalogueGain | None = None
+    colour_gains: tuple[ColourGain, ColourGain] | None = None
+    frame_rate_hz: FrameRate | None = None
     roi_margin: RoiMargin | None = None
     markers: dict[Name, HsvRange | None] | None = None
 

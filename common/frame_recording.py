@@ -18,6 +18,7 @@ from typing import Literal
 from msgspec import Struct
 
 from common.calibration import CameraCalibration, RigCalibration, check, load
+from common.camera_calibration import Pixel
 from common.errors import CalibrationError, RecordingError
 from common.messages import TimeNs
 from common.object_profile import ObjectProfile
@@ -67,7 +68,7 @@ class Manifest(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     cameras: dict[str, CameraCalibration]
     rig: RigCalibration | None = None
     rigs: tuple[RigCalibration, ...] = ()
-    clicks: dict[str, dict[str, tuple[float, float]]] = {}
+    clicks: dict[str, dict[str, tuple[Pixel, Pixel]]] = {}
     continuous: bool = True
     note: str = ""
     clock: RecordedClock | None = None
@@ -186,6 +187,8 @@ def check_manifest(manifest: Manifest, where: str) -> None:
     """
     for name, camera in manifest.cameras.items():
         check(camera, f"{where}: cameras.{name}")
+    for name, profile in manifest.objects.items():
+        check(profile, f"{where}: objects.{name}")
     for rig in (manifest.rig, *manifest.rigs):
         if rig is None:
             continue

@@ -9,7 +9,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from common.calibration_parts import NonNegative, Part, Positive
+from common.calibration_parts import Angle, Distance, Duration, Length, NonNegative, Part, Positive
 from common.errors import CalibrationError
 
 
@@ -23,16 +23,16 @@ class PinchSettings(Part, frozen=True):
     `sigma_most_m`: of the gap, above which it is not known; `lost_s`: how long a pinch lasts without it.
     """
 
-    begin_gap_m: Positive = 0.009
-    end_gap_m: Positive = 0.015
-    closed_gap_m: NonNegative = 0.001
-    open_gap_m: Positive = 0.040
-    clear_m: NonNegative = 0.006
-    away_m: Positive = 0.025
-    apart_rad: Positive = math.radians(105.0)
+    begin_gap_m: Length = 0.009
+    end_gap_m: Length = 0.015
+    closed_gap_m: Distance = 0.001
+    open_gap_m: Length = 0.040
+    clear_m: Distance = 0.006
+    away_m: Length = 0.025
+    apart_rad: Angle = math.radians(105.0)
     fist_curl: Positive = 0.75
-    sigma_most_m: Positive = 0.005
-    lost_s: NonNegative = 0.35
+    sigma_most_m: Length = 0.005
+    lost_s: Duration = 0.35
 
 
 class DialSettings(Part, frozen=True):
@@ -50,23 +50,23 @@ class DialSettings(Part, frozen=True):
     may be unknown; `sigma_most_m`: of a tip, above which it is.
     """
 
-    hold_s: NonNegative = 0.2
-    again_s: NonNegative = 0.08
-    still_m: Positive = 0.004
-    radius_low_m: Positive = 0.014
-    radius_high_m: Positive = 0.042
+    hold_s: Duration = 0.2
+    again_s: Duration = 0.08
+    still_m: Length = 0.004
+    radius_low_m: Length = 0.014
+    radius_high_m: Length = 0.042
     curl_least: NonNegative = 0.3
-    across_m: NonNegative = 0.018
-    aslant_rad: Positive = math.radians(55.0)
+    across_m: Distance = 0.018
+    aslant_rad: Angle = math.radians(55.0)
     fingers_least: Annotated[int, Meta(ge=2, le=4)] = 3
-    round_m: Positive = 0.012
-    opposed_rad: Positive = math.radians(75.0)
-    quick_m: Positive = 0.0009
-    loose_m: Positive = 0.0025
-    open_m: Positive = 0.006
-    regrip_s: NonNegative = 0.8
-    lost_s: NonNegative = 0.5
-    sigma_most_m: Positive = 0.015
+    round_m: Length = 0.012
+    opposed_rad: Angle = math.radians(75.0)
+    quick_m: Length = 0.0009
+    loose_m: Length = 0.0025
+    open_m: Length = 0.006
+    regrip_s: Duration = 0.8
+    lost_s: Duration = 0.5
+    sigma_most_m: Length = 0.015
 
 
 class TapSettings(Part, frozen=True):
@@ -84,21 +84,21 @@ class TapSettings(Part, frozen=True):
     told as none. `sigma_most_m`, `place_sigma_m`: of the gap, and of the finger's PIP, above which nothing is told.
     """
 
-    touch_gap_m: Positive = 0.005
-    leave_gap_m: Positive = 0.0085
-    rise_m: Positive = 0.005
-    down_gap_m: Positive = 0.003
-    pressed_m: Positive = 0.007
-    approach_s: Positive = 0.4
-    shortest_s: NonNegative = 0.03
-    longest_s: Positive = 0.6
-    apart_s: NonNegative = 0.08
-    level_rad: Positive = math.radians(50.0)
+    touch_gap_m: Length = 0.005
+    leave_gap_m: Length = 0.0085
+    rise_m: Length = 0.005
+    down_gap_m: Length = 0.003
+    pressed_m: Length = 0.007
+    approach_s: Duration = 0.4
+    shortest_s: Duration = 0.03
+    longest_s: Duration = 0.6
+    apart_s: Duration = 0.08
+    level_rad: Angle = math.radians(50.0)
     curl_most: Positive = 0.8
-    quiet_rad: Positive = math.radians(25.0)
-    nearer_m: NonNegative = 0.0002
-    sigma_most_m: Positive = 0.006
-    place_sigma_m: Positive = 0.008
+    quiet_rad: Angle = math.radians(25.0)
+    nearer_m: Distance = 0.0002
+    sigma_most_m: Length = 0.006
+    place_sigma_m: Length = 0.008
 
 
 class PointSettings(Part, frozen=True):
@@ -110,12 +110,12 @@ class PointSettings(Part, frozen=True):
     ray, above which it is told to nobody (half as much again for one that has begun).
     """
 
-    stretched_rad: Positive = math.radians(45.0)
-    bent_rad: Positive = math.radians(85.0)
-    slack_rad: NonNegative = math.radians(20.0)
-    hold_s: NonNegative = 0.12
-    sigma_most_m: Positive = 0.015
-    ray_sigma_rad: Positive = math.radians(6.0)
+    stretched_rad: Angle = math.radians(45.0)
+    bent_rad: Angle = math.radians(85.0)
+    slack_rad: Annotated[float, Meta(ge=0.0, le=6.2832)] = math.radians(20.0)
+    hold_s: Duration = 0.12
+    sigma_most_m: Length = 0.015
+    ray_sigma_rad: Angle = math.radians(6.0)
 
 
 def check_actions(

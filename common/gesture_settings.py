@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration_parts import NonNegative, Number, Part, Positive, Provenance
+from common.calibration_parts import Duration, Part, Provenance
 from common.errors import CalibrationError
 from common.gesture_actions import DialSettings, PinchSettings, PointSettings, TapSettings, check_actions
 from common.messages import Name
@@ -30,15 +30,18 @@ Quantity = Literal[
     "index_middle_spread_deg", "middle_ring_spread_deg", "ring_little_spread_deg",
 ]  # fmt: skip
 Finger = Literal["thumb", "index", "middle", "ring", "little"]
+Measured = Annotated[float, Meta(ge=-1e4, le=1e4)]  # degrees, mm, shares
+Border = Annotated[float, Meta(ge=1e-3, le=1e4)]
+Weight = Annotated[float, Meta(ge=1e-3, le=1e3)]
 Score = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Span(Part, frozen=True):
     """What a quantity may be: from `low` to `high` without loss, beyond with one standard deviation per `soft`."""
 
-    low: Number
-    high: Number
-    soft: Positive
+    low: Measured
+    high: Measured
+    soft: Border
 
 
 class PoseShape(Part, frozen=True):
@@ -49,7 +52,7 @@ class PoseShape(Part, frozen=True):
 
     ranges: Annotated[dict[Quantity, Span], Meta(min_length=1)]
     needs: tuple[Finger, ...] = ()
-    weight: Positive = 1.0
+    weight: Weight = 1.0
 
 
 class HoldSettings(Part, frozen=True):
@@ -65,13 +68,13 @@ class HoldSettings(Part, frozen=True):
 
     begin: Score = 0.45
     end: Score = 0.22
-    begin_s: NonNegative = 0.012
-    doubt_s: NonNegative = 0.1
-    end_s: NonNegative = 0.04
-    still_deg_s: Positive = 60.0
-    slow_s: NonNegative = 0.25
-    lost_s: NonNegative = 0.5
-    hidden_s: NonNegative = 3.0
+    begin_s: Duration = 0.012
+    doubt_s: Duration = 0.1
+    end_s: Duration = 0.04
+    still_deg_s: Annotated[float, Meta(ge=1e-3, le=1e6)] = 60.0
+    slow_s: Duration = 0.25
+    lost_s: Duration = 0.5
+    hidden_s: Duration = 3.0
     known_share: Score = 0.5
 
 

@@ -1,17 +1,26 @@
 """Typed files of hands: bones and markers of one hand, its limits and couplings."""
 
+import math
+from itertools import combinations
 from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from common.calibration_parts import NonNegative, Number, Part, Positive, Provenance, Quaternion, Vector3
-from common.messages import Name
+from common.calibration_parts import Part, Provenance, Quaternion
+from common.errors import CalibrationError
+from common.messages import MAX_MARKERS, Name
+
+HandCoordinate = Annotated[float, Meta(ge=-0.5, le=0.5)]  # [m] twice the longest hand, from its wrist
+HandPlace = tuple[HandCoordinate, HandCoordinate, HandCoordinate]
+Thickness = Annotated[float, Meta(ge=5e-4, le=0.2)]  # [m] radius at a joint, painted length of a cap
+_MIN_BONE_M = 1e-3
+_UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one
 
 
 class RestJoint(Part, frozen=True):
     """One joint of the flat hand, palm frame; OpenXR axes: -z along the bone to the tip, +y dorsal."""
 
-    position_m: Vector3
+    position_m: HandPlace
     orientation_wxyz: Quaternion
 
 
@@ -19,11 +28,13 @@ class MarkerMount(Part, frozen=True):
     """Where a painted cap sits: the joint it is fixed to (or palm_frame), its centroid there, its painted length."""
 
     joint: str
-    offset_m: Vector3
-    painted_m: Positive = 0.016
+    offset_m: HandPlace
+    painted_m: Thickness = 0.016
 
 
-Span = tuple[Number, Number]
+HandAngle = Annotated[float, Meta(ge=-6.2832, le=6.2832)]  # [rad] a turn
+Span = tuple[HandAngle, HandAngle]
+Ratio = Annotated[float, Meta(ge=0.0, le=10.0)]  # of two angles of one finger
 Share = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
@@ -58,9 +69,9 @@ class Couplings(Part, frozen=True):
     kept exactly. `mcp_per_pip` None: no natural flexion. `neighbours`: fingers side by side tend to bend alike.
     """
 
-    dip_per_pip: NonNegative | None = 2.0 / 3.0
+    dip_per_pip: Ratio | None = 2.0 / 3.0
     dip_spread_rad: Annotated[float, Meta(ge=0.0, le=3.2)] = 0.0
-    mcp_per_pip: NonNegative | None = 0.54
+    mcp_per_pip: Ratio | None = 0.54
     neighbours: bool = True
 
 
@@ -80,10 +91,30 @@ class HandProfile(Part, frozen=True):
     version: Literal[1]
     name: Name
     side: Literal["left", "right"]
-    rest_joints: dict[str, RestJoint]
-    markers: dict[Name, MarkerMount]
-    radius_m: dict[str, Positive] | None = None
+    rest_joints: Annotated[dict[str, RestJoint], Meta(max_length=64)]
+    markers: Annotated[dict[Name, MarkerMount], Meta(max_length=MAX_MARKERS)]
+    radius_m: dict[str, Thickness] | None = None
     palmar_scale: dict[Finger, PalmarScale] = {}
     limits_rad: Limits | Preset | None = None
     couplings: Couplings | Preset | None = None
     provenance: dict[str, Provenance] = {}
+
+
+def check_hand(hand: HandProfile, where: str) -> None:
+    """Refuse what the types alone cannot.
+
+    Raises:
+        CalibrationError: An orientation is no rotation, or two joints lie in one place; with `where` and the key.
+    """
+    for name, joint in hand.rest_joints.items():
+        length = math.hypot(*joint.orientation_wxyz)
+        if abs(length - 1.0) > _UNIT_WITHIN:
+            raise CalibrationError(
+                f"{where}: rest_joints.{name}.orientation_wxyz: length {length:.4g},"
+                " a rotation is a unit quaternion wxyz, of length 1"
+            )
+    for (one, a), (other, b) in combinations(hand.rest_joints.items(), 2):
+        if math.dist(a.position_m, b.position_m) < _MIN_BONE_M:
+            raise CalibrationError(
+                f"{where}: rest_joints.{other}.position_m: where {one} is; a bone has a length, 1 mm or more"
+            )

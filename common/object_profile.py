@@ -6,13 +6,14 @@ import numpy as np
 from msgspec import Meta
 
 from common.arrays import Float
-from common.calibration_parts import Matrix4, Number, Part, Positive, Provenance, Vector3
+from common.calibration_parts import Matrix4, Part, Provenance, StampOffset, Vector3
 from common.errors import CalibrationError
 from common.messages import MAX_MARKERS, MAX_TAGS, Name
 
 TagFamily = Literal[
     "apriltag_16h5", "apriltag_25h9", "apriltag_36h11", "aruco_4x4_50", "aruco_5x5_100", "aruco_6x6_250"
 ]
+PartLength = Annotated[float, Meta(ge=1e-4, le=100.0)]  # [m] of a bead, a tag, a part of a surface
 TagId = Annotated[int, Meta(ge=0, le=65535)]
 
 
@@ -20,7 +21,7 @@ class Bead(Part, frozen=True):
     """A painted ball of the object: its middle, object frame, and its radius."""
 
     position_m: Vector3
-    radius_m: Positive = 0.008
+    radius_m: PartLength = 0.008
 
 
 class Tag(Part, frozen=True):
@@ -30,7 +31,7 @@ class Tag(Part, frozen=True):
     """
 
     id: TagId
-    edge_m: Positive
+    edge_m: PartLength
     T_object_tag: Matrix4
 
 
@@ -44,22 +45,22 @@ class Tags(Part, frozen=True):
 class BoxShape(Part, frozen=True, tag="box", tag_field="kind"):
     """A box about the origin of its own frame, sides along its axes."""
 
-    size_m: tuple[Positive, Positive, Positive]
+    size_m: tuple[PartLength, PartLength, PartLength]
     T_object_part: Matrix4 | None = None
 
 
 class CylinderShape(Part, frozen=True, tag="cylinder", tag_field="kind"):
     """A closed cylinder about the origin of its own frame, along its z."""
 
-    radius_m: Positive
-    length_m: Positive
+    radius_m: PartLength
+    length_m: PartLength
     T_object_part: Matrix4 | None = None
 
 
 class SphereShape(Part, frozen=True, tag="sphere", tag_field="kind"):
     """A ball about the origin of its own frame."""
 
-    radius_m: Positive
+    radius_m: PartLength
     T_object_part: Matrix4 | None = None
 
 
@@ -81,7 +82,7 @@ class ObjectProfile(Part, frozen=True):
     tags: Tags | None = None
     tracker: Name | None = None
     T_object_tracker: Matrix4 | None = None
-    stamp_offset_us: Number = 0.0
+    stamp_offset_us: StampOffset = 0.0
     shape: Annotated[tuple[Shape, ...], Meta(max_length=16)] = ()
     provenance: dict[str, Provenance] = {}
 

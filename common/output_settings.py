@@ -10,7 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 
 from msgspec import Meta
 
-from common.calibration_parts import Part, Positive, Quaternion
+from common.calibration_parts import Part, Quaternion
 from common.errors import CalibrationError
 from common.messages import Name
 
@@ -45,7 +45,7 @@ class VmcOutput(Part, frozen=True):
     port: Port = 39539
     hand: Literal["palm", "bend", "rest"] = "palm"
     q_avatar_rig: Quaternion = (0.0, 1.0, 0.0, 0.0)
-    forearm_m: Positive = 0.25
+    forearm_m: Annotated[float, Meta(ge=0.01, le=2.0)] = 0.25
 
 
 class Ros2Output(Part, frozen=True):

@@ -1,6 +1,7 @@
 """Typed files of rigs: which cameras, where, which markers, which depth model, whose hand, and what else watches it."""
 
 import math
+from itertools import combinations
 from typing import Annotated, Literal
 
 import numpy as np
@@ -8,13 +9,16 @@ from msgspec import Meta
 
 from common.arrays import Float
 from common.calibration_parts import (
+    Angle,
+    Frequency,
+    Length,
     Matrix4,
     NonNegative,
-    Number,
     Part,
-    Positive,
     Provenance,
     Quaternion,
+    Rate,
+    StampOffset,
     Vector3,
 )
 from common.errors import CalibrationError
@@ -25,21 +29,28 @@ from common.wrist_calibration import FingerLine, FlatField, Laser, LaserPlane, c
 
 Markers = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=MAX_MARKERS)]
 
+# [m px] Baseline times focal length, from 0.1 mm and 10 px to 100 m and 1e7 px.
+DepthFactor = Annotated[float, Meta(ge=1e-3, le=1e9)]
+Drift = Annotated[float, Meta(ge=0.0, le=10.0)]  # [rad/s] far more than the bias of any gyroscope
+MIN_BASELINE_M = (
+    1e-3  # of two cameras: nothing can be triangulated from one place, and no two lenses fit into less
+)
+
 UNIT_WITHIN = 1e-2  # of the length of a quaternion: what rounding leaves of one, and far from any mistake
 
 
 class PowerLawCalibration(Part, frozen=True):
     """Depth D = k x^z with x = u_left - u_right [px] (Kalbfleisch's corrected depth)."""
 
-    k_m: Positive
-    z: Annotated[float, Meta(ge=-3.0, lt=0.0)]
+    k_m: DepthFactor
+    z: Annotated[float, Meta(ge=-3.0, le=-0.1)]
 
 
 class AffineDisparityCalibration(Part, frozen=True):
     """Disparity x = a / D + x0 [px]."""
 
-    a_m_px: Positive
-    x0_px: Number
+    a_m_px: DepthFactor
+    x0_px: Annotated[float, Meta(ge=-32768.0, le=32768.0)]
 
 
 class FilterCalibration(Part, frozen=True):
@@ -48,10 +59,10 @@ class FilterCalibration(Part, frozen=True):
     `jitter_m`: what may be left of the noise of a marker at rest, per axis; noisier axes are filtered more.
     """
 
-    min_cutoff_hz: Positive = 6.0
+    min_cutoff_hz: Frequency = 6.0
     beta: NonNegative = 120.0
-    d_cutoff_hz: Positive = 6.0
-    jitter_m: Positive = 3e-4
+    d_cutoff_hz: Frequency = 6.0
+    jitter_m: Length = 3e-4
 
 
 class Volume(Part, frozen=True):
@@ -71,13 +82,13 @@ class ImuCalibration(Part, frozen=True):
     """
 
     name: Name = "imu"
-    rate_hz: Positive = 120.0
+    rate_hz: Rate = 120.0
     q_palm_imu: Quaternion | None = None
     q_rig_world: Quaternion | None = None
-    orientation_sigma_rad: Positive = math.radians(2.0)
-    heading_sigma_rad: Positive | None = None
-    heading_drift_rad_s: NonNegative = 0.0
-    stamp_offset_us: Number = 0.0
+    orientation_sigma_rad: Angle = math.radians(2.0)
+    heading_sigma_rad: Angle | None = None
+    heading_drift_rad_s: Drift = 0.0
+    stamp_offset_us: StampOffset = 0.0
 
     @property
     def placed(self) -> bool:
@@ -121,12 +132,12 @@ class RigCalibration(Part, frozen=True):
     pairing: Literal["interpolate", "predict"] = "interpolate"
     filter: FilterCalibration = FilterCalibration()
     volume: Volume | None = None
-    stamp_offset_us: dict[Name, Number] = {}
+    stamp_offset_us: dict[Name, StampOffset] = {}
     provenance: dict[str, Provenance] = {}
     laser_plane: LaserPlane | None = None
     laser: Laser | None = None
     T_camera_palm: Matrix4 | None = None
-    led: tuple[Vector3, ...] | None = None
+    led: Annotated[tuple[Vector3, ...], Meta(max_length=64)] | None = None
     flat_field: FlatField | None = None
     finger_lines: dict[Name, FingerLine] = {}
     forward: Literal["table", "cubic"] = "table"
@@ -178,6 +189,8 @@ def check_rig(rig: RigCalibration, where: str) -> None:
     if rig.kind == "wrist":
         if len(rig.cameras) != 1:
             raise CalibrationError(f"{where}: cameras: a wrist device has one, not {len(rig.cameras)}")
+        if rig.T_camera_palm is not None:
+            check_pose(np.array(rig.T_camera_palm), f"{where}: T_camera_palm")
         for key in ("other_hands", "T_world_rig", "objects", "T_rig_tracking"):
             if getattr(rig, key):
                 raise CalibrationError(f"{where}: {key}: of marker rigs; a wrist device is worn by one hand")
@@ -194,10 +207,26 @@ def check_rig(rig: RigCalibration, where: str) -> None:
         if camera not in rig.T_rig_camera:
             raise CalibrationError(f"{where}: T_rig_camera: camera {camera!r} is missing")
         check_pose(rig.camera_pose(camera), f"{where}: T_rig_camera.{camera}")
+    check_places(rig, where)
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
             f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
         )
+
+
+def check_places(rig: RigCalibration, where: str) -> None:
+    """Refuse two cameras in one place: rays from one point have no intersection that tells a depth.
+
+    Raises:
+        CalibrationError: With `where` and both cameras.
+    """
+    centres = [(name, rig.camera_pose(name)[:3, 3]) for name in rig.cameras if name in rig.T_rig_camera]
+    for (one, a), (other, b) in combinations(centres, 2):
+        if (apart := math.dist(a, b)) < MIN_BASELINE_M:
+            raise CalibrationError(
+                f"{where}: T_rig_camera.{other}: {1e3 * apart:.2g} mm from camera {one!r}; two cameras are at least"
+                f" {1e3 * MIN_BASELINE_M:g} mm apart"
+            )
 
 
 def _check_imu(imu: ImuCalibration, cameras: tuple[str, ...], where: str) -> None:

@@ -10,9 +10,12 @@ from typing import Annotated
 from msgspec import Meta
 
 from common import eye_safety
-from common.calibration_parts import NonNegative, Part, Positive
+from common.calibration_parts import Part
 from common.errors import CalibrationError
 
+Power = Annotated[float, Meta(ge=1e-6, le=1000.0)]  # [W], [W/sr] the limits for eyes lie far below
+Current = Annotated[float, Meta(ge=1e-6, le=100.0)]  # [A]
+Emitter = Annotated[float, Meta(ge=1e-5, le=0.1)]  # [m] from a bare die to a lamp
 NearInfrared = Annotated[float, Meta(ge=700.0, le=1050.0)]
 HARDWARE_TIMEOUT_S = 0.010  # of the flash driver that `--lights i2c` talks to: a pulse that nobody ends
 
@@ -29,11 +32,11 @@ class LaserLight(Part, frozen=True):
         current_a: Its current, where a driver chip sets that [A].
     """
 
-    power_w: Positive
+    power_w: Power
     wavelength_nm: NearInfrared
-    electrical_w: Positive
+    electrical_w: Power
     peak_over_mean: Annotated[float, Meta(ge=1.0, le=100.0)] = 1.6
-    current_a: Positive | None = None
+    current_a: Current | None = None
 
 
 class LedLight(Part, frozen=True):
@@ -49,11 +52,11 @@ class LedLight(Part, frozen=True):
     """
 
     count: Annotated[int, Meta(ge=1, le=64)]
-    intensity_w_sr: Positive
-    emitter_m: Positive
+    intensity_w_sr: Power
+    emitter_m: Emitter
     wavelength_nm: NearInfrared
-    electrical_w: Positive
-    current_a: Positive | None = None
+    electrical_w: Power
+    current_a: Current | None = None
 
 
 class StrobeCalibration(Part, frozen=True):
@@ -69,11 +72,11 @@ class StrobeCalibration(Part, frozen=True):
 
     laser: LaserLight
     led: LedLight
-    max_pulse_us: Annotated[float, Meta(gt=0.0, le=250_000.0)]
-    max_duty: Annotated[float, Meta(gt=0.0, le=1.0)]
-    others_w: NonNegative
+    max_pulse_us: Annotated[float, Meta(ge=1.0, le=250_000.0)]
+    max_duty: Annotated[float, Meta(ge=1e-6, le=1.0)]
+    others_w: Annotated[float, Meta(ge=0.0, le=1000.0)]
     lead_us: Annotated[float, Meta(ge=300.0, le=10_000.0)] = 1000.0
-    max_electrical_w: Positive = 0.4
+    max_electrical_w: Power = 0.4
 
 
 @dataclass(frozen=True, slots=True)

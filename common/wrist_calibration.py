@@ -6,30 +6,36 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from common.calibration_parts import NonNegative, Number, Part, Positive, Vector3
+from common.calibration_parts import Direction, Part
 from common.errors import CalibrationError
 
 FLAT_FIELD_TERMS = (1, 3, 6, 10, 15, 21, 28)  # of polynomials in two variables, by degree
 _UNIT_WITHIN = 1e-2  # of the length of a direction: what rounding leaves of one
 _ACROSS = 0.2  # of a direction that should lie in a plane: 12 degrees, far more than a line laser is bent
+Reach = Annotated[float, Meta(ge=-1.0, le=1.0)]  # [m] the device sees the fingers of the hand that wears it
+Place = tuple[Reach, Reach, Reach]
+Coefficient = Annotated[float, Meta(ge=-1e6, le=1e6)]
+_MIN_OFFSET_M = (
+    1e-3  # of the laser's plane from the camera: nearer, it is seen along itself, and tells no depth
+)
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 
 
 class LaserPlane(Part, frozen=True):
     """Plane normal . X = offset in the wrist camera's frame."""
 
-    normal: Vector3
-    offset_m: Number
+    normal: Direction
+    offset_m: Reach
 
 
 class Laser(Part, frozen=True):
     """Laser line of the wrist device, as far as known, in the wrist camera's frame."""
 
-    origin: Vector3 | None = None
-    forward: Vector3 | None = None
-    right: Vector3 | None = None
-    fan_rad: Positive | None = None
-    baseline: Positive | None = None
+    origin: Place | None = None
+    forward: Direction | None = None
+    right: Direction | None = None
+    fan_rad: Annotated[float, Meta(ge=1e-3, le=math.pi)] | None = None
+    baseline: Annotated[float, Meta(ge=1e-4, le=1.0)] | None = None
 
 
 class FlatField(Part, frozen=True):
@@ -39,7 +45,7 @@ class FlatField(Part, frozen=True):
     x^2 y, ..., every degree whole.
     """
 
-    coefficients: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=FLAT_FIELD_TERMS[-1])]
+    coefficients: Annotated[tuple[Coefficient, ...], Meta(min_length=1, max_length=FLAT_FIELD_TERMS[-1])]
 
 
 class FingerLine(Part, frozen=True):
@@ -52,10 +58,10 @@ class FingerLine(Part, frozen=True):
         residual_m: RMS distance of the points from the line.
     """
 
-    origin_m: Vector3
-    direction: Vector3
-    range_m: tuple[Number, Number]
-    residual_m: NonNegative
+    origin_m: Place
+    direction: Direction
+    range_m: tuple[Reach, Reach]
+    residual_m: Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 def check_wrist(
@@ -71,6 +77,11 @@ def check_wrist(
         "laser.forward": None if laser is None else laser.forward,
         "laser.right": None if laser is None else laser.right,
     }
+    if plane is not None and abs(plane.offset_m) < _MIN_OFFSET_M:
+        raise CalibrationError(
+            f"{where}: laser_plane.offset_m: {plane.offset_m:g}, the plane runs through the camera, which then sees no"
+            f" depth on it; it is {_MIN_OFFSET_M:g} or more to either side"
+        )
     for key, way in directions.items():
         if way is not None and abs(math.hypot(*way) - 1.0) > _UNIT_WITHIN:
             raise CalibrationError(f"{where}: {key}: length {math.hypot(*way):.4g}, not 1")

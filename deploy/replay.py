@@ -88,7 +88,7 @@ def _rigs(recording: Path, only: str | None) -> list[_Rig]:
         manifest = json.loads(path.read_text())
         rigs = [rig for rig in (manifest.get("rig"), *(manifest.get("rigs") or ())) if rig is not None]
         found = [_Rig(rig["kind"], list[str](rig["cameras"])) for rig in rigs]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ReplayError(f"{path}: not a recording of raw frames ({reason})") from error
     if wanted := sorted((rig for rig in found if rig.kind in kinds), key=lambda rig: rig.kind):

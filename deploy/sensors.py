@@ -109,7 +109,7 @@ def _rig(calibration: Path, name: str) -> _Rig:
         ]
         cameras = cast(list[str], rig["cameras"])
         return _Rig(str(rig.get("kind")), str(rig.get("hand")), cameras, imus, objects, trackers)
-    except (AttributeError, OSError, ValueError, KeyError, TypeError) as error:
+    except (AttributeError, OSError, ValueError, RecursionError, KeyError, TypeError) as error:
         raise DemoError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
         ) from error

@@ -57,7 +57,7 @@ def read_rig(calibration: Path, name: str) -> RigFile:
         ]
         files += [f"objects/{one}.json" for one in objects]
         return RigFile(name, str(rig["kind"]), cameras, str(imu["name"]) if imu else None, tuple(files))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         raise DeployError(
             f"{path}: cannot read the rig ({error}); give --calibration DIR and --rig NAME"
         ) from error

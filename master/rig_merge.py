@@ -16,6 +16,7 @@ from common.calibration_parts import Matrix4, Quaternion, Row4, Vector3
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, transform
 from common.hand_model import HandModel
+from common.rig_calibration import check_places
 
 _ALIKE = ("markers", "free_markers", "pairing", "filter")
 _UNTURNED = 1e-9  # of a rotation matrix that turns nothing
@@ -28,7 +29,8 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
     is a box along the axes of the shared frame, and the first place of a tracking system and file of gestures.
 
     Raises:
-        CalibrationError: One depth model is not "stereo", they share a camera, or markers, filter or pairing differ.
+        CalibrationError: One depth model is not "stereo", they share a camera, two cameras stand in
+            one place, or markers, filter or pairing differ.
     """
     placed = [in_world(rig) for rig in rigs]
     if len(placed) == 1:
@@ -46,7 +48,7 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
                 raise CalibrationError(
                     f"rigs {first.name!r} and {rig.name!r}: {key}: differ, and both watch hand {first.hand!r}"
                 )
-    return replace(
+    merged = replace(
         first,
         name="_and_".join(rig.name for rig in placed),
         cameras=tuple(name for rig in placed for name in rig.cameras),
@@ -59,6 +61,8 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
         T_rig_tracking=next((rig.T_rig_tracking for rig in placed if rig.T_rig_tracking is not None), None),
         gestures=gestures_named(placed),
     )
+    check_places(merged, f"rigs {' and '.join(repr(rig.name) for rig in placed)} in one frame (T_world_rig)")
+    return merged
 
 
 def gestures_named(rigs: Sequence[RigCalibration]) -> str | None:

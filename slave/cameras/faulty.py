@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Annotated
 
 import cv2
-import msgspec
 import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace as with_fields
 
 from common.arrays import Image
 from common.calibration import CameraCalibration
-from common.errors import CameraError
+from common.errors import CalibrationError, CameraError
+from common.json_file import decode_json
 from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
 
@@ -134,9 +134,9 @@ class FaultyCamera:
         if raw is None:
             return
         try:
-            faults = msgspec.json.decode(raw, type=Faults)
-        except msgspec.MsgspecError as error:
-            raise CameraError(f"{self._path}: {error}") from error
+            faults = decode_json(raw, Faults, str(self._path))
+        except CalibrationError as error:
+            raise CameraError(str(error)) from error
         if faults.exposes != self._faults.exposes:
             self._source.tune(self._exposed(self._camera, faults))
         self._faults = faults

@@ -205,7 +205,7 @@ def _rig(calibration: Mapping[str, bytes], name: str) -> dict[str, Any]:
     try:
         rig = cast(dict[str, Any], json.loads(calibration[file]))
         _names(rig)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
         raise InstallError(f"calib_json/{file}: cannot read the rig ({error})") from error
     return rig
 

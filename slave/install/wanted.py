@@ -55,7 +55,7 @@ class Record:
             return Record(dict(found["calibration"]), tuple(found["groups"]))
         except FileNotFoundError:
             return Record({})
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, RecursionError, KeyError, TypeError) as error:
             raise InstallError(
                 f"{root / RECORD}: cannot read it ({error}); remove it, and install again"
             ) from error

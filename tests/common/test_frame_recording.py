@@ -29,7 +29,7 @@ def camera(name: str) -> dict[str, Any]:
 
 
 def rig(kind: str = "markers", cameras: tuple[str, ...] = ("left", "right")) -> dict[str, Any]:
-    poses = dict.fromkeys(cameras, IDENTITY)
+    poses = {name: [[1, 0, 0, 0.1 * i], *IDENTITY[1:]] for i, name in enumerate(cameras)}
     return {"version": 1, "name": kind, "kind": kind, "cameras": cameras, "T_rig_camera": poses, "hand": "me"}
 
 

@@ -111,6 +111,10 @@ def test_cameras_together_are_placed_as_well_as_the_worst(bench: RigSetup) -> No
             {"depth_model": "power_law", "power_law": {"k_m": 37.5, "z": -1.0}},
             r"'side': depth_model 'power_law' .*'stereo'",
         ),
+        (
+            {"T_world_rig": None},
+            r"'bench' and 'side' in one frame \(T_world_rig\): T_rig_camera\.left2: 0 mm from",
+        ),
     ],
 )
 def test_marker_rigs_that_contradict_each_other_are_refused(
@@ -169,7 +173,7 @@ def test_a_rig_that_watches_two_hands_is_a_setup_for_each() -> None:
 
 
 def test_each_hand_keeps_the_rows_of_the_rigs_that_it_shares() -> None:
-    side = rig_file(("left2", "right2"), name="side", markers=TWO[:2])
+    side = rig_file(("left2", "right2"), name="side", markers=TWO[:2], T_world_rig=rows(ASIDE))
     right, left = setups(two_hands(free_markers=(), markers=TWO[:4]), side)
     assert right.camera_names == ("left", "right", "left2", "right2")
     assert left.camera_names == ("left", "right")

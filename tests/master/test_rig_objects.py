@@ -110,7 +110,7 @@ def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> 
         name="side",
         cameras=("left2", "right2"),
         objects=("cube", "box"),
-        T_rig_camera={"left2": rows(np.eye(4)), "right2": rows(np.eye(4))},
+        T_rig_camera={"left2": rows(np.eye(4)), "right2": ((1.0, 0.0, 0.0, 0.075), *rows(np.eye(4))[1:])},
         T_world_rig=rows(ASIDE),
         T_rig_tracking=rows(np.eye(4)),
     )

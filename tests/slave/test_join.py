@@ -28,7 +28,7 @@ RIG = RigCalibration(
     kind="markers",
     cameras=NAMES,
     hand="default-right",
-    T_rig_camera=dict.fromkeys(NAMES, POSE),
+    T_rig_camera={name: ((1.0, 0.0, 0.0, 0.1 * i), *POSE[1:]) for i, name in enumerate(NAMES)},
 )
 WRIST = RigCalibration(version=1, name="wrist", kind="wrist", cameras=("wrist",), hand="default-right")
 HERE = RecordedClock(id="here", wall_ahead_ns=1_700_000_000_000_000_000)

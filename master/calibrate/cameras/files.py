@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from common.arrays import Float
-from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, load
+from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, check, load
 from common.errors import CalibrationError
 from common.geometry import invert
 from master.calibrate.cameras.lens_files import matrix_of
@@ -142,11 +142,14 @@ def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -
 def write_files(
     out: Path, cameras: Mapping[str, CameraCalibration], rigs: Mapping[str, RigCalibration]
 ) -> list[Path]:
-    """Save files, by their names in the tree; each is replaced whole or not at all.
+    """Save files, by their names in the tree; each is replaced whole or not at all, and none where one is impossible.
 
     Raises:
-        CalibrationError: A folder or file cannot be written.
+        CalibrationError: A folder or file cannot be written, or what is measured cannot be.
     """
+    for folder, files in (("cameras", cameras), ("rigs", rigs)):
+        for name, value in files.items():
+            check(value, str(out / folder / f"{name}.json"))
     written = [write_camera(out, name, camera) for name, camera in cameras.items()]
     return written + [write_rig(out, name, rig) for name, rig in rigs.items()]
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import Intrinsics, Matrix4
-from common.errors import FitError
+from common.camera_calibration import check_lens
+from common.errors import CalibrationError, FitError
 from common.geometry import invert, skew
 from master.calibrate.cameras.alone import Rejection
 from master.calibrate.cameras.audit import PairAudit, audit_pair, pairs_with_views
@@ -76,7 +77,7 @@ def result(fit: CamerasFit, held: Mapping[str, Float]) -> CamerasResult:
     """The numbers of a fit.
 
     Raises:
-        FitError: They are not worth writing: a focal length is not determined, or a lens barely covered.
+        FitError: They are not worth writing: a focal length is not determined, a lens barely covered, or it folds.
     """
     names = fit.views.cameras
     bundle = fit.solution.bundle
@@ -131,6 +132,10 @@ def _lens(fit: CamerasFit, index: int, estimated: bool) -> LensResult:
         )
     if estimated:
         _check_determined(name, float(sd[0] / lens[0]), covered, len(own))
+    try:
+        check_lens(intrinsics_of(lens), fit.views.sizes_px[name], f"camera {name!r}: the fit cannot be used")
+    except CalibrationError as error:
+        raise FitError(str(error)) from error
     return LensResult(
         intrinsics=intrinsics_of(lens),
         sd=sd,

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -14,11 +15,13 @@ from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.geometry import invert
 from master.calibrate.cameras.boards import Checkerboard, grid_edges
 from master.calibrate.cameras.detect import find_board
+from master.calibrate.cameras.files import write_files
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.cli import calibrate_app
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import scene
 
+ROOT = Path(__file__).resolve().parents[4]
 BOARD = ["--board", "9x6", "--square-mm", "25"]
 
 
@@ -134,9 +137,10 @@ def test_a_rig_that_is_there_keeps_everything_but_the_places(tmp_path: Path) -> 
     (out / "rigs").mkdir()
     law = PowerLawCalibration(k_m=45.4, z=-1.03)
     T_rig_right = ((1.0, 0.0, 0.0, 0.5), (0.0, 0.0, -1.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    T_rig_left = ((1.0, 0.0, 0.0, 0.6), *T_rig_right[1:])
     kept = RigCalibration(
         version=1, name="pair", kind="markers", cameras=("right", "left"), hand="mine",
-        T_rig_camera={"right": T_rig_right, "left": T_rig_right}, power_law=law, depth_model="power_law",
+        T_rig_camera={"right": T_rig_right, "left": T_rig_left}, power_law=law, depth_model="power_law",
     )  # fmt: skip
     save(out / "rigs" / "pair.json", kept)
     said = run(
@@ -206,3 +210,14 @@ def test_views_are_matched_by_the_rest_of_the_name(tmp_path: Path) -> None:
         "right",
         "left_top",
     }
+
+
+def test_nothing_is_written_where_one_file_would_be_impossible(tmp_path: Path) -> None:
+    file = load(ROOT / "calib_json/cameras/left.json", CameraCalibration)
+    rig = load(ROOT / "calib_json/rigs/desk.json", RigCalibration)
+    one_place = msgspec.structs.replace(
+        rig, T_rig_camera=dict.fromkeys(rig.cameras, rig.T_rig_camera["left"])
+    )
+    with pytest.raises(CalibrationError, match=r"desk\.json: T_rig_camera\.right: 0 mm from camera 'left'"):
+        write_files(tmp_path, {"left": file}, {"desk": one_place})
+    assert not list(tmp_path.iterdir())

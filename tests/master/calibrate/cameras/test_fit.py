@@ -193,6 +193,18 @@ def test_terms_of_the_distortion_are_zero_unless_the_views_show_them() -> None:
     assert lens[8] == 0.0
 
 
+def test_a_lens_that_folds_inside_the_picture_is_refused_and_not_written() -> None:
+    truth = scene(15, 1, views=16)
+    folds = {
+        "left": np.array([530.0, 530.0, 320.0, 240.0, -0.34, 0.0, 0.0, 0.0, 0.0])
+    }  # 350 px from the axis
+    fit = fit_cameras(replace(truth, lenses=folds).views(NOISE_PX, 15))
+    with pytest.raises(
+        FitError, match=r"camera 'left': the fit cannot be used: .* the lens folds 3\d\d px from"
+    ):
+        result(fit, {})
+
+
 def test_parallel_views_do_not_give_a_focal_length() -> None:
     truth = scene(16, 1, views=16, tilt_deg=0.0)
     with pytest.raises(FitError, match=r"focal length is not determined.*tilt the board"):

@@ -39,7 +39,7 @@ def recording(folder: Path, t_ns: Sequence[int], late_ns: int = 0) -> FrameRecor
     }  # fmt: skip
     rig = {
         "version": 1, "name": "desk", "kind": "markers", "cameras": CAMERAS, "hand": "h", "markers": NAMES,
-        "T_rig_camera": {"left": EYE, "right": EYE},
+        "T_rig_camera": {"left": EYE, "right": [[1, 0, 0, 0.075], *EYE[1:]]},
     }  # fmt: skip
     folder.mkdir()
     cameras = {name: camera | {"name": name} for name in CAMERAS}

@@ -1,0 +1,175 @@
+"""The one way in for JSON files: bounded in size and nesting, no key twice, no NaN, every value of its type.
+
+msgspec decodes and checks the types. Of two equal keys it keeps the last, and a file of a million brackets ends in a
+RecursionError: the first is looked for after it by a second, untyped pass, the second before it.
+"""
+
+import json
+import os
+import re
+from pathlib import Path
+from typing import TypeVar, cast
+
+import msgspec
+import numpy as np
+
+from common.errors import CalibrationError
+
+MAX_BYTES = 4 << 20  # the largest file of ours, a hand with its provenance, has 12 kB
+MAX_DEPTH = 32  # ours have 7 levels
+_MAX_TEXT = 600  # of an error: keys of a file may be as long as the file
+
+T = TypeVar("T")
+
+_STRING = re.compile(rb'"(?:[^"\\]++|\\.)*+"?', re.DOTALL)  # possessive: linear in time on any input
+_STEP = re.compile(r"\.(\w+)|\[(\d+)\]|\[\.\.\.\]")
+_STEPS = np.zeros(256, np.int8)
+_STEPS[list(b"[{")] = 1
+_STEPS[list(b"]}")] = -1
+
+
+def read_json(path: Path, kind: type[T]) -> T:
+    """Read one JSON file as `kind`.
+
+    Raises:
+        CalibrationError: It cannot be read, is too large, or as of `decode_json`; the text names the file.
+    """
+    return decode_json(read_bytes(path), kind, str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """Bytes of a file that is meant to be JSON; its size is looked at before anything is read.
+
+    Raises:
+        CalibrationError: It cannot be read, or is too large.
+    """
+    try:
+        with path.open("rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            raw = file.read(MAX_BYTES + 1) if size <= MAX_BYTES else b""
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise CalibrationError(f"{path}: cannot read: {getattr(error, 'strerror', error)}") from error
+    _check_size(max(size, len(raw)), str(path))
+    return raw
+
+
+def decode_json(raw: bytes, kind: type[T], where: str) -> T:
+    """Decode JSON as `kind`; `where` names the source in errors.
+
+    Raises:
+        CalibrationError: Too large, nested too deeply, not JSON, a key that is unknown, missing or there twice, or a
+            value of another type or out of range. The text has `where` and the path of the key.
+    """
+    _check_size(len(raw), where)
+    if (depth := _depth(raw)) > MAX_DEPTH:
+        raise CalibrationError(f"{where}: nested {depth} levels deep, at most {MAX_DEPTH} are allowed")
+    try:
+        value = msgspec.json.decode(raw, type=kind)
+        root = json.loads(raw, strict=False, object_pairs_hook=_object, parse_int=str, parse_float=str)
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise CalibrationError(f"{where}: {_printable(_with_keys(str(error), raw, kind))}") from error
+    if (twice := _duplicate(root)) is not None:
+        raise CalibrationError(f"{where}: duplicate key - at `{_printable('$' + twice)}`; remove one of them")
+    return value
+
+
+def _check_size(size: int, where: str) -> None:
+    if size > MAX_BYTES:
+        raise CalibrationError(f"{where}: larger than 4 MiB; no JSON file of ours is")
+
+
+def _depth(raw: bytes) -> int:
+    """How deeply brackets are nested, outside of strings."""
+    bare = np.frombuffer(_STRING.sub(b"", raw), np.uint8)
+    return int(np.cumsum(_STEPS[bare], dtype=np.int32).max(initial=0))
+
+
+class _Repeating(dict[str, object]):
+    """An object of a file in which `key` stands twice."""
+
+    key = ""
+
+
+def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    found = dict(pairs)
+    if len(found) == len(pairs):
+        return found
+    seen = set[str]()
+    repeating = _Repeating(found)
+    repeating.key = next(key for key, _ in pairs if key in seen or seen.add(key))
+    return repeating
+
+
+def _duplicate(value: object) -> str | None:
+    """Path of the first key that stands twice in what `_object` made; None: no key does."""
+    if isinstance(value, _Repeating):
+        return _step(value.key)
+    if isinstance(value, dict):
+        steps = [(_step(key), part) for key, part in cast(dict[str, object], value).items()]
+    elif isinstance(value, list):
+        steps = [(f"[{i}]", part) for i, part in enumerate(cast(list[object], value))]
+    else:
+        return None
+    for step, part in steps:
+        if (inner := _duplicate(part)) is not None:
+            return step + inner
+    return None
+
+
+def _with_keys(text: str, raw: bytes, kind: type[object]) -> str:
+    """The error of msgspec with the keys of a map, where it has `[...]`."""
+    if (place := text.rfind("`$")) < 0 or "[...]" not in text[place:]:
+        return text
+    try:
+        root = holder = [msgspec.json.decode(raw)]
+    except msgspec.MsgspecError:  # malformed further on
+        return text
+    if _error_of(root[0], kind) != text:  # of a key that stands twice
+        return text
+    at: object = 0
+    path = "$"
+    for step in _STEP.finditer(text, place):
+        value = cast(dict[object, object], holder)[at]
+        if step[0] == "[...]":
+            if not isinstance(value, dict):
+                return text
+            key: object = _culprit(root, holder, at, kind, text)
+            path += _step(str(key))
+        else:
+            key = int(step[2]) if step[2] else step[1]
+            path += step[0]
+        holder, at = cast(list[object], cast(dict[object, object], holder)[at]), key
+    return f"{text[:place]}`{path}`"
+
+
+def _culprit(root: list[object], holder: list[object], at: object, kind: type[object], text: str) -> str:
+    """Key of the map at `holder[at]` whose value gives the error `text`, by halving; the map is left with it alone."""
+    parts = cast(dict[object, dict[str, object]], holder)
+    value = parts[at]
+    keys = list(value)
+    while len(keys) > 1:
+        half = keys[: len(keys) // 2]
+        parts[at] = {key: value[key] for key in half}
+        keys = half if _error_of(root[0], kind) == text else keys[len(keys) // 2 :]
+    parts[at] = {key: value[key] for key in keys}
+    return keys[0]
+
+
+def _error_of(value: object, kind: type[object]) -> str:
+    try:
+        msgspec.json.decode(msgspec.json.encode(value), type=kind)
+    except msgspec.MsgspecError as error:
+        return str(error)
+    return ""
+
+
+def _step(key: str) -> str:
+    return f".{key}" if re.fullmatch(r"[\w-]+", key) else f"[{json.dumps(key)}]"
+
+
+def _printable(text: str) -> str:
+    """On one line of a terminal: control characters as escapes, the middle of a long text left out."""
+    text = "".join(
+        c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * _MAX_TEXT]
+    )
+    return text if len(text) <= _MAX_TEXT else f"{text[: _MAX_TEXT // 2]} ... {text[-_MAX_TEXT // 2 :]}"

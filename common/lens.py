@@ -1,0 +1,168 @@
+"""OpenCV's distortion as a map of normalised points: where it folds, and its inverse.
+
+It is a polynomial, and beyond some radius it may turn back. There two directions have one pixel, and no pixel beyond
+has a direction at all. The map (x, y) -> (x', y') can be inverted as far from the axis as its Jacobian, a symmetric
+matrix, stays positive definite; along each direction from the axis that must be so until the picture is left. Its
+least eigenvalue is how much a small thing is shrunk against one on the axis.
+
+How far that is: a radial map r (1 + k1 r^2 + k2 r^4 + k3 r^6) that rises has a slope that is a nonnegative even
+polynomial of degree 6 with the value 1 on the axis, and the least integral of such a polynomial over [-R, R] is
+1 / (K(0, 0)) R with the Christoffel-Darboux kernel of the Legendre polynomials up to degree 3, K(0, 0) = 9 / 8. So it
+has reached at least 4/9 R at R, and beyond 9/4 of the picture's distorted radius nothing of the picture is left.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Bool, Float
+
+_DIRECTIONS, _RADII = 64, 256
+_STEPS = 12  # of Newton: quadratic from a start within a thousandth, slower where the picture is shrunk
+_LEAST = 0.01  # eigenvalue: a pixel there covers a hundred times the angle of one on the axis
+_REACH = 9.0 / 4.0 * 1.1  # a tenth more for the tangential terms
+
+
+class Lens(NamedTuple):
+    """Size of the picture [px], fx, fy, cx, cy [px], and k1, k2, p1, p2, k3."""
+
+    size_px: tuple[int, int]
+    focal_px: tuple[float, float]
+    centre_px: tuple[float, float]
+    distortion: tuple[float, float, float, float, float]
+
+
+class Fold(NamedTuple):
+    """Where a lens turns back: the pixel, and its distance from the principal point [px]."""
+
+    u: float
+    v: float
+    radius_px: float
+
+
+def fold_of(lens: Lens) -> Fold | None:
+    """The fold nearest to the axis inside the picture; None: there is none.
+
+    Where the principal point lies outside the picture, what is between them counts as well.
+    """
+    low, high = _borders(lens)
+    corners = np.array([(x, y) for x in (low[0], high[0]) for y in (low[1], high[1])])
+    angles = np.concatenate(
+        [np.linspace(0.0, math.tau, _DIRECTIONS, endpoint=False), np.arctan2(corners[:, 1], corners[:, 0])]
+    )
+    ways = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    radii = np.linspace(0.0, _reach(lens), _RADII)
+    shrunk = _least_eigenvalue(lens, radii[:, None, None] * ways)
+    bad = shrunk <= _LEAST
+    first = np.where(bad.any(axis=0), bad.argmax(axis=0), 0)
+    turns = np.flatnonzero(first)
+    if len(turns) == 0:
+        return None
+    before, at = shrunk[first[turns] - 1, turns], shrunk[first[turns], turns]
+    share = (before - _LEAST) / (before - at)
+    r = radii[first[turns] - 1] + share * (radii[1] - radii[0])
+    seen = distorted(lens, r[:, None] * ways[turns])
+    inside = _within(seen, low, high)
+    if not inside.any():
+        return None
+    pixels = seen[inside] * lens.focal_px
+    nearest = pixels[np.hypot(*pixels.T).argmin()]
+    u, v = (nearest + lens.centre_px).tolist()
+    return Fold(u, v, float(np.hypot(*nearest)))
+
+
+def _borders(lens: Lens) -> tuple[Float, Float]:
+    """Corners (2,), (2,) of the picture as normalised distorted points."""
+    focal, centre = np.array(lens.focal_px), np.array(lens.centre_px)
+    return (-0.5 - centre) / focal, (np.array(lens.size_px) - 0.5 - centre) / focal
+
+
+def undistorted(lens: Lens, seen: Float) -> Float:
+    """Normalised points (N, 2) of distorted ones (N, 2), by Newton; NaN: none that the lens shows before it folds."""
+    r, shown, _ = _radial(lens)
+    rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
+    length = np.hypot(seen[:, 0], seen[:, 1])
+    enough = 1e-10 * _reach(lens)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
+        xy = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
+        for _ in range(_STEPS):
+            off_x, off_y = off = (seen - distorted(lens, xy)).T
+            if not (np.abs(off) > enough).any():
+                break
+            xx, yy, mixed = _jacobian(lens, xy)
+            det = xx * yy - mixed * mixed
+            xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
+        settled = (np.abs(seen - distorted(lens, xy)) <= enough).all(axis=1)
+        settled &= _least_eigenvalue(lens, xy) > 0.0
+    return np.where(settled[:, None], xy, np.nan)
+
+
+def contraction(lens: Lens) -> float:
+    """How much of an error each step of the usual iteration leaves, at most, inside the picture; from 1 it diverges.
+
+    The iteration x <- x' / g(r) of `cv2.undistortPoints` multiplies an error along the radius by -r g'(r) / g(r).
+    """
+    _, shown, left = _radial(lens)
+    return float(left[shown <= _reach(lens) / _REACH].max())
+
+
+def _radial(lens: Lens) -> tuple[Float, Float, Float]:
+    """Radii (R,), what the lens makes of them without tangential terms (R,), and r |g'(r)| / g(r) (R,)."""
+    k1, k2, _, _, k3 = lens.distortion
+    r = np.linspace(0.0, _reach(lens), _RADII)
+    s = r * r
+    g = 1.0 + s * (k1 + s * (k2 + s * k3))
+    rise = 2.0 * s * (k1 + s * (2.0 * k2 + 3.0 * s * k3))
+    return r, r * g, np.abs(rise) / np.maximum(g, 1e-9)
+
+
+def _reach(lens: Lens) -> float:
+    """Normalised radius beyond which nothing of the picture is left."""
+    low, high = _borders(lens)
+    return _REACH * float(np.hypot(*np.maximum(np.abs(low), np.abs(high))))
+
+
+def _within(points: Float, low: Float, high: Float) -> Bool:
+    """Whether points (N, 2) lie in the picture or between it and the axis: further out on their ray is the picture."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        a, b = low / points, high / points
+    near, far = np.fmin(a, b), np.fmax(a, b)
+    beside = (points == 0.0) & ((low > 0.0) | (high < 0.0))
+    enters = np.where(points == 0.0, -np.inf, near).max(axis=-1)
+    leaves = np.where(points == 0.0, np.inf, far).min(axis=-1)
+    return (leaves >= np.maximum(enters, 1.0)) & ~beside.any(axis=-1)
+
+
+def distorted(lens: Lens, xy: Float) -> Float:
+    """Distorted points (..., 2) of normalised points (..., 2)."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    x, y = xy[..., 0], xy[..., 1]
+    s = x * x + y * y
+    g = 1.0 + s * (k1 + s * (k2 + s * k3))
+    return np.stack(
+        [
+            x * g + 2.0 * p1 * x * y + p2 * (s + 2.0 * x * x),
+            y * g + p1 * (s + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _jacobian(lens: Lens, xy: Float) -> tuple[Float, Float, Float]:
+    """Derivatives (...) of `distorted` at points (..., 2): x' by x, y' by y, and x' by y, which is y' by x."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    x, y = xy[..., 0], xy[..., 1]
+    s = x * x + y * y
+    g = 1.0 + s * (k1 + s * (k2 + s * k3))
+    rise = 2.0 * (k1 + s * (2.0 * k2 + 3.0 * s * k3))  # of g by s, twice
+    xx = g + rise * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+    yy = g + rise * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+    return xx, yy, rise * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+
+
+def _least_eigenvalue(lens: Lens, xy: Float) -> Float:
+    """Smaller eigenvalue (...) of the Jacobian at points (..., 2)."""
+    xx, yy, mixed = _jacobian(lens, xy)
+    return 0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), mixed)
