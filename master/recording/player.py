@@ -27,6 +27,8 @@ from master.tuning import LivePipeline
 from master.world import World
 
 SETTLE_NS = 2_000_000_000
+GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
+_STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
 BESIDE = ("health", "checklist", "preview", "still")  # told again as they were told
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
@@ -219,7 +221,12 @@ class Player:
                 wait_s = self._clock.wait_s(t_ns, now_ns())
                 if wait_s == 0.0:
                     return True
-                self._changed.wait(wait_s)
+                if wait_s is not None and (gap_ns := t_ns - self._clock.position_ns(now_ns())) > GAP_NS:
+                    at_s = (self.at_ns - self._recording.begin_t_ns) * 1e-9
+                    self._tell_events([f"at {at_s:.1f} s nothing comes for {gap_ns * 1e-9:.0f} s: skipped"])
+                    self._clock.seek(t_ns, now_ns())
+                    return True
+                self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
             return False
 
     def _told(self, world: World | None, one: Recorded) -> Iterable[Told]:
