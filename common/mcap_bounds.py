@@ -21,6 +21,7 @@ SUMMARY_BYTES = 64 << 20  # a day of chunks takes 26 MiB
 AROUND_BYTES = 1024  # of a record, beside its content; and all that a header may have
 LAST_T_NS = 2**62  # 146 years; the difference of two times fits 64 bits
 
+BEYOND = "more than a file of this size can hold"
 _FREE_BYTES = 16 << 20  # that a pass may unpack of the smallest file
 _RATIO = 256  # unpacked bytes for each byte of the file
 _INDEX_BYTES = 16  # of the file, for each message in it
@@ -36,19 +37,22 @@ class WorkBudget:
         self._records = CHUNK_RECORDS + file_bytes // _INDEX_BYTES
 
     def holds(self, records: int) -> bool:
-        """Whether so many records can be in the file."""
+        """Whether there may be so many records more."""
         return records <= self._records
 
-    def take(self, size: int, records: int = 0) -> None:
-        """Use up a part of it.
+    def take_records(self, count: int) -> None:
+        """Use up so many records, or what is left."""
+        self._records = max(self._records - count, 0)
+
+    def take(self, size: int) -> None:
+        """Use up so many bytes.
 
         Raises:
-            RecordingError: There is not so much left.
+            RecordingError: There are not so many left.
         """
-        if size > self._bytes or records > self._records:
-            raise RecordingError("more than a file of this size can hold")
+        if size > self._bytes:
+            raise RecordingError(BEYOND)
         self._bytes -= size
-        self._records -= records
 
 
 @dataclass(slots=True)
@@ -68,4 +72,4 @@ class Losses:
         self.count += 1
         if len(self.named) < _NAMED:
             text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in what[:200])
-            self.named.append(text)
+            self.named += [text] if text not in self.named else []

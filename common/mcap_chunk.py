@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk
 
 from common.errors import RecordingError
-from common.mcap_bounds import CHANNEL_BYTES, CHUNK_BYTES, CHUNK_RECORDS, LAST_T_NS, WorkBudget
+from common.mcap_bounds import BEYOND, CHANNEL_BYTES, CHUNK_BYTES, CHUNK_RECORDS, LAST_T_NS, WorkBudget
 
 HEAD = struct.Struct("<BQ")  # of every record: what it is, and the length of what follows
 BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, MemoryError, OverflowError, RuntimeError)
@@ -71,19 +71,23 @@ def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
 
 def _walked(content: bytes, budget: WorkBudget) -> OpenedChunk:
     opened, at, count = OpenedChunk(), 0, 0
-    while at < len(content):
-        opcode, length = HEAD.unpack_from(content, at)
-        at, count = at + HEAD.size, count + 1
-        if length > len(content) - at:
-            raise RecordingError("a record is longer than the chunk")
-        if count > CHUNK_RECORDS:
-            raise RecordingError(f"more than {CHUNK_RECORDS} records")
-        if opcode == Opcode.MESSAGE:
-            opened.messages.append(_message(content, at, length))
-        elif opcode == Opcode.CHANNEL:
-            opened.channels.append(read_channel(content[at : at + length]))
-        at += length
-    budget.take(0, count)
+    try:
+        while at < len(content):
+            opcode, length = HEAD.unpack_from(content, at)
+            at, count = at + HEAD.size, count + 1
+            if length > len(content) - at:
+                raise RecordingError("a record is longer than the chunk")
+            if count > CHUNK_RECORDS or not budget.holds(count):
+                raise RecordingError(
+                    BEYOND if count <= CHUNK_RECORDS else f"more than {CHUNK_RECORDS} records"
+                )
+            if opcode == Opcode.MESSAGE:
+                opened.messages.append(_message(content, at, length))
+            elif opcode == Opcode.CHANNEL:
+                opened.channels.append(read_channel(content[at : at + length]))
+            at += length
+    finally:
+        budget.take_records(count)  # also of a chunk that is refused: it was work
     return opened
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import cast
 
 from common.clock import now_ns
+from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
@@ -111,6 +112,7 @@ class Player:
         self._jump: int | None = None
         self._stopped = False
         self._said: set[str] = set()
+        self._unsolved: set[tuple[str, str]] = set()
         self.poses = 0
         self.at_ns = self.first_ns
 
@@ -235,7 +237,20 @@ class Player:
             return (cast(Told, one.message),)
         if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
             return ()
-        return (_plain(solved) for solved in world.push(cast(Taken, one.message)))
+        return self._solve(world, cast(Taken, one.message), one.name)
+
+    def _solve(self, world: World, message: Taken, name: str) -> Iterable[Told]:
+        """What the world makes of a message; nothing of one that it cannot solve, which the recording may hold."""
+        try:
+            return [_plain(solved) for solved in world.push(message)]
+        except PhalanxError:
+            raise
+        except Exception as error:  # noqa: BLE001 -- a file may hold whatever makes the solver raise
+            kind = type(error).__name__
+            if (name, kind) not in self._unsolved:
+                self._say(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
+            self._unsolved.add((name, kind))
+            return ()
 
     def _write(self, told: Iterable[Told], digest: ToldDigest) -> None:
         for message in told:

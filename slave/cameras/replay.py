@@ -22,8 +22,8 @@ class ReplayCamera:
     """A `FrameSource` that reads PNG files.
 
     Holds the list of frames and the next index. Paced, the first frame comes at once and each further one when
-    as much time has passed as in the recording, a gap of more than ten minutes left out; its `t_ns` is on the slave's clock then. Unpaced, `t_ns` is
-    the recording's.
+    as much time has passed as in the recording, a gap of more than ten minutes left out; its `t_ns` is on the
+    slave's clock then. Unpaced, `t_ns` is the recording's.
     """
 
     def __init__(self, folder: Path, camera: str, paced: bool, clock: Clock) -> None:
