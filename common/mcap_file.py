@@ -194,7 +194,7 @@ def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budge
         content.counts.update(Statistics.read(stream(data)).channel_message_counts)
     elif opcode == Opcode.CHUNK_INDEX:
         one = ChunkIndex.read(stream(data))
-        if max(one.message_start_time, one.message_end_time) > LAST_T_NS:
+        if not one.message_start_time <= one.message_end_time <= LAST_T_NS:
             raise RecordingError("a time that cannot be")
         place = one.chunk_start_offset + HEAD.size, one.chunk_length - HEAD.size
         content.chunks.append(ChunkPlace(*place, one.message_start_time, one.message_end_time))
