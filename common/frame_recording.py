@@ -148,11 +148,11 @@ class FrameRecording:
         return tuple(sorted((row for row in self.rows if row.camera == camera), key=lambda row: row.t_ns))
 
 
-def open_recording(folder: Path) -> FrameRecording:
-    """Read manifest and frame table; the images stay on disk.
+def load_manifest(folder: Path) -> Manifest:
+    """Read the manifest alone.
 
     Raises:
-        RecordingError: A file is missing or broken; the text names file, line and column.
+        RecordingError: It is missing or broken, or leads out of the folder; the text names file and key.
     """
     refuse_links(folder, [MANIFEST])
     try:
@@ -160,6 +160,16 @@ def open_recording(folder: Path) -> FrameRecording:
         check_manifest(manifest, str(folder / MANIFEST))
     except CalibrationError as error:
         raise RecordingError(str(error)) from error
+    return manifest
+
+
+def open_recording(folder: Path) -> FrameRecording:
+    """Read manifest and frame table; the images stay on disk.
+
+    Raises:
+        RecordingError: A file is missing or broken, or leads out of the folder; the text names file, line and column.
+    """
+    manifest = load_manifest(folder)
     path = folder / FRAMES
     try:
         rows = _rows(path, read_table(folder, FRAMES))

@@ -32,24 +32,26 @@ def read_table(folder: Path, name: str) -> str:
 
 
 def refuse_links(folder: Path, names: Iterable[str]) -> None:
-    """Refuse files that symbolic links lead out of a folder.
+    """Refuse files that symbolic links lead out of a folder, and pipes and devices, whose reading has no end.
 
     Args:
         folder: Itself it may be a link.
         names: Relative paths without "..".
 
     Raises:
-        RecordingError: One is outside; the text names it.
+        RecordingError: One is; the text names it.
     """
+    inside: dict[PurePath, bool] = {}
     try:
         root = folder.resolve()
-        parents: dict[PurePath, bool] = {}
         for name in names:
-            path = folder / name
-            parent = PurePath(name).parent
-            if parent not in parents:
-                parents[parent] = (folder / parent).resolve().is_relative_to(root)
-            if not parents[parent] or (path.is_symlink() and not path.resolve().is_relative_to(root)):
+            path, parent = folder / name, PurePath(name).parent
+            if parent not in inside:
+                inside[parent] = (folder / parent).resolve().is_relative_to(root)
+            mode = path.lstat().st_mode if path.exists() or path.is_symlink() else stat.S_IFREG
+            if not inside[parent] or (stat.S_ISLNK(mode) and not path.resolve().is_relative_to(root)):
                 raise RecordingError(f"{path}: leads to {path.resolve()}, outside the recording's folder")
+            if not stat.S_ISREG(mode) and not path.is_file():
+                raise RecordingError(f"{path}: must be a plain file")
     except (OSError, RuntimeError) as error:  # a link to itself
         raise RecordingError(f"{folder}: its links cannot be followed: {error}") from error
