@@ -17,6 +17,7 @@ from master.recording.files import carried_files
 from master.tuning import RigFiles
 from tests.commands import command
 from tests.common.hostile_mcap import HostileMcap, channel, chunk, message, record, tiny_messages
+from tests.master.export.made import RIGHT, poses_of
 from tests.master.recording.recorded_run import scene
 
 SECRET = "secret-of-another-folder"
@@ -62,6 +63,13 @@ class Made:
         times = [t_ns for _, t_ns in messages]
         counts = dict.fromkeys(numbers.values(), len(messages) // len(numbers))
         return self.mcap().add(chunk(content, min(times), max(times)), channels).ended(counts)
+
+    def poses(self) -> bytes:
+        """Four poses of a hand, the last two a hundred years after the first."""
+        poses, years_ns = poses_of(1, 4), LAST_T_NS - 10**12
+        late = [msgspec.structs.replace(one, t_ns=one.t_ns + years_ns) for one in poses[2:]]
+        own = Made(self.folder, self.files | {"hands/made-right.json": msgspec.json.encode(RIGHT.profile)})
+        return own.taken(*((one, one.t_ns + LATE_NS) for one in (*poses[:2], *late)), stream="hand")
 
     def frames(self) -> list[tuple[MarkerDetections, int]]:
         """What two honest cameras saw, with log times."""
@@ -185,6 +193,13 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "more markers than the rig has": (
         lambda made: made.taken(*((wider(one), t_ns) for one, t_ns in made.frames())),
         {PLAY: "play: messages of (left|right) cannot be solved and are left out: IndexError"},
+    ),
+    "poses a hundred years apart": (
+        lambda made: made.poses(),
+        {
+            ("export", "--to", "bvh"): r"\d+ frames at .* Hz, at most 1000000: export one part",
+            EXPORT: "4 rows",
+        },
     ),
     "a report in place of a frame": (
         lambda made: made.taken((Health("left", 1, 5, {}, {}), 10**9)),
