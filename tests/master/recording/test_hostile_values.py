@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.records import Channel
 
 from common.errors import PhalanxError
-from common.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS
+from common.mcap_bounds import CHUNK_BYTES, CHUNK_RECORDS, LAST_T_NS
 from common.messages import MAX_STILL_BYTES, Backlog, MarkerDetections, Message, Still, encode
 from common.recording import MessageWriter, open_messages
 from common.streams import STREAMS, sender_of
@@ -65,16 +65,18 @@ HONEST = honest()
 def messages(draw: st.DrawFn) -> tuple[Channel, bytes]:
     """The channel of an honest message, and its record with a field, a length or a time of another kind."""
     stream, one = draw(st.sampled_from(HONEST))
+    own = HONEST.index((stream, one)) + 1
     data = msgspec.msgpack.decode(encode(one))
     for key in draw(st.lists(st.sampled_from(sorted(data)), max_size=2)):
         data[key] = draw(VALUES)
     content = msgspec.msgpack.encode(data)
-    number = HONEST.index((stream, one)) + 1
-    row = Channel(
-        number, "topic", "msgpack", {"stream": stream, "name": draw(seldom(sender_of(one), TEXTS))}, 0
-    )
+    names = {
+        "stream": draw(seldom(stream, st.sampled_from(sorted(STREAMS)))),
+        "name": draw(seldom(sender_of(one), TEXTS)),
+    }
+    row = Channel(own, "topic", "msgpack", names, 0)
     body = draw(seldom(content, NESTED | st.binary(max_size=40)))
-    return row, record(message(body, draw(seldom(10**9 + number, NUMBERS)), number))
+    return row, record(message(body, draw(seldom(10**9 + own, NUMBERS)), own))
 
 
 @st.composite
@@ -103,6 +105,10 @@ def shown(path: Path) -> None:
     recording = open_messages(path)
     for line in table(recording, events_of(recording)):
         assert line.isprintable()
+    for one in recording.read():
+        assert isinstance(one.message, STREAMS[one.stream].message)
+        assert (one.name, abs(one.t_ns) <= LAST_T_NS) == (sender_of(one.message), True)
+        assert abs(getattr(one.message, "t_ns", 0)) <= LAST_T_NS
 
 
 def played(path: Path) -> None:
@@ -128,7 +134,7 @@ def spent_s(read: Callable[[Path], None], path: Path) -> float:
     return time.process_time() - before
 
 
-@settings(max_examples=400)
+@settings(max_examples=300)
 @given(data=files())
 def test_any_file_is_refused_or_its_losses_are_counted(data: bytes) -> None:
     with TemporaryDirectory() as folder:
