@@ -23,7 +23,7 @@ LAST_T_NS = 2**62  # 146 years; the difference of two times fits 64 bits
 
 BEYOND = "more than a file of this size can hold"
 _FREE_BYTES = 16 << 20  # that a pass may unpack of the smallest file
-_RATIO = 256  # unpacked bytes for each byte of the file
+_RATIO = 256  # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
 _INDEX_BYTES = 16  # of the file, for each message in it
 _NAMED = 5
 
