@@ -12,7 +12,7 @@ import re
 from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Literal
 
 from msgspec import Struct
@@ -20,8 +20,11 @@ from msgspec import Struct
 from common.calibration import CameraCalibration, RigCalibration, check, load
 from common.camera_calibration import Pixel
 from common.errors import CalibrationError, RecordingError
+from common.message_parts import MAX_TIME_NS
 from common.messages import TimeNs
 from common.object_profile import ObjectProfile
+from common.plain_names import PLAIN, is_plain
+from common.recorded_files import read_table, refuse_links
 
 MANIFEST = "recording.json"
 FRAMES = "frames.csv"
@@ -146,24 +149,39 @@ class FrameRecording:
         return tuple(sorted((row for row in self.rows if row.camera == camera), key=lambda row: row.t_ns))
 
 
-def open_recording(folder: Path) -> FrameRecording:
-    """Read manifest and frame table; the images stay on disk.
+def load_manifest(folder: Path) -> Manifest:
+    """Read the manifest alone.
 
     Raises:
-        RecordingError: A file is missing or broken; the text names file, line and column.
+        RecordingError: It is missing or broken, or leads out of the folder; the text names file and key.
     """
+    refuse_links(folder, [MANIFEST])
     try:
         manifest = load(folder / MANIFEST, Manifest)
         check_manifest(manifest, str(folder / MANIFEST))
     except CalibrationError as error:
         raise RecordingError(str(error)) from error
+    return manifest
+
+
+def open_recording(folder: Path) -> FrameRecording:
+    """Read manifest and frame table; the images stay on disk.
+
+    Raises:
+        RecordingError: A file is missing or broken, or leads out of the folder; the text names file, line and column.
+    """
+    manifest = load_manifest(folder)
     path = folder / FRAMES
     try:
-        rows = _rows(path, path.read_bytes().decode())
-    except OSError as error:
+        rows = _rows(path, read_table(folder, FRAMES))
+    except FileNotFoundError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
+    except csv.Error as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
+    unknown = {row.camera for row in rows} - manifest.cameras.keys()
+    if unknown:
+        raise RecordingError(f"{path}: camera {min(unknown)!r} is not in {MANIFEST}")
+    refuse_links(folder, (row.file for row in rows))
     repeated = Counter(row.camera for row in rows)
     repeated -= Counter(camera for camera, _ in {(row.camera, row.t_ns) for row in rows})
     for camera, count in repeated.items():
@@ -173,9 +191,6 @@ def open_recording(folder: Path) -> FrameRecording:
             camera,
             count,
         )
-    unknown = {row.camera for row in rows} - manifest.cameras.keys()
-    if unknown:
-        raise RecordingError(f"{path}: camera {min(unknown)!r} is not in {MANIFEST}")
     return FrameRecording(folder, manifest, rows)
 
 
@@ -185,6 +200,10 @@ def check_manifest(manifest: Manifest, where: str) -> None:
     Raises:
         CalibrationError: With `where` and the key.
     """
+    for key, names in (("cameras", manifest.cameras), ("objects", manifest.objects)):
+        for name in names:
+            if not is_plain(name):
+                raise CalibrationError(f"{where}: {key}: {name[:80]!r}: must be {PLAIN}")
     for name, camera in manifest.cameras.items():
         check(camera, f"{where}: cameras.{name}")
     for name, profile in manifest.objects.items():
@@ -225,10 +244,12 @@ def _row(path: Path, number: int, line: list[str]) -> FrameRow:
         raise RecordingError(f"{where}: expected the {len(COLUMNS)} columns {','.join(COLUMNS)}, got {line}")
     camera, seq, t_ns, illumination, file = line
     for column, text in (("seq", seq), ("t_ns", t_ns)):
-        if not _INTEGER.fullmatch(text):
-            raise RecordingError(f"{where}: {column}: {text!r} is not an integer")
+        if not _INTEGER.fullmatch(text) or abs(int(text)) > MAX_TIME_NS:
+            raise RecordingError(f"{where}: {column}: {text!r} is not an integer of at most {MAX_TIME_NS}")
     if illumination not in set(Illumination):
         raise RecordingError(f"{where}: illumination: {illumination!r} is none of {', '.join(Illumination)}")
-    if PurePath(file).is_absolute() or ".." in PurePath(file).parts:
-        raise RecordingError(f"{where}: file: {file!r} is outside the recording's folder")
+    if not all(map(is_plain, file.split("/"))):
+        raise RecordingError(
+            f"{where}: file: {file[:80]!r} is outside the recording's folder, or not FOLDER/NAME: each must be {PLAIN}"
+        )
     return FrameRow(camera, int(seq), int(t_ns), Illumination(illumination), file)

@@ -19,6 +19,7 @@ import numpy as np
 from common.arrays import Float
 from common.errors import RecordingError
 from common.messages import ImuSample
+from common.recorded_files import read_table
 from common.replacing import replacing
 
 IMU = "imu.csv"
@@ -28,6 +29,7 @@ HEADERS = tuple(
     ("t_ns", *_RATES, *field, *turn) for field in ((), _FIELD) for turn in ((), _TURN, (*_TURN, _DRIFT))
 )
 _INTEGER = re.compile(r"-?[0-9]{1,18}")
+_MOST = 1e6  # no sensor gives as much, in any of the units
 _LOG = logging.getLogger(__name__)
 
 
@@ -39,13 +41,9 @@ def read_imu(folder: Path, source: str) -> tuple[ImuSample, ...]:
     """
     path = folder / IMU
     try:
-        text = path.read_bytes().decode()
+        text = read_table(folder, IMU)
     except FileNotFoundError:
         return ()
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: not a table of text: {error}") from error
     whole, _, cut = text.rpartition("\n")
     if cut:
         _LOG.warning("%s: the last line is cut, left out: the recording was not ended, but broke off", path)
@@ -124,6 +122,6 @@ def _number(where: str, name: str, text: str) -> float:
         value = float(text)
     except ValueError as error:
         raise RecordingError(f"{where}: {name}: {text!r} is not a number") from error
-    if np.isinf(value):
-        raise RecordingError(f"{where}: {name}: {text!r} is not a finite number")
+    if abs(value) > _MOST:
+        raise RecordingError(f"{where}: {name}: {text!r} is not a finite number, or above {_MOST:g}")
     return value

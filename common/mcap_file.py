@@ -4,48 +4,50 @@ A file that was ended has a summary behind its data, with a check sum: then noth
 other is walked record by record up to the first that is not whole, and its chunks are opened once to see what they
 hold. Bytes that were flipped cost the chunk or the attachment they are in, no other: each has a check sum. Records
 are read by the `mcap` library from bytes that were cut out here, never from the file: a length that lies reads nothing.
+What is beyond a bound is a loss as what is broken is: it is counted with its cause, and the rest is read.
 """
 
-import io
 import os
 import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeAlias
 
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import (
     Attachment,
     AttachmentIndex,
     Channel,
-    Chunk,
     ChunkIndex,
     Footer,
     Header,
-    McapRecord,
-    Message,
     Metadata,
     MetadataIndex,
     Statistics,
 )
-from mcap.stream_reader import breakup_chunk
 
 from common.errors import RecordingError
+from common.mcap_bounds import (
+    AROUND_BYTES,
+    ATTACHED_BYTES,
+    ATTACHMENT_BYTES,
+    ATTACHMENTS,
+    CHANNELS,
+    CHUNK_BYTES,
+    METADATA,
+    METADATA_BYTES,
+    SUMMARY_BYTES,
+    Losses,
+    WorkBudget,
+)
+from common.mcap_chunk import BROKEN, HEAD, ChunkMessage, OpenedChunk, open_chunk, read_channel, stream
+from common.message_parts import MAX_TIME_NS
 
 MAGIC = b"\x89MCAP0\r\n"
-_MOST_BYTES = (
-    64 << 20
-)  # of a chunk in memory; ours have less than 2 MiB, and a broken length must not ask for more
-_HEAD = struct.Struct("<BQ")  # of every record: what it is, and the length of what follows
 _FOOTER = struct.Struct("<QQI")
-_BROKEN = (McapError, ValueError, struct.error, zstandard.ZstdError, MemoryError, OverflowError, RuntimeError)
 _Place: TypeAlias = tuple[int, int, int]  # opcode, offset of the content, its length
 
 
@@ -71,7 +73,7 @@ class McapContent:
         attachments: Those that are whole.
         metadata: Those that are whole, by name.
         cut: It has no end: it broke off, or its end is broken.
-        broken: Chunks and attachments that cannot be read, as far as that is known.
+        losses: What cannot be read, as far as that is known.
     """
 
     profile: str
@@ -81,16 +83,17 @@ class McapContent:
     attachments: list[Attachment] = field(default_factory=list[Attachment])
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
     cut: bool = False
-    broken: int = 0
+    losses: Losses = field(default_factory=Losses)
 
-    def add(self, record: Attachment | Metadata | None) -> None:
-        """Keep an attachment or metadata; None: it was broken."""
-        if isinstance(record, Attachment):
-            self.attachments.append(record)
-        elif isinstance(record, Metadata):
-            self.metadata[record.name] = record.metadata
-        else:
-            self.broken += 1
+    def add_channel(self, channel: Channel) -> None:
+        """Keep a channel.
+
+        Raises:
+            RecordingError: There are too many.
+        """
+        self.channels[channel.id] = channel
+        if len(self.channels) > CHANNELS:
+            raise RecordingError(f"more than {CHANNELS} channels")
 
 
 def read_content(path: Path) -> McapContent:
@@ -106,17 +109,21 @@ def read_content(path: Path) -> McapContent:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
 
 
-def messages_of(path: Path, chunks: list[ChunkPlace]) -> Iterator[tuple[ChunkPlace, list[Message] | None]]:
-    """The messages of each chunk, in the order in which they were written; None: the chunk is broken.
+def messages_of(
+    path: Path, chunks: list[ChunkPlace], losses: Losses
+) -> Iterator[tuple[ChunkPlace, list[ChunkMessage]]]:
+    """The messages of each chunk, in the order in which they were written; `losses` counts what is broken.
 
     Raises:
         RecordingError: The file cannot be read any more.
     """
     try:
         with path.open("rb") as file:
+            budget = WorkBudget(os.fstat(file.fileno()).st_size)
             for place in chunks:
-                records = _opened(_bytes(file.fileno(), place.length, place.offset))
-                yield place, None if records is None else [r for r in records if isinstance(r, Message)]
+                opened = _opened(file.fileno(), place.offset, place.length, budget, losses)
+                if opened is not None:
+                    yield place, opened.messages
     except OSError as error:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
 
@@ -130,11 +137,11 @@ def _content(path: Path, fd: int, size: int) -> McapContent:
 
 
 def _walk(fd: int, at: int, end: int) -> Iterator[_Place]:
-    """The records from `at` on, up to the first that does not end before `end`."""
-    while at + _HEAD.size <= end:
-        opcode, length = _HEAD.unpack(os.pread(fd, _HEAD.size, at))
-        at += _HEAD.size
-        if length > end - at:
+    """The records from `at` on, up to the first that does not end before `end`, or that is none."""
+    while at + HEAD.size <= end:
+        opcode, length = HEAD.unpack(os.pread(fd, HEAD.size, at))
+        at += HEAD.size
+        if length > end - at or opcode == 0:  # a hole in a file reads as zeros without end
             return
         yield opcode, at, length
         at += length
@@ -145,109 +152,130 @@ def _bytes(fd: int, length: int, at: int) -> bytes:
     return os.pread(fd, length, at) if 0 < length <= os.fstat(fd).st_size - at else b""
 
 
-def _stream(data: bytes) -> ReadDataStream:
-    return ReadDataStream(io.BytesIO(data))
-
-
 def _header(fd: int, place: _Place | None) -> Header | None:
-    if place is None or place[0] != Opcode.HEADER:
+    if place is None or place[0] != Opcode.HEADER or place[2] > AROUND_BYTES:
         return None
     try:
-        return Header.read(_stream(os.pread(fd, place[2], place[1])))
-    except _BROKEN:
+        return Header.read(stream(os.pread(fd, place[2], place[1])))
+    except BROKEN:
         return None
 
 
 def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
-    """By the summary at the end; None: there is none, or it is broken."""
-    tail = os.pread(fd, _HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
+    """By the summary at the end; None: there is none, or it is broken or says what cannot be."""
+    tail = os.pread(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:
         return None
     footer = Footer(*_FOOTER.unpack(tail[9:29]))
-    summary = _bytes(fd, size - 37 - footer.summary_start, footer.summary_start)
+    length = size - 37 - footer.summary_start
+    summary = _bytes(fd, length, footer.summary_start) if length <= SUMMARY_BYTES else b""
     if not summary or zlib.crc32(tail[:25], zlib.crc32(summary)) != footer.summary_crc:
         return None
-    content = McapContent(profile)
+    content, budget = McapContent(profile), WorkBudget(size)
     try:
         for opcode, at, length in _walk(fd, footer.summary_start, size - 37):
-            _take_summary(content, fd, opcode, _stream(_bytes(fd, length, at)))
-    except _BROKEN:
+            begin = at - footer.summary_start
+            _take_summary(content, fd, opcode, summary[begin : begin + length], budget)
+    except (*BROKEN, RecordingError):
         return None
-    return content
+    return content if budget.holds(content.counts.total()) else None
 
 
-def _take_summary(content: McapContent, fd: int, opcode: int, stream: ReadDataStream) -> None:
+def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budget: WorkBudget) -> None:
+    """Keep what one record of the summary says.
+
+    Raises:
+        RecordingError: It is beyond a bound.
+        McapError, ValueError, struct.error: It is broken.
+    """
     if opcode == Opcode.CHANNEL:
-        channel = Channel.read(stream)
-        content.channels[channel.id] = channel
+        content.add_channel(read_channel(data))
     elif opcode == Opcode.STATISTICS:
-        content.counts.update(Statistics.read(stream).channel_message_counts)
+        content.counts.update(Statistics.read(stream(data)).channel_message_counts)
     elif opcode == Opcode.CHUNK_INDEX:
-        one = ChunkIndex.read(stream)
-        place = one.chunk_start_offset + _HEAD.size, one.chunk_length - _HEAD.size
+        one = ChunkIndex.read(stream(data))
+        if not one.message_start_time <= one.message_end_time <= MAX_TIME_NS:
+            raise RecordingError("a time that cannot be")
+        place = one.chunk_start_offset + HEAD.size, one.chunk_length - HEAD.size
         content.chunks.append(ChunkPlace(*place, one.message_start_time, one.message_end_time))
     elif opcode == Opcode.ATTACHMENT_INDEX:
-        kept = AttachmentIndex.read(stream)
-        content.add(_attachment(_bytes(fd, kept.length - _HEAD.size, kept.offset + _HEAD.size)))
+        kept = AttachmentIndex.read(stream(data))
+        _take_attachment(content, fd, kept.offset + HEAD.size, kept.length - HEAD.size, budget)
     elif opcode == Opcode.METADATA_INDEX:
-        told = MetadataIndex.read(stream)
-        content.add(_metadata(_bytes(fd, told.length - _HEAD.size, told.offset + _HEAD.size)))
+        about = MetadataIndex.read(stream(data))
+        _take_metadata(content, fd, about.offset + HEAD.size, about.length - HEAD.size, budget)
 
 
 def _scanned(fd: int, size: int, profile: str) -> McapContent:
     """Record by record, up to the first that is not whole."""
-    content = McapContent(profile, cut=True)
+    content, budget = McapContent(profile, cut=True), WorkBudget(size)
     for opcode, at, length in _walk(fd, len(MAGIC), size):
         if opcode == Opcode.DATA_END:
             break
         if opcode == Opcode.ATTACHMENT:
-            content.add(_attachment(os.pread(fd, length, at)))
+            _take_attachment(content, fd, at, length, budget)
         elif opcode == Opcode.METADATA:
-            content.add(_metadata(os.pread(fd, length, at)))
+            _take_metadata(content, fd, at, length, budget)
         elif opcode == Opcode.CHUNK:
-            _take_chunk(content, at, length, _opened(os.pread(fd, length, at)))
+            _take_chunk(content, at, length, _opened(fd, at, length, budget, content.losses))
     return content
 
 
-def _take_chunk(content: McapContent, at: int, length: int, records: list[McapRecord] | None) -> None:
-    if records is None:
-        content.broken += 1
+def _take_chunk(content: McapContent, at: int, length: int, opened: OpenedChunk | None) -> None:
+    if opened is None:
         return
-    for record in records:
-        if isinstance(record, Channel):
-            content.channels[record.id] = record
-    messages = [record for record in records if isinstance(record, Message)]
-    if messages:
-        times = [one.log_time for one in messages]
-        content.chunks.append(ChunkPlace(at, length, min(times), max(times)))
-        content.counts.update(one.channel_id for one in messages)
-
-
-def _attachment(data: bytes) -> Attachment | None:
-    """An attachment whose check sum fits; the library does not look at it."""
-    if len(data) < 4 or zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
-        return None
-    with suppress(*_BROKEN):
-        return Attachment.read(_stream(data))
-    return None
-
-
-def _metadata(data: bytes) -> Metadata | None:
-    with suppress(*_BROKEN):
-        return Metadata.read(_stream(data))
-    return None
-
-
-def _opened(data: bytes) -> list[McapRecord] | None:
-    """What is in a chunk, or None where any of it is broken."""
     try:
-        chunk = Chunk.read(_stream(data))
-        if chunk.compression not in ("", "zstd"):  # not ours; the library unpacks lz4 without any bound
-            return None
-        packed = chunk.compression == "zstd"
-        asked = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
-        if max(asked, chunk.uncompressed_size) > _MOST_BYTES:
-            return None
-        return breakup_chunk(chunk, validate_crc=True)
-    except _BROKEN:
+        for channel in opened.channels:
+            content.add_channel(channel)
+    except RecordingError as error:
+        content.losses.add(f"chunk at byte {at}: {error}")
+        return
+    if opened.messages:
+        times = [one.log_time for one in opened.messages]
+        content.chunks.append(ChunkPlace(at, length, min(times), max(times)))
+        content.counts.update(one.channel_id for one in opened.messages)
+
+
+def _opened(fd: int, at: int, length: int, budget: WorkBudget, losses: Losses) -> OpenedChunk | None:
+    """The chunk whose content stands there; None: it is lost."""
+    try:
+        if not 0 < length <= CHUNK_BYTES + AROUND_BYTES:
+            raise RecordingError(f"{length} bytes, at most {CHUNK_BYTES}")
+        budget.take(length)
+        return open_chunk(_bytes(fd, length, at), budget)
+    except RecordingError as error:
+        losses.add(f"chunk at byte {at}: {error}")
         return None
+
+
+def _take_attachment(content: McapContent, fd: int, at: int, length: int, budget: WorkBudget) -> None:
+    """Keep an attachment whose check sum fits; the library does not look at it."""
+    try:
+        if len(content.attachments) >= ATTACHMENTS:
+            raise RecordingError(f"there are {ATTACHMENTS} already")
+        attached = sum(len(one.data) for one in content.attachments)
+        if length > min(ATTACHMENT_BYTES, ATTACHED_BYTES - attached) + AROUND_BYTES:
+            raise RecordingError(f"{length} bytes, at most {ATTACHMENT_BYTES}, and {ATTACHED_BYTES} of all")
+        budget.take(max(length, 0))
+        data = _bytes(fd, length, at)
+        if len(data) <= 4 or zlib.crc32(data[:-4]).to_bytes(4, "little") != data[-4:]:
+            raise RecordingError("broken")
+        content.attachments.append(Attachment.read(stream(data)))
+    except (*BROKEN, RecordingError) as error:
+        content.losses.add(f"attachment at byte {at}: {error}")
+
+
+def _take_metadata(content: McapContent, fd: int, at: int, length: int, budget: WorkBudget) -> None:
+    """Keep metadata that are printable; they have no check sum, so any byte of them may be another one."""
+    try:
+        if len(content.metadata) >= METADATA:
+            raise RecordingError(f"there are {METADATA} already")
+        if length > METADATA_BYTES:
+            raise RecordingError(f"{length} bytes, at most {METADATA_BYTES}")
+        budget.take(max(length, 0))
+        one = Metadata.read(stream(_bytes(fd, length, at)))
+        if not "".join([one.name, *one.metadata, *one.metadata.values()]).isprintable():
+            raise RecordingError("not printable")
+        content.metadata[one.name] = one.metadata
+    except (*BROKEN, RecordingError) as error:
+        content.losses.add(f"metadata at byte {at}: {error}")

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import Protocol, cast
+from typing import cast
 
 from mcap.writer import Writer
 
@@ -32,23 +32,13 @@ from common.messages import (
     decode,
     encode,
 )
+from common.recording_disk import Disk, Output
+from common.recording_parts import channel_names, check_files, refuse_misplaced
 from common.streams import sender_of
 
 PROFILE = "phalanx"
 _CHUNK_NS = 500_000_000
 _CHUNK_BYTES = 512 << 10
-
-
-class Disk(Protocol):
-    """Where the bytes go: a file, or what a test puts in its place."""
-
-    def write(self, data: bytes, /) -> int | None:
-        """Write some of it and tell how much; OSError where that fails."""
-        ...
-
-    def close(self) -> None:
-        """Give it back."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,8 +77,9 @@ class MessageWriter:
             open_disk: Makes the file.
 
         Raises:
-            RecordingError: It is there already, or cannot be written.
+            RecordingError: It is there already, or cannot be written; a file of calibration has no plain name.
         """
+        check_files(path, files)
         try:
             self._disk = open_disk(path)
         except FileExistsError as error:
@@ -97,7 +88,7 @@ class MessageWriter:
             ) from error
         except OSError as error:
             raise RecordingError(f"{path}: cannot write: {error.strerror}") from error
-        self._path, self._out = path, _Output(self._disk)
+        self._path, self._out = path, Output(self._disk)
         self._writer = Writer(cast(io.BufferedWriter, self._out), _CHUNK_BYTES)
         self._schemas: dict[str, int] = {}
         self._channels: dict[tuple[str, str, str], int] = {}
@@ -195,29 +186,6 @@ class MessageWriter:
             self._disk.close()
 
 
-class _Output:
-    """What the library writes to: every byte goes to the disk at once, and is counted."""
-
-    def __init__(self, disk: Disk) -> None:
-        self._disk, self._written = disk, 0
-
-    def write(self, data: bytes) -> int:
-        """Write all of it, or raise OSError."""
-        left = memoryview(data)
-        while left:
-            count = self._disk.write(bytes(left)) or 0
-            left = left[count:]
-            self._written += count
-        return len(data)
-
-    def tell(self) -> int:
-        """How many bytes were written."""
-        return self._written
-
-    def flush(self) -> None:
-        """Nothing waits here."""
-
-
 class MessageRecording:
     """An opened recording.
 
@@ -229,19 +197,21 @@ class MessageRecording:
         counts: Stream -> messages.
         senders: Stream -> sender -> messages.
         cut: It has no end: it broke off, or its end is broken.
-        broken: Chunks, attachments and messages that cannot be read, as far as they were met.
+        losses: Chunks, attachments and messages that cannot be read, as far as they were met.
     """
 
     def __init__(self, path: Path, content: McapContent) -> None:
-        """Of the content of a file."""
-        self.path, self.cut, self.broken = path, content.cut, content.broken
+        """Of the content of a file.
+
+        Raises:
+            RecordingError: A name in it is not plain.
+        """
+        self.path, self.cut, self.losses = path, content.cut, content.losses
         self.files = {one.name: one.data for one in content.attachments}
+        check_files(path, self.files)
         self.about = content.metadata.get(PROFILE, {})
         self._chunks = content.chunks
-        self._named = {
-            number: (one.metadata.get("stream", ""), one.metadata.get("name", ""))
-            for number, one in content.channels.items()
-        }
+        self._named = channel_names(path, content.channels.values())
         self.begin_t_ns = min((one.first_ns for one in self._chunks), default=0)
         self.end_t_ns = max((one.last_ns for one in self._chunks), default=0)
         self.senders: dict[str, Counter[str]] = {}
@@ -249,6 +219,11 @@ class MessageRecording:
             stream, name = self._named.get(number, ("", ""))
             self.senders.setdefault(stream, Counter())[name] += count
         self.counts = {stream: names.total() for stream, names in self.senders.items()}
+
+    @property
+    def broken(self) -> int:
+        """How many losses there are."""
+        return self.losses.count
 
     def read(
         self,
@@ -269,25 +244,25 @@ class MessageRecording:
         first = self.begin_t_ns if from_t_ns is None else from_t_ns
         last = self.end_t_ns if to_t_ns is None else to_t_ns
         places = [one for one in self._chunks if one.last_ns >= first and one.first_ns <= last]
-        for _, messages in messages_of(self.path, places):
-            if messages is None:
-                self.broken += 1
-                continue
+        for place, messages in messages_of(self.path, places, self.losses):
             for one in messages:
                 stream, name = self._named.get(one.channel_id, ("", ""))
                 if not first <= one.log_time <= last or (streams is not None and stream not in streams):
                     continue
                 try:
-                    yield Recorded(stream, name, one.log_time, decode(one.data))
-                except MessageError:
-                    self.broken += 1
+                    message = decode(one.data)
+                    refuse_misplaced(stream, name, message)
+                except (MessageError, RecordingError) as error:
+                    self.losses.add(f"message in the chunk at byte {place.offset}: {error}")
+                    continue
+                yield Recorded(stream, name, one.log_time, message)
 
 
 def open_messages(path: Path) -> MessageRecording:
     """Open a recording, whole or cut.
 
     Raises:
-        RecordingError: It cannot be read, or is no recording of ours.
+        RecordingError: It cannot be read, is no recording of ours, or has a name that is not plain.
     """
     content = read_content(path)
     if content.profile != PROFILE:

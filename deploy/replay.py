@@ -1,12 +1,16 @@
 """Replay: `phalanx-slave detect` in every camera of a recording, then `phalanx-master solve` of all together."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
+
+_MANIFEST_BYTES = 4 << 20
+_PLAIN = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 
 
 class ReplayError(Exception):
@@ -85,12 +89,27 @@ def _rigs(recording: Path, only: str | None) -> list[_Rig]:
     path = recording / "recording.json"
     kinds = ("markers", "wrist") if only is None else (only,)
     try:
+        if path.resolve().parent != recording.resolve():
+            raise ValueError(f"a link to {path.resolve()}")
+        if path.stat().st_size > _MANIFEST_BYTES:
+            raise ValueError(f"larger than {_MANIFEST_BYTES >> 20} MiB")
         manifest = json.loads(path.read_text())
         rigs = [rig for rig in (manifest.get("rig"), *(manifest.get("rigs") or ())) if rig is not None]
-        found = [_Rig(rig["kind"], list[str](rig["cameras"])) for rig in rigs]
-    except (OSError, ValueError, RecursionError, KeyError, TypeError, AttributeError) as error:
+        found = [_Rig(rig["kind"], [_camera(name) for name in rig["cameras"]]) for rig in rigs]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ReplayError(f"{path}: not a recording of raw frames ({reason})") from error
     if wanted := sorted((rig for rig in found if rig.kind in kinds), key=lambda rig: rig.kind):
         return wanted
     raise ReplayError(f"{path}: no rig of kind {' or '.join(map(repr, kinds))}")
+
+
+def _camera(name: object) -> str:
+    """A name that goes into a command line and a file's name.
+
+    Raises:
+        ValueError: It is not plain.
+    """
+    if not isinstance(name, str) or not _PLAIN.fullmatch(name):
+        raise ValueError(f"cameras: {name!r:.80}: must be letters, digits, _ . -, at most 64")
+    return name

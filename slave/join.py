@@ -15,7 +15,14 @@ import msgspec
 
 from common.calibration import RigCalibration
 from common.errors import RecordingError
-from common.frame_recording import FrameRecording, FrameRow, Manifest, RecordedClock, open_recording
+from common.frame_recording import (
+    MAX_TIME_NS,
+    FrameRecording,
+    FrameRow,
+    Manifest,
+    RecordedClock,
+    open_recording,
+)
 from common.frame_writing import RecordingWriter, refuse_occupied
 from common.imu_recording import IMU, read_imu, write_imu
 from common.messages import ImuSample
@@ -53,6 +60,11 @@ def join_recordings(
     _check_overlap(parts, shifts_ns)
     samples = _imu(parts, shifts_ns)
     manifest, owners = _manifest(parts)
+    for part, shift_ns in zip(parts, shifts_ns, strict=True):
+        if any(abs(row.t_ns + shift_ns) > MAX_TIME_NS for row in part.rows):
+            raise RecordingError(
+                f"{part.folder}: its times on the clock of {first.folder} are beyond any clock"
+            )
     frames = sorted(
         (
             (row.t_ns + shift_ns, row, part.folder / row.file)

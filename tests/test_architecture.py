@@ -55,7 +55,9 @@ SYSTEM = frozenset({"picamera2", "libcamera"})
 # Files of common that the slave never loads may use what only the PC has.
 PC_ONLY = {
     "common/recording.py": frozenset({"mcap"}),
-    "common/mcap_file.py": frozenset({"mcap", "zstandard"}),
+    "common/recording_parts.py": frozenset({"mcap"}),
+    "common/mcap_file.py": frozenset({"mcap"}),
+    "common/mcap_chunk.py": frozenset({"mcap", "zstandard"}),
 }
 # Calls that touch the world; none may run because a module is imported.
 DEVICES = frozenset(

@@ -23,6 +23,7 @@ from master.outputs.poses import Poses
 
 GAP_S = 0.25  # without a pose: longer than that nobody knows how the hand went
 _GAP_POSES = 3.0  # of a source that is as slow as that all the time
+MOST_FRAMES = 1_000_000  # 4.6 hours at 60 Hz; each takes some kB while it is made
 _DENSE, _MOST_HZ = 10.0, 1000.0  # per cent of the steps
 _UNIT = 0.5  # a quaternion shorter than that is none
 _STRAIGHT = 1e-7
@@ -164,8 +165,15 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
     Args:
         motion: In the rig frame.
         rate_hz: Positive.
+
+    Raises:
+        RecordingError: That would be more frames than fit in memory.
     """
     count = 1 + int((motion.t_ns[-1] - motion.t_ns[0]) * 1e-9 * rate_hz + 1e-6)
+    if count > MOST_FRAMES:
+        raise RecordingError(
+            f"{count} frames at {rate_hz:g} Hz, at most {MOST_FRAMES}: export one part, with --from and --until"
+        )
     t_ns = motion.t_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     passed = cast(Int, np.searchsorted(motion.t_ns, t_ns, side="right"))
     before = np.maximum(passed - 1, 0)

@@ -3,10 +3,11 @@
 import json
 import tempfile
 from collections.abc import Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from common.errors import RecordingError
 from common.recording import MessageRecording
+from common.recording_parts import plain_names
 from master.rig import RigSetup, load_setups
 from master.tuning import RigFiles
 
@@ -44,17 +45,15 @@ def recorded_rigs(recording: MessageRecording) -> tuple[str, ...]:
     """The names of the rigs of a recording.
 
     Raises:
-        RecordingError: It does not say.
+        RecordingError: It does not say, or one is no plain name.
     """
-    try:
-        rigs = json.loads(recording.about.get("rigs", ""))
-    except ValueError:
-        rigs = None
-    if not isinstance(rigs, list) or not rigs:
+    text = recording.about.get("rigs")
+    rigs = plain_names(recording.path, "rigs", text) if text is not None else ()
+    if not rigs:
         raise RecordingError(
             f"{recording.path}: does not say which rigs it is of; it was cut before its first message"
         )
-    return tuple(str(rig) for rig in rigs)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+    return rigs
 
 
 def recorded_setups(recording: MessageRecording) -> tuple[RigSetup, ...]:
@@ -71,16 +70,13 @@ def recorded_setups(recording: MessageRecording) -> tuple[RigSetup, ...]:
 
 
 def unpack(recording: MessageRecording, folder: Path) -> None:
-    """Write the files of a recording into a folder, as the calibration tree that they are.
+    """Write the files of a recording, whose names were checked, into a folder, as the calibration tree that they are.
 
     Raises:
-        RecordingError: One would stand outside the folder, or cannot be written.
+        RecordingError: One cannot be written.
     """
     for name, data in recording.files.items():
-        inside = PurePosixPath(name)
-        if inside.is_absolute() or ".." in inside.parts or not inside.parts:
-            raise RecordingError(f"{recording.path}: its file {name!r} would stand outside its folder")
-        path = folder / inside
+        path = folder / name
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(data)

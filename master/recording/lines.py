@@ -5,6 +5,7 @@ from typing import TextIO
 import msgspec
 
 from common.messages import WIRE_VERSION, Health
+from common.plain_names import is_plain
 from common.recording import MessageRecording
 from master.recording.recorder import Progress
 
@@ -86,6 +87,7 @@ def table(recording: MessageRecording, events: list[str]) -> list[str]:
     lines += ["", "files: " + (", ".join(sorted(recording.files)) or "none")]
     if recording.broken:
         lines.append(f"broken: {recording.broken} chunks, files or messages cannot be read")
+        lines += [f"  {one}" for one in recording.losses.named]
     return lines + raw_lines(recording) + [f"event: {event}" for event in events]
 
 
@@ -93,7 +95,9 @@ def raw_lines(recording: MessageRecording) -> list[str]:
     """What raw frames the slaves kept beside it, as far as they told; nothing where nobody asked them."""
     try:
         folders = RAW_FOLDERS.decode(recording.about.get("raw", "{}"))
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, RecursionError):
+        folders = {"?": "?"}
+    if not all(map(is_plain, (*folders, *folders.values()))):
         return ["raw frames: the file does not say where they are"]
     last: dict[str, Health] = {}
     for one in recording.read(["health"]) if folders else ():

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import cast
 
 from common.clock import now_ns
+from common.errors import PhalanxError
 from common.messages import Backlog, Contact, Gesture, HandPose, Message, Told
 from common.recording import MessageRecording, Recorded
 from master.app import Solved
@@ -27,6 +28,8 @@ from master.tuning import LivePipeline
 from master.world import World
 
 SETTLE_NS = 2_000_000_000
+GAP_NS = 600_000_000_000  # longer than that nobody waits for the next message
+_STEP_S = 60.0  # of a wait, whatever the speed; a change ends it
 SOLVED = ("hand", "object", "contact", "gesture")
 BESIDE = ("health", "checklist", "preview", "still")  # told again as they were told
 _OWN = frozenset({"master", "recorder"})  # whose reports are not: the player is the master now
@@ -109,6 +112,7 @@ class Player:
         self._jump: int | None = None
         self._stopped = False
         self._said: set[str] = set()
+        self._unsolved: set[tuple[str, str]] = set()
         self.poses = 0
         self.at_ns = self.first_ns
 
@@ -219,7 +223,12 @@ class Player:
                 wait_s = self._clock.wait_s(t_ns, now_ns())
                 if wait_s == 0.0:
                     return True
-                self._changed.wait(wait_s)
+                if wait_s is not None and (gap_ns := t_ns - self._clock.position_ns(now_ns())) > GAP_NS:
+                    at_s = (self.at_ns - self._recording.begin_t_ns) * 1e-9
+                    self._tell_events([f"at {at_s:.1f} s nothing comes for {gap_ns * 1e-9:.0f} s: skipped"])
+                    self._clock.seek(t_ns, now_ns())
+                    return True
+                self._changed.wait(None if wait_s is None else min(wait_s, _STEP_S))
             return False
 
     def _told(self, world: World | None, one: Recorded) -> Iterable[Told]:
@@ -228,7 +237,20 @@ class Player:
             return (cast(Told, one.message),)
         if one.stream != "taken" or world is None or isinstance(one.message, Backlog):
             return ()
-        return (_plain(solved) for solved in world.push(cast(Taken, one.message)))
+        return self._solve(world, cast(Taken, one.message), one.name)
+
+    def _solve(self, world: World, message: Taken, name: str) -> Iterable[Told]:
+        """What the world makes of a message; nothing of one that it cannot solve, which the recording may hold."""
+        try:
+            return [_plain(solved) for solved in world.push(message)]
+        except PhalanxError:
+            raise
+        except Exception as error:  # noqa: BLE001 -- a file may hold whatever makes the solver raise
+            kind = type(error).__name__
+            if (name, kind) not in self._unsolved:
+                self._say(f"messages of {name} cannot be solved and are left out: {kind}: {error}")
+            self._unsolved.add((name, kind))
+            return ()
 
     def _write(self, told: Iterable[Told], digest: ToldDigest) -> None:
         for message in told:

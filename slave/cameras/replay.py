@@ -14,6 +14,7 @@ from common.errors import CameraError, RecordingError
 from common.frame_recording import FrameRow, Manifest, open_recording
 from slave.cameras.source import Frame
 
+GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
 STEP_S = 0.05  # longest sleep at a time, so that a signal ends a wait soon
 
 
@@ -21,8 +22,8 @@ class ReplayCamera:
     """A `FrameSource` that reads PNG files.
 
     Holds the list of frames and the next index. Paced, the first frame comes at once and each further one when
-    as much time has passed as in the recording; its `t_ns` is on the slave's clock then. Unpaced, `t_ns` is
-    the recording's.
+    as much time has passed as in the recording, a gap of more than ten minutes left out; its `t_ns` is on the
+    slave's clock then. Unpaced, `t_ns` is the recording's.
     """
 
     def __init__(self, folder: Path, camera: str, paced: bool, clock: Clock) -> None:
@@ -60,8 +61,9 @@ class ReplayCamera:
         image, exposure_us = self._load(row), self._calibration.exposure_us
         if not self._paced:
             return Frame(row.seq, row.t_ns, row.t_ns, image, row.illumination, exposure_us=exposure_us)
-        if self._shift_ns is None:
-            self._shift_ns = self._clock.now_ns() - row.t_ns
+        now_ns = self._clock.now_ns()
+        if self._shift_ns is None or row.t_ns + self._shift_ns - now_ns > GAP_NS:
+            self._shift_ns = now_ns - row.t_ns
         t_ns = row.t_ns + self._shift_ns
         self._wait_until(t_ns)
         return Frame(row.seq, t_ns, self._clock.now_ns(), image, row.illumination, exposure_us=exposure_us)

@@ -4,7 +4,6 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from common.calibration import load
 from common.errors import CalibrationError
 
 PURPOSE = "detect in a recording"
@@ -42,14 +41,14 @@ def run(options: argparse.Namespace, aside: Callable[[str], None]) -> int:
     Raises:
         PhalanxError: The recording or a file of calib_json is missing or broken, or an option makes no sense for it.
     """
-    from common.frame_recording import MANIFEST, Manifest
+    from common.frame_recording import load_manifest
     from slave.cameras.replay import is_grey
 
     def progress(done: int, total: int) -> None:
         if done % _EVERY == 0 or done == total:
             aside(f"{options.camera}: {done} of {total} frames")
 
-    if is_grey(load(options.recording / MANIFEST, Manifest), options.camera):
+    if is_grey(load_manifest(options.recording), options.camera):
         _detect_fingers(options, progress, aside)
         return 0
     if options.hand is not None:

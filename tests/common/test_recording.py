@@ -245,6 +245,15 @@ def test_a_missing_file_and_one_that_is_there_are_refused(tmp_path: Path) -> Non
         MessageWriter(tmp_path / "no" / "a.mcap", {})
 
 
+@pytest.mark.parametrize(
+    "name", ["../desk.json", "rigs/a/desk.json", "rigs/\0.json", "rigs/...json", "desk.json"]
+)
+def test_what_could_not_be_read_again_is_not_written(name: str, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"must be FOLDER/NAME\.json"):
+        MessageWriter(tmp_path / "a.mcap", {name: b"{}"})
+    assert not list(tmp_path.iterdir())
+
+
 class SmallDisk:
     """A file that takes so many bytes, and the last write only in part, as a disk that fills does."""
 

@@ -14,7 +14,7 @@ from common.recording import open_messages
 from common.streams import MASTER
 from master.outputs.files import load_poses
 from master.recording.clock import ReplayClock
-from master.recording.files import recorded_setups, unpack
+from master.recording.files import recorded_setups
 from master.recording.lines import events_of, table
 from master.recording.play import PlaySettings, run_play
 from master.recording.player import Passed, Player
@@ -189,10 +189,6 @@ def test_what_cannot_be_played_is_refused(run: RecordedRun, tmp_path: Path, root
     os.truncate(empty, empty.stat().st_size // 2)
     with pytest.raises(RecordingError, match="nothing to play"):
         play(empty)
-    recording = open_messages(run.path)
-    recording.files = {"../out.json": b"{}"}
-    with pytest.raises(RecordingError, match="outside its folder"):
-        unpack(recording, tmp_path)
 
 
 def test_the_table_shows_streams_rates_and_files(run: RecordedRun) -> None:

@@ -1,0 +1,74 @@
+"""Bounds of an MCAP file: what a recording of ours can hold; what is beyond them is lost, counted, with its cause.
+
+A few bytes can claim any size, and zstd packs 4 MiB of zeros into 400 bytes. So each part is bounded, and so is what
+one pass over a file unpacks, by the size of the file: a writer of ours leaves 16 bytes of index for each message.
+"""
+
+from dataclasses import dataclass, field
+
+from common.errors import RecordingError
+
+CHUNK_BYTES = 4 << 20  # unpacked; ours is closed at 512 KiB, and a message has less than 1 MiB
+CHUNK_RECORDS = 16_384  # ours has 7,400 at most: each takes 70 bytes or more
+CHANNEL_BYTES = 4096
+CHANNELS = 1024
+ATTACHMENT_BYTES = 4 << 20  # of one file of calibration
+ATTACHED_BYTES = 64 << 20  # of all
+ATTACHMENTS = 256
+METADATA_BYTES = 16 << 10  # of one; the names of 32 cameras and of their folders take 6 KiB
+METADATA = 16
+SUMMARY_BYTES = 64 << 20  # a day of chunks takes 26 MiB
+AROUND_BYTES = 1024  # of a record, beside its content; and all that a header may have
+
+BEYOND = "more than a file of this size can hold"
+_FREE_BYTES = 16 << 20  # that a pass may unpack of the smallest file
+_RATIO = 256  # unpacked bytes for each byte of the file; ours reach 100 where nobody sees any of 48 markers
+_INDEX_BYTES = 16  # of the file, for each message in it
+_NAMED = 5
+
+
+class WorkBudget:
+    """What one pass over a file may still read and unpack. Holds the bytes and records that are left."""
+
+    def __init__(self, file_bytes: int) -> None:
+        """Of a file of that size."""
+        self._bytes = _FREE_BYTES + _RATIO * file_bytes
+        self._records = CHUNK_RECORDS + file_bytes // _INDEX_BYTES
+
+    def holds(self, records: int) -> bool:
+        """Whether there may be so many records more."""
+        return records <= self._records
+
+    def take_records(self, count: int) -> None:
+        """Use up so many records, or what is left."""
+        self._records = max(self._records - count, 0)
+
+    def take(self, size: int) -> None:
+        """Use up so many bytes.
+
+        Raises:
+            RecordingError: There are not so many left.
+        """
+        if size > self._bytes:
+            raise RecordingError(BEYOND)
+        self._bytes -= size
+
+
+@dataclass(slots=True)
+class Losses:
+    """What of a file cannot be read.
+
+    Attributes:
+        count: Chunks, attachments, metadata and messages, as far as they were met.
+        named: The first few, with the cause; printable.
+    """
+
+    count: int = 0
+    named: list[str] = field(default_factory=list[str])
+
+    def add(self, what: str) -> None:
+        """Count one."""
+        self.count += 1
+        if len(self.named) < _NAMED:
+            text = "".join(one if one.isprintable() else f"\\x{ord(one):02x}" for one in what[:200])
+            self.named += [text] if text not in self.named else []
