@@ -89,9 +89,9 @@ def _why_expired_there(identity: Identity) -> str:
     if fault := own.invalid_at(now, whose):
         return f"who listens there refused it, and {fault}. Is that the time? If not, {CLOCK_FIX}"
     return (
-        f"who listens there refused {whose} as no longer, or not yet, valid. It is so from {own.since:%Y-%m-%d} to "
-        f"{own.until:%Y-%m-%d}, and the clock of this machine says {now:%Y-%m-%d %H:%M} UTC. Is the clock of the "
-        f"machine there wrong? There, {CLOCK_FIX}"
+        f"who listens there refused {whose} as no longer, or not yet, valid: it is valid from "
+        f"{own.since:%Y-%m-%d} to {own.until:%Y-%m-%d}, and the clock of this machine says {now:%Y-%m-%d %H:%M} UTC. "
+        f"Is the clock of the machine there wrong? There, {CLOCK_FIX}"
     )
 
 
