@@ -11,7 +11,7 @@ HEAVY = (
     "scipy.stats",
     "scipy.optimize",
 )  # seconds, on a machine that is busy tracking
-COMMANDS = ("run", "solve", "view", "report", "camera", "send")
+COMMANDS = ("run", "solve", "view", "report", "camera", "send", "install")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
