@@ -208,6 +208,20 @@ def test_the_loop_is_ready_once_and_gives_a_sign_of_life_four_times_in_a_period(
             manager.recv(100)
 
 
+# Loaded by every Python below the manager: a signal makes a thread of the running master fail.
+_PLANTED = """
+import signal, threading
+def fail():
+    raise OverflowError("planted")
+signal.signal(signal.SIGUSR1, lambda *_: threading.Thread(target=fail, name="planted").start())
+"""
+
+
+_NOTES_ENDS = """[Service]
+ExecStopPost=/bin/sh -c 'echo $$EXIT_CODE $$EXIT_STATUS >> %h/ends'
+"""
+
+
 class Installed:
     """The master as a service of a real manager of a user. Holds its environment and its port."""
 
@@ -215,6 +229,9 @@ class Installed:
         self.environment, self._keys = environment, keys
         self._port = free_port(socket.SOCK_STREAM)
         self.options = ["--rig", "desk", "--keys", str(keys), "--bus", f"tls/127.0.0.1:{self._port}"]
+        beside = self.unit.with_name(f"{UNIT}.d") / "test.conf"
+        beside.parent.mkdir(parents=True)
+        beside.write_text(_NOTES_ENDS)
         self.options += [
             "--bind",
             "127.0.0.1:0",
@@ -231,6 +248,10 @@ class Installed:
     def install(self, *more: str) -> subprocess.CompletedProcess[str]:
         """`phalanx-master install` with the options of the rig."""
         return self.asked(str(PROGRAM), "install", *self.options, *more)
+
+    def ends(self) -> list[str]:
+        """How it ended, each time."""
+        return (Path(self.environment["HOME"]) / "ends").read_text().splitlines()
 
     def pid(self) -> int:
         """Of the master; 0: it does not run."""
@@ -255,10 +276,17 @@ def installed(keys: Path) -> Generator[Installed, None, None]:
     """A user's service manager without any service of ours."""
     if (why := why_not()) is not None:
         pytest.skip(why)
-    with user_manager() as environment:
+    planted = keys.parent / "planted"
+    planted.mkdir()
+    (planted / "sitecustomize.py").write_text(_PLANTED)
+    with user_manager({"PYTHONPATH": str(planted)}) as environment:
         if isinstance(environment, str):
             pytest.skip(environment)
         yield Installed(environment, keys)
+
+
+def _fault(installed: Installed) -> None:
+    os.kill(installed.pid(), signal.SIGUSR1)
 
 
 def _kill(installed: Installed) -> None:
@@ -269,13 +297,16 @@ def _hang(installed: Installed) -> None:
     os.kill(installed.pid(), signal.SIGSTOP)
 
 
-def test_a_master_that_is_killed_or_hangs_is_back(installed: Installed) -> None:
+def test_a_master_that_is_killed_or_hangs_or_has_a_fault_is_back(installed: Installed) -> None:
     assert (done := installed.install()).returncode == 0, done.stderr
     assert "enable-linger" in done.stdout
-    for end in (_kill, _hang):
+    for end in (_fault, _kill, _hang):
         pid = installed.pid()
         end(installed)
         assert until(lambda pid=pid: installed.another_ready(pid))
+    *first, hung = installed.ends()
+    assert first == ["exited 70", "killed KILL"]
+    assert hung in ("killed ABRT", "dumped ABRT", "killed KILL")  # by the watchdog
     before = installed.unit.read_text(), installed.pid()
     assert "unchanged" in installed.install().stdout
     assert (installed.unit.read_text(), installed.pid()) == before
@@ -291,7 +322,7 @@ def test_one_that_is_stopped_stays_so_and_uninstalling_leaves_nothing(installed:
     assert "removed" in installed.asked(str(PROGRAM), "install", "--uninstall").stdout
     assert installed.state() == "inactive"
     config = Path(installed.environment["HOME"]) / ".config"
-    assert [path for path in config.rglob("*") if not path.is_dir()] == []
+    assert [path.name for path in config.rglob("*") if not path.is_dir()] == ["test.conf"]
     assert "nothing to remove" in installed.asked(str(PROGRAM), "install", "--uninstall").stdout
 
 
@@ -301,6 +332,7 @@ def test_an_error_is_named_and_the_service_recovers_by_itself_once_it_is_mended(
         assert done.returncode == 1
         assert "does not run: failed: cannot open the bus" in done.stderr
         assert "Address already in use" in done.stderr
+        assert set(installed.ends()) == {"exited 1"}
     assert until(lambda: installed.state() == "active")
 
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import tempfile
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -18,7 +18,7 @@ mount -t tmpfs none /run && mkdir -p /run/systemd/system
 umount -R /sys/fs/cgroup 2>/dev/null
 mount -t cgroup2 none /sys/fs/cgroup || exit 1
 mkdir -p "/sys/fs/cgroup/$0" && echo $$ > "/sys/fs/cgroup/$0/cgroup.procs" || exit 1
-exec {manager} --user --log-target=console
+exec {manager} --user --log-target=null
 """
 # Last: its processes, however they are, and its control groups.
 _CLEAR = """
@@ -42,8 +42,12 @@ def _unshared(script: str, group: str) -> list[str]:
 
 
 @contextmanager
-def user_manager() -> Generator[dict[str, str] | str, None, None]:
-    """The environment in which `systemctl --user` reaches it; or why none can be started here."""
+def user_manager(more: Mapping[str, str]) -> Generator[dict[str, str] | str, None, None]:
+    """The environment in which `systemctl --user` reaches it; or why none can be started here.
+
+    Args:
+        more: Variables of the services that it starts.
+    """
     folder = Path(tempfile.mkdtemp(prefix="phx"))  # short: the path of a socket has 107 characters at most
     group = folder.name
     environment = os.environ | {"HOME": str(folder), "XDG_RUNTIME_DIR": str(folder / "run")}
@@ -60,7 +64,7 @@ def user_manager() -> Generator[dict[str, str] | str, None, None]:
     with log.open("wb") as out:
         manager = subprocess.Popen(
             _unshared(_ALONE.format(manager=MANAGER), group),
-            env=environment,
+            env=environment | dict(more),
             stdout=out,
             stderr=out,
             start_new_session=True,
