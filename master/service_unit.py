@@ -35,7 +35,7 @@ TimeoutStartSec=60
 TimeoutStopSec=10
 TimeoutAbortSec=2
 
-# 138 MB at its start, 159 MB after an hour with three cameras (docs/soak.md); 14 threads, and one for each processor
+# 130 MB at its start, 159 MB after an hour with three cameras (docs/soak.md); 14 threads, and one for each processor
 # that numpy uses. What asks for more is ended and started again, before the machine is out of memory or of processes.
 MemoryMax=1G
 TasksMax=256
