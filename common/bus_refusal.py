@@ -6,13 +6,16 @@ import ssl
 import threading
 import time
 from collections.abc import Callable
+from datetime import UTC, datetime
 
+from common.certificates import CLOCK_FIX, Shown, shown
 from common.endpoints import host_of, port_of
 from common.keys import Identity
 
 _PATIENCE_S = 0.5
 _ALONE_S = 2.0  # without anybody for so long, a process says why
 _LOOK_S = 0.25
+_NOT_YET_VALID, _EXPIRED = 9, 10  # X509_V_ERR_CERT_NOT_YET_VALID, X509_V_ERR_CERT_HAS_EXPIRED of OpenSSL
 _LOG = logging.getLogger(__name__)
 
 
@@ -46,12 +49,16 @@ def why_refused(endpoint: str, identity: Identity) -> str:
     except TimeoutError:
         return ""  # accepted: whoever refuses says so at once
     except ssl.SSLCertVerificationError as error:
+        if error.verify_code in (_NOT_YET_VALID, _EXPIRED):
+            return _why_invalid(endpoint, identity)
         return (
             f"who listens there has no certificate of this rig's master ({error.verify_message}): another rig's, or"
             " somebody who plays the master"
         )
     except ssl.SSLError as error:
         said = (error.reason or str(error)).lower().replace("_", " ")
+        if "certificate expired" in said:
+            return _why_expired_there(identity)
         return (
             f"who listens there refused the certificate of {identity.name!r}, or speaks no TLS ({said}): keys of"
             " another rig?"
@@ -59,6 +66,42 @@ def why_refused(endpoint: str, identity: Identity) -> str:
     except OSError as error:
         return f"nobody listens there ({error.strerror or error}). Is the master running?"
     return ""
+
+
+def _why_invalid(endpoint: str, identity: Identity) -> str:
+    """Which certificate is not valid by the clock of this machine: that of the rig, or that of who listens."""
+    now = datetime.now(UTC)
+    named = {"the certificate of this rig (ca.pem)": shown(identity.authority.read_bytes())}
+    if (there := _shown_there(endpoint)) is not None:
+        named[f"the certificate of who listens there ({there.name!r})"] = there
+    faults = [fault for whose, one in named.items() if (fault := one.invalid_at(now, whose))]
+    unknown = (
+        "the certificate of who listens there is not valid now: the clock of this machine says "
+        f"{now:%Y-%m-%d %H:%M} UTC"
+    )
+    return f"{faults[0] if faults else unknown}. Is that the time? If not, {CLOCK_FIX}"
+
+
+def _why_expired_there(identity: Identity) -> str:
+    """Our certificate is not valid at the time of who listens: is it by our clock, or is the clock there wrong?"""
+    now, own = datetime.now(UTC), shown(identity.certificate.read_bytes())
+    whose = f"the certificate of {identity.name!r}"
+    if fault := own.invalid_at(now, whose):
+        return f"who listens there refused it, and {fault}. Is that the time? If not, {CLOCK_FIX}"
+    return (
+        f"who listens there refused {whose} as no longer, or not yet, valid: it is valid from "
+        f"{own.since:%Y-%m-%d} to {own.until:%Y-%m-%d}, and the clock of this machine says {now:%Y-%m-%d %H:%M} UTC. "
+        f"Is the clock of the machine there wrong? There, {CLOCK_FIX}"
+    )
+
+
+def _shown_there(endpoint: str) -> Shown | None:
+    """The certificate of who listens, whatever its validity; None: it could not be read."""
+    try:
+        pem = ssl.get_server_certificate((host_of(endpoint), port_of(endpoint)), timeout=_PATIENCE_S)
+        return shown(pem.encode("ascii"))
+    except (OSError, ValueError):
+        return None
 
 
 def say_why_alone(

@@ -22,6 +22,10 @@ from common.errors import PhalanxError
 MASTER, OPERATOR = "master", "operator"
 LIFE = timedelta(days=3652)
 FIRST_DAY = datetime(1970, 1, 1, tzinfo=UTC)
+CLOCK_FIX = (
+    "set the clock (timedatectl shows it; timedatectl set-ntp true, chrony, or a clock battery keep it); if it is "
+    "right, make new certificates: phalanx-master keys renew DIR, then phalanx deploy"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +89,31 @@ class Shown:
     Attributes:
         name: Role or device.
         listens: Whether it may be shown by the side that listens.
+        since: Beginning of its validity.
         until: End of its validity.
         fingerprint: First 16 hexadecimal digits of its SHA-256, to tell two of one name apart.
     """
 
     name: str
     listens: bool
+    since: datetime
     until: datetime
     fingerprint: str
+
+    def invalid_at(self, now: datetime, whose: str) -> str:
+        """Say that it is not valid at a time of this machine's clock, and what its validity is; empty: it is valid.
+
+        Args:
+            now: Time of the clock of this machine, with its zone.
+            whose: Subject of the sentence, for example `the certificate of 'left'`.
+        """
+        if self.since <= now <= self.until:
+            return ""
+        which = "no longer" if now > self.until else "not yet"
+        return (
+            f"{whose} is {which} valid: the clock of this machine says {now:%Y-%m-%d %H:%M} UTC, the certificate is "
+            f"valid from {self.since:%Y-%m-%d} to {self.until:%Y-%m-%d}"
+        )
 
 
 def shown(pem: bytes) -> Shown:
@@ -111,6 +132,7 @@ def shown(pem: bytes) -> Shown:
     return Shown(
         str(names[0].value) if names else "",
         listens,
+        certificate.not_valid_before_utc,
         certificate.not_valid_after_utc,
         certificate.fingerprint(hashes.SHA256()).hex()[:16],
     )

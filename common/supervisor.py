@@ -51,12 +51,15 @@ def supervised_threads() -> Generator[ThreadSupervisor, None, None]:
     """Supervise every thread of this process for as long as the block runs.
 
     Raises:
-        SystemExit: At the end of the block, with `EXIT_CODE`, if a thread failed.
+        SystemExit: At the end of the block, with `EXIT_CODE`, if a thread failed, or the block itself.
     """
     supervisor, before = ThreadSupervisor(), threading.excepthook
     threading.excepthook = supervisor.thread_failed
     try:
         yield supervisor
+    except Exception as error:  # the main thread is one of them
+        _LOG.critical("the process ends by a fault: %r", error, exc_info=error)
+        raise SystemExit(EXIT_CODE) from error
     finally:
         threading.excepthook = before
         if supervisor.failed is not None:

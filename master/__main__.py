@@ -1,60 +1,19 @@
 """Entry point `phalanx-master`: its commands, and the errors that end them."""
 
 import logging
+import os
 import sys
 
 try:
-    import typer
+    from master.key_options import command_of, program
 except ModuleNotFoundError as error:  # a slave's machine has the scripts of both, and the packages of one
     raise SystemExit(
         f"phalanx-master: {error.name} is missing: install the master's packages, pip install '.[master]'"
     ) from error
 
 from common.errors import PhalanxError
+from common.service_manager import ServiceManager, one_line
 from common.supervisor import supervised_threads
-from master.calibrate.cli import calibrate_app
-from master.camera_command import camera
-from master.checklist.command import check
-from master.console_command import console
-from master.export.command import export
-from master.fleet import fleet
-from master.gestures.command import gestures_app
-from master.hear import hear
-from master.key_options import program
-from master.keys_command import keys_app
-from master.recording.command import info, play, record
-from master.report_command import report
-from master.router_command import relay, router
-from master.run_command import run
-from master.send.command import send
-from master.solve_command import solve
-from master.study.command import evaluate_app
-from master.view_command import view
-
-
-def command_line() -> typer.Typer:
-    """All commands of `phalanx-master`."""
-    app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
-    app.callback()(phalanx_master)
-    first = (run, solve, view, console, report)
-    for command in (*first, camera, check, export, fleet, hear, record, play, info, router, relay, send):
-        app.command()(command)
-    groups = {
-        "calibrate": calibrate_app,
-        "evaluate": evaluate_app,
-        "gestures": gestures_app,
-        "keys": keys_app,
-    }
-    for name, group in groups.items():
-        app.add_typer(group(), name=name)
-    return app
-
-
-def phalanx_master() -> None:
-    """Turn the detections of several cameras, or of a wrist device, into one hand of 26 joints.
-
-    `phalanx-master COMMAND --help` shows its examples.
-    """
 
 
 def main() -> None:
@@ -63,8 +22,17 @@ def main() -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     with supervised_threads():
         try:
-            program(command_line())()
+            # A master that starts again after a fault is back a third sooner without the other commands.
+            if sys.argv[1:2] == ["run"]:
+                from master.run_command import run
+
+                command_of(run)(sys.argv[2:], "phalanx-master run")
+            else:
+                from master.commands import command_line
+
+                program(command_line())()
         except PhalanxError as error:
+            ServiceManager(os.environ).send(f"STATUS=failed: {one_line(str(error))}")
             print(f"phalanx-master: {error}", file=sys.stderr)
             sys.exit(1)
 

@@ -5,6 +5,7 @@ recorder, or what the console's page begins, belong to the same rig.
 """
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -19,27 +20,44 @@ _NEEDED_BY = frozenset({"bus", "key_file", "listen"})  # parameters of the comma
 
 def program(app: typer.Typer) -> TyperGroup:
     """Return `app` as a program whose commands have the options."""
-    group, both = typer.main.get_command(app), typer.Typer()
-    both.command()(_options)
-    options = typer.main.get_command(both)
+    group = typer.main.get_command(app)
     assert isinstance(group, TyperGroup)
-    assert isinstance(options, TyperCommand)
-    _extend(group, options)
+    _extend(group, _both())
     return group
+
+
+def command_of(function: Callable[..., None]) -> TyperCommand:
+    """Return the command of `function` with the options, by itself."""
+    app = typer.Typer(add_completion=False)
+    app.command()(function)
+    command = typer.main.get_command(app)
+    assert isinstance(command, TyperCommand)
+    _add(command, _both())
+    return command
+
+
+def _both() -> TyperCommand:
+    app = typer.Typer(add_completion=False)
+    app.command()(_options)
+    options = typer.main.get_command(app)
+    assert isinstance(options, TyperCommand)
+    return options
 
 
 def _extend(group: TyperGroup, options: TyperCommand) -> None:
     for command in group.commands.values():
         if isinstance(command, TyperGroup):
             _extend(command, options)
-            continue
-        taken = {name for parameter in command.params for name in parameter.opts}
-        if _NEEDED_BY & {parameter.name for parameter in command.params}:
-            command.params += [
-                one
-                for one in options.params
-                if one.name in ("keys", "open_bus") and not taken & set(one.opts)
-            ]
+        elif isinstance(command, TyperCommand):
+            _add(command, options)
+
+
+def _add(command: TyperCommand, options: TyperCommand) -> None:
+    taken = {name for parameter in command.params for name in parameter.opts}
+    if _NEEDED_BY & {parameter.name for parameter in command.params}:
+        command.params += [
+            one for one in options.params if one.name in ("keys", "open_bus") and not taken & set(one.opts)
+        ]
 
 
 def _use_keys(folder: Path | None) -> Path | None:

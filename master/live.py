@@ -1,6 +1,7 @@
 """A live master: opens bus, ingest and sinks, runs the loop, reports once a second, writes the summary."""
 
 import gc
+import os
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from common.clock import Clock, SystemClock
 from common.link_key import LinkKey
+from common.service_manager import ServiceManager
 from common.supervisor import until
 from common.zenoh_bus import ZenohBus
 from master.admission import limits_of
@@ -19,6 +21,7 @@ from master.guard import SolverGuard
 from master.hurry import Hurry, Shedding
 from master.ingest import Ingest
 from master.live_report import Reporter, cameras_line, unplaced_line
+from master.loop_watch import WatchedLoop
 from master.master_bus import carry_bus
 from master.odd_watch import OddWatch
 from master.outputs.bus import BusSink
@@ -167,7 +170,7 @@ def run_live(
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         source = Tapped(DevicePoses(ingest, bus), tap, hurry)
-        run(source, guard, sinks, clock, figures, stop)
+        run(WatchedLoop(source, ServiceManager(os.environ)), guard, sinks, clock, figures, stop)
         source.flush()
         tap.drain()
         stop.set()

@@ -1,8 +1,5 @@
 """What a slave tells the system's service manager: ready, what it does now, and that its loop goes round.
 
-The protocol of sd_notify(3): datagrams of `NAME=VALUE` lines to the socket in `NOTIFY_SOCKET`. Without that variable
-nobody listens, nothing is sent, and a slave on a terminal runs as ever.
-
 The watchdog is fed by the loop itself, never by a thread that would live on while the loop hangs. A wait that may be
 long and is no hang says so: for the master it comes round again and again; a lost camera asks for more patience
 (`WATCHDOG_USEC`), as does a slow start (`EXTEND_TIMEOUT_USEC`), and a hang in those is ended, too, only later.
@@ -11,12 +8,11 @@ It is fed four times in a period, not twice: of a slave that is stopped for 3 s 
 have passed since it was asked to live, and it goes on; fed every 2.5 s it might be ended.
 """
 
-import logging
-import os
-import socket
 import time
 from collections.abc import Callable, Mapping
 from typing import Protocol
+
+from common.service_manager import WATCHDOG, ServiceManager, one_line
 
 FEEDS = 4  # in a period of the watchdog
 STATUS_NS = 5_000_000_000  # between two lines of status where there is no watchdog
@@ -24,8 +20,6 @@ AWAY_S = 90.0  # to open a camera again takes seconds, with all its settings che
 COMPILE_S = 180.0  # numba compiles 15 s on a desktop processor, more than a minute on a Raspberry Pi
 NEVER_NS = 2**63
 WAITING = "waits for the master"
-MAIN, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
-_LOG = logging.getLogger(__name__)
 
 
 class Away(Protocol):
@@ -60,8 +54,8 @@ class Service:
             now_ns: The time [ns].
             noun: What the loop goes round for.
         """
-        self._address = _address(environment.get(MAIN, ""))
-        self._period_us = 0 if self._address is None else _watchdog_us(environment)
+        self._manager = ServiceManager(environment)
+        self._send, self._period_us = self._manager.send, self._manager.watchdog_us
         self._now_ns, self._noun = now_ns, noun
         self._linked: Callable[[], bool] = lambda: False
         self._every_ns = self._period_us * 1000 // FEEDS or STATUS_NS
@@ -71,7 +65,7 @@ class Service:
 
     def starting(self, patience_s: float, what: str = "compiles") -> None:
         """To become ready may take so long from now [s]: the manager waits, and so does an installer, by the status."""
-        status = f"{_line(what)}: may take {patience_s:.0f} s"
+        status = f"{one_line(what)}: may take {patience_s:.0f} s"
         self._send(f"STATUS={status}\nEXTEND_TIMEOUT_USEC={round(patience_s * 1e6)}")
 
     def ready(self, linked: Callable[[], bool]) -> None:
@@ -111,7 +105,7 @@ class Service:
             self.starting(patience_s, what)
             return
         self._patient = True
-        self._send(f"STATUS={_line(what)}{self._fed(round(patience_s * 1e6))}", wait=True)
+        self._send(f"STATUS={one_line(what)}{self._fed(round(patience_s * 1e6))}", wait=True)
 
     def stopping(self) -> None:
         """It ends now, in order."""
@@ -120,60 +114,20 @@ class Service:
 
     def failed(self, why: str) -> None:
         """It ends because of an error; the last line of status tells which."""
-        self._send(f"STATUS=failed: {_line(why)}")
+        self._send(f"STATUS=failed: {one_line(why)}")
 
     def _say(self, doing: str, now_ns: int) -> None:
         """What it does; from now on with no more patience than usual."""
-        if self._send(f"STATUS={_line(doing)}{self._fed(self._period_us if self._patient else 0)}"):
+        if self._send(f"STATUS={one_line(doing)}{self._fed(self._period_us if self._patient else 0)}"):
             self._patient = False
         self._begin(now_ns)
 
     def _begin(self, now_ns: int) -> None:
         self._rounds = 0
-        self._due_ns = NEVER_NS if self._address is None else now_ns + self._every_ns
+        self._due_ns = now_ns + self._every_ns if self._manager.listens else NEVER_NS
 
     def _fed(self, period_us: int = 0) -> str:
         """What feeds the watchdog, and changes its period where one is given [us]; nothing where there is none."""
         if not self._period_us:
             return ""
         return f"\n{WATCHDOG}={period_us}\nWATCHDOG=1" if period_us else "\nWATCHDOG=1"
-
-    def _send(self, text: str, wait: bool = False) -> bool:
-        """Say it, and whether that could be done; what could not be said will be soon, in other words.
-
-        Only where a loss would matter is it waited until the manager has room for it.
-        """
-        if self._address is None:
-            return True
-        try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as to:
-                to.sendto(text.encode(), 0 if wait else socket.MSG_DONTWAIT, self._address)
-        except OSError as error:
-            if wait:
-                _LOG.warning("%s: cannot tell the service manager: %s", MAIN, error)
-            return False
-        return True
-
-
-def _address(text: str) -> str | None:
-    """The address of a socket: a path, or `@name` for one without a file. None: nobody listens."""
-    if not text:
-        return None
-    if text[0] == "@":
-        return "\0" + text[1:]
-    if text[0] != "/":
-        _LOG.warning("%s=%s: neither a path nor @name; nothing is told", MAIN, text)
-        return None
-    return text
-
-
-def _watchdog_us(environment: Mapping[str, str]) -> int:
-    """The period of the watchdog [us]; 0: none, or that of another process."""
-    period, pid = environment.get(WATCHDOG, ""), environment.get(WATCHDOG_PID, "")
-    mine = not pid or pid == str(os.getpid())
-    return int(period) if mine and period.isdecimal() else 0
-
-
-def _line(text: str) -> str:
-    """One line, not too long for `systemctl status`."""
-    return " ".join(text.split())[:200]

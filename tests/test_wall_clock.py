@@ -18,6 +18,7 @@ BESIDE = ("slave/install/", "slave/doctor/", "master/calibrate/", "master/consol
           "master/study/", "master/keys_command.py", "master/keys_folder.py", "master/listening.py",
           "common/certificates.py")  # fmt: skip
 REASONS = {
+    "common/bus_refusal.py": "what the validity of certificates is judged by, in words about a refused connection",
     "common/calibration_parts.py": "the date of a measurement, in its file",
     "common/recording.py": "the date of a recording, in its file",
     "slave/recorder.py": "what the wall clock said when a recording began, in its file",

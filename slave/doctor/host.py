@@ -33,6 +33,7 @@ def check_host(system: System) -> Iterator[Finding]:
     yield _board(system)
     yield _python()
     yield from _gauges(system)
+    yield _memory_limit(system)
     yield _throttled(system)
 
 
@@ -88,6 +89,20 @@ def _gauges(system: System) -> Iterator[Finding]:
         yield warn("temperature", f"{now:.0f} °C, it slows down from {limit:.0f} °C on", COOL)
     else:
         yield ok("temperature", f"{now:.0f} °C, limit {limit:.0f} °C")
+
+
+def _memory_limit(system: System) -> Finding:
+    """Whether the kernel keeps the unit's MemoryMax; that of Raspberry Pi OS does so only where it is asked to."""
+    controllers = system.text("/sys/fs/cgroup/cgroup.controllers")
+    if controllers is None:
+        return unseen("memory limit", "no control groups of version 2 here")
+    if "memory" in controllers.split():
+        return ok("memory limit", "the kernel keeps it")
+    return warn(
+        "memory limit",
+        "the kernel does not keep the unit's MemoryMax",
+        "write cgroup_enable=memory at the end of the one line of /boot/firmware/cmdline.txt, and restart the machine",
+    )
 
 
 def _throttled(system: System) -> Finding:

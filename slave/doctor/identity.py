@@ -8,7 +8,7 @@ from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 
-from common.certificates import shown
+from common.certificates import CLOCK_FIX, shown
 from common.errors import PhalanxError
 from common.keys import RIG_KEY, access_of, link_key, rig_key, secret_of
 from slave.doctor.finding import Finding, fail, ok, unseen, warn
@@ -66,7 +66,8 @@ def _certificate(system: System, folder: Path, name: str, now: datetime) -> Find
         own = x509.load_pem_x509_certificate(identity.certificate.read_bytes())
         authority = x509.load_pem_x509_certificate(identity.authority.read_bytes())
         key = serialization.load_pem_private_key(identity.key.read_bytes(), None)
-        until = shown(identity.certificate.read_bytes()).until
+        validity = shown(identity.certificate.read_bytes())
+        of_rig = shown(identity.authority.read_bytes())
     except (PhalanxError, OSError, ValueError) as error:
         return fail("certificate", str(error), MAKE.format(name))
     if key.public_key().public_bytes(*_PUBLIC) != own.public_key().public_bytes(*_PUBLIC):
@@ -77,13 +78,17 @@ def _certificate(system: System, folder: Path, name: str, now: datetime) -> Find
         return fail(
             "certificate", f"{identity.certificate}: not signed by {identity.authority}", MAKE.format(name)
         )
-    days = (until - now).days
-    if until <= now or authority.not_valid_after_utc <= now:
-        return fail(
-            "certificate", f"ended {-days} days ago, or the clock is wrong", "phalanx-master keys renew DIR"
-        )
+    for whose, one in {
+        f"the certificate of {name!r}": validity,
+        "the certificate of this rig": of_rig,
+    }.items():
+        if fault := one.invalid_at(now, whose):
+            return fail("certificate", fault, CLOCK_FIX)
+    until = validity.until
     if until - now < SOON:
         return warn(
-            "certificate", f"ends in {days} days", "phalanx-master keys renew DIR, then phalanx deploy"
+            "certificate",
+            f"ends in {(until - now).days} days",
+            "phalanx-master keys renew DIR, then phalanx deploy",
         )
     return ok("certificate", f"of {name}, signed by the rig's authority, until {until:%Y-%m-%d}")

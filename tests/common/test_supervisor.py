@@ -49,6 +49,16 @@ def test_a_failed_thread_ends_a_process_that_waits_for_a_signal_and_lets_it_clos
     assert "OverflowError" in done.stderr
 
 
+def test_a_fault_of_the_main_thread_ends_with_the_same_code_and_names_its_place() -> None:
+    done = run("""
+        with supervised_threads():
+            fail()
+    """)
+    assert done.returncode == EXIT_CODE
+    assert "in fail" in done.stderr
+    assert "OverflowError: int too big" in done.stderr
+
+
 def test_a_process_that_hangs_or_heeds_no_signal_ends_too() -> None:
     hangs = run("""
         signal.signal(signal.SIGTERM, lambda *_: None)

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import pytest
 import typer
 
-from master.__main__ import command_line
+from master.commands import command_line
 
 WIDE = {"COLUMNS": "4000", "TERMINAL_WIDTH": "4000"}
 

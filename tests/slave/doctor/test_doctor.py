@@ -64,6 +64,7 @@ def pi(root: Path, said: Mapping[str, Ran] | None = None) -> System:
         "sys/class/thermal/thermal_zone0/type": "cpu-thermal\n",
         "sys/class/thermal/thermal_zone0/temp": "51200\n",
         "disk_free_mb": "20000\n",
+        "sys/fs/cgroup/cgroup.controllers": "cpuset cpu io memory pids\n",
     }
     return machine(root, said, files)
 
@@ -99,7 +100,10 @@ def test_a_pi_in_trouble(tmp_path: Path) -> None:
     (tmp_path / "disk_free_mb").write_text("60\n")
     (tmp_path / "sys/class/thermal/thermal_zone0/temp").write_text("83000\n")
     (tmp_path / "etc/os-release").write_text("PRETTY_NAME=Elsewhere\n")
+    (tmp_path / "sys/fs/cgroup/cgroup.controllers").write_text("cpuset cpu io pids\n")
     said = by_check(list(check_host(system)))
+    assert said["memory limit"].verdict is Verdict.WARN
+    assert "cgroup_enable=memory" in said["memory limit"].fix
     assert said["disk"].verdict is Verdict.FAIL
     assert said["temperature"].verdict is Verdict.WARN
     assert said["system"].verdict is Verdict.WARN
@@ -213,7 +217,10 @@ def test_keys_that_are_not(tmp_path: Path) -> None:
     keys = keys_of(tmp_path / "keys", "left")
     assert "certificate of 'left', not of 'right'" in verdicts(keys, "right")["certificate"].text
     assert "ends in 38 days" in verdicts(keys, "left", NOW + timedelta(days=3614))["certificate"].text
-    assert verdicts(keys, "left", NOW + timedelta(days=3700))["certificate"].verdict is Verdict.FAIL
+    late = verdicts(keys, "left", NOW + timedelta(days=3700))["certificate"]
+    assert late.verdict is Verdict.FAIL
+    assert "no longer valid: the clock of this machine says 2037-01-08" in late.text
+    assert "timedatectl" in late.fix
     assert verdicts(keys, None)["certificate"].verdict is Verdict.UNSEEN
     other = keys_of(tmp_path / "other", "left")
     (keys / "ca.pem").write_bytes((other / "ca.pem").read_bytes())
