@@ -45,14 +45,27 @@ def lines(command: list[str], folder: Path, path: str) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.fixture
+def bare(clone: Path, usual: str) -> str:
+    """The PATH of the gate on that machine."""
+    (clone / "bare").mkdir()
+    assert lines([".ci/bare_path", "bare"], clone, usual) == []
+    return str(clone / "bare")
+
+
 def test_the_gate_runs_the_command_of_the_readme_and_it_finds_only_what_is_listed(
     clone: Path, usual: str
 ) -> None:
     assert lines(["make", "test"], clone, usual)[-1].endswith("bin/foreign"), (
         "planted: everybody else finds it"
     )
-    bare = str(clone / "out/bare-path")
-    assert lines(["bash", ".ci/run"], clone, usual) == ["test", bare, "no foreign program"]
+    asked, path, found = lines(["bash", ".ci/run"], clone, usual)
+    assert asked == "test"
+    assert found == "no foreign program"
+    assert not Path(path).exists(), "it leaves nothing behind"
+
+
+def test_on_the_path_is_what_is_listed_and_python(bare: str) -> None:
     listed = {
         program
         for line in (ROOT / ".ci/programs").read_text().splitlines()
@@ -64,10 +77,11 @@ def test_the_gate_runs_the_command_of_the_readme_and_it_finds_only_what_is_liste
     there = {path.name for path in Path(bare).iterdir()}
     assert there >= listed
     assert {"python3"} <= there - listed <= {"python3", "python3.11", "python3.12", "python3.13"}
+    for program in ("foreign", "rsync", "ssh", "node"):
+        assert shutil.which(program, path=bare) is None
 
 
-def test_its_python_is_the_interpreter_itself(clone: Path, usual: str) -> None:
-    (bare,) = lines([".ci/bare_path", "bare"], clone, usual)
+def test_its_python_is_the_interpreter_itself(clone: Path, bare: str) -> None:
     (real,) = lines(["python3", "-c", "import sys; print(sys.executable)"], clone, bare)
     (base,) = lines([real, "-c", "import sys; print(sys._base_executable)"], clone, bare)
     assert not Path(real).is_relative_to(clone)
@@ -75,11 +89,11 @@ def test_its_python_is_the_interpreter_itself(clone: Path, usual: str) -> None:
 
 
 def test_what_make_installs_after_the_path_was_made_is_found(clone: Path, usual: str) -> None:
-    with (clone / ".ci/programs").open("a") as file:
-        file.write("later: installed-later\n")
-    (bare,) = lines([".ci/bare_path", "bare"], clone, usual)
-    link = Path(bare) / "installed-later"
-    assert shutil.which(link.name, path=bare) is None
+    (clone / ".ci/programs").write_text("later: installed-later\n")
+    (clone / "bare").mkdir()
+    lines([".ci/bare_path", "bare"], clone, usual)
+    link = clone / "bare/installed-later"
+    assert shutil.which(link.name, path=str(link.parent)) is None
     assert link.readlink() == Path("/usr/bin/installed-later")
 
 
