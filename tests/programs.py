@@ -17,7 +17,6 @@ _PACKAGES = {
     "systemd-analyze": "systemd",
     "systemd-nspawn": "systemd-container",
     "systemd-sysusers": "systemd",
-    "umount": "mount",
 }
 
 
