@@ -1,12 +1,13 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo browser emulator hosts-tools api test test-deploy test-nightly check format audit bench soak scale faults instructions schema clean
+.PHONY: help install demo browser emulator hosts-tools api test test-bare test-deploy test-nightly check format audit bench soak scale faults instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
 DEMO_SECONDS ?= 30
 DEMO_ARGS ?=
 TEST_ARGS ?=
+BARE_ARGS ?=
 BENCH_ARGS ?=
 SOAK_ARGS ?=
 SCALE_ARGS ?=
@@ -61,6 +62,13 @@ hosts-tools: emulator ## what the tests with whole machines need; without root i
 
 test: check browser emulator ## check, then all tests
 	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+
+test-bare: ## the gate on a Debian that has git, make and python3-venv alone, and is thrown away; as root, 30 min
+	$(call apt,the gate on a bare Debian,mmdebstrap debian-archive-keyring,mmdebstrap)
+	@mkdir -p out && git bundle create --quiet out/head.bundle HEAD
+	@! command -v mmdebstrap >/dev/null || mmdebstrap --quiet --variant=apt --include=ca-certificates,git,make,python3-venv \
+	  --customize-hook='upload out/head.bundle /head.bundle' $(BARE_ARGS) \
+	  --customize-hook='chroot "$$1" sh -c "git clone -q -c advice.detachedHead=false /head.bundle /root/phalanx && exec env -u MAKEFLAGS -u MAKELEVEL /root/phalanx/.ci/run"' bookworm /dev/null
 
 test-deploy: $(STAMP) hosts-tools ## deploy by ssh to two small machines and an emulated arm64 board; as root, 15 min
 	@$(BIN)/python -m pytest tests/hosts $(TEST_ARGS)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.local_rig import free_port
+from common.bus import Subscription
 from common.clock import SystemClock
 from common.messages import Command, Health, MarkerDetections
 from common.zenoh_bus import ZenohBus
@@ -34,7 +35,7 @@ def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
     slave = guest.start(["-m", "slave", "run", *options, *link])
     try:
         seen = _frames(ingest)
-        reports = [report for _ in range(3) if (report := health.get(PATIENCE_S)) is not None]
+        reports = _reports(health)
         answer = bus.ask(Command("left", "stop"), PATIENCE_S)
         said, errors = slave.communicate(timeout=PATIENCE_S)
     finally:
@@ -47,7 +48,6 @@ def test_a_slave_on_aarch64_serves_a_master_here(tmp_path: Path) -> None:
     assert [one.seq for one in seen] == sorted(one.seq for one in seen)
     assert ingest.counts_of("left").received >= WANTED
     assert not ingest.refused
-    assert all(isinstance(report, Health) and report.counts["frames"] > 0 for report in reports)
     assert len(reports) == 3
     assert answer.source == "left"
     assert slave.returncode == 0, errors
@@ -65,3 +65,16 @@ def _frames(ingest: Ingest) -> list[MarkerDetections]:
 
     until(enough, PATIENCE_S)
     return seen
+
+
+def _reports(health: Subscription) -> list[Health]:
+    """Three reports that count frames; a slow machine sends some before its first frame."""
+    reports: list[Health] = []
+
+    def enough() -> bool:
+        if isinstance(message := health.get(0.1), Health) and message.counts["frames"] > 0:
+            reports.append(message)
+        return len(reports) == 3
+
+    until(enough, PATIENCE_S)
+    return reports

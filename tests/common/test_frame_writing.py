@@ -20,6 +20,7 @@ from common.errors import RecordingError
 from common.frame_recording import Illumination, Manifest, RecordedClock, open_recording
 from common.frame_writing import RecordingWriter, encode_png
 from tests.network_helpers import until
+from tests.programs import needs
 
 CAMERA = CameraCalibration(
     version=1,
@@ -76,6 +77,7 @@ def file_size_limit(size: int) -> Generator[None, None, None]:
 @contextmanager
 def small_disk(folder: Path, size: str) -> Generator[Path, None, None]:
     """A file system of its own that really gets full."""
+    needs("mount")
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "phalanx-test", str(folder)]
     if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode != 0:

@@ -142,11 +142,12 @@ def test_what_is_sent_has_the_keys_of_that_machine_alone_and_runs_from_memory(tm
 
 @pytest.fixture
 def fake_ssh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
-    """Puts a script in the place of ssh."""
+    """Puts a script in the place of ssh, and one that only starts it in that of rsync."""
 
     def put(text: str) -> None:
-        (tmp_path / "ssh").write_text(f"#!/bin/sh\n{text}\n")
-        (tmp_path / "ssh").chmod(0o755)
+        for name, script in (("ssh", text), ("rsync", "ssh & wait")):
+            (tmp_path / name).write_text(f"#!/bin/sh\n{script}\n")
+            (tmp_path / name).chmod(0o755)
         monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
     return put

@@ -4,7 +4,6 @@ until it is switched off."""
 import base64
 import contextlib
 import os
-import shutil
 import subprocess
 import tempfile
 import time
@@ -23,6 +22,7 @@ from tests.hosts.measured import Measured
 from tests.hosts.rig import Rig
 from tests.hosts.tap import Tap
 from tests.hosts.undo import Undo
+from tests.programs import missing
 
 MASTER_PORT = 47801
 UP_S = 600.0  # 25 s where nothing else runs; tests are not for the load of the machine
@@ -32,27 +32,17 @@ FASTER = (
 )
 
 
-TOOLS = {
-    "mmdebstrap": "mmdebstrap",
-    "qemu-system-aarch64": "qemu-system-arm",
-    "qemu-system-x86_64": "qemu-system-x86",
-    "mke2fs": "e2fsprogs",
-    "depmod": "kmod",
-    "systemd-sysusers": "systemd",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "rsync": "rsync",
-    "ip": "iproute2",
-}
+TOOLS = (
+    *("mmdebstrap", "qemu-system-aarch64", "qemu-system-x86_64", "mke2fs", "depmod", "systemd-sysusers"),
+    *("ssh", "ssh-keygen", "rsync", "ip"),
+)
 
 
 def why_not() -> str | None:
     """What keeps this machine from running a board, and the way out of it; None: nothing."""
     if os.geteuid() != 0:
         return "needs root: the board is on a network of its own (sudo make test-deploy)"
-    if absent := sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None}):
-        return f"missing here: {', '.join(absent)} (Debian: apt install {' '.join(absent)})"
-    return None
+    return missing(*TOOLS)
 
 
 @dataclass(frozen=True)

@@ -2,27 +2,18 @@
 
 import os
 import platform
-import shutil
 import subprocess
 from pathlib import Path
 
 from bench.made_once import key_of, made_once
+from tests.programs import missing
 
 SUITE, MIRROR = "trixie", "http://deb.debian.org/debian"
 PACKAGES = (
     *("systemd", "systemd-sysv", "dbus", "iproute2", "procps", "sudo"),
     *("openssh-server", "rsync", "chrony", "python3", "python3-venv", "libgomp1"),
 )
-# The tool, and the Debian package that brings it.
-TOOLS = {
-    "mmdebstrap": "mmdebstrap",
-    "systemd-nspawn": "systemd-container",
-    "ip": "iproute2",
-    "rsync": "rsync",
-    "ssh": "openssh-client",
-    "ssh-keygen": "openssh-client",
-    "tcpdump": "tcpdump",
-}
+TOOLS = ("mmdebstrap", "systemd-nspawn", "ip", "rsync", "ssh", "ssh-keygen", "tcpdump")
 ARCHITECTURES = {"x86_64": "amd64", "aarch64": "arm64"}
 
 
@@ -30,8 +21,8 @@ def why_not() -> str | None:
     """What keeps this machine from running hosts, and the way out of it; None: nothing."""
     if os.geteuid() != 0:
         return "needs root: whole machines are started by systemd-nspawn on a bridge (sudo make test-deploy)"
-    if absent := sorted({package for tool, package in TOOLS.items() if shutil.which(tool) is None}):
-        return f"missing here: {', '.join(absent)} (Debian: apt install {' '.join(absent)})"
+    if (reason := missing(*TOOLS)) is not None:
+        return reason
     if control_groups() is None:
         return "needs control groups of version 2 (mount -t cgroup2)"
     return None if platform.machine() in ARCHITECTURES else f"no Debian for {platform.machine()} known here"

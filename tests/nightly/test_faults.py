@@ -1,7 +1,6 @@
 """Faults that take long or need root: a full disk, a million hostile datagrams, strangers at the console."""
 
 import os
-import shutil
 import socket
 import subprocess
 import sys
@@ -17,6 +16,7 @@ from bench.faults_measured import false
 from bench.faults_ports import assault
 from bench.faults_rig import ROOT, FaultRig, end
 from bench.local_rig import free_port, until
+from tests.programs import needs
 
 MILLION = 1_000_000
 DISK_MB, RESERVE_MB = 203, 200
@@ -24,6 +24,7 @@ DISK_MB, RESERVE_MB = 203, 200
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
+    needs("mount")
     if os.geteuid() != 0:
         pytest.skip("a small disk is a tmpfs, which only root may mount")
     folder = tmp_path / "disk"
@@ -60,8 +61,7 @@ def test_a_full_disk_ends_the_recording_and_nothing_else(tmp_path: Path, small_d
 
 def test_a_wall_clock_that_jumps_is_not_noticed(tmp_path: Path) -> None:
     """Of a slave and of the master, ten seconds ahead and back, while the hand is tracked."""
-    if shutil.which("cc") is None:
-        pytest.skip("no cc to build bench/wall_clock.c: apt install gcc libc6-dev")
+    needs("cc")  # for bench/wall_clock.c
     for runs in faults_wall_clock.measure(tmp_path, 2).values():
         assert not any(one.rise[name] for one in runs for name in one.rise)
         assert max(one.share for one in runs) > faults_wall_clock.LEAST_SHARE

@@ -16,6 +16,7 @@ from slave.install.release import Source
 from slave.install.removal import uninstall
 from slave.install.transaction import NOTES, Transaction
 from slave.install.wanted import CALIB
+from tests.programs import needs
 from tests.slave.install.conftest import ROOT, Board, site_of
 
 UNIT = "phalanx-slave@left.service"
@@ -241,6 +242,7 @@ def test_uninstalling_leaves_nothing_of_ours(board: Board, site: Path) -> None:
 def test_a_full_disk_is_told_and_leaves_what_runs(
     board: Board, site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    needs("mount")
     disk = board.root / "opt"
     mount = ["mount", "-t", "tmpfs", "-o", "size=60m", "none", str(disk)]
     if os.geteuid() != 0 or subprocess.run(mount, check=False).returncode != 0:

@@ -3,7 +3,6 @@ all that a slave needs has wheels for the Raspberry Pi."""
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 import tomllib
@@ -13,14 +12,12 @@ from pathlib import Path
 import pytest
 
 from slave.doctor.devices import GROUPS
+from tests.programs import needs
 
 ROOT = Path(__file__).resolve().parents[3]
 FILES = resources.files("slave.install") / "files"
 UNIT = FILES / "phalanx-slave@.service"
 MOST_EXPOSED = 25  # of 250; systemd-analyze counts in tenths
-NEEDS_SYSTEMD = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="systemd-analyze is missing: apt install systemd"
-)
 # What the unit mentions, so that nothing of this machine's own systemd takes part.
 TARGETS = ("sysinit", "basic", "shutdown", "multi-user", "network")
 PROGRAMS = ("opt/phalanx/current/bin/phalanx-slave", "bin/sh")
@@ -34,6 +31,7 @@ def settings(text: str) -> list[tuple[str, str]]:
 
 def verified(tmp_path: Path, text: str) -> str:
     """What systemd says about this text as our unit: nothing, or what is wrong."""
+    needs("systemd-analyze")
     units = tmp_path / "etc/systemd/system"
     units.mkdir(parents=True)
     for name in TARGETS:
@@ -50,12 +48,10 @@ def verified(tmp_path: Path, text: str) -> str:
     return done.stderr + done.stdout + ("" if done.returncode == 0 else f"exit {done.returncode}")
 
 
-@NEEDS_SYSTEMD
 def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
     assert verified(tmp_path, UNIT.read_text()) == ""
 
 
-@NEEDS_SYSTEMD
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -71,9 +67,9 @@ def test_a_slip_in_the_unit_would_be_said(tmp_path: Path, old: str, new: str, sa
     assert said in verified(tmp_path, text.replace(old, new, 1))
 
 
-@NEEDS_SYSTEMD
 @pytest.mark.parametrize(("drop", "passes"), [(None, True), ("SystemCallFilter", False)])
 def test_exposure_of_the_unit(tmp_path: Path, drop: str | None, passes: bool) -> None:
+    needs("systemd-analyze")
     text = UNIT.read_text()
     unit = tmp_path / "phalanx-slave@.service"
     unit.write_text(text if drop is None else re.sub(rf"^{drop}=.*$", "", text, flags=re.MULTILINE))

@@ -20,7 +20,6 @@ from slave.wrist.background import lit
 from slave.wrist.fingers import separate
 from slave.wrist.fingertips import Fingertips, fingertips
 from slave.wrist.led_depth import SHRINK
-from slave.wrist.registration import led_shift, shifted
 from slave.wrist.strobe import Triple
 from slave.wrist.tip_bends import bends_of
 from slave.wrist.tip_templates import templates_of
@@ -185,25 +184,21 @@ def test_templates_point_away_when_stretched_and_at_the_camera_when_half_bent() 
     assert (facing[1:].max(axis=1) > 0.9).all()  # a thumb turns aside before
 
 
-@pytest.mark.parametrize("name", ["curl", "spread"])
-def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
-    # The LED frames of these recordings lie beside the others: registration tells by how much.
-    recording = open_recording(datasets / "wrist" / name)
+@pytest.mark.parametrize(("name", "hidden"), [("curl", 7), ("mcp", 2), ("spread", 0)])
+def test_recorded_tips_are_found(datasets: Path, name: str, hidden: int) -> None:
+    folder = datasets / "wrist" / name
+    recording = open_recording(folder)
     rig = recording.manifest.wrist_rig()
     camera = recording.manifest.cameras[rig.cameras[0]]
     view = WristView.of(rig, camera, load(datasets / f"hands/{rig.hand}.json", HandProfile))
-    rows, truth = recording.frames_of(camera.name), np.load(datasets / "wrist" / name / "truth.npz")
+    rows, truth = recording.frames_of(camera.name), np.load(folder / "truth.npz")
     frames = [
-        Frame(
-            row.seq, row.t_ns, row.t_ns, read_png(datasets / "wrist" / name / row.file, (480, 640), grey=True)
-        )
-        for row in rows
+        Frame(row.seq, row.t_ns, row.t_ns, read_png(folder / row.file, (480, 640), grey=True)) for row in rows
     ]
     triples = [Triple(*frames[k : k + 3]) for k in range(0, len(frames) - 2, 3)]
-    back = -led_shift(triples, view.optics)
     errors = np.array(
         [
-            found(shifted(lit(triple.led.image, triple.ambient.image), back), view).uv - uv
+            found(lit(triple.led.image, triple.ambient.image), view).uv - uv
             for triple, uv in zip(triples, truth["tip_uv"], strict=True)
         ]
     )
@@ -213,7 +208,19 @@ def test_recorded_tips_are_found(datasets: Path, name: str) -> None:
     assert not reported[:, 0].any()  # the thumb's end is never in sight there
     assert (distance[visible] <= 6.0).mean() >= 0.8
     assert (distance[reported] > ELSEWHERE_PX).mean() <= 0.02
-    assert (~visible[reported]).mean() <= 0.09
+    # A round end stays in sight while its foremost point has just turned behind it, and is reported: of the curl's 69
+    # two by 2 and 4 px (triples 5 and 20) and five of the fist's last three triples, PIP 110 to 120 degrees, by 9 to
+    # 20 px; of the mcp's 12 two by 1 px (triple 7). The pictures before the repair, moved back by a fraction of a
+    # pixel, were blurred by that: the curl had 6 of 68, the little finger of triple 23 was not found in them.
+    behind = reported & ~visible
+    assert behind.sum() <= hidden
+    for k, finger in np.argwhere(behind).tolist():
+        labels = read_png(folder / f"label_{k:06d}.png", (480, 640), grey=True)
+        u, v = np.rint(truth["tip_uv"][k, finger]).astype(int).tolist()
+        assert labels[v, u] == 10 * (finger + 1) + 3, (
+            k,
+            finger,
+        )  # its own last bone, no other finger, is before it
 
 
 def test_relative_depth_orders_the_tips_by_their_distance() -> None:
