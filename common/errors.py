@@ -8,6 +8,7 @@
     ├── TrackerError       a device that tracks itself is gone, or nothing here can read it
     │   └── TrackerChoiceError  several are there, and nobody said which
     ├── LightsError        laser or LEDs cannot be switched, or would be on for longer than is safe
+    ├── PictureError       bytes that are no picture, or one of another size
     ├── MessageError       bytes that are not a message of ours
     │   └── BoundsError    a message with a number that cannot be
     ├── BusError           the bus cannot be opened, or nobody answers
@@ -48,6 +49,10 @@ class TrackerChoiceError(TrackerError):
 
 class LightsError(PhalanxError):
     """Laser or LEDs cannot be switched, or would be on for longer than is safe. Never answered with fake ones."""
+
+
+class PictureError(PhalanxError):
+    """Bytes that are no picture, or claim another size than they may have. The text goes on behind a name."""
 
 
 class MessageError(PhalanxError):

@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 from msgspec import Meta, Struct
 from msgspec.structs import force_setattr
 
+from common.errors import PictureError
 from common.message_parts import (
     MAX_COUNT,
     MAX_NUMBER,
@@ -18,6 +19,7 @@ from common.message_parts import (
     TimeNs,
     printable,
 )
+from common.picture_size import MAX_PIXELS, jpeg_size
 
 MAX_PREVIEW_BYTES = 256 * 1024
 MAX_STILL_BYTES = 900 * 1024
@@ -25,7 +27,6 @@ MAX_BODY_CHARACTERS = 64 * 1024
 MAX_CHECKS = 64
 MAX_NUMBERS = 512
 _NAME = 64
-_JPEG_START = b"\xff\xd8\xff"
 
 CheckCode = Literal[
     "camera_absent",
@@ -151,7 +152,8 @@ class Preview(Message, frozen=True, eq=False, tag=True):
     Attributes:
         camera: Camera name.
         t_ns: Middle of the exposure of row 0 [ns], sender's clock.
-        jpeg: A whole JPEG file of the view, usually of half the camera's width and height.
+        jpeg: A whole JPEG file of the view, usually of half the camera's width and height: 256 KiB, sides of at most
+            16384 px, 2^26 px, 64 scans.
     """
 
     camera: Name
@@ -159,8 +161,7 @@ class Preview(Message, frozen=True, eq=False, tag=True):
     jpeg: Annotated[bytes, Meta(max_length=MAX_PREVIEW_BYTES)]
 
     def __post_init__(self) -> None:
-        if len(self.jpeg) > MAX_PREVIEW_BYTES or not self.jpeg.startswith(_JPEG_START):
-            raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_PREVIEW_BYTES}")
+        _check_jpeg(self.jpeg, MAX_PREVIEW_BYTES)
 
 
 class Still(Message, frozen=True, eq=False, tag=True):
@@ -170,7 +171,7 @@ class Still(Message, frozen=True, eq=False, tag=True):
         camera: Camera name.
         seq: Frame counter of this camera.
         t_ns: Middle of the exposure of row 0 [ns], sender's clock.
-        jpeg: A whole JPEG file of the camera's width and height.
+        jpeg: A whole JPEG file of the camera's width and height: 900 KiB, otherwise as that of a preview.
     """
 
     camera: Name
@@ -179,5 +180,20 @@ class Still(Message, frozen=True, eq=False, tag=True):
     jpeg: Annotated[bytes, Meta(max_length=MAX_STILL_BYTES)]
 
     def __post_init__(self) -> None:
-        if len(self.jpeg) > MAX_STILL_BYTES or not self.jpeg.startswith(_JPEG_START):
-            raise ValueError(f"jpeg: {len(self.jpeg)} bytes, expected a JPEG of at most {MAX_STILL_BYTES}")
+        _check_jpeg(self.jpeg, MAX_STILL_BYTES)
+
+
+def _check_jpeg(jpeg: bytes, most: int) -> None:
+    """Refuse what no camera of ours sends; whoever decodes it compares its size with the camera file as well.
+
+    Raises:
+        ValueError: Too many bytes, no JPEG, or one that claims too many pixels or scans.
+    """
+    if len(jpeg) > most:
+        raise ValueError(f"jpeg: {len(jpeg)} bytes, expected a JPEG of at most {most}")
+    try:
+        width, height = jpeg_size(jpeg)
+    except PictureError as error:
+        raise ValueError(f"jpeg: {error}") from error
+    if width * height > MAX_PIXELS:
+        raise ValueError(f"jpeg: claims {width} x {height} px, more than {MAX_PIXELS}")

@@ -95,12 +95,14 @@ def run(
     """Detect and send until the source ends or `stop` is set. A frame without any marker is sent as well.
 
     Tags are sought once the markers of the frame are sent. `show` is offered every frame after that; it must not wait.
-    `alive` is called when a frame is done with.
+    `alive` is called when a frame is done with. Whatever these raise costs that frame alone; where every frame fails,
+    `alive` is not called, and a watchdog begins the process anew.
 
     Raises:
         CameraError: The camera is gone.
     """
-    while not stop.is_set() and (frame := source.read()) is not None:
+
+    def work(frame: Frame) -> None:
         began_ns = time.perf_counter_ns()
         found = detector.push(frame.image, frame.t_ns)
         detect_ns = time.perf_counter_ns() - began_ns
@@ -124,6 +126,12 @@ def run(
         show(frame)
         alive()
 
+    while not stop.is_set() and (frame := source.read()) is not None:
+        try:
+            work(frame)
+        except Exception as error:  # noqa: BLE001 - one frame; it is counted and logged
+            tally.failed(frame.seq, error)
+
 
 def run_wrist(
     source: FrameSource,
@@ -138,25 +146,33 @@ def run_wrist(
     """Detect and send until the source ends or `stop` is set. A triple without any finger is sent as well.
 
     `show` is offered the frame under the LEDs of every triple, and every frame while there are no triples. `alive` is
-    called for every frame.
+    called for every frame. Whatever these raise costs that frame alone, as in `run`.
 
     Raises:
         CameraError: The camera is gone.
     """
     took_ns: deque[int] = deque(maxlen=3)  # of the frames that may be a triple; those before are none of it
     parts = 0
-    while not stop.is_set() and (frame := source.read()) is not None:
+
+    def work(frame: Frame) -> None:
+        nonlocal parts
         began_ns = time.perf_counter_ns()
         found = detector.push(frame)
         took_ns.append(time.perf_counter_ns() - began_ns)
-        alive()
         if found is None:
             tally.part(frame.seq)
             parts += 1
             if parts > DARK_AFTER:
                 show(frame)
-            continue
-        sender.send(found.message(camera, sender.session))
-        tally.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
-        parts = 0
-        show(found.triple.led)
+        else:
+            sender.send(found.message(camera, sender.session))
+            tally.frame(frame.seq, sum(took_ns), np.vstack([found.laser.uv, found.tips.uv]))
+            parts = 0
+            show(found.triple.led)
+        alive()
+
+    while not stop.is_set() and (frame := source.read()) is not None:
+        try:
+            work(frame)
+        except Exception as error:  # noqa: BLE001 - one frame; it is counted and logged
+            tally.failed(frame.seq, error)

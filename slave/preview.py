@@ -23,6 +23,7 @@ from common.errors import BusError, CalibrationError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still
 from common.preview_wish import PreviewWish
 from slave.cameras.source import Frame
+from slave.failures import Failures
 from slave.overlay import Overlay
 
 PERIOD_NS = 100_000_000
@@ -85,6 +86,7 @@ class Previews:
         self._still_wanted = False
         self._still: deque[Frame] = deque(maxlen=1)
         self._wake = threading.Event()
+        self._failures = Failures(f"{camera} preview")
         self._closing = threading.Event()
         self._lock = threading.Lock()  # a bus is never closed while it is published on
         self._bus: Bus | None = None
@@ -144,12 +146,18 @@ class Previews:
             if not self._wake.wait(WAIT_S):
                 self._shown.clear()  # nobody looks any more
             self._wake.clear()
-            if self._still and not self._closing.is_set():
-                self._send_whole(self._still.popleft())
-            if self._waiting and not self._closing.is_set():
-                frame = self._waiting.popleft()
-                self._shown.append(frame)
-                self._publish("preview", Preview(self._camera, frame.t_ns, self._picture(frame)))
+            try:
+                self._send_waiting()
+            except Exception as error:  # noqa: BLE001 - one picture, and whatever it is drawn with
+                self._failures.log("a picture is not shown", error)
+
+    def _send_waiting(self) -> None:
+        if self._still and not self._closing.is_set():
+            self._send_whole(self._still.popleft())
+        if self._waiting and not self._closing.is_set():
+            frame = self._waiting.popleft()
+            self._shown.append(frame)
+            self._publish("preview", Preview(self._camera, frame.t_ns, self._picture(frame)))
 
     def _picture(self, frame: Frame) -> bytes:
         """The JPEG file of a frame, with what is wished for."""

@@ -15,6 +15,7 @@ from common.clock import Clock
 from common.errors import BusError
 from common.machine import Machine, program
 from common.messages import Command, Health
+from slave.failures import Failures
 
 PERIOD_S = (
     0.5  # two reports make a judgement in the checklist of the master, which is to be out within two seconds
@@ -139,6 +140,7 @@ class Reporter:
         self._gauges: dict[str, float] = {}
         self._bus: Bus | None = None
         self._endpoint: str | None = None
+        self._failures = Failures(f"{name} health")
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._work, name=f"{name} health", daemon=True)
         self._thread.start()
@@ -182,10 +184,10 @@ class Reporter:
         while not self._closing.wait(self._period_s):
             if count % LOG_EVERY == ALONE_AT and self._link.zenoh_endpoint is None:
                 _LOG.warning("%s", _why_alone(self._link.counts))
-            for part in self._parts:
-                part.look()
-            self._gauges = dict(self._numbers.gauges()) | self._figures()
             try:
+                for part in self._parts:
+                    part.look()
+                self._gauges = dict(self._numbers.gauges()) | self._figures()
                 self._follow(self._link.zenoh_endpoint)
                 if self._bus is not None:
                     self._bus.publish("health", self._name, self.health())
@@ -193,6 +195,8 @@ class Reporter:
                 self._leave()
                 if count % LOG_EVERY == 0:
                     _LOG.warning("no bus: %s", error)
+            except Exception as error:  # noqa: BLE001 - whatever it is of, the next report is tried
+                self._failures.log("no report", error)
             if count % LOG_EVERY == 0 and self._numbers.counts().get("frames", 0):
                 _LOG.info("%s", "  ".join(f"{k} {_short(v)}" for k, v in self._gauges.items()))
             count += 1

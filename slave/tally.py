@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from common.arrays import Float
+from slave.failures import Failures
 
 SMOOTHING = 0.05  # weight of the newest frame in the running means
 
@@ -14,7 +15,7 @@ SMOOTHING = 0.05  # weight of the newest frame in the running means
 class Tally:
     """Counters of the loop, written by the loop and read by the health thread.
 
-    Holds the counts since the start, running means, and what the last rate was reckoned from.
+    Holds the counts since the start, running means, what the last rate was reckoned from, and what frames failed of.
     """
 
     def __init__(
@@ -31,7 +32,8 @@ class Tally:
         self._lock = threading.Lock()
         self._frames = self._sought = 0
         self._dropped = 0
-        self._empty = 0
+        self._empty = self._failed = 0
+        self._failures = Failures("the loop")
         self._seen = np.zeros(len(names), np.int64)
         self._names = names
         self._last_seq: int | None = None
@@ -62,6 +64,15 @@ class Tally:
         with self._lock:
             self._count(seq)
 
+    def failed(self, seq: int, error: Exception) -> None:
+        """Count one frame whose detection, or what follows it, raised an error, and log that now and then.
+
+        A frame that was not counted by `frame` or `part` before is one that was dropped.
+        """
+        self._failures.log(f"nothing is made of frame {seq}", error)
+        with self._lock:
+            self._failed += 1
+
     def _count(self, seq: int) -> None:
         if self._last_seq is not None and seq > self._last_seq + 1:
             self._dropped += seq - self._last_seq - 1
@@ -69,9 +80,10 @@ class Tally:
         self._frames += 1
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: frames, dropped, empty, seen.<name>, and the others."""
+        """Event -> how often since the start: frames, dropped, empty, failed, seen.<name>, and the others."""
         with self._lock:
             counts = {"frames": self._frames, "dropped": self._dropped, "empty": self._empty}
+            counts["failed"] = self._failed
             counts |= {f"seen.{n}": int(k) for n, k in zip(self._names, self._seen, strict=True)}
         return {**counts, **self._others()}
 

@@ -27,6 +27,7 @@ from master.console.history import STEP_S, History
 from master.console.link import Link
 from master.console.local import LocalProcesses
 from master.console.looking import Looking
+from master.console.picture_sizes import PictureSizes
 from master.console.tuner import Tuner
 from master.master_bus import join_bus
 from master.options import HERE_BEACON, HERE_BIND, HERE_BUS
@@ -107,6 +108,7 @@ class ConsoleState:
         self._previews, self._checklists = Newest[Preview](), Newest[Checklist]()
         self._latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self._closing = threading.Event()
+        self._sizes = PictureSizes(self.camera)
         self.link = Link(open_bus or (lambda: join_bus(settings.bus)), _takers(self))
         self._looking = Looking(self.link.ask)
         self._tuners: dict[str, Tuner] = {}
@@ -158,7 +160,7 @@ class ConsoleState:
 
     def preview_error(self, camera: str) -> str:
         """Why there is no picture of a camera that somebody looks at; empty while it answers."""
-        return self._looking.error(camera)
+        return self._sizes.error(camera) or self._looking.error(camera)
 
     def tuner(self, camera: str) -> Tuner:
         """What tunes a camera, the same for every page: all revert to what it was before the first change."""
@@ -224,7 +226,8 @@ class ConsoleState:
             case Gesture():
                 self.gestures_heard.push(message, time.monotonic())
             case Preview():
-                self._previews.put(message.camera, message)
+                if self._sizes.fits(message):
+                    self._previews.put(message.camera, message)
             case Checklist():
                 self._checklists.put(message.source, message)
             case _:

@@ -1,4 +1,4 @@
-"""Asks the cameras for their pictures as long as somebody looks, and reads how large those are."""
+"""Asks the cameras for their pictures as long as somebody looks."""
 
 import logging
 import threading
@@ -62,16 +62,3 @@ class PictureAsker:
                 if not silent and not self._closing.is_set():
                     self._say(f"no picture of camera {camera} yet: {error}")
                 silent = True
-
-
-def jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height [px] in the frame header of a JPEG file (ITU-T T.81, B.2.2), or None if it has none."""
-    at = 2
-    while data[:2] == b"\xff\xd8" and at + 9 <= len(data) and data[at] == 0xFF:
-        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # those three are tables, not frames
-            height = int.from_bytes(data[at + 5 : at + 7], "big")
-            width = int.from_bytes(data[at + 7 : at + 9], "big")
-            return (width, height) if width and height else None
-        at += 2 + length
-    return None

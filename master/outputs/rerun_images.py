@@ -8,7 +8,8 @@ import rerun as rr
 
 from common.arrays import Image
 from common.camera_model import CameraModel
-from master.outputs.previews import jpeg_size
+from common.errors import PictureError
+from common.picture_size import Size, jpeg_size
 from master.outputs.rerun_blueprint import TIMELINE, camera_path
 
 IMAGE_PERIOD_NS = 100_000_000  # images at most at 10 Hz: they cost the viewer more than all else
@@ -28,8 +29,8 @@ class CameraImages:
     def log(self, camera: str, image: Image | bytes, t_ns: int, shown_ns: int | None = None) -> bool:
         """Show an image of a camera at its full size, however small it is.
 
-        More than 10 a second are left out, and so are images of a camera that the rig does not have, and
-        bytes that are no JPEG.
+        More than 10 a second are left out, and so are images of a camera that the rig does not have, bytes that are
+        no JPEG, and what claims to be larger than the camera's picture.
 
         Args:
             camera: A camera of the rig.
@@ -41,17 +42,18 @@ class CameraImages:
             Whether it was logged.
         """
         last = self._last_ns.get(camera)
-        size = jpeg_size(image) if isinstance(image, bytes) else (image.shape[1], image.shape[0])
         if last is not None and 0 <= t_ns - last < IMAGE_PERIOD_NS:
             return False
-        if size is None or camera not in self._models:
+        model = self._models.get(camera)
+        size = _size(image)
+        if model is None or size is None or size[0] > model.width_px or size[1] > model.height_px:
             return False
         self._last_ns[camera] = t_ns
         if isinstance(image, bytes):
             jpeg = image
         else:
             jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
-        path, model = f"{camera_path(camera)}/image", self._models[camera]
+        path = f"{camera_path(camera)}/image"
         if self._size.get(camera) != size:
             # The pinhole and all centroids are in pixels of the camera; a preview has fewer.
             scale = [model.width_px / size[0], model.height_px / size[1], 1.0]
@@ -60,3 +62,13 @@ class CameraImages:
         self._rec.set_time(TIMELINE, duration=np.timedelta64(t_ns if shown_ns is None else shown_ns, "ns"))
         self._rec.log(path, rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
         return True
+
+
+def _size(image: Image | bytes) -> Size | None:
+    """Width and height [px]; None: no JPEG."""
+    if not isinstance(image, bytes):
+        return image.shape[1], image.shape[0]
+    try:
+        return jpeg_size(image)
+    except PictureError:
+        return None

@@ -44,6 +44,8 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
         keep_one_in: Of so many frames one is delivered: a camera, or a cable, that is too slow.
         swap_every: Of so many frames two come in the wrong order: the strobe of a wrist device slips. 0: none.
         unplugged: It is not there: lost while it runs, and not to be opened.
+        raises: Its driver raises an error that is none of ours at the next frame.
+        frozen: It sends one picture again and again, with new stamps, also after it was opened again.
     """
 
     exposes: Annotated[float, Meta(gt=0.0, le=10.0)] = 1.0
@@ -52,13 +54,36 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
     keep_one_in: Annotated[int, Meta(ge=1, le=100)] = 1
     swap_every: Annotated[int, Meta(ge=0, le=1000)] = 0
     unplugged: bool = False
+    raises: bool = False
+    frozen: bool = False
+
+
+class Frozen:
+    """The one picture of a camera that is frozen, kept while it is opened again. Holds it, if it is."""
+
+    def __init__(self) -> None:
+        """It is not."""
+        self._image: Image | None = None
+
+    def shown(self, image: Image, frozen: bool) -> Image:
+        """What comes in place of a picture."""
+        if not frozen:
+            self._image = None
+            return image
+        if self._image is None:
+            self._image = image
+        return self._image
 
 
 class FaultyCamera:
     """A `FrameSource` and `Tunable` around a simulated one. Holds the faults, and what the camera was told last."""
 
-    def __init__(self, source: SyntheticCamera, camera: CameraCalibration, path: Path) -> None:
+    def __init__(
+        self, source: SyntheticCamera, camera: CameraCalibration, path: Path, frozen: Frozen | None = None
+    ) -> None:
         """Have the faults that `path` says; there need be no such file yet.
+
+        `frozen` is the same for every opening of one camera.
 
         Raises:
             CameraError: The file is broken, or says that the camera is unplugged.
@@ -69,6 +94,7 @@ class FaultyCamera:
         self._looked_ns = 0
         self._count = 0
         self._held: Frame | None = None
+        self._frozen = frozen or Frozen()
         self._look()
         self._refuse_unplugged()
 
@@ -77,6 +103,7 @@ class FaultyCamera:
 
         Raises:
             CameraError: The camera was unplugged.
+            RuntimeError: Its driver is to raise something that no driver of ours raises.
         """
         while (frame := self._source.read()) is not None:
             if frame.ready_t_ns - self._looked_ns >= LOOK_NS:
@@ -86,10 +113,13 @@ class FaultyCamera:
                 except CameraError as error:
                     _LOG.warning("%s", error)
                 self._refuse_unplugged()
+            if self._faults.raises:
+                raise RuntimeError(f"the driver of camera {self._camera.name!r} fails, says {self._path}")
             self._count += 1
             if self._count % self._faults.keep_one_in:
                 continue
-            return replace(frame, image=self._spoiled(self._swapped(frame)))
+            image = self._spoiled(self._swapped(frame))
+            return replace(frame, image=self._frozen.shown(image, self._faults.frozen))
         return None
 
     def close(self) -> None:

@@ -39,7 +39,6 @@ _PACKED = {
     "Y10P": (5, 4),
     "Y12P": (3, 2),
 }  # bytes of a group; its first ones, each the highest 8 bits of a pixel
-_JPEG = ("MJPG", "JPEG")
 _LUMA = {
     "NV12": (1, 0),
     "YU12": (1, 0),
@@ -48,7 +47,8 @@ _LUMA = {
 }  # bytes from pixel to pixel, the first
 # The best first: without conversion, then with the fewest bytes; JPEG where nothing else is fast enough.
 GREY_FORMATS = ("GREY", "Y10P", "Y12P", "Y10", "Y12", "Y16")
-LUMA_FORMATS = (*_LUMA, *_JPEG)
+LUMA_FORMATS = tuple(_LUMA)
+JPEG_FORMATS = ("MJPG", "JPEG")
 _LIMITED = 255.0 / 219.0  # luma of 16 to 235 (ITU-R BT.601, 2.5.3) as 0 to 255
 _FULL_RANGE = np.clip(np.round((np.arange(256) - 16.0) * _LIMITED), 0, 255).astype(np.uint8)
 
@@ -92,21 +92,16 @@ def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: 
 def luma(
     data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: int, *, full_range: bool
 ) -> Image | None:
-    """New image (H, W) of the luma of a colour format, black 0 and white 255; None for a frame that is cut or broken.
+    """New image (H, W) of the luma of a colour format, black 0 and white 255; None for a frame that is cut.
 
     Args:
         data: (N,) the bytes of the frame.
         name: Four letters of the format, one of `LUMA_FORMATS`.
         size: Width and height [px].
-        stride: Bytes from row to row; meaningless for JPEG.
-        full_range: Whether it is coded as 0 to 255 (as JPEG always is), and not as 16 to 235.
+        stride: Bytes from row to row.
+        full_range: Whether it is coded as 0 to 255, and not as 16 to 235.
     """
     width, height = size
-    if name in _JPEG:
-        image = cv2.imdecode(
-            data, cv2.IMREAD_GRAYSCALE
-        )  # None where the end is missing (OpenCV 4.12 and 5.0)
-        return None if image is None or image.shape != (height, width) else np.asarray(image, np.uint8)
     step, first = _LUMA[name]
     rows = _rows(data, height, stride, width * step)
     if rows is None:

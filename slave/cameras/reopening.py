@@ -4,9 +4,11 @@ An error while the camera is opened for the first time is an error. Once it has 
 given back, and opened again after 0.2 s, 0.4 s … at most 2 s, until it is there or the slave is told to stop. Every
 opening writes and checks all settings again, as they were last changed. `seq` keeps rising, by as many frames as fit
 into the absence, so that those count as dropped.
+
+Whatever a driver raises is a loss of its camera, also what is no `CameraError`. A camera that repeats one picture with
+new stamps measures nothing: the copies are left out, and after a second of them it is opened again as one that is lost.
 """
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -15,21 +17,22 @@ from dataclasses import replace
 from common.calibration import CameraCalibration
 from common.clock import Clock
 from common.errors import CameraError
+from slave.cameras.repeated import RepeatedPictures
 from slave.cameras.settings import Tunable
 from slave.cameras.source import Frame, FrameSource
+from slave.failures import Failures
 from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
-LOG_EVERY_NS = 10_000_000_000
-_LOG = logging.getLogger(__name__)
+FROZEN_NS = 1_000_000_000
 
 
 class ReopeningCamera:
     """A `FrameSource` around one that can be lost.
 
-    Holds the open camera, if there is one, its settings, the number and time of the last frame, and in `lost` how
-    often the camera went away.
+    Holds the open camera, if there is one, its settings, the number and time of the last frame, its picture, in `lost`
+    how often the camera went away, and in `frozen` how many frames were copies of the one before.
     """
 
     def __init__(
@@ -63,9 +66,11 @@ class ReopeningCamera:
         self._fresh = False  # the next frame is the first one after a loss
         self._last: tuple[int, int] | None = None  # seq, t_ns
         self._wait_s = FIRST_WAIT_S
-        self._said_ns: int | None = None
         self._past: Counter[str] = Counter()  # of the cameras that were given back
-        self.lost = 0
+        self._pictures = RepeatedPictures()
+        self._frozen_ns: int | None = None  # since when it repeats one
+        self._failures = Failures("camera", clock.now_ns)
+        self.lost = self.frozen = 0
 
     def read(self) -> Frame | None:
         """Next frame; waits for a lost camera. None at the end of the stream, when stopped, or once closed."""
@@ -75,13 +80,18 @@ class ReopeningCamera:
                 return None
             try:
                 frame = source.read()
-            except CameraError as error:
+                if frame is None:
+                    return None
+                if not self._repeats(frame):
+                    return self._number(frame)
+            except Exception as error:  # noqa: BLE001 - whatever a driver raises is its camera's failure
+                if self._closed.is_set():  # under its hands
+                    return None
                 self.lost += 1
-                self._away(f"camera lost: {error}")
-                self._say(f"lost: {error}")
+                self._away(f"camera lost: {self._failures.log('lost', error)}")
                 self._drop()
-                continue
-            return None if frame is None else self._number(frame)
+            if self._stop.is_set():
+                return None
 
     def close(self) -> None:
         """Give the camera back. Safe to call twice, and from another thread that ends a wait."""
@@ -97,32 +107,59 @@ class ReopeningCamera:
         source = self._source
         if not isinstance(source, Tunable):
             raise CameraError(f"camera {camera.name!r} is away: its settings can be changed when it is back")
-        source.tune(camera)
+        try:
+            source.tune(camera)
+        except CameraError:
+            raise
+        except Exception as error:
+            why = self._failures.log("its settings cannot be changed", error)
+            raise CameraError(f"camera {camera.name!r}: its settings cannot be changed: {why}") from error
         self._camera = camera
 
     def figures(self) -> dict[str, float]:
-        """Those of the open camera; none while it is away."""
+        """Those of the open camera; none while it is away, or does not tell them."""
         source = self._source
-        return source.figures() if isinstance(source, Tunable) else {}
+        return self._failures.ask(source.figures) if isinstance(source, Tunable) else {}
 
     def counts(self) -> dict[str, int]:
-        """`camera.lost`, and the events of all cameras that were opened."""
-        source = self._source
-        counts = Counter({"camera.lost": self.lost})
+        """`camera.lost`, `.frozen`: copies of the frame before; `.raised`: what a driver raised that is no error of
+        ours; and the events of all cameras that were opened."""
+        own = {"camera.lost": self.lost, "camera.frozen": self.frozen, "camera.raised": self._failures.raised}
+        counts = Counter(own)
         counts.update(self._past)
-        counts.update(source.counts() if isinstance(source, Tunable) else {})
+        counts.update(self._events(self._source))
         return dict(counts)
 
     def _drop(self) -> None:
         source, self._source = self._source, None
         if source is None:
             return
-        if isinstance(source, Tunable):
-            self._past.update(source.counts())
-        try:
-            source.close()
-        except CameraError as error:
-            self._say(f"could not be given back: {error}")
+        self._past.update(self._events(source))
+        self._frozen_ns = None
+        self._failures.close(source)
+
+    def _events(self, source: FrameSource | None) -> dict[str, int]:
+        """What a camera counted."""
+        return self._failures.ask(source.counts) if isinstance(source, Tunable) else {}
+
+    def _repeats(self, frame: Frame) -> bool:
+        """Whether a frame has the picture of the one before, and so is no measurement.
+
+        Raises:
+            CameraError: All have had it for a second.
+        """
+        if not self._pictures.push(frame.image):
+            self._frozen_ns = None
+            return False
+        self.frozen += 1
+        now_ns = self._clock.now_ns()
+        if self._frozen_ns is None:
+            self._frozen_ns = now_ns
+        if now_ns - self._frozen_ns >= FROZEN_NS:
+            raise CameraError(
+                "it has repeated one picture, with new stamps, for a second: it is opened again"
+            )
+        return True
 
     def _return(self) -> FrameSource | None:
         """Open until it works; None when told to stop."""
@@ -130,9 +167,8 @@ class ReopeningCamera:
             self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a frame has come
             try:
                 self._source, self._fresh = self._open(self._camera), True
-            except CameraError as error:
-                self._away(f"camera away: {error}")
-                self._say(f"still away: {error}")
+            except Exception as error:  # noqa: BLE001 - as above
+                self._away(f"camera away: {self._failures.log('still away', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()
@@ -142,8 +178,8 @@ class ReopeningCamera:
     def _number(self, frame: Frame) -> Frame:
         """The frame with a number that goes on where the last camera ended."""
         if self._fresh:
-            _LOG.warning("camera: back after loss number %d", self.lost)
-            self._said_ns, self._wait_s, self._fresh = None, FIRST_WAIT_S, False
+            self._failures.over(f"back after loss number {self.lost}")
+            self._wait_s, self._fresh = FIRST_WAIT_S, False
             if self._last is not None:
                 seq, t_ns = self._last
                 self._base = (
@@ -152,10 +188,3 @@ class ReopeningCamera:
         seq = frame.seq + self._base
         self._last = (seq, frame.t_ns)
         return frame if self._base == 0 else replace(frame, seq=seq)
-
-    def _say(self, text: str) -> None:
-        """Log the first event of an absence at once, further ones every ten seconds."""
-        now_ns = self._clock.now_ns()
-        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
-            _LOG.warning("camera: %s", text)

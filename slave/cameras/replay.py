@@ -3,15 +3,13 @@
 import time
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from common.arrays import Image
 from common.calibration import CameraCalibration
 from common.camera_settings import figures, same_exposed
 from common.clock import Clock
-from common.errors import CameraError, RecordingError
+from common.errors import CameraError, PictureError, RecordingError
 from common.frame_recording import FrameRow, Manifest, open_recording
+from common.pictures import decode
 from slave.cameras.source import Frame
 
 GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
@@ -117,17 +115,11 @@ def read_png(path: Path, size: tuple[int, int], *, grey: bool = False) -> Image:
         grey: Whether one channel is wanted.
 
     Raises:
-        CameraError: Missing, not an image, or of another size; the text names the file.
+        CameraError: Missing, no image, or of another size; the text names the file.
     """
     try:
-        raw = np.frombuffer(path.read_bytes(), np.uint8)
+        return decode(path.read_bytes(), (size[1], size[0]), grey=grey)
     except OSError as error:
         raise CameraError(f"{path}: cannot read: {error.strerror}") from error
-    image = cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR) if raw.size else None
-    if image is None:
-        raise CameraError(f"{path}: not an image, or cut; record again or remove its line from frames.csv")
-    if image.shape[:2] != size:
-        raise CameraError(
-            f"{path}: {image.shape[1]}x{image.shape[0]} px, the camera file says {size[1]}x{size[0]}"
-        )
-    return np.asarray(image, dtype=np.uint8)
+    except PictureError as error:
+        raise CameraError(f"{path}: {error}; record again, or remove its line from frames.csv") from error

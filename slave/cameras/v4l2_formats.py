@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 
 from common.arrays import Image
-from common.errors import CameraError
-from slave.cameras.grey import GREY_FORMATS, LUMA_FORMATS, Pixels, grey, luma
+from common.errors import CameraError, PictureError
+from common.pictures import decode
+from slave.cameras.grey import GREY_FORMATS, JPEG_FORMATS, LUMA_FORMATS, Pixels, grey, luma
 from slave.cameras.v4l2_abi import (
     CAPTURE,
     COLORSPACE_JPEG,
@@ -39,9 +40,9 @@ from slave.cameras.v4l2_abi import (
 RATE_SHARE = 0.01  # 59.94 Hz serves 60 Hz
 MOST = 256  # entries of an enumeration; a driver that never ends it is broken
 PREFERENCE = {
-    Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", "MJPG", "JPEG"),
+    Pixels.COLOUR: ("BGR3", "RGB3", "YUYV", "UYVY", *JPEG_FORMATS),
     Pixels.GREY: GREY_FORMATS,
-    Pixels.LUMA: LUMA_FORMATS,
+    Pixels.LUMA: (*LUMA_FORMATS, *JPEG_FORMATS),
 }
 
 _WHY_NOT = {
@@ -142,12 +143,20 @@ class Layout:
         Raises:
             CameraError: Its values do not lie where they should.
         """
+        if self.name in JPEG_FORMATS:
+            return self._decoded(bytes(data))
         raw = np.frombuffer(data, np.uint8)
         if self.pixels is Pixels.COLOUR:
             return _colours(raw, self.name, self.size, self.stride)
         if self.pixels is Pixels.LUMA:
             return luma(raw, self.name, self.size, self.stride, full_range=self.full_range)
         return grey(raw, self.name, self.size, self.stride)
+
+    def _decoded(self, jpeg: bytes) -> Image | None:
+        try:
+            return decode(jpeg, self.size, grey=self.pixels is not Pixels.COLOUR)
+        except PictureError:
+            return None  # the caller counts it as broken
 
 
 def set_format(device: Device, offer: Offer, pixels: Pixels) -> Layout:
@@ -172,10 +181,6 @@ def set_format(device: Device, offer: Offer, pixels: Pixels) -> Layout:
 
 def _colours(raw: Image, name: str, size: tuple[int, int], stride: int) -> Image | None:
     width, height = size
-    if name in ("MJPG", "JPEG"):
-        image = cv2.imdecode(raw, cv2.IMREAD_COLOR)  # None where the end is missing (OpenCV 4.12 and 5.0)
-        whole = image is not None and image.shape == (height, width, 3)
-        return np.asarray(image, np.uint8) if whole else None
     used = width * (3 if name in ("BGR3", "RGB3") else 2)
     if raw.size < stride * (height - 1) + used or stride < used:
         return None

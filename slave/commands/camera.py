@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from common.calibration import CameraCalibration, RigCalibration
 from common.clock import Clock
-from common.errors import CameraError, PhalanxError
+from common.errors import CameraError
 from slave.cameras import real
 from slave.cameras.source import FrameSource
 from slave.commands.options import add_place, add_simulated, epoch_of, number, world_of
@@ -78,7 +78,7 @@ def open_lit(
     guard = open_guarded(lights, rig)
     try:
         source = _open(options, rig, camera, clock, true_clock, stop, away)
-    except PhalanxError:
+    except Exception:
         guard.close()
         raise
     return StrobedCamera(source, camera, rig, StrobeController(schedule, guard, clock))
@@ -133,8 +133,10 @@ def _open_synthetic(
 
     if getattr(options, "faults", None) is None:
         return draw(camera)
-    from slave.cameras.faulty import FaultyCamera
+    from slave.cameras.faulty import FaultyCamera, Frozen
+
+    frozen = Frozen()
 
     return real.lasting(
-        lambda file: FaultyCamera(draw(file), file, options.faults), camera, clock, stop, away
+        lambda file: FaultyCamera(draw(file), file, options.faults, frozen), camera, clock, stop, away
     )

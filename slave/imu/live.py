@@ -25,10 +25,12 @@ def wait_for_start(
     stop: threading.Event,
     orientation: Orientation | None = None,
     alive: Callable[[], None] = nothing,
+    failed: Callable[[int, Exception], None] | None = None,
 ) -> bool:
     """Wait for the master as long as it takes; False if told to stop before, or the source has ended.
 
     Samples are read meanwhile, and forgotten: none grows old in a buffer, and the filter knows its bias when it starts.
+    `failed` is told of a sample of which the filter raised something.
 
     Raises:
         ImuError: The IMU is gone.
@@ -38,8 +40,13 @@ def wait_for_start(
             return True
         if (sample := source.read()) is None:
             return False
-        if orientation is not None:
-            orientation.push(sample)
+        try:
+            if orientation is not None:
+                orientation.push(sample)
+        except Exception as error:
+            if failed is None:
+                raise
+            failed(sample.seq, error)
         alive()
     return False
 
@@ -54,17 +61,20 @@ def run(
 ) -> None:
     """Send every sample until the source ends or `stop` is set.
 
-    Its orientation is that of the filter, without one the sensor's own; rates and forces stay as they were measured.
+    Its orientation is that of the filter, without one the sensor's own; rates and forces stay as they were measured. A
+    sample of which the filter raises something is left out.
 
     Raises:
         ImuError: The IMU is gone.
     """
     while not stop.is_set() and (sample := source.read()) is not None:
-        if orientation is not None:
-            sample = orientation.push(sample)
-        sender.send(replace(sample, session=sender.session))
-        tally.sample(sample.seq)
-        alive()
+        try:
+            turned = sample if orientation is None else orientation.push(sample)
+            sender.send(replace(turned, session=sender.session))
+            tally.sample(sample.seq)
+            alive()
+        except Exception as error:  # noqa: BLE001 - one sample; it is counted and logged
+            tally.failed(sample.seq, error)
 
 
 def run_live(
@@ -103,7 +113,7 @@ def run_live(
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
         say("ready, waiting for the master")
         service.ready(lambda: uplink.started)
-        if wait_for_start(source, uplink, stop, orientation, service.waiting):
+        if wait_for_start(source, uplink, stop, orientation, service.waiting, tally.failed):
             run(source, uplink, tally, stop, orientation, service.working)
     finally:
         service.stopping()

@@ -3,10 +3,9 @@
 As for cameras: an error while it is opened for the first time is an error. Once it has run, losing it is an event: it
 is given back, and opened again after 0.2 s, 0.4 s ... at most 2 s, until it is there or the slave is told to stop.
 Every opening asks who is there and writes all settings again. Meanwhile there are no samples; `seq` goes on behind
-a gap of as many as fit into the absence, so that those count as skipped.
+a gap of as many as fit into the absence, so that those count as skipped. Whatever a driver raises is a loss of its IMU.
 """
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -14,15 +13,13 @@ from collections.abc import Callable, Mapping
 from msgspec.structs import replace
 
 from common.clock import Clock
-from common.errors import ImuError
 from common.messages import ImuSample
+from slave.failures import Failures
 from slave.imu.source import ImuSource, Telling
 from slave.service import Away, nobody
 
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 1.0  # what is plugged in again tracks within two seconds
-LOG_EVERY_NS = 10_000_000_000
-_LOG = logging.getLogger(__name__)
 
 
 class ReopeningImu:
@@ -58,7 +55,7 @@ class ReopeningImu:
         self._base: int | None = 0  # added to the own numbers of the IMU; None: of one that was just opened
         self._last: tuple[int, int] | None = None  # seq, t_ns
         self._away_ns: int | None = None  # since when; until a sample has come
-        self._said_ns: int | None = None
+        self._failures = Failures("IMU", clock.now_ns)
         self._wait_s = FIRST_WAIT_S
         self._counts: Counter[str] = Counter()  # with those of the IMUs that were given back
 
@@ -70,13 +67,14 @@ class ReopeningImu:
                 return None
             try:
                 sample = source.read()
-            except ImuError as error:
+                if sample is None:
+                    return None
+                if (numbered := self._number(sample)) is not None:
+                    return numbered
+            except Exception as error:  # noqa: BLE001 - whatever a driver raises is its IMU's failure
+                if self._closed.is_set():  # under its hands
+                    return None
                 self._lose(error)
-                continue
-            if sample is None:
-                return None
-            if (numbered := self._number(sample)) is not None:
-                return numbered
 
     def close(self) -> None:
         """Give the IMU back. Safe to call twice, and from another thread that ends a wait."""
@@ -84,33 +82,35 @@ class ReopeningImu:
         self._drop()
 
     def counts(self) -> Mapping[str, int]:
-        """`lost`, `back`; `late`: samples no later than the one before; the events of all IMUs that were opened."""
-        source = self._source
+        """`lost`, `back`; `late`: samples no later than the one before; `raised`: what a driver raised that is no
+        error of ours; the events of all IMUs that were opened."""
         counts = Counter(self._counts)
-        counts.update(source.counts() if isinstance(source, Telling) else {})
-        return {"lost": 0, "back": 0, **counts}
+        source = self._source
+        counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
     def gauges(self) -> Mapping[str, float]:
         """`away_s`, for how long it has been lost, 0: it is there; and what the open IMU tells."""
         source, away_ns = self._source, self._away_ns
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
-        return {"away_s": away_s, **(source.gauges() if isinstance(source, Telling) else {})}
+        return {
+            "away_s": away_s,
+            **(self._failures.ask(source.gauges) if isinstance(source, Telling) else {}),
+        }
 
-    def _lose(self, error: ImuError) -> None:
+    def _lose(self, error: Exception) -> None:
         if self._away_ns is None:
             self._away_ns = self._clock.now_ns()
             self._counts["lost"] += 1
-        self._away(f"IMU lost: {error}")
-        self._say(f"lost: {error}")
+        self._away(f"IMU lost: {self._failures.log('lost', error)}")
         self._drop()
 
     def _drop(self) -> None:
         source, self._source = self._source, None
         if source is None:
             return
-        if isinstance(source, Telling):
-            self._counts.update(source.counts())
-        source.close()
+        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        self._failures.close(source)
 
     def _return(self) -> ImuSource | None:
         """Open until it works; None when told to stop."""
@@ -118,9 +118,8 @@ class ReopeningImu:
             self._wait_s = min(2.0 * self._wait_s, LONGEST_WAIT_S)  # until a sample has come
             try:
                 self._source = self._open()
-            except ImuError as error:
-                self._away(f"IMU away: {error}")
-                self._say(f"still away: {error}")
+            except Exception as error:  # noqa: BLE001 - as above
+                self._away(f"IMU away: {self._failures.log('still away', error)}")
                 continue
             if self._closed.is_set():  # while it was being opened
                 self._drop()
@@ -134,9 +133,9 @@ class ReopeningImu:
             self._counts["late"] += 1
             return None
         if self._away_ns is not None:
-            _LOG.warning("IMU: back after loss number %d", self._counts["lost"])
+            self._failures.over(f"back after loss number {self._counts['lost']}")
             self._counts["back"] += 1
-            self._said_ns, self._away_ns, self._wait_s = None, None, FIRST_WAIT_S
+            self._away_ns, self._wait_s = None, FIRST_WAIT_S
         if self._base is None:
             self._base = -sample.seq
             if self._last is not None:
@@ -145,10 +144,3 @@ class ReopeningImu:
         seq = sample.seq + self._base
         self._last = (seq, sample.t_ns)
         return sample if self._base == 0 else replace(sample, seq=seq)
-
-    def _say(self, text: str) -> None:
-        """Log the first event of an absence at once, further ones every ten seconds."""
-        now_ns = self._clock.now_ns()
-        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
-            _LOG.warning("IMU: %s", text)

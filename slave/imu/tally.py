@@ -51,10 +51,14 @@ class SampleTally:
         """Count one sample; a gap in their numbers counts as left out."""
         self._tally.part(seq)
 
+    def failed(self, seq: int, error: Exception) -> None:
+        """Count one sample that was left out because of an error, and log that now and then."""
+        self._tally.failed(seq, error)
+
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: samples, skipped; broken, lost and back of a real IMU; `fusion.`..."""
+        """Event -> how often since the start: samples, skipped, failed; `lost` … of a real IMU; `fusion.`..."""
         counts = self._tally.counts()
-        found = {"samples": counts["frames"], "skipped": counts["dropped"]}
+        found = {"samples": counts["frames"], "skipped": counts["dropped"], "failed": counts["failed"]}
         if self._source is not None:
             found.update(self._source.counts())
         if self._orientation is not None:

@@ -57,7 +57,7 @@ class StrobedCamera:
         """Next frame of the camera; dark at once where there is none."""
         try:
             frame = self._source.read()
-        except CameraError:
+        except Exception:
             self._controller.stalled()
             raise
         if frame is None:

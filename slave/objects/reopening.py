@@ -3,10 +3,10 @@
 As for IMUs: an error while it is opened for the first time is an error. Once it runs, losing it (SteamVR was closed,
 survive-cli has died) is an event: it is given back and opened again after 0.2 s, 0.4 s ... until it is there or the
 slave is told to stop. Meanwhile poses of NaN say four times a second that the device is lost. That several devices are
-there and nobody said which one is meant is mended by no waiting: that error goes on to the user.
+there and nobody said which one is meant is mended by no waiting: that error goes on to the user. Anything else that a
+driver raises is a loss.
 """
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -15,8 +15,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from common.clock import Clock
-from common.errors import TrackerChoiceError, TrackerError
+from common.errors import TrackerChoiceError
 from common.messages import TrackerPose
+from slave.failures import Failures
 from slave.imu.source import Telling
 from slave.objects.source import TrackerSource
 from slave.service import Away, nobody
@@ -24,8 +25,6 @@ from slave.service import Away, nobody
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 10.0  # each try leaves 100 kB in openvr (ValveSoftware/openvr, issue 1221)
 SAY_LOST_S = 0.25
-LOG_EVERY_NS = 10_000_000_000
-_LOG = logging.getLogger(__name__)
 
 
 class ReopeningTracker:
@@ -62,7 +61,7 @@ class ReopeningTracker:
         self._away_ns: int | None = None
         self._try_ns = 0
         self._wait_s = FIRST_WAIT_S
-        self._said_ns: int | None = None
+        self._failures = Failures("tracker", clock.now_ns)
         self._counts: Counter[str] = Counter()
 
     def read(self) -> TrackerPose | None:
@@ -80,7 +79,9 @@ class ReopeningTracker:
                 pose = source.read()
             except TrackerChoiceError:
                 raise
-            except TrackerError as error:
+            except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
+                if self._closed.is_set():  # under its hands
+                    return None
                 self._lose(error)
                 continue
             if pose is None:
@@ -89,9 +90,9 @@ class ReopeningTracker:
                 self._counts["late"] += 1
                 continue
             if self._away_ns is not None and np.isfinite(pose.position_m).all():
-                _LOG.warning("tracker: back after loss number %d", self._counts["lost"])
+                self._failures.over(f"back after loss number {self._counts['lost']}")
                 self._counts["back"] += 1
-                self._away_ns, self._said_ns, self._wait_s = None, None, FIRST_WAIT_S
+                self._away_ns, self._wait_s = None, FIRST_WAIT_S
             return self._numbered(pose)
         return None
 
@@ -101,25 +102,28 @@ class ReopeningTracker:
         self._drop()
 
     def counts(self) -> Mapping[str, int]:
-        """`lost`, `back`; `late`: poses no later than the one before; the events of all that were opened."""
-        source = self._source
+        """`lost`, `back`; `late`: poses no later than the one before; `raised`: what a driver raised that is no
+        error of ours; the events of all that were opened."""
         counts = Counter(self._counts)
-        counts.update(source.counts() if isinstance(source, Telling) else {})
-        return {"lost": 0, "back": 0, **counts}
+        source = self._source
+        counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        return {"lost": 0, "back": 0, "raised": self._failures.raised, **counts}
 
     def gauges(self) -> Mapping[str, float]:
         """`away_s`, for how long the system has been lost, 0: it is there; and what the open one tells."""
         source, away_ns = self._source, self._away_ns
         away_s = 0.0 if away_ns is None else (self._clock.now_ns() - away_ns) * 1e-9
-        return {"away_s": away_s, **(source.gauges() if isinstance(source, Telling) else {})}
+        return {
+            "away_s": away_s,
+            **(self._failures.ask(source.gauges) if isinstance(source, Telling) else {}),
+        }
 
-    def _lose(self, error: TrackerError) -> None:
+    def _lose(self, error: Exception) -> None:
         now_ns = self._clock.now_ns()
         if self._away_ns is None:
             self._away_ns = now_ns
             self._counts["lost"] += 1
-        self._away(f"tracker lost: {error}")
-        self._say(f"lost: {error}")
+        self._away(f"tracker lost: {self._failures.log('lost', error)}")
         self._drop()
         self._try_ns = now_ns + round(1e9 * self._wait_s)
 
@@ -127,9 +131,8 @@ class ReopeningTracker:
         source, self._source = self._source, None
         if source is None:
             return
-        if isinstance(source, Telling):
-            self._counts.update(source.counts())
-        source.close()
+        self._counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})
+        self._failures.close(source)
 
     def _return(self) -> TrackerSource | None:
         """Open it again where that is due; None: not yet, or not there."""
@@ -141,8 +144,8 @@ class ReopeningTracker:
         self._try_ns = now_ns + round(1e9 * self._wait_s)
         try:
             self._source = self._open()
-        except TrackerError as error:
-            self._say(f"still away: {error}")
+        except Exception as error:  # noqa: BLE001 - as above
+            self._failures.log("still away", error)
         return self._source
 
     def _nowhere(self) -> TrackerPose:
@@ -153,10 +156,3 @@ class ReopeningTracker:
         """The pose with the number behind the last one: what a system counts begins anew with it."""
         self._seq, self._last_ns = self._seq + 1, pose.t_ns
         return pose if pose.seq == self._seq else replace(pose, seq=self._seq)
-
-    def _say(self, text: str) -> None:
-        """Log the first event of an absence at once, further ones every ten seconds."""
-        now_ns = self._clock.now_ns()
-        if self._said_ns is None or now_ns - self._said_ns >= LOG_EVERY_NS:
-            self._said_ns = now_ns
-            _LOG.warning("tracker: %s", text)

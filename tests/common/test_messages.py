@@ -48,6 +48,7 @@ from common.messages import (
     restamped,
 )
 
+JPEG_HEAD = b"\xff\xd8\xff\xc0\0\x11\x08\0\xf0\x01\x40\x03"  # a frame header of 320 x 240 px
 names = st.from_regex(r"[A-Za-z0-9_.-]{1,64}", fullmatch=True)
 counts = st.integers(0, 2**63 - 1)
 times = st.integers(-MAX_TIME_NS, MAX_TIME_NS)
@@ -242,7 +243,7 @@ healths = st.builds(
 commands = st.builds(Command, target=names, verb=names, body=st.text(max_size=200))
 backlogs = st.builds(Backlog, source=names, t_ns=times, leave_out=st.integers(0, 64))
 previews = st.builds(
-    Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: b"\xff\xd8\xff" + tail)
+    Preview, camera=names, t_ns=times, jpeg=st.binary(max_size=200).map(lambda tail: JPEG_HEAD + tail)
 )
 
 
@@ -314,8 +315,8 @@ SAMPLES: tuple[Message, ...] = (
     Checklist("master", 1, 2, (CheckItem("camera_absent", "left", "It is not there.", "Start its slave."),)),
     Command("left", "stop"),
     Backlog("master", 5, 3),
-    Preview("left", 2, b"\xff\xd8\xff\xe0jpeg"),
-    Still("left", 1, 2, b"\xff\xd8\xff\xe0jpeg"),
+    Preview("left", 2, JPEG_HEAD),
+    Still("left", 1, 2, JPEG_HEAD),
 )
 
 
@@ -512,8 +513,9 @@ def test_a_message_knows_whether_a_marker_has_a_rival() -> None:
         (Preview, {"jpeg": b""}),
         (Preview, {"jpeg": b"GIF89a"}),
         (Preview, {"jpeg": "text"}),
-        (Preview, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 2)}),
-        (Still, {"jpeg": b"\xff\xd8\xff" + b"\0" * (MAX_STILL_BYTES - 2)}),
+        (Preview, {"jpeg": b"\xff\xd8\xff\xe0jpeg"}),
+        (Preview, {"jpeg": JPEG_HEAD + b"\0" * MAX_PREVIEW_BYTES}),
+        (Still, {"jpeg": JPEG_HEAD + b"\0" * MAX_STILL_BYTES}),
         (MarkerDetections, {"t_sigma_ns": -1.0}),
         (MarkerDetections, {"t_sigma_ns": float("nan")}),
         (Command, {"body": "x" * (MAX_BODY_CHARACTERS + 1)}),
@@ -752,7 +754,7 @@ def test_any_bytes_are_a_message_or_a_message_error(data: bytes) -> None:
 
 
 def test_the_largest_preview_travels_and_one_byte_more_does_not() -> None:
-    jpeg = b"\xff\xd8\xff" + b"\0" * (MAX_PREVIEW_BYTES - 3)
+    jpeg = JPEG_HEAD + b"\0" * (MAX_PREVIEW_BYTES - len(JPEG_HEAD))
     assert_same(decode(encode(Preview("left", 1, jpeg))), Preview("left", 1, jpeg))
     with pytest.raises(ValueError, match="jpeg: 262145 bytes"):
         Preview("left", 1, jpeg + b"\0")

@@ -162,3 +162,29 @@ def test_a_camera_that_is_unplugged_is_told_by_its_slave_and_is_back_with_the_pl
     assert rig.processes["left"].poll() is None
     assert after.get("left.restarts", 0) == told.get("left.restarts", 0)
     assert after["poses"] > told["poses"]
+
+
+@pytest.mark.parametrize(("fault", "counted"), [("raises", "camera.raised"), ("frozen", "camera.frozen")])
+def test_a_camera_whose_driver_fails_or_repeats_one_picture_is_absent_until_it_is_well(
+    fault: str, counted: str, rig: Rig, lag: Lag
+) -> None:
+    """Its slave lives on; what it has no new picture of is not measured."""
+    until(lambda: not rig.lists.now() - {("rate_low", "left"), ("rate_low", "right")}, 10.0)
+    lag.begin()
+    before = rig.ask("left", "report").counts
+    rig.fault("left", **{fault: True})
+    began = time.monotonic()
+    assert until(lambda: ("camera_absent", "left") in rig.lists.now(), 30.0), rig.lists.now()
+    assert time.monotonic() - began < BACK_S + lag.reports
+    sent = rig.ask(MASTER, "report").counts["left.received"]
+    during = rig.ask("left", "report").counts
+    assert during[counted] > before[counted]
+    assert until(lambda: rig.ask("left", "report").counts["camera.lost"] > during["camera.lost"], 30.0)
+    assert rig.ask(MASTER, "report").counts["left.received"] == sent, (
+        "nothing is measured in the same picture"
+    )
+    rig.fault("left")
+    assert until(lambda: rig.ask(MASTER, "report").counts["left.received"] > sent + 3, 30.0)
+    assert until(lambda: ("camera_absent", "left") not in rig.lists.now(), 30.0)
+    assert rig.processes["left"].poll() is None
+    assert rig.ask(MASTER, "report").counts.get("left.restarts", 0) == 0

@@ -1,18 +1,14 @@
-"""Cameras are asked again and again, each by itself; a JPEG tells its size without being decoded."""
+"""Cameras are asked again and again, each by itself."""
 
 import logging
 import threading
 
-import cv2
-import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from common.bus import LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health
-from master.outputs.previews import PictureAsker, jpeg_size
+from master.outputs.previews import PictureAsker
 from tests.network_helpers import until
 
 
@@ -65,18 +61,3 @@ def test_absence_is_said_once_and_again_after_the_camera_was_there(caplog: pytes
         assert until(lambda: len(caplog.records) == 2)
     finally:
         asker.close()
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (240, 320), (121, 77, 3), (544, 728, 3)])
-@pytest.mark.parametrize("flags", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 4]])
-def test_the_size_of_what_opencv_writes(shape: tuple[int, ...], flags: list[int]) -> None:
-    data = cv2.imencode(".jpg", np.full(shape, 90, np.uint8), flags)[1].tobytes()
-    assert jpeg_size(data) == (shape[1], shape[0])
-    for cut in range(20):
-        assert jpeg_size(data[:cut]) is None
-
-
-@given(st.binary(max_size=200))
-def test_no_bytes_crash_or_hang_it(tail: bytes) -> None:
-    size = jpeg_size(b"\xff\xd8" + tail)
-    assert size is None or min(size) > 0

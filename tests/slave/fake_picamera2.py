@@ -79,6 +79,8 @@ class Sensor:
         delay: Frames until metadata show what was asked for.
         tamper: Changes the metadata of frame k.
         lost_after: From this frame on no frame comes.
+        frozen_after: From this frame on it sends the picture of this one.
+        breaks_at: Frame numbers at which the library raises what it never says that it does.
         dropped: Frames that never reach the application.
         sync_ready_at: Frame from which on the cameras are in step; None: never.
         loses: Writings of controls that come while a request is recycled, and are lost.
@@ -96,6 +98,8 @@ class Sensor:
     delay: int = 4
     tamper: Callable[[int, dict[str, Any]], None] = lambda _k, _metadata: None
     lost_after: int | None = None
+    frozen_after: int | None = None
+    breaks_at: frozenset[int] = frozenset()
     dropped: frozenset[int] = frozenset()
     sync_ready_at: int | None = 30
     sync_heard_at: int = 10
@@ -275,6 +279,8 @@ class Picamera2:
         while self._frame in sensor.dropped:
             self._frame += 1
         number, self._frame = self._frame, self._frame + 1
+        if number in sensor.breaks_at:
+            raise ZeroDivisionError("a fault in the library")
         self._out.add(number)
         return CompletedRequest(self, number)
 
@@ -373,7 +379,9 @@ class CompletedRequest:
     def _raw(self, config: Mapping[str, Any]) -> np.ndarray:
         """(H, stride) bytes with the padding: 10 bits, in column 0 four times the frame's number, rising by one."""
         width, height = config["size"]
-        tens = np.minimum(4 * (self._number % 256) + np.arange(width), 1023)
+        frozen = self._camera._sensor.frozen_after
+        number = self._number if frozen is None else min(self._number, frozen)
+        tens = np.minimum(4 * (number % 256) + np.arange(width), 1023)
         words = {
             "R8": (tens >> 2).astype(np.uint8),
             "R10": tens.astype("<u2"),

@@ -86,6 +86,8 @@ class Camera:
         cut: Frame numbers whose bytes end early.
         low_words: Its words of 16 bits hold 10, at their low ends.
         pictures: What it sees, frame by frame, (H, W) grey, sent as Y10.
+        frozen_after: From this frame on it sends the picture of this one.
+        fails_at: Frame numbers before which its driver raises something of its own.
         gone_after: From this frame on the device is unplugged; `silent_after`: it just sends nothing.
     """
 
@@ -114,6 +116,8 @@ class Camera:
     skip: frozenset[int] = frozenset()
     damaged: frozenset[int] = frozenset()
     cut: frozenset[int] = frozenset()
+    frozen_after: int | None = None
+    fails_at: frozenset[int] = frozenset()
     gone_after: int | None = None
     silent_after: int | None = None
     writes: list[tuple[str, int]] = field(default_factory=list[tuple[str, int]])
@@ -176,6 +180,8 @@ class FakeDevice:
         assert timeout_s > 0.0
         if self._gone():
             return True  # POLLERR
+        if self.frame in self.camera.fails_at:
+            raise ZeroDivisionError("a fault in the driver")
         if self.camera.silent_after is not None and self.frame >= self.camera.silent_after:
             return False
         for _ in range(self.camera.queue):
@@ -200,10 +206,11 @@ class FakeDevice:
             return
         index = self._empty.pop(0)
         name = "Y10" if camera.low_words else self._format
+        picture = number if camera.frozen_after is None else min(number, camera.frozen_after)
         if camera.pictures:
-            data = as_y10(camera.pictures[number % len(camera.pictures)], self._stride)
+            data = as_y10(camera.pictures[picture % len(camera.pictures)], self._stride)
         else:
-            data = encode(name, self._size, self._stride, number)
+            data = encode(name, self._size, self._stride, picture)
         if number in camera.cut:
             data = data[: len(data) // 2]
         self._memory[index][: len(data)] = data

@@ -246,7 +246,13 @@ def test_a_camera_that_comes_back_has_the_settings_it_was_given_last(monkeypatch
         source.tune(changed(exposure_us=9000.0))
         assert until(lambda: source.counts()["camera.broken"] == 2)
         first.gone_after = 0
-        assert until(lambda: source.counts() == {"camera.lost": 1, "camera.broken": 3})
+        assert until(lambda: source.counts()["camera.broken"] == 3)
+        assert source.counts() == {
+            "camera.lost": 1,
+            "camera.frozen": 0,
+            "camera.raised": 0,
+            "camera.broken": 3,
+        }
         assert source.figures()["exposure_us"] == 9000.0
     assert second.knob("Exposure Time").value == 90
 

@@ -7,9 +7,10 @@ import pytest
 
 from common.calibration import CameraCalibration
 from common.errors import CameraError
-from slave.cameras import reopening
-from slave.cameras.reopening import LOG_EVERY_NS, LONGEST_WAIT_S, ReopeningCamera
+from slave import failures
+from slave.cameras.reopening import LONGEST_WAIT_S, ReopeningCamera
 from slave.cameras.source import Frame
+from slave.failures import LOG_EVERY_NS
 
 CALIBRATION = CameraCalibration(
     version=1,
@@ -159,7 +160,7 @@ def test_a_stop_and_a_close_end_the_wait() -> None:
 
 
 def test_a_long_absence_is_logged_now_and_then(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.WARNING, logger=reopening.__name__)
+    caplog.set_level(logging.WARNING, logger=failures.__name__)
     world = World()
     world.lives = [1]
     source = frames(reopening_camera(world))

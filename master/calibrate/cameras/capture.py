@@ -6,18 +6,19 @@ nobody tracks. Nothing is calibrated here; the folder it leaves is what `calibra
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 
 from common.arrays import Image
 from common.bus import Bus, Subscription
 from common.clock import now_ns
-from common.errors import BusError, CalibrationError
+from common.errors import BusError, CalibrationError, PictureError
 from common.messages import Command, Still
+from common.picture_size import Size
+from common.pictures import decode
 from master.calibrate.cameras.live_views import LiveViews, Verdict
 from master.calibrate.tree_files import date_now
 from master.ingest import Ingest
@@ -37,11 +38,13 @@ class Round:
         stills: Camera -> what it sent.
         images: Camera -> the same, decoded.
         spread_ms: Time between the first and the last of them [ms]; NaN while a clock is not known.
+        refused: Camera -> why its picture was not decoded.
     """
 
     stills: Mapping[str, Still]
     images: Mapping[str, Image]  # (H, W, 3) BGR
     spread_ms: float
+    refused: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 def capture(
@@ -73,7 +76,7 @@ def capture(
         began_ns = now_ns()
         round_ = take()
         verdict = live.push(round_.images) if round_.images else Verdict(False, "no camera answers")
-        text = verdict.text + _without([name for name in live.cameras if name not in round_.images])
+        text = verdict.text + _without(live.cameras, round_)
         if verdict.kept:
             view = live.views[-1]
             spread.append(round_.spread_ms)
@@ -89,12 +92,16 @@ def capture(
 
 
 class StillTaker:
-    """Asks every camera for its next frame. Holds the bus subscription and the ingest that keeps the clocks."""
+    """Asks every camera for its next frame.
 
-    def __init__(self, bus: Bus, ingest: Ingest, cameras: tuple[str, ...]) -> None:
-        """Listen for stills of `cameras` from now on."""
-        self._bus, self._ingest, self._cameras = bus, ingest, cameras
-        self._feed: Subscription = bus.subscribe("still", depth=4 * len(cameras))
+    Holds the bus subscription and the ingest that keeps the clocks.
+    """
+
+    def __init__(self, bus: Bus, ingest: Ingest, sizes: Mapping[str, Size]) -> None:
+        """Listen for stills from now on, of cameras whose files say these widths and heights [px]."""
+        self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
+        self._cameras = tuple(sizes)
+        self._feed: Subscription = bus.subscribe("still", depth=4 * len(sizes))
 
     def take(self) -> Round:
         """One round: ask all, then wait until all that answered have sent, at most a second."""
@@ -113,12 +120,7 @@ class StillTaker:
             thread.join()
         while self._ingest.get(0.0) is not None:
             pass  # detections come along; nobody needs them
-        images = {
-            name: image
-            for name in self._cameras
-            if name in stills and (image := _decoded(stills[name])) is not None
-        }
-        return Round(stills, images, self._spread_ms(stills))
+        return self._round(stills)
 
     def close(self) -> None:
         """Listen no more. Safe to call twice."""
@@ -130,6 +132,16 @@ class StillTaker:
         except BusError:
             return  # it is not there, or busy: the next round asks again, and the person reads who is seen
 
+    def _round(self, stills: Mapping[str, Still]) -> Round:
+        images, refused = dict[str, Image](), dict[str, str]()
+        for name in self._cameras:
+            if name in stills:
+                try:
+                    images[name] = decode(stills[name].jpeg, self._sizes[name])
+                except PictureError as error:
+                    refused[name] = str(error)
+        return Round(stills, images, self._spread_ms(stills), refused)
+
     def _spread_ms(self, stills: Mapping[str, Still]) -> float:
         times: list[int] = []
         for name, still in stills.items():
@@ -139,17 +151,19 @@ class StillTaker:
         return (max(times) - min(times)) * 1e-6 if times else float("nan")
 
 
-def _decoded(still: Still) -> Image | None:
-    image = cv2.imdecode(np.frombuffer(still.jpeg, np.uint8), cv2.IMREAD_COLOR)
-    return None if image is None else np.asarray(image, np.uint8)
-
-
 def _then(advice: str) -> str:
     return f"; {advice}" if advice else ""
 
 
-def _without(silent: list[str]) -> str:
-    return f" (no picture from {' and '.join(silent)}: is the slave running?)" if silent else ""
+def _without(cameras: tuple[str, ...], round_: Round) -> str:
+    """Which cameras gave no picture, and why."""
+    silent = [name for name in cameras if name not in round_.images and name not in round_.refused]
+    absent = f" (no picture from {' and '.join(silent)}: is the slave running?)" if silent else ""
+    refused = (
+        f" (the picture of {name} {why}; see cameras/{name}.json here and on the slave)"
+        for name, why in round_.refused.items()
+    )
+    return absent + "".join(refused)
 
 
 def new_folder(folder: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from common.calibration import RigCalibration, load
+from common.calibration import CameraCalibration, RigCalibration, load
 from common.clock import SystemClock
 from common.errors import CalibrationError
 from common.keys import link_key
@@ -64,7 +64,9 @@ def capture_views(
       phalanx-master calibrate stereo views --board 9x6 --square-mm 25 --rig desk --out calib_json      then
     """
     ends = address(beacon, "--beacon"), address(bind, "--bind")
-    live = LiveViews(board_of(board, square_mm, marker_mm, dictionary), cameras_of(calibration, rig))
+    cameras = cameras_of(calibration, rig)
+    sizes = _sizes(calibration, cameras)
+    live = LiveViews(board_of(board, square_mm, marker_mm, dictionary), cameras)
     key = link_key(os.environ, key_file)
     clock = SystemClock()
     new_folder(out)
@@ -75,7 +77,7 @@ def capture_views(
         ingest = Ingest(live.cameras, key, clock, *ends, bus, _START_S)
         stack.callback(ingest.close)
         _wait(ingest, live.cameras, stop)
-        taker = StillTaker(link, ingest, live.cameras)
+        taker = StillTaker(link, ingest, sizes)
         stack.callback(taker.close)
         kept = capture(taker.take, live, out, views, stop, typer.echo, live.missing)
     if kept < FEWEST:
@@ -93,6 +95,12 @@ def _next(live: LiveViews, out: Path, rig: str) -> str:
 def cameras_of(calibration: Path, rig: str) -> tuple[str, ...]:
     """The cameras of a rig, which need not have lenses or places yet."""
     return load(calibration / "rigs" / f"{rig}.json", RigCalibration).cameras
+
+
+def _sizes(calibration: Path, cameras: tuple[str, ...]) -> dict[str, tuple[int, int]]:
+    """Width and height [px] that the camera files say."""
+    files = (load(calibration / "cameras" / f"{name}.json", CameraCalibration) for name in cameras)
+    return {file.name: (file.width_px, file.height_px) for file in files}
 
 
 def _wait(ingest: Ingest, cameras: tuple[str, ...], stop: threading.Event) -> None:

@@ -5,12 +5,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from common.arrays import Image
-from common.errors import RecordingError
+from common.errors import PictureError, RecordingError
 from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+from common.pictures import decode_file
 from master.calibrate.cameras.views import ImageSet
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -97,15 +97,14 @@ def _natural(name: str) -> tuple[tuple[int, str], ...]:
 
 
 def _load(file: Path) -> Image:
-    # Through numpy, because imread takes no name outside the locale's letters, and says nothing of the reason.
     try:
         raw = file.read_bytes()
     except OSError as error:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
-    image = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), cv2.IMREAD_COLOR) if raw else None
-    if image is None:
-        raise RecordingError(f"{file}: is no image")
-    return image.astype(np.uint8, copy=False)
+    try:
+        return decode_file(raw)
+    except PictureError as error:
+        raise RecordingError(f"{file}: is no image: it {error}") from error
 
 
 def _showing(rows: Sequence[FrameRow]) -> list[FrameRow]:

@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from common.arrays import Image
-from common.errors import RecordingError
+from common.errors import PictureError, RecordingError
 from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
+from common.pictures import decode_file
 
 MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -114,12 +114,11 @@ def load_grey(file: Path) -> Image:
     Raises:
         RecordingError: The file cannot be read, or is no image.
     """
-    # Through numpy, because imread takes no name outside the locale's letters, and says nothing of the reason.
     try:
         raw = file.read_bytes()
     except OSError as error:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
-    image = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), cv2.IMREAD_GRAYSCALE) if raw else None
-    if image is None:
-        raise RecordingError(f"{file}: is no image")
-    return image.astype(np.uint8, copy=False)
+    try:
+        return decode_file(raw, grey=True)
+    except PictureError as error:
+        raise RecordingError(f"{file}: is no image: it {error}") from error

@@ -7,8 +7,9 @@ from nicegui import events, ui
 from common.calibration import CameraCalibration, RigCalibration, load
 from common.errors import CalibrationError
 from common.messages import Command, Preview
+from common.picture_size import jpeg_size
 from master.console.setup.parts import Desk, heading, jpeg_url
-from master.console.setup.picking import keep_colours, pick, pixel_of, preview_size, ranges_of
+from master.console.setup.picking import keep_colours, pick, pixel_of, ranges_of
 
 _PICTURE_S = 0.2
 _STEP_PX, _FINE_PX = 8.0, 1.0
@@ -187,7 +188,7 @@ class _Picker:
         if preview is self._newest:
             return
         if choice.size is None:
-            choice.size = preview_size(preview)
+            choice.size = jpeg_size(preview.jpeg)
             self._tell()
         self._newest = preview
         self._image.set_source(jpeg_url(preview.jpeg))

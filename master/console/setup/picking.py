@@ -4,13 +4,10 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-import cv2
-import numpy as np
 from msgspec.structs import replace
 
 from common.calibration import CameraCalibration, HsvRange, load, save
-from common.errors import CalibrationError
-from common.messages import Command, Health, Preview
+from common.messages import Command, Health
 from master.console.setup.files import keep_old
 
 
@@ -21,18 +18,6 @@ def pixel_of(
     scale_u, scale_v = camera.width_px / preview_px[0], camera.height_px / preview_px[1]
     u, v = (at_px[0] + 0.5) * scale_u - 0.5, (at_px[1] + 0.5) * scale_v - 0.5
     return min(max(u, 0.0), camera.width_px - 1.0), min(max(v, 0.0), camera.height_px - 1.0)
-
-
-def preview_size(preview: Preview) -> tuple[int, int]:
-    """Width and height of a preview [px].
-
-    Raises:
-        CalibrationError: It is no picture.
-    """
-    image = cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise CalibrationError(f"camera {preview.camera!r}: its preview is no picture")
-    return int(image.shape[1]), int(image.shape[0])
 
 
 def pick(camera: str, marker: str, uv: tuple[float, float]) -> Command:

@@ -26,8 +26,7 @@ from master.recording.recorder import MessageRecorder, Progress
 from master.recording.tap import LEASE_NS, Tap, Tapped, came_ns
 from master.tuning import RigFiles
 from tests.network_helpers import ManualClock, detections, free_endpoint, until
-
-JPEG = b"\xff\xd8\xff\xd9"
+from tests.picture_helpers import TINY
 
 
 class Listed:
@@ -222,8 +221,8 @@ def test_a_recorder_keeps_what_a_master_takes_and_tells(
         assert until(lambda: NAME in asker.alive() and len(asked) == 4 and bool(said))
         for message in frames(30):
             master.tap.show(message)
-        asker.publish("preview", "left", Preview("left", 5, JPEG))
-        asker.publish("still", "left", Still("left", 1, 5, JPEG))
+        asker.publish("preview", "left", Preview("left", 5, TINY))
+        asker.publish("still", "left", Still("left", 1, 5, TINY))
         assert until(lambda: asker.ask(Command(NAME, "report"), 1.0).counts.get("taken") == 30)
         told = asker.ask(Command(NAME, "report"), 1.0)
         assert told.counts["dropped"] == told.counts["lost"] == 0

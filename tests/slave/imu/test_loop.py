@@ -65,7 +65,7 @@ def test_every_sample_is_sent_in_the_name_of_this_process_and_gaps_are_counted()
     assert [(one.source, one.session, one.seq, one.t_ns) for one in wire.sent] == [
         ("imu", 77, seq, 8_333_333 * seq) for seq in (40, 41, 45, 46)
     ]
-    assert tally.counts() == {"samples": 4, "skipped": 3}
+    assert tally.counts() == {"samples": 4, "skipped": 3, "failed": 0}
     assert tally.gauges()["rate_hz"] > 0.0
     assert set(tally.gauges()) == {"rate_hz"}
 
@@ -109,7 +109,15 @@ def test_the_filters_orientation_is_sent_and_what_it_and_the_imu_tell_is_told() 
     tally = SampleTally(source, orientation)
     run(source, wire, tally, threading.Event(), orientation)
     assert [one.orientation_wxyz.tolist() for one in wire.sent] == [[1.0, 0.0, 0.0, 0.0]] * 2
-    assert tally.counts() == {"samples": 2, "skipped": 0, "lost": 1, "back": 1, "broken": 0, "fusion.gap": 2}
+    assert tally.counts() == {
+        "samples": 2,
+        "skipped": 0,
+        "failed": 0,
+        "lost": 1,
+        "back": 1,
+        "broken": 0,
+        "fusion.gap": 2,
+    }
     gauges = tally.gauges()
     assert gauges.pop("rate_hz") > 0.0
     assert gauges == {
@@ -153,7 +161,7 @@ def test_it_reports_and_stops_on_the_bus() -> None:
     assert until(lambda: "imu" in bus.alive())
     health = bus.ask(Command("imu", "report", ""), 5.0)
     assert (health.source, health.session) == ("imu", 77)
-    assert health.counts == {"samples": 3, "skipped": 1, "sent": 3, "unsent": 1}
+    assert health.counts == {"samples": 3, "skipped": 1, "failed": 0, "sent": 3, "unsent": 1}
     with pytest.raises(Exception, match="no command 'preview'; there are report, stop"):
         bus.ask(Command("imu", "preview", ""), 5.0)
     bus.ask(Command("imu", "stop", ""), 5.0)

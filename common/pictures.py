@@ -1,0 +1,50 @@
+"""Decode pictures that come from elsewhere, never larger than they may be: the only place that calls a decoder."""
+
+import cv2
+import numpy as np
+
+from common.arrays import Image
+from common.errors import PictureError
+from common.picture_size import Size, size_of
+
+
+def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
+    """The picture of a device, whose size is known: (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
+
+    Args:
+        data: A whole file.
+        size: Width and height [px] that it must have: those of the camera file.
+        grey: Whether one channel is wanted.
+
+    Raises:
+        PictureError: It has another size, or is no whole picture. Another size costs no memory.
+    """
+    found = size_of(data)
+    if found != size:
+        raise PictureError(f"is {found[0]}x{found[1]} px, the camera file says {size[0]}x{size[1]}")
+    kind = cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR
+    image = _decoded(data, kind | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image.shape[1::-1] != size:  # of a JPEG with two frame headers, should a decoder ever take the second
+        raise PictureError(f"is not of the size {size[0]}x{size[1]} that it claims")
+    return image
+
+
+def decode_file(data: bytes, *, grey: bool = False) -> Image:
+    """A picture that a person keeps on a disk, of any size up to 16384 x 16384: (H, W, 3) BGR or (H, W), uint8.
+
+    Raises:
+        PictureError: It is larger, of another kind than JPEG, PNG, BMP and TIFF, or no whole picture.
+    """
+    size_of(data)
+    return _decoded(data, cv2.IMREAD_GRAYSCALE if grey else cv2.IMREAD_COLOR)
+
+
+def _decoded(data: bytes, flags: int) -> Image:
+    try:
+        # None where the end is missing (OpenCV 4.12 and 5.0).
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    except cv2.error as error:
+        raise PictureError(f"cannot be decoded: {error.err}") from error
+    if image is None:
+        raise PictureError("is cut or broken")
+    return np.asarray(image, np.uint8)

@@ -1,0 +1,83 @@
+"""Log what a device or a frame failed of, at most one line in ten seconds, and go on.
+
+What is a `PhalanxError` is said in its own words. Whatever else a driver or a detector raises is a fault in a program:
+it is counted, and logged with its traceback.
+"""
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Protocol, TypeVar
+
+from common.clock import now_ns
+from common.errors import PhalanxError
+
+LOG_EVERY_NS = 10_000_000_000
+_LOG = logging.getLogger(__name__)
+
+ValueT = TypeVar("ValueT", int, float)
+
+
+class Closing(Protocol):
+    """A device that is open."""
+
+    def close(self) -> None:
+        """Give it back."""
+        ...
+
+
+class Failures:
+    """Holds how many errors were none of ours, when the last line was logged, what was left out, and if any is open."""
+
+    def __init__(self, of: str, clock: Callable[[], int] = now_ns) -> None:
+        """Nothing failed yet.
+
+        Args:
+            of: Whose failures, as the lines begin.
+            clock: The time [ns].
+        """
+        self._of, self._clock = of, clock
+        self._logged_ns: int | None = None
+        self._silent = 0
+        self._open = False  # a failure was logged, and not yet that it is over
+        self.raised = 0
+
+    def log(self, event: str, error: Exception) -> str:
+        """Count an error, and log `event` with it unless a line is younger than ten seconds; the error in words."""
+        ours = isinstance(error, PhalanxError)
+        why = str(error) if ours else f"{type(error).__name__}: {error}"
+        self.raised += not ours
+        if self._is_due():
+            more = f" ({self._silent} more since the last such line)" if self._silent else ""
+            _LOG.warning("%s: %s: %s%s", self._of, event, why, more, exc_info=None if ours else error)
+            self._silent, self._open = 0, True
+        else:
+            self._silent += 1
+        return why
+
+    def ask(self, tell: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
+        """What a driver tells of itself; nothing where it raises, so that the reports go on."""
+        try:
+            return dict(tell())
+        except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
+            self.log("does not say how it is", error)
+            return {}
+
+    def close(self, source: Closing) -> None:
+        """Give a device back; one that does not let itself be given back is opened again nevertheless, or not there."""
+        try:
+            source.close()
+        except Exception as error:  # noqa: BLE001 - as above
+            self.log("could not be given back", error)
+
+    def over(self, event: str) -> None:
+        """Log that all is well again, unless what went wrong was left out, too."""
+        if self._open:
+            _LOG.warning("%s: %s", self._of, event)
+        self._open = False
+
+    def _is_due(self) -> bool:
+        t_ns = self._clock()
+        if self._logged_ns is not None and t_ns - self._logged_ns < LOG_EVERY_NS:
+            return False
+        self._logged_ns = t_ns
+        return True

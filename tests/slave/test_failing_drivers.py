@@ -1,0 +1,381 @@
+"""Whatever a driver raises, or a camera repeats: the slave's loop goes on, and measures nothing twice."""
+
+import logging
+import threading
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from common.arrays import Image
+from common.calibration import CameraCalibration
+from common.clock import SystemClock
+from common.errors import CameraError, ImuError
+from common.messages import ImuSample, MarkerDetections, Message, TrackerPose
+from slave import failures
+from slave.app import run, run_wrist
+from slave.cameras import reopening
+from slave.cameras.grey import Pixels
+from slave.cameras.picamera2 import Picamera2Camera
+from slave.cameras.picamera2_settings import Picamera2Options
+from slave.cameras.reopening import ReopeningCamera
+from slave.cameras.repeated import CONTRAST, RepeatedPictures
+from slave.cameras.source import Frame, FrameSource
+from slave.cameras.v4l2 import V4l2Camera, V4l2Options
+from slave.failures import LOG_EVERY_NS, Failures
+from slave.imu import live as imu_live
+from slave.imu import reopening as imu_reopening
+from slave.imu.reopening import ReopeningImu
+from slave.imu.tally import SampleTally
+from slave.markers.blind import BlindDetector
+from slave.markers.detector import Detections
+from slave.objects import live as objects_live
+from slave.objects import reopening as objects_reopening
+from slave.objects.reopening import ReopeningTracker
+from slave.objects.tally import PoseTally
+from slave.tally import Tally
+from slave.wrist.blind import BlindWrist
+from tests.slave.fake_picamera2 import OV7251, Sensor, install
+from tests.slave.fake_v4l2 import Camera, FakeDevice
+
+FILE = CameraCalibration(
+    version=1,
+    name="left",
+    width_px=640,
+    height_px=480,
+    frame_rate_hz=30.0,
+    exposure_us=5000.0,
+    analogue_gain=1.25,
+    colour_gains=(0.83, 1.24),
+    row_time_us=33.6,
+)
+MONO = replace(FILE, colour_gains=(1.0, 1.0))
+CODES = {"gain": 32, "white_balance_temperature": 4600}
+GREY = {"GREY": {(640, 480): (30.0,)}}
+CLOCK = SystemClock()
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is waited for as long as it would be."""
+    monkeypatch.setattr(reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(reopening, "FROZEN_NS", 30_000_000)
+    monkeypatch.setattr(imu_reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(objects_reopening, "FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(objects_reopening, "SAY_LOST_S", 0.001)
+
+
+class Wire:
+    """Stands for the uplink. Ends the loop after so many messages."""
+
+    session = 77
+
+    def __init__(self, stop: threading.Event, most: int) -> None:
+        self.sent: list[Message] = []
+        self._stop, self._most = stop, most
+
+    def send(self, message: Message) -> None:
+        self.sent.append(message)
+        if len(self.sent) >= self._most:
+            self._stop.set()
+
+
+def usb(camera: Camera, file: CameraCalibration, pixels: Pixels = Pixels.GREY) -> V4l2Camera:
+    return V4l2Camera(
+        file, V4l2Options(controls=CODES, pixels=pixels), CLOCK, lambda _path: FakeDevice(camera)
+    )
+
+
+def tracked(
+    opener: Callable[[CameraCalibration], FrameSource], most: int
+) -> tuple[ReopeningCamera, list[Frame]]:
+    """Run the slave's loop with a camera until it has sent so many frames: the camera, and what was sent of."""
+    stop = threading.Event()
+    source = ReopeningCamera(opener, FILE, CLOCK, stop)
+    wire, shown = Wire(stop, most), list[Frame]()
+    run(source, BlindDetector(6), wire, "left", Tally(("a",) * 6), stop, shown.append)
+    source.close()
+    seqs = [one.seq for one in wire.sent if isinstance(one, MarkerDetections)]
+    assert len(seqs) == len(shown) == most
+    assert seqs == sorted(set(seqs))
+    return source, shown
+
+
+def equal_neighbours(frames: list[Frame]) -> int:
+    return sum(np.array_equal(a.image, b.image) for a, b in pairwise(frames))
+
+
+def test_a_usb_driver_that_raises_something_of_its_own_costs_no_process(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    plugged = [Camera(formats=GREY, fails_at=frozenset({20})), Camera(formats=GREY)]
+    source, _ = tracked(lambda file: usb(plugged.pop(0), file), 30)
+    assert (source.counts()["camera.lost"], source.counts()["camera.raised"]) == (1, 1)
+    lost = [
+        record for record in caplog.records if "ZeroDivisionError: a fault in the driver" in record.message
+    ]
+    assert len(lost) == 1
+    assert lost[0].exc_info, "the cause with its traceback"
+    assert "back after loss number 1" in caplog.text
+
+
+def test_a_pi_library_that_raises_something_of_its_own_costs_no_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    sensor = install(monkeypatch, Sensor(modes=OV7251, monochrome=True, breaks_at=frozenset({40})))
+    options = Picamera2Options(pixels=Pixels.GREY)
+
+    def opener(_file: CameraCalibration) -> Picamera2Camera:
+        camera = Picamera2Camera(MONO, options, CLOCK)
+        sensor.breaks_at = frozenset() if len(sensor.opened) > 1 else sensor.breaks_at
+        return camera
+
+    source, _ = tracked(opener, 60)
+    assert (source.counts()["camera.lost"], source.counts()["camera.raised"]) == (1, 1)
+    assert len(sensor.opened) == 2
+
+
+@pytest.mark.parametrize("where", ["open", "close", "counts", "figures", "tune"])
+def test_nothing_else_that_a_driver_raises_ends_the_slave(where: str) -> None:
+    class Odd(V4l2Camera):
+        pass
+
+    def fail(*_arguments: object) -> None:
+        raise KeyError(where)
+
+    opened = list[V4l2Camera]()
+
+    def opener(file: CameraCalibration) -> V4l2Camera:
+        if where == "open" and len(opened) == 1:
+            opened.append(opened[0])
+            fail()
+        camera = Odd(file, V4l2Options(controls=CODES, pixels=Pixels.GREY), CLOCK, device)
+        opened.append(camera)
+        return camera
+
+    def device(_path: object) -> FakeDevice:
+        return FakeDevice(Camera(formats=GREY, gone_after=20 if not opened else None))
+
+    if where != "open":
+        setattr(Odd, where, fail)
+    stop = threading.Event()
+    source = ReopeningCamera(opener, FILE, CLOCK, stop)
+    wire = Wire(stop, 30)
+    run(source, BlindDetector(1), wire, "left", Tally(("a",)), stop)
+    assert len(wire.sent) == 30
+    if where == "tune":
+        with pytest.raises(CameraError, match="its settings cannot be changed: KeyError"):
+            source.tune(FILE)
+    assert source.figures().keys() >= (set() if where == "figures" else {"exposure_us"})
+    assert source.counts()["camera.lost"] == 1
+    assert source.counts()["camera.raised"] >= 1
+    source.close()
+
+
+def test_a_frozen_usb_camera_is_not_measured_and_is_opened_again(caplog: pytest.LogCaptureFixture) -> None:
+    plugged = [Camera(formats=GREY, frozen_after=20), Camera(formats=GREY)]
+    source, frames = tracked(lambda file: usb(plugged.pop(0), file), 40)
+    assert equal_neighbours(frames) == 0
+    assert source.counts()["camera.lost"] == 1
+    assert source.counts()["camera.frozen"] > 1
+    assert source.counts()["camera.raised"] == 0
+    assert "repeated one picture" in caplog.text
+
+
+def test_a_frozen_pi_camera_is_not_measured_and_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    sensor = install(monkeypatch, Sensor(modes=OV7251, monochrome=True, frozen_after=40))
+
+    def opener(_file: CameraCalibration) -> Picamera2Camera:
+        sensor.frozen_after = 40 if not sensor.opened else None
+        return Picamera2Camera(MONO, Picamera2Options(pixels=Pixels.GREY), CLOCK)
+
+    source, frames = tracked(opener, 60)
+    assert equal_neighbours(frames) == 0
+    assert source.counts()["camera.lost"] == 1
+    assert source.counts()["camera.frozen"] > 1
+
+
+def test_a_camera_that_stays_frozen_is_never_measured_again() -> None:
+    """As that of a wrist device: the picture is the same however often it is opened."""
+    stop, opened = threading.Event(), list[Camera]()
+
+    def opener(file: CameraCalibration) -> V4l2Camera:
+        opened.append(Camera(formats=GREY, frozen_after=0))
+        if len(opened) == 4:
+            stop.set()
+        return usb(opened[-1], file)
+
+    source = ReopeningCamera(opener, FILE, CLOCK, stop)
+    tally = Tally(())
+    run_wrist(source, BlindWrist(), Wire(stop, 1), "left", tally, stop, lambda _frame: stop.set())
+    source.close()
+    assert tally.counts()["frames"] == 1, "its first picture, and no other"
+    assert source.counts()["camera.lost"] >= 3
+
+
+def test_a_camera_that_sends_each_picture_twice_keeps_half_of_its_frames() -> None:
+    class Twice(FakeDevice):
+        def _expose(self) -> None:
+            self.camera.frozen_after = self.frame // 2 * 2 if self.frame > 20 else None
+            super()._expose()
+
+    camera = Camera(formats=GREY)
+    options = V4l2Options(controls=CODES, pixels=Pixels.GREY)
+    source, frames = tracked(lambda file: V4l2Camera(file, options, CLOCK, lambda _path: Twice(camera)), 40)
+    assert equal_neighbours(frames) == 0
+    assert source.counts()["camera.lost"] == 0
+    assert {b.seq - a.seq for a, b in pairwise(frames[20:])} == {2}, "the copies count as dropped"
+
+
+def test_only_a_picture_with_contrast_that_is_equal_in_every_byte_is_a_repeated_one() -> None:
+    rng = np.random.default_rng(1)
+    for shape in ((48, 64, 3), (48, 64), (3, 5, 3)):
+        image: Image = rng.integers(0, 255, shape, np.uint8)
+        for at in (0, image.size // 2, image.size - 1):
+            other = image.copy()
+            other.reshape(-1)[at] ^= 1
+            pictures = RepeatedPictures()
+            given = (image, image.copy(), image, other, image, image[:-1])
+            assert [pictures.push(one) for one in given] == [False, True, True, False, False, False]
+    flat = np.full((48, 64, 3), (10, 90, 200), np.uint8)
+    flat[20:30] += CONTRAST
+    pictures = RepeatedPictures()
+    assert not any(pictures.push(flat.copy()) for _ in range(5)), "behind a cap, or fully exposed"
+    flat[20, 20] += 2
+    assert [pictures.push(flat.copy()) for _ in range(3)] == [False, True, True]
+
+
+class Failing(BlindDetector):
+    """A detector that raises in some frames."""
+
+    def __init__(self, fails: frozenset[int]) -> None:
+        super().__init__(1)
+        self._count, self._fails = 0, fails
+
+    def push(self, image: Image, t_ns: int) -> Detections:
+        self._count += 1
+        if self._count in self._fails:
+            raise IndexError("a fault in the detector")
+        return super().push(image, t_ns)
+
+
+def test_a_frame_that_the_detector_fails_of_is_dropped_and_counted(caplog: pytest.LogCaptureFixture) -> None:
+    stop, alive = threading.Event(), list[int]()
+    source = usb(Camera(formats=GREY), FILE)
+    wire, tally = Wire(stop, 20), Tally(("a",))
+    run(source, Failing(frozenset({3, 4, 9})), wire, "left", tally, stop, alive=lambda: alive.append(1))
+    source.close()
+    counts = tally.counts()
+    assert (counts["frames"], counts["failed"], counts["dropped"]) == (20, 3, 3)
+    assert len(wire.sent) == len(alive) == 20, "what fails does not feed the watchdog"
+    assert caplog.text.count("nothing is made of frame") == 1, "one line, however many frames"
+
+
+def test_what_shows_or_finds_tags_costs_no_detection() -> None:
+    def fail(_frame: Frame) -> None:
+        raise ValueError("a fault in what shows")
+
+    stop = threading.Event()
+    source = usb(Camera(formats=GREY), FILE)
+    wire, tally = Wire(stop, 10), Tally(("a",))
+    run(source, BlindDetector(1), wire, "left", tally, stop, fail)
+    source.close()
+    counts = tally.counts()
+    assert (counts["frames"], counts["failed"], len(wire.sent)) == (10, 10, 10)
+
+
+class Samples:
+    """An IMU whose driver, and whose filter, raise something of their own."""
+
+    def __init__(self, fails: bool) -> None:
+        self._fails, self._seq = fails, 0
+
+    def read(self) -> ImuSample:
+        if self._fails and self._seq == 5:
+            raise IndexError("a fault in the driver")
+        self._seq += 1
+        return ImuSample(
+            "imu",
+            0,
+            self._seq,
+            CLOCK.now_ns(),
+            np.zeros(3),
+            np.ones(3),
+            np.full(3, np.nan),
+            np.full(4, np.nan),
+        )
+
+    def close(self) -> None:
+        raise OSError("cannot be closed")
+
+
+def test_an_imu_whose_driver_raises_something_of_its_own_is_opened_again(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    stop = threading.Event()
+    made = [Samples(True), Samples(False)]
+
+    def opener() -> Samples:
+        if len(made) == 1 and not raised:
+            raised.append(True)
+            raise ImuError("not there yet")
+        return made.pop(0)
+
+    raised = list[bool]()
+    source = ReopeningImu(opener, 100.0, CLOCK, stop)
+    wire, tally = Wire(stop, 20), SampleTally(source)
+    imu_live.run(source, wire, tally, stop)
+    source.close()
+    assert len(wire.sent) == 20
+    assert (source.counts()["lost"], source.counts()["back"]) == (1, 1)
+    assert source.counts()["raised"] == 3  # what it raised once, and twice when it was given back
+    assert "IMU: lost: IndexError: a fault in the driver" in caplog.text
+
+
+class Poses:
+    """A tracking system whose driver raises something of its own."""
+
+    def __init__(self, fails: bool) -> None:
+        self._fails, self._seq = fails, 0
+
+    def read(self) -> TrackerPose:
+        if self._fails and self._seq == 5:
+            raise IndexError("a fault in the driver")
+        self._seq += 1
+        return TrackerPose("wand", 0, self._seq, CLOCK.now_ns(), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+    def close(self) -> None:
+        return
+
+
+def test_a_tracker_whose_driver_raises_something_of_its_own_is_opened_again() -> None:
+    stop = threading.Event()
+    made = [Poses(True), Poses(False)]
+    source = ReopeningTracker("wand", lambda: made.pop(0), CLOCK, stop)
+    wire, tally = Wire(stop, 30), PoseTally(source)
+    objects_live.run(source, wire, tally, stop)
+    source.close()
+    assert (source.counts()["lost"], source.counts()["back"], source.counts()["raised"]) == (1, 1, 1)
+
+
+def test_failures_are_logged_once_in_ten_seconds_with_how_many_were_left_out(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.WARNING, logger=failures.__name__)
+    now = [0]
+    log = Failures("camera", lambda: now[0])
+    for _ in range(100):
+        assert log.log("lost", CameraError("no frame")) == "no frame"
+        log.over("back")
+    now[0] = LOG_EVERY_NS
+    log.log("lost", KeyError("x"))
+    log.over("back")
+    assert [record.message for record in caplog.records] == [
+        "camera: lost: no frame",
+        "camera: back",
+        "camera: lost: KeyError: 'x' (99 more since the last such line)",
+        "camera: back",
+    ]
+    assert log.raised == 1
