@@ -1,0 +1,193 @@
+"""Stolen devices say what they like to a running master, in their own sessions; what others lose by it.
+
+`python -m bench.hostile [--messages 200000] [--per-s 2000] [--devices NAME ...]`: a phase without attack, then each
+device in turn sends its share of hostile messages of every kind (`bench.hostile_messages`). It prints a table and a
+line of JSON, and ends with 1 where a limit is broken.
+"""
+
+import argparse
+import json
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from bench.hostile_rig import STOLEN, HostileRig, Phase
+from common.messages import Health
+
+CALM_S = 10.0
+MOST_LOST, MOST_LINES_PER_S, MOST_GROWN_MB, LONGEST_SILENT_S = 0.01, 10.0, 20.0, 3.0
+HEAD = (
+    "| device | messages | poses lost | oldest report | undecodable | lines/s | memory | cores | refused, by reason |\n"
+    "|---|--:|--:|--:|--:|--:|--:|--:|---|"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one stolen device brought about.
+
+    Attributes:
+        device: Its name.
+        sent: Messages that it sent, by type; `unsent`: too long for a datagram, or without a session.
+        calm, attack: What was measured before and meanwhile.
+        refused: Counts of the master that rose, without what is no refusal.
+        broken: Limits that were broken, in words.
+    """
+
+    device: str
+    sent: Mapping[str, float]
+    calm: Phase
+    attack: Phase
+    refused: Mapping[str, int]
+    broken: tuple[str, ...]
+
+    @property
+    def messages(self) -> int:
+        """How many it sent."""
+        return round(sum(count for name, count in self.sent.items() if name not in ("unsent", "seconds")))
+
+
+def attacked(rig: HostileRig, device: str, count: int, per_s: float, seed: int, calm: Phase) -> Outcome:
+    """Have one device send so many; its session is over afterwards."""
+    process = rig.start_stolen(device, count, per_s, seed)
+    try:
+        _line(process)
+        before = rig.ask()
+        with _asked_by_operators(rig) as failed:
+            end = rig.begin()
+            assert process.stdin is not None
+            process.stdin.write("\n")
+            process.stdin.flush()
+            sent = json.loads(_line(process) or "{}")
+            phase = end()
+        time.sleep(0.2)
+        after = rig.ask()
+    finally:
+        process.kill()
+        process.wait()
+    rise = _rise(before, after)
+    broken = (*_broken(rig, phase, calm, after), *failed)
+    return Outcome(device, sent, calm, phase, rise, tuple(dict.fromkeys(broken)))
+
+
+def _line(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    return process.stdout.readline().strip()
+
+
+def _rise(before: Health | None, after: Health | None) -> dict[str, int]:
+    """Counts that say what was refused, by how much they rose."""
+    if before is None or after is None:
+        return {}
+    said = {
+        name: number - before.counts.get(name, 0)
+        for name, number in after.counts.items()
+        if name.startswith(("refused.", "fault.")) or name in ("unsynchronised", "queue.dropped")
+    }
+    return {name.removeprefix("refused."): number for name, number in said.items() if number}
+
+
+def _broken(rig: HostileRig, phase: Phase, calm: Phase, after: Health | None) -> Iterator[str]:
+    lost = phase.lost - calm.lost
+    checks = {
+        "the master ended": not rig.alive(),
+        "the master does not answer": after is None,
+        f"{100.0 * lost:.1f} % of the poses lost": not lost <= MOST_LOST,
+        f"{phase.undecodable} messages that no reader decodes": phase.undecodable > 0,
+        f"no report for {phase.silent_s:.1f} s": phase.silent_s > LONGEST_SILENT_S,
+        f"{phase.lines_per_s:.0f} log lines a second": phase.lines_per_s > MOST_LINES_PER_S,
+        f"{phase.grown_mb:.0f} MB more": phase.grown_mb > MOST_GROWN_MB,
+        f"{phase.threads_ended} threads fewer": phase.threads_ended > 0,
+        "terminal sequences in the log": b"\x1b" in rig.log.read_bytes(),
+    }
+    return (what for what, holds in checks.items() if holds)
+
+
+@contextmanager
+def _asked_by_operators(rig: HostileRig) -> Generator[list[str]]:
+    """Run `check` and `fleet` meanwhile; what is wrong with what they say is in the list afterwards."""
+    failed: list[str] = []
+
+    def ask() -> None:
+        for command, exits in ((("check",), (0, 1)), (("fleet", "--seconds", "2"), (0,))):
+            code, said = rig.command(*command)
+            if code not in exits or b"Traceback" in said:
+                failed.append(f"{command[0]} ended with {code}: {said.decode(errors='replace')[-200:]!r}")
+            if b"\x1b]" in said or b"\x07" in said:
+                failed.append(f"{command[0]} writes to the terminal")
+
+    thread = threading.Thread(target=ask)
+    thread.start()
+    try:
+        yield failed
+    finally:
+        thread.join()
+
+
+def row(outcome: Outcome) -> str:
+    """A line of the table."""
+    phase = outcome.attack
+    refused = ", ".join(f"`{name}` {count}" for name, count in sorted(outcome.refused.items())) or "–"
+    return (
+        f"| {outcome.device} | {outcome.messages} | {100.0 * phase.lost:.2f} % (calm {100.0 * outcome.calm.lost:.2f} %)"
+        f" | {phase.silent_s:.1f} s | {phase.undecodable} | {phase.lines_per_s:.1f} | {phase.grown_mb:+.1f} MB"
+        f" | {phase.cpu:.2f} (calm {outcome.calm.cpu:.2f}) | {refused} |"
+        + (f" **{'; '.join(outcome.broken)}**" if outcome.broken else "")
+    )
+
+
+def all_attacked(
+    rig: HostileRig,
+    devices: Sequence[str],
+    messages: int,
+    per_s: float,
+    seed: int,
+    say: Callable[[str], None],
+) -> list[Outcome]:
+    """Each device in turn sends its share; stops when the master has ended."""
+    end = rig.begin()
+    time.sleep(CALM_S)
+    calm = end()
+    outcomes: list[Outcome] = []
+    for k, device in enumerate(devices):
+        if not rig.alive():
+            break
+        outcome = attacked(rig, device, messages // len(devices), per_s, seed + k, calm)
+        outcomes.append(outcome)
+        say(row(outcome))
+    return outcomes
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Attack, print the table; 1 if a limit is broken."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument(
+        "--messages", type=int, default=200_000, metavar="N", help="of all devices (default: 200000)"
+    )
+    parser.add_argument(
+        "--per-s", type=float, default=2000.0, metavar="N", help="messages a second (default: 2000)"
+    )
+    parser.add_argument("--devices", nargs="+", choices=list(STOLEN), default=list(STOLEN))
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(prefix="phalanx-hostile-") as folder:
+        rig = HostileRig(Path(folder) / "rig")
+        try:
+            print(HEAD, flush=True)
+            place = (options.devices, options.messages, options.per_s, options.seed)
+            outcomes = all_attacked(rig, *place, lambda line: print(line, flush=True))
+            if not rig.alive():
+                print(rig.log.read_text(errors="replace")[-3000:])
+        finally:
+            rig.close()
+    print(json.dumps([asdict(outcome) for outcome in outcomes]))
+    return int(len(outcomes) < len(options.devices) or any(outcome.broken for outcome in outcomes))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
