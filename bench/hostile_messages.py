@@ -12,7 +12,7 @@ from typing import TypeAlias, get_args
 import msgspec
 from msgspec import Struct, inspect
 
-from bench.hostile_values import DTYPES, hostile, nested
+from bench.hostile_values import dtype_of, hostile, nested
 from common.messages import AnyMessage, Message
 from common.session import EchoAnswer, Hello, Started
 
@@ -79,11 +79,11 @@ def wire(message: Struct) -> Fields:
     out: Fields = {"type": type(message).__name__} if isinstance(message, Message) else {}
     for one in msgspec.structs.fields(type(message)):
         value = getattr(message, one.name)
-        array = one.type in DTYPES
+        dtype = dtype_of(one.type)
         out[one.encode_name] = (
-            value.astype(DTYPES[one.type]).tobytes()
-            if array
-            else msgspec.to_builtins(value, builtin_types=(bytes,))
+            msgspec.to_builtins(value, builtin_types=(bytes,))
+            if dtype is None
+            else value.astype(dtype).tobytes()
         )
     return out
 
@@ -103,6 +103,8 @@ def _simplest(kind: inspect.Type) -> object:
         return kind.values[0]
     if isinstance(kind, inspect.VarTupleType | inspect.ListType):
         return [_simplest(kind.item_type)]
+    if isinstance(kind, inspect.Metadata):
+        return _simplest(kind.type)
     if isinstance(kind, inspect.UnionType):
         return _simplest(kind.types[0])
     if type(kind) not in _ZERO:
@@ -137,10 +139,10 @@ def attacks(kind: type[Struct], base: Mapping[str, object], source: random.Rando
 def _fields(kind: type[Struct], base: Mapping[str, object], source: random.Random) -> Iterator[Attack]:
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
-    dtypes = {one.encode_name: one.type for one in msgspec.structs.fields(kind)}
+    types = {one.encode_name: one.type for one in msgspec.structs.fields(kind)}
     for one in info.fields:
         name = one.encode_name
-        for what, value in hostile(one.type, base[name], source, dtypes[name]):
+        for what, value in hostile(one.type, base[name], source, types[name]):
             yield Attack(f"{kind.__name__}.{name}: {what}", kind, {name: value})
 
 

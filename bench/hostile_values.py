@@ -7,7 +7,7 @@ here, and a field of a type that is not known is an error.
 import random
 from collections.abc import Callable, Iterator, Mapping
 from math import inf, nan
-from typing import TypeAlias, cast
+from typing import Annotated, TypeAlias, cast, get_args, get_origin
 
 import msgspec
 import numpy as np
@@ -33,19 +33,21 @@ _MOST_BYTES = 3000  # what fits into a datagram beside the other fields
 _DEEP = 1500
 
 
-def hostile(kind: inspect.Type, base: object, source: random.Random, dtype: object = None) -> Iterator[Value]:
+def hostile(
+    kind: inspect.Type, base: object, source: random.Random, annotation: object = None
+) -> Iterator[Value]:
     """All hostile values of one field.
 
     Args:
         kind: Its type.
         base: A plausible value of it, as msgpack has it.
         source: Of what is drawn at random.
-        dtype: Of an array its annotation, a key of `DTYPES`.
+        annotation: Of the field, which says of an array what its elements are.
 
     Raises:
         TypeError: The type has no values here.
     """
-    yield from _of_type(kind, base, source, dtype)
+    yield from _of_type(kind, base, source, annotation)
     yield from wrong_types(base)
 
 
@@ -62,12 +64,22 @@ def wrong_types(base: object) -> Iterator[Value]:
     yield "a reserved code", msgspec.Raw(b"\xc1")
 
 
+def bare(annotation: object) -> object:
+    """An annotation without what stands beside its type."""
+    return get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+
+
+def dtype_of(annotation: object) -> np.dtype[np.generic] | None:
+    """What the elements of an array field are on the wire; None: it is no array."""
+    return DTYPES.get(bare(annotation))
+
+
 def nested(depth: int) -> msgspec.Raw:
     """An array in an array, so deep."""
     return msgspec.Raw(b"\x91" * depth + b"\xc0")
 
 
-def _of_type(kind: inspect.Type, base: object, source: random.Random, dtype: object) -> Iterator[Value]:
+def _of_type(kind: inspect.Type, base: object, source: random.Random, annotation: object) -> Iterator[Value]:
     match kind:
         case inspect.BoolType():
             yield "the other", not base
@@ -90,8 +102,13 @@ def _of_type(kind: inspect.Type, base: object, source: random.Random, dtype: obj
                 yield f"{size} bytes", source.randbytes(min(size, _MOST_BYTES))
             yield "a JPEG that ends", b"\xff\xd8\xff"
             yield "a JPEG of 30000 x 30000", b"\xff\xd8\xff\xc0\x00\x11\x08\x75\x30\x75\x30\x03" + bytes(300)
-        case inspect.CustomType() if dtype in DTYPES:
-            yield from _arrays(DTYPES[dtype], cast(bytes, base), source)
+        case inspect.Metadata():
+            yield from _of_type(kind.type, base, source, annotation)
+            if kind.extra and "bounds" in kind.extra:
+                bounds = cast(tuple[float, float], kind.extra["bounds"])
+                yield from _within_bounds(bounds, base, annotation, source)
+        case inspect.CustomType() if dtype_of(annotation) is not None:
+            yield from _arrays(DTYPES[bare(annotation)], cast(bytes, base), source)
         case inspect.DictType():
             yield from _dicts(kind, cast(dict[str, object], base), source)
         case inspect.VarTupleType() | inspect.ListType():
@@ -100,7 +117,7 @@ def _of_type(kind: inspect.Type, base: object, source: random.Random, dtype: obj
             yield from _structs(kind, cast(dict[str, object], base), source)
         case inspect.UnionType():
             for one in kind.types:
-                yield from _of_type(one, base, source, dtype)
+                yield from _of_type(one, base, source, annotation)
         case inspect.NoneType():
             yield "nothing", None
         case _:
@@ -148,6 +165,34 @@ _CHANGES: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
     "a hair farther": lambda array: array + 1e-9,
 }
 _ANY_DTYPE = {"all like the first", "backwards"}
+
+
+def _within_bounds(
+    bounds: tuple[float, float], base: object, annotation: object, source: random.Random
+) -> Iterator[Value]:
+    """Of a number, or of elements of an array, whose field states its bounds: at, just beyond, and anywhere within."""
+    low, high = bounds
+    one = {f"at the bound {bound:g}": bound for bound in bounds}
+    one |= {f"beyond the bound {b:g}": float(np.nextafter(b, way)) for b, way in ((low, -inf), (high, inf))}
+    one["anywhere within its bounds"] = source.uniform(low, high)
+    dtype = dtype_of(annotation)
+    if dtype is None:
+        yield from one.items()
+        return
+    whole = np.frombuffer(cast(bytes, base), dtype)
+    for what, value in one.items():
+        yield f"one entry {what}", np.array(value, dtype).tobytes() + whole[1:].tobytes()
+        yield f"all {what}", np.full_like(whole, value).tobytes()
+    for what, draw in (
+        ("at either bound", lambda: source.choice(bounds)),
+        ("anywhere within", lambda: source.uniform(low, high)),
+        ("of any size within", lambda: source.choice(bounds) * 10.0 ** source.uniform(-12.0, 0.0)),
+    ):
+        yield f"each {what}", np.array([draw() for _ in whole], dtype).tobytes()
+        yield (
+            f"each {what}, some not seen",
+            np.array([source.choice((draw(), nan)) for _ in whole], dtype).tobytes(),
+        )
 
 
 def _dicts(kind: inspect.DictType, base: dict[str, object], source: random.Random) -> Iterator[Value]:
