@@ -19,7 +19,7 @@ from pathlib import Path
 from bench.hostile_rig import STOLEN, HostileRig, Phase
 from common.messages import Health
 
-CALM_S = 10.0
+CALM_S, SETTLE_S = 10.0, 1.0
 MOST_LOST, MOST_LINES_PER_S, MOST_GROWN_MB, LONGEST_SILENT_S = 0.01, 10.0, 20.0, 3.0
 HEAD = (
     "| device | messages | poses lost | oldest report | undecodable | lines/s | memory | cores | refused, by reason |\n"
@@ -52,27 +52,19 @@ class Outcome:
         return round(sum(count for name, count in self.sent.items() if name not in ("unsent", "seconds")))
 
 
-def attacked(rig: HostileRig, device: str, count: int, per_s: float, seed: int, calm: Phase) -> Outcome:
-    """Have one device send so many; its session is over afterwards."""
-    process = rig.start_stolen(device, count, per_s, seed)
-    try:
-        _line(process)
-        before = rig.ask()
-        with _asked_by_operators(rig) as failed:
-            end = rig.begin()
-            assert process.stdin is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
-            sent = json.loads(_line(process) or "{}")
-            phase = end()
-        time.sleep(0.2)
-        after = rig.ask()
-    finally:
-        process.kill()
-        process.wait()
-    rise = _rise(before, after)
+def attacked(rig: HostileRig, device: str, process: subprocess.Popen[str], calm: Phase) -> Outcome:
+    """Have one device send what it has made; its session is over afterwards."""
+    before = rig.ask()
+    with _asked_by_operators(rig) as failed:
+        end = rig.begin()
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+        sent = json.loads(_line(process) or "{}")
+        phase = end()
+    after = rig.ask()
     broken = (*_broken(rig, phase, calm, after), *failed)
-    return Outcome(device, sent, calm, phase, rise, tuple(dict.fromkeys(broken)))
+    return Outcome(device, sent, calm, phase, _rise(before, after), tuple(dict.fromkeys(broken)))
 
 
 def _line(process: subprocess.Popen[str]) -> str:
@@ -147,19 +139,32 @@ def all_attacked(
     messages: int,
     per_s: float,
     seed: int,
-    say: Callable[[str], None],
+    calm_s: float = CALM_S,
+    say: Callable[[str], None] = lambda _line: None,
 ) -> list[Outcome]:
-    """Each device in turn sends its share; stops when the master has ended."""
-    end = rig.begin()
-    time.sleep(CALM_S)
-    calm = end()
+    """Each device in turn sends its share, after a calm phase with all of them connected.
+
+    It stops when the master has ended.
+    """
+    share = messages // len(devices)
+    stolen = {name: rig.start_stolen(name, share, per_s, seed + k) for k, name in enumerate(devices)}
     outcomes: list[Outcome] = []
-    for k, device in enumerate(devices):
-        if not rig.alive():
-            break
-        outcome = attacked(rig, device, messages // len(devices), per_s, seed + k, calm)
-        outcomes.append(outcome)
-        say(row(outcome))
+    try:
+        for process in stolen.values():
+            _line(process)
+        time.sleep(SETTLE_S)
+        end = rig.begin()
+        time.sleep(calm_s)
+        calm = end()
+        for device, process in stolen.items():
+            if not rig.alive():
+                break
+            outcomes.append(attacked(rig, device, process, calm))
+            say(row(outcomes[-1]))
+    finally:
+        for process in stolen.values():
+            process.kill()
+            process.wait()
     return outcomes
 
 
@@ -180,7 +185,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         try:
             print(HEAD, flush=True)
             place = (options.devices, options.messages, options.per_s, options.seed)
-            outcomes = all_attacked(rig, *place, lambda line: print(line, flush=True))
+            outcomes = all_attacked(rig, *place, say=lambda line: print(line, flush=True))
             if not rig.alive():
                 print(rig.log.read_text(errors="replace")[-3000:])
         finally:

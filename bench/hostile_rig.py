@@ -69,7 +69,7 @@ class Phase:
         undecodable: Messages of the master that a reader could not decode.
         lines_per_s: Lines of its log.
         grown_mb: How much more memory it has that is no file's.
-        threads_ended: How many threads fewer it has.
+        threads_ended: How many of Python's threads fewer it has.
         cpu: Cores that the master took.
     """
 
@@ -170,7 +170,7 @@ class HostileRig:
     def begin(self) -> Callable[[], Phase]:
         """Begin to measure; what is returned ends it and says what was measured."""
         began, log = time.monotonic(), len(self.log.read_bytes())
-        before = footprint(self.master.pid)
+        before, threads = footprint(self.master.pid), self._threads()
         refused = self._undecodable()
 
         def end() -> Phase:
@@ -187,7 +187,7 @@ class HostileRig:
                 self._undecodable() - refused,
                 lines / (ended - began),
                 after.anonymous_mb - before.anonymous_mb,
-                before.threads - after.threads,
+                threads - self._threads(),
                 (after.cpu_s - before.cpu_s) / (ended - began),
             )
 
@@ -216,6 +216,15 @@ class HostileRig:
             cwd=ROOT, env=self.environment, capture_output=True, timeout=UP_S, check=False,
         )  # fmt: skip
         return done.returncode, done.stdout + done.stderr
+
+    def _threads(self) -> int:
+        """How many of the master's threads are Python's: they have the name of the process, those of zenoh do not."""
+        folder = Path(f"/proc/{self.master.pid}")
+        try:
+            own = (folder / "comm").read_text()
+            return sum((one / "comm").read_text() == own for one in (folder / "task").iterdir())
+        except OSError:
+            return 0
 
     def _undecodable(self) -> int:
         return sum(reader.inbox.refused for reader in self._readers)
