@@ -1,11 +1,10 @@
 """A plausible message of each type that a slave may say: what hostile ones are made from."""
 
-from typing import cast
-
 import numpy as np
 from msgspec import Struct
 
-from bench.hostile_messages import Fields, wire
+from bench.hostile_messages import Attack, Fields, wire
+from bench.scale_rig import told
 from common.arrays import Float
 from common.messages import (
     Backlog,
@@ -18,6 +17,7 @@ from common.messages import (
     Health,
     ImuSample,
     MarkerDetections,
+    Message,
     ObjectPose,
     Preview,
     Still,
@@ -30,13 +30,53 @@ from common.sim.wrist.scene import WristScene
 from master.rig import RigSetup
 
 _JPEG = b"\xff\xd8\xff\xe0" + bytes(100)
+_LOOP, _RATE_HZ = 300, 30.0  # frames, then the same again
+_FOLLOWED = 10**6
 _UNIT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def examples(name: str) -> dict[type[Struct], Fields]:
-    """One of each type, in the name of a device."""
-    said = (*_sensed(name), *_solved(name), *_state(name), *_handshakes(name))
-    return {type(message): wire(message) for message in said}
+class Speaker:
+    """Makes what one device says. Holds plausible messages of each type, and the number of the newest."""
+
+    def __init__(self, name: str, setup: RigSetup | None = None) -> None:
+        """Of a device of a setup; a camera of it sees what the camera of a simulation does."""
+        self.bases = examples(name)
+        self._frames = frames_of(name, setup)
+        self._seq = 0
+
+    def body(self, attack: Attack, session: int, now_ns: int) -> bytes:
+        """The bytes of an attack, made of a plausible message of now."""
+        self._seq += 1
+        frames = self._frames.get(attack.kind)
+        base = self.bases[attack.kind] if frames is None else frames[self._seq % len(frames)]
+        live: Fields = {
+            "session": session,
+            "seq": self._seq,
+            "t_ns": now_ns,
+            "ready_t_ns": now_ns + 1_000_000,
+        }
+        seq = attack.changes.get("seq")
+        if isinstance(seq, int) and 0 < seq - self._seq < _FOLLOWED:
+            self._seq = seq  # it may have been taken: what comes after it is not to be late
+        return attack.body(base | {name: live[name] for name in live if name in base}, now_ns)
+
+
+def frames_of(name: str, setup: RigSetup | None) -> dict[type[Struct], list[Fields]]:
+    """What the camera of that name sees of a moving hand; nothing of what is no camera."""
+    if setup is None or name not in setup.models:
+        return {}
+    if setup.wrist_cameras:
+        return {WristDetections: [wire(one) for one in triples(setup, _LOOP, _RATE_HZ)]}
+    return {MarkerDetections: [wire(one) for one in told(setup, _RATE_HZ)[name][:_LOOP]]}
+
+
+def own_kinds(name: str, setup: RigSetup) -> tuple[type[Message], ...]:
+    """The types that a device of that name says."""
+    if name in setup.imus:
+        return (ImuSample,)
+    if name in setup.trackers:
+        return (TrackerPose,)
+    return (WristDetections,) if name in setup.wrist_cameras else (MarkerDetections, TagDetections)
 
 
 def triples(setup: RigSetup, count: int, rate_hz: float) -> list[WristDetections]:
@@ -51,6 +91,12 @@ def triples(setup: RigSetup, count: int, rate_hz: float) -> list[WristDetections
         name = setup.rig.cameras[0]
         out.append(WristDetections(name, 1, 3 * k, 0, 0, laser, sigma, length, tips, tip_sigma, depth))
     return out
+
+
+def examples(name: str) -> dict[type[Struct], Fields]:
+    """One of each type, in the name of a device."""
+    said = (*_sensed(name), *_solved(name), *_state(name), *_handshakes(name))
+    return {type(message): wire(message) for message in said}
 
 
 def _seen(uv: Float, value: float) -> Float:
@@ -107,14 +153,3 @@ def _handshakes(name: str) -> tuple[Struct, ...]:
         Started(1),
         EchoAnswer(1, 2, 3),
     )
-
-
-def of_now(fields: Fields, session: int, seq: int, t_ns: int) -> Fields:
-    """The same, of this session and moment."""
-    live: Fields = {"session": session, "seq": seq, "t_ns": t_ns, "ready_t_ns": t_ns + 1_000_000}
-    return fields | {name: value for name, value in live.items() if name in fields}
-
-
-def of_frames(frames: list[MarkerDetections] | list[WristDetections]) -> list[Fields]:
-    """What a camera says one after the other."""
-    return [wire(cast(Struct, frame)) for frame in frames]

@@ -16,20 +16,17 @@ from pathlib import Path
 
 from msgspec import Struct
 
-from bench.hostile_examples import examples, of_frames, of_now, triples
-from bench.hostile_messages import SAID, Attack, Fields, flood
-from bench.scale_rig import told
+from bench.hostile_examples import Speaker, own_kinds
+from bench.hostile_messages import SAID, Attack, flood, wire
 from common.clock import SystemClock
 from common.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
 from common.keys import rig_key
-from common.messages import ImuSample, MarkerDetections, Message, TagDetections, TrackerPose, WristDetections
 from common.session import EchoAnswer, Hello, RigKeys, Started
 from master.rig import RigSetup, load_setup
 from slave.uplink import Uplink
 
 _START_S = 60.0
 _OWN, _OTHERS, _SHAKES = 0.6, 0.2, 0.2  # of what it says: its own kinds, those of others, handshakes
-_LOOP = 300  # frames, then the same again
 
 
 class HostileUplink(Uplink):
@@ -59,15 +56,12 @@ class HostileUplink(Uplink):
 class HostileSender:
     """One device that sends attacks. Holds its link, and the plausible messages that they are made from."""
 
-    def __init__(self, name: str, key: bytes, port: int, setup: RigSetup | None, seed: int = 1) -> None:
+    def __init__(self, name: str, key: bytes, port: int, setup: RigSetup, seed: int = 1) -> None:
         """Listen for the master; of a setup with this camera it says what the camera of a simulation sees."""
         self.name, self._clock, self._keys = name, SystemClock(), RigKeys(key)
         self.uplink = HostileUplink(name, key, self._clock, port, "127.0.0.1")
         self._hello = self._keys.sealer(self.uplink.session ^ 1)
-        self._bases = examples(name)
-        self._frames: dict[type[Struct], list[Fields]] = frames_of(name, setup)
-        self._own = own_kinds(name, setup)
-        self._seed, self._seq = seed, 0
+        self._speaker, self._own, self._seed = Speaker(name, setup), own_kinds(name, setup), seed
         self.sent: Counter[str] = Counter()
 
     def attacks(self, count: int) -> Iterator[Attack]:
@@ -77,11 +71,11 @@ class HostileSender:
         shares: dict[type[Struct], float] = {}
         for kinds, share in ((self._own, _OWN), (others, _OTHERS), (shakes, _SHAKES)):
             shares |= {kind: share / len(kinds) for kind in kinds}
-        return flood(shares, self._bases, count, self._seed)
+        return flood(shares, self._speaker.bases, count, self._seed)
 
     def send(self, attack: Attack) -> bool:
         """Send one; False: it fits into no datagram, or there is no session."""
-        body = attack.body(self._base(attack.kind), self._clock.now_ns())
+        body = self._body(attack)
         sent = self._send(attack.kind, body) and (not attack.twice or self._send(attack.kind, body))
         self.sent[attack.kind.__name__ if sent else "unsent"] += 1
         return sent
@@ -98,15 +92,12 @@ class HostileSender:
             if k % 16 == 15:
                 time.sleep(max(0.0, (k + 1) / per_s - (time.monotonic() - began)))
 
-    def _base(self, kind: type[Struct]) -> Fields:
-        self._seq += 1
-        frames = self._frames.get(kind)
-        base = self._bases[kind] if frames is None else frames[self._seq % len(frames)]
-        if kind is Hello and self.uplink.master is not None:
-            nonce = os.urandom(16)
-            hello = self._keys.hello(self.name, self.uplink.session, nonce, self.uplink.master[0])
-            return {name: getattr(hello, name) for name in base}
-        return of_now(base, self.uplink.session, self._seq, self._clock.now_ns())
+    def _body(self, attack: Attack) -> bytes:
+        now_ns, master = self._clock.now_ns(), self.uplink.master
+        if attack.kind is Hello and master is not None:
+            hello = self._keys.hello(self.name, self.uplink.session, os.urandom(16), master[0])
+            return attack.body(wire(hello), now_ns)
+        return self._speaker.body(attack, self.uplink.session, now_ns)
 
     def _send(self, kind: type[Struct], body: bytes) -> bool:
         if kind is Hello:
@@ -115,26 +106,6 @@ class HostileSender:
         if kind is Started:
             return self.uplink.say(Kind.STARTED, body)
         return self.uplink.say(Kind.ECHO_ANSWER if kind is EchoAnswer else Kind.DATA, body)
-
-
-def frames_of(name: str, setup: RigSetup | None) -> dict[type[Struct], list[Fields]]:
-    """What the camera of that name sees of a moving hand; nothing of what is no camera."""
-    if setup is None or name not in setup.models:
-        return {}
-    if setup.wrist_cameras:
-        return {WristDetections: of_frames(triples(setup, _LOOP, 30.0))}
-    return {MarkerDetections: of_frames(told(setup, 30.0)[name][:_LOOP])}
-
-
-def own_kinds(name: str, setup: RigSetup | None) -> tuple[type[Message], ...]:
-    """The types that a device of that name says."""
-    if setup is not None and name in setup.imus:
-        return (ImuSample,)
-    if setup is not None and name in setup.trackers:
-        return (TrackerPose,)
-    if setup is not None and name in setup.wrist_cameras:
-        return (WristDetections,)
-    return MarkerDetections, TagDetections
 
 
 def main() -> None:

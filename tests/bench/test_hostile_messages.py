@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from msgspec import Meta, Struct
 
-from bench.hostile_examples import examples, of_now
+from bench.hostile_examples import Speaker, examples
 from bench.hostile_messages import SAID, Attack, Now, all_attacks, attacks, flood, plausible
 from common.arrays import Float
 from common.datagram import Kind
 from common.errors import MessageError
 from common.message_parts import Count, within
-from common.messages import Message, decode, encode
+from common.messages import Message, TrackerPose, decode, encode
 from common.session import EchoAnswer, Hello, Started, read
 
 MESSAGES = [kind for kind in SAID if issubclass(kind, Message)]
@@ -130,5 +130,11 @@ def test_a_flood_repeats_with_its_seed_and_half_of_it_is_whole_but_for_one_field
 def test_times_are_those_of_the_moment_of_sending() -> None:
     attack = Attack("", Started, {"start_t_ns": Now(5)})
     assert msgspec.msgpack.decode(attack.body({"start_t_ns": 0}, 1000)) == {"start_t_ns": 1005}
-    now = of_now({"seq": 0, "t_ns": 0, "other": 1}, 7, 8, 9)
-    assert now == {"seq": 8, "t_ns": 9, "other": 1}
+
+
+def test_what_is_not_attacked_is_of_the_session_and_its_number_is_the_next() -> None:
+    speaker, plain = Speaker("left"), Attack("", TrackerPose)
+    leap = Attack("", TrackerPose, {"seq": 1000})
+    made = [decode(speaker.body(attack, 7, 10**12)) for attack in (plain, plain, leap, plain)]
+    assert [one.seq for one in made if isinstance(one, TrackerPose)] == [1, 2, 1000, 1001]
+    assert {(one.session, one.t_ns) for one in made if isinstance(one, TrackerPose)} == {(7, 10**12)}
