@@ -20,6 +20,7 @@ from bench.hostile_rig import STOLEN, HostileRig, Phase
 from common.messages import Health
 
 CALM_S, SETTLE_S = 10.0, 1.0
+BUSY = 0.25  # cores that were not free for the master: poses are lost to that, and who attacks is not judged by it
 HEAD = (
     "| device | messages | poses lost | oldest report | undecodable | lines/s | memory | cores | refused, by reason |\n"
     "|---|--:|--:|--:|--:|--:|--:|--:|---|"
@@ -102,10 +103,11 @@ def _broken(
     rig: HostileRig, phase: Phase, calm: Phase, after: Health | None, limits: Limits
 ) -> Iterator[str]:
     lost = phase.lost - calm.lost
+    judged = phase.waited < BUSY or not rig.alive()
     checks = {
         "the master ended": not rig.alive(),
         "the master does not answer": after is None,
-        f"{100.0 * lost:.1f} % of the poses lost": not lost <= limits.lost,
+        f"{100.0 * lost:.1f} % of the poses lost": judged and not lost <= limits.lost,
         f"{phase.undecodable} messages that no reader decodes": phase.undecodable > 0,
         f"no report for {phase.silent_s:.1f} s": phase.silent_s > limits.silent_s,
         f"{phase.lines_per_s:.0f} log lines a second": phase.lines_per_s > limits.lines_per_s,
@@ -147,7 +149,7 @@ def row(outcome: Outcome) -> str:
     return (
         f"| {outcome.device} | {outcome.messages} | {100.0 * phase.lost:.2f} % (calm {100.0 * outcome.calm.lost:.2f} %)"
         f" | {phase.silent_s:.1f} s | {phase.undecodable} | {phase.lines_per_s:.1f} | {phase.grown_mb:+.1f} MB"
-        f" | {phase.cpu:.2f} (calm {outcome.calm.cpu:.2f}) | {refused} |"
+        f" | {phase.cpu:.2f} (calm {outcome.calm.cpu:.2f}), waited {phase.waited:.2f} | {refused} |"
         + (f" **{'; '.join(outcome.broken)}**" if outcome.broken else "")
     )
 

@@ -71,6 +71,7 @@ class Phase:
         grown_mb: How much more memory it has that is no file's.
         threads_ended: How many of Python's threads fewer it has.
         cpu: Cores that the master took.
+        waited: Cores that it would have taken besides, had the machine had them free.
     """
 
     seconds: float
@@ -82,6 +83,7 @@ class Phase:
     grown_mb: float
     threads_ended: int
     cpu: float
+    waited: float
 
 
 class _Reader:
@@ -171,7 +173,7 @@ class HostileRig:
         """Begin to measure; what is returned ends it and says what was measured."""
         began, log = time.monotonic(), len(self.log.read_bytes())
         before, threads = footprint(self.master.pid), self._threads()
-        refused = self._undecodable()
+        refused, waited_s = self._undecodable(), self._waited_s()
 
         def end() -> Phase:
             ended = time.monotonic()
@@ -189,6 +191,7 @@ class HostileRig:
                 after.anonymous_mb - before.anonymous_mb,
                 threads - self._threads(),
                 (after.cpu_s - before.cpu_s) / (ended - began),
+                (self._waited_s() - waited_s) / (ended - began),
             )
 
         return end
@@ -225,6 +228,14 @@ class HostileRig:
             return sum((one / "comm").read_text() == own for one in (folder / "task").iterdir())
         except OSError:
             return 0
+
+    def _waited_s(self) -> float:
+        """How long threads of the master were ready to run and had no processor, since they began [s]."""
+        try:
+            tasks = [one / "schedstat" for one in Path(f"/proc/{self.master.pid}/task").iterdir()]
+            return 1e-9 * sum(int(one.read_text().split()[1]) for one in tasks)
+        except OSError:
+            return 0.0
 
     def _undecodable(self) -> int:
         return sum(reader.inbox.refused for reader in self._readers)
