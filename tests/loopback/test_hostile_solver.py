@@ -10,8 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from master.admission import limits_of
-from master.link_senders import Taken
+from msgspec import Struct
 
 from bench.hostile_examples import Speaker, own_kinds
 from bench.hostile_messages import Attack, all_attacks
@@ -20,8 +19,10 @@ from bench.scale_rig import ROOM, told
 from common.datagram import MAX_DATAGRAM, OVERHEAD, Kind
 from common.messages import HandPose, decode, encode
 from common.session import EchoAnswer, Started
+from master.admission import limits_of
 from master.app import told_at
 from master.link import MasterLink
+from master.link_senders import Taken
 from master.rig import RigSetup, load_setup, load_setups
 from master.world import fresh_world
 from slave.link import SlaveLink
@@ -29,7 +30,7 @@ from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
 from tests.network_helpers import seeded
 
 BETWEEN = 6  # attacks between two honest frames
-KINDS = {EchoAnswer: Kind.ECHO_ANSWER, Started: Kind.STARTED}
+KINDS: dict[type[Struct], Kind] = {EchoAnswer: Kind.ECHO_ANSWER, Started: Kind.STARTED}
 
 
 @pytest.fixture(scope="module")
