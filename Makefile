@@ -1,6 +1,6 @@
 # Every target sets itself up: a fresh clone needs Python 3.11-3.13, make and a package registry, nothing else.
 .DEFAULT_GOAL := help
-.PHONY: help install demo browser emulator hosts-tools api test test-bare test-deploy test-nightly check format audit bench soak scale faults instructions schema clean
+.PHONY: help install demo browser emulator hosts-tools api test test-bare test-deploy test-nightly check format audit bench soak scale faults hostile instructions schema clean
 .DELETE_ON_ERROR:
 
 PYTHON ?=
@@ -13,6 +13,7 @@ SOAK_ARGS ?=
 SCALE_ARGS ?=
 AUDIT_ARGS ?=
 FAULTS_ARGS ?=
+HOSTILE_ARGS ?=
 INSTRUCTIONS_ARGS ?=
 
 BIN := .venv/bin
@@ -98,6 +99,9 @@ faults: $(STAMP) ## every fault on real processes: what is expected, what is mea
 	@$(BIN)/python -m bench.faults $(FAULTS_ARGS)
 	@$(BIN)/python -m bench.faults_unplugged $(FAULTS_ARGS)
 	@$(BIN)/python -m bench.faults_wall_clock $(FAULTS_ARGS)
+
+hostile: $(STAMP) ## stolen devices say what they like to a running master; HOSTILE_ARGS='--messages 20000' for less
+	@$(BIN)/python -m bench.hostile $(HOSTILE_ARGS)
 
 audit: $(STAMP) ## known vulnerabilities of all that is locked; AUDIT_ARGS='--sbom out/sbom.json' writes what is in it
 	@$(BIN)/python -m bench.audit $(AUDIT_ARGS)

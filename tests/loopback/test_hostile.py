@@ -1,0 +1,179 @@
+"""Whoever has a device's own key says what he likes to a real master: it goes on, and so do all others.
+
+One hand before two honest cameras; a third camera of it, a tracker, and a second hand's wrist device are stolen
+(`bench.hostile_rig`). `python -m bench.hostile` is the same with ten times as many messages.
+"""
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Generator
+from pathlib import Path
+from shutil import copytree
+
+import numpy as np
+import pytest
+from msgspec import Struct
+
+from bench.hostile import Limits, all_attacked, row
+from bench.hostile_rig import ROOT, STOLEN, HostileRig
+from bench.scale_rig import ROOM
+from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
+from common.session import EchoAnswer
+from tests.hostile_rigs import (
+    BOUNDS,
+    LATE,
+    LEAST,
+    MARKERS,
+    MOST,
+    PICTURE,
+    READY,
+    SEQUENCE,
+    SESSION,
+    UNASKED,
+    Rigs,
+    counts,
+    refused,
+    stolen,
+    unharmed,
+)
+from tests.network_helpers import until
+
+MESSAGES, PER_S = 20_000, 2500.0
+COUNTED_S = 3.0
+GENEROUS = Limits(
+    lost=0.3, silent_s=20.0
+)  # of a machine that has other things to do; the bench holds its own
+
+
+@pytest.fixture(scope="module")
+def rigs(tmp_path_factory: pytest.TempPathFactory) -> Generator[Rigs]:
+    made = Rigs(tmp_path_factory.mktemp("hostile"))
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def rig(rigs: Rigs) -> HostileRig:
+    return rigs.well()
+
+
+def test_twenty_thousand_hostile_messages_of_every_kind_cost_the_others_nothing(rig: HostileRig) -> None:
+    outcomes = all_attacked(rig, tuple(STOLEN), MESSAGES, PER_S, seed=2, calm_s=3.0, limits=GENEROUS)
+    shown = "\n".join(row(one) for one in outcomes)
+    assert len(outcomes) == len(STOLEN), shown
+    assert sum(one.messages for one in outcomes) > 0.9 * MESSAGES
+    assert not any(one.broken for one in outcomes), shown
+
+
+@pytest.mark.parametrize("t2_ns", [MOST, LEAST, 0])
+def test_an_echo_that_nobody_asked_for_is_refused_and_ends_nothing(rig: HostileRig, t2_ns: int) -> None:
+    with stolen(rig, "cam02") as sender, unharmed(rig) as rise:
+        time.sleep(0.3)  # good ones came before
+        for t1_ns in (LEAST, LEAST // 2, -1, 0, 1, MOST // 2, MOST):
+            sender.send_message(EchoAnswer, t1_ns=t1_ns, t2_ns=t2_ns, t3_ns=MOST)
+            sender.send_message(EchoAnswer, t1_ns=t1_ns // 4, t2_ns=t2_ns // 4, t3_ns=t2_ns // 4)
+        time.sleep(0.3)
+        for _ in range(10):
+            sender.send_message(MarkerDetections)
+    assert refused(rise, UNASKED) >= 5, rise
+    assert rise["cam02.received"] >= 5, "its clock is still known"
+
+
+def test_a_slave_whose_rig_has_other_markers_is_refused_by_name_with_the_fix(
+    rig: HostileRig, tmp_path: Path
+) -> None:
+    own = tmp_path / "calib"
+    copytree(rig.tree, own)
+    path, other = own / f"rigs/{ROOM}.json", json.loads((own / "rigs/desk-back3.json").read_text())
+    edited = {name: other[name] for name in ("hand", "markers")}
+    path.write_text(json.dumps(json.loads(path.read_text()) | edited))
+    place = ["--name", "cam02", "--camera", "synthetic", "--rig", ROOM, "--calibration", str(own)]
+    link = ["--bind", "127.0.0.1", "--beacon-port", str(rig.port)]
+    with unharmed(rig) as rise, (tmp_path / "slave.log").open("w") as log:
+        slave = subprocess.Popen(
+            [sys.executable, "-m", "slave", "run", *place, *link],
+            cwd=ROOT, env=rig.environment, stdout=log, stderr=log,
+        )  # fmt: skip
+        try:
+            assert until(lambda: says_which_and_what_to_do(rig.log.read_text()), 20.0), rig.log.read_text()
+            _, said = rig.command("check")
+        finally:
+            slave.kill()
+            slave.wait()
+    assert refused(rise, MARKERS) > 0, rise
+    assert says_which_and_what_to_do(said.decode()), said.decode()
+
+
+def says_which_and_what_to_do(text: str) -> bool:
+    """Whether it names the camera, both numbers of markers and the fix."""
+    flat = " ".join(text.split())
+    return all(word in flat for word in ("cam02", "8 markers", "6", "phalanx deploy"))
+
+
+def test_a_session_that_is_not_the_hellos_and_a_leaping_seq_are_refused(rig: HostileRig) -> None:
+    with stolen(rig, "cam02") as sender, unharmed(rig) as rise:
+        for seq in (1, MOST, 0, MOST, 2, MOST - 1, 3):
+            sender.send_message(MarkerDetections, seq=seq)
+            sender.send_message(TagDetections, seq=seq)
+        for session in (0, 1, MOST, 2):
+            sender.send_message(MarkerDetections, session=session, seq=MOST * (session % 2))
+    assert refused(rise, SESSION) >= 3, rise
+    assert refused(rise, SEQUENCE) >= 3, rise
+    for command in (("fleet", "--seconds", "1"), ("check",)):
+        code, said = rig.command(*command)
+        assert code in (0, 1), said
+        assert b"Traceback" not in said
+
+
+def array(count: int, value: float) -> bytes:
+    return np.full(count, value).tobytes()
+
+
+Absurd = tuple[
+    type[Struct], dict[str, object], tuple[str, ...]
+]  # the field, and the reasons, of which one is counted
+ABSURD: dict[str, list[Absurd]] = {
+    "cam02": [
+        *((MarkerDetections, {"uv": array(12, v)}, (PICTURE, BOUNDS)) for v in (1e9, 1e15, -1e9, 1500.0)),
+        *((MarkerDetections, {name: array(6, 1e300)}, (BOUNDS,)) for name in ("sigma_px", "area", "quality")),
+        (MarkerDetections, {"ready_t_ns": LEAST}, (READY, BOUNDS)),
+        (MarkerDetections, {"ready_t_ns": 0}, (READY,)),
+        (MarkerDetections, {"t_ns": 0, "ready_t_ns": 1000}, (LATE,)),
+        (TagDetections, {"uv": array(24, 1e300)}, (BOUNDS,)),
+        (TagDetections, {"sigma_px": array(3, 1e300)}, (BOUNDS,)),
+        (TagDetections, {"ready_t_ns": 0}, (READY,)),
+    ],
+    "wrist": [
+        (WristDetections, {"laser_uv": array(10, 1e15)}, (PICTURE, BOUNDS)),
+        (WristDetections, {"laser_sigma_px": array(5, 1e300)}, (BOUNDS,)),
+        (WristDetections, {"ready_t_ns": -(2**61)}, (READY,)),
+        (WristDetections, {"t_ns": 0, "ready_t_ns": 1000}, (LATE,)),
+    ],
+    "imu": [
+        (ImuSample, {"heading_sigma_rad": 1e300}, (BOUNDS,)),
+        (ImuSample, {"gyro_rad_s": array(3, 1e300)}, (BOUNDS,)),
+        (ImuSample, {"accel_m_s2": array(3, 1e15)}, (BOUNDS,)),
+        (ImuSample, {"t_ns": 0}, (LATE,)),
+    ],
+    "tracker": [
+        (TrackerPose, {"position_m": array(3, 1e300)}, (BOUNDS,)),
+        (TrackerPose, {"orientation_wxyz": array(4, 1e9)}, (BOUNDS,)),
+        (TrackerPose, {"t_ns": 0}, (LATE,)),
+    ],
+}
+
+
+@pytest.mark.parametrize("device", STOLEN)
+def test_numbers_that_cannot_be_are_refused_for_their_reason(rig: HostileRig, device: str) -> None:
+    """And nobody's pose becomes one that readers cannot decode."""
+    with stolen(rig, device) as sender, unharmed(rig):
+        for kind, changes, reasons in ABSURD[device]:
+            before = refused(counts(rig), *reasons)
+            for _ in range(10):  # of frames in which not all is seen, some are undecodable then
+                sender.send_message(kind)
+                sender.send_message(kind, **changes)
+                time.sleep(0.02)
+            enough = until(lambda: refused(counts(rig), *reasons) >= before + 4, COUNTED_S)  # noqa: B023
+            assert enough, f"{kind.__name__} {list(changes)}: none of {reasons} was counted: {counts(rig)}"

@@ -1,0 +1,97 @@
+"""What a device says of itself on the bus, and what it asks there: nobody's terminal, report or master suffers."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
+
+import msgspec
+import pytest
+import zenoh
+
+from bench.hostile_rig import ROOT, HostileRig
+from common.bus_settings import settings
+from common.messages import Command, Health, encode
+from tests.hostile_rigs import Rigs, counts, unharmed
+from tests.network_helpers import PATIENCE_S
+
+OWNED = "pi\x1b]0;owned\x07\u202e"
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Generator[HostileRig]:
+    made = Rigs(tmp_path_factory.mktemp("hostile"))
+    yield made.well()
+    made.close()
+
+
+@contextmanager
+def on_bus(rig: HostileRig) -> Generator[zenoh.Session]:
+    """Somebody on the bus who puts bytes there as he likes."""
+    made = settings(None, [rig.endpoint], "client", None)
+    with zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(made).decode())) as session:
+        yield session
+
+
+def report(session: zenoh.Session, name: str, changes: Mapping[str, object]) -> None:
+    """Publish a report of a device with these fields, whatever the types say."""
+    whole = encode(Health(name, 1, time.monotonic_ns(), {"frames": 1}, {"rate_hz": 30.0}))
+    fields = msgspec.msgpack.decode(whole) | changes
+    session.put(f"phalanx/health/{name}", msgspec.msgpack.encode(fields))
+
+
+def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> None:
+    shown: list[bytes] = []
+    commands = (
+        ("-m", "master", "check"),
+        ("-m", "master", "fleet", "--seconds", "1"),
+        ("-m", "deploy", "fleet"),
+    )
+    with unharmed(rig), on_bus(rig) as session:
+        running = [
+            subprocess.Popen(
+                [sys.executable, *command, "--bus", rig.endpoint],
+                cwd=ROOT, env=rig.environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+            )
+            for command in commands
+        ]  # fmt: skip
+        while any(one.poll() is None for one in running):
+            for changes in (
+                {"host": OWNED, "version": OWNED},
+                {"gauges": {"temperature_c": 1e300}},
+                {"gauges": {OWNED: 1.0}},
+                {"counts": {"frames": 2**64 - 1}},
+                {"version": "9" * 64},
+            ):
+                report(session, "cam02", changes)
+            time.sleep(0.05)
+        shown += [one.communicate(timeout=PATIENCE_S)[0] for one in running]
+    assert any(b"cam02" in text for text in shown), shown
+    for text in (*shown, rig.log.read_bytes()):
+        assert b"Traceback" not in text, text
+        for sequence in ("\x1b]", "\x07", "\u202e"):
+            assert sequence.encode() not in text, text
+
+
+@pytest.mark.parametrize("verb", ["stop", "report"])
+def test_a_command_for_another_that_comes_under_the_masters_key_is_not_obeyed(
+    rig: HostileRig, verb: str
+) -> None:
+    with unharmed(rig), on_bus(rig) as session:
+        replies = list(
+            session.get("phalanx/command/master", payload=encode(Command("left", verb)), timeout=5.0)
+        )
+    assert replies
+    assert all(reply.ok is None for reply in replies)
+    assert all(reply.err is not None and b"left" in reply.err.payload.to_bytes() for reply in replies)
+
+
+@pytest.mark.parametrize(
+    "payload", [b"", b"\xc1", b"\x91" * 10_000, encode(Command("master", "no-such-verb"))]
+)
+def test_a_command_that_is_none_is_refused(rig: HostileRig, payload: bytes) -> None:
+    with unharmed(rig), on_bus(rig) as session:
+        replies = list(session.get("phalanx/command/master", payload=payload, timeout=5.0))
+    assert all(reply.ok is None for reply in replies)
+    assert counts(rig)["poses"] > 0
