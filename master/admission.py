@@ -29,7 +29,7 @@ _ANY_HZ = 10_000.0  # where no file says a rate
 _LEAST_HZ = 60.0
 _IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
 _TRACKER_HZ = 500.0
-_BURST_S = 0.5  # of it may come at once: a network that halted for that long, at the rate of the file for a second
+_BURST_S = 0.5  # of it may come at once: at the rate of the file, what a second's halt of the network held up
 
 Sensed = Detections | TagDetections | ImuSample | TrackerPose
 
