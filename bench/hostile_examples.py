@@ -1,5 +1,6 @@
 """A plausible message of each type that a slave may say: what hostile ones are made from."""
 
+import cv2
 import numpy as np
 from msgspec import Struct
 
@@ -29,7 +30,7 @@ from common.session import EchoAnswer, Hello, Started
 from common.sim.wrist.scene import WristScene
 from master.rig import RigSetup
 
-_JPEG = b"\xff\xd8\xff\xe0" + bytes(100)
+_JPEG = cv2.imencode(".jpg", np.full((16, 16, 3), 90, np.uint8))[1].tobytes()
 _LOOP, _RATE_HZ = 300, 30.0  # frames, then the same again
 _FOLLOWED = 10**6
 _UNIT = np.array([1.0, 0.0, 0.0, 0.0])
