@@ -19,20 +19,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage.
 
     Raises:
-        SystemExit: With code 70, if a thread failed.
+        SystemExit: With code 70, if a thread or the command itself failed.
     """
     options = parser().parse_args(arguments)
     cv2.setNumThreads(1)  # small windows are faster on one thread, and the other cores stay free
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
-    try:
-        with supervised_threads():
+    with supervised_threads():
+        try:
             return COMMANDS[options.command](options)
-    except PhalanxError as error:
-        _aside(f"phalanx-slave: {error}")
-        Service(os.environ).failed(str(error))
-        return 1
-    except KeyboardInterrupt:  # while detecting offline; a live run ends by its event
-        return 130
+        except PhalanxError as error:
+            _aside(f"phalanx-slave: {error}")
+            Service(os.environ).failed(str(error))
+            return 1
+        except KeyboardInterrupt:  # while detecting offline; a live run ends by its event
+            return 130
 
 
 def _install(options: argparse.Namespace) -> int:
