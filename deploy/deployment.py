@@ -9,7 +9,7 @@ from pathlib import Path
 
 from deploy.hearing import Before, Ears, Heard, heard_of
 from deploy.one_host import Host, Wish
-from deploy.remote import Deadline, Remote, run_bounded
+from deploy.remote import Deadline, Remote, printable, run_bounded
 from deploy.targets import DeployError, Target
 
 _KEYS_S = 60.0
@@ -174,7 +174,7 @@ class Lines:
     def __call__(self, line: str) -> None:
         """Write one."""
         with self._lock:
-            self._write(line)
+            self._write(printable(line))
 
 
 def reach_of(

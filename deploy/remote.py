@@ -206,7 +206,12 @@ def _feed(pipe: IO[bytes], content: bytes) -> None:
 def _lines(pipe: IO[bytes], on_line: Callable[[str], None]) -> None:
     with pipe:
         for line in pipe:
-            on_line(line.decode(errors="replace").rstrip("\r\n"))
+            on_line(printable(line.decode(errors="replace").rstrip("\r\n")))
+
+
+def printable(text: str) -> str:
+    """The text with a question mark for each control character: a device writes to the operator's terminal."""
+    return "".join(c if c.isprintable() or c == "\t" else "?" for c in text)
 
 
 def _plain(errors: Sequence[str], host: str) -> str:
