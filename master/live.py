@@ -34,7 +34,7 @@ from master.rig import RigSetup
 from master.stages import StageTimes
 from master.summary import write_summary
 from master.time_watch import TimeWatch
-from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.tuning import LivePipeline, RigFiles, RigTuning, renew
 from master.world import World, fresh_world
 
 __all__ = ["LiveSettings", "cameras_line", "cameras_of", "devices_of", "ingest_of", "run_live", "trackers_of"]
@@ -139,18 +139,11 @@ def run_live(
         writes_to = Path.cwd() if settings.poses is None else settings.poses.parent
         checklist = ChecklistFeed(bus, clock, ingest, setups, pipelines, files, reporter.session, writes_to)
         in_use = (lambda: setups) if tuning is None else (lambda: tuning.setups)
-
-        def renew(sender: str) -> None:
-            for setup, pipeline in zip(in_use(), pipelines, strict=True):
-                if sender in setup.senders:
-                    pipeline.renew()
-            world.prepare(in_use())()
-
         guard = SolverGuard(
             Observed(world, figures.rates, watch.push),
             ingest.quarantine,
             clock,
-            renew,
+            (lambda sender: renew(setups, pipelines, world, sender)) if tuning is None else tuning.renew,
             lambda sender: fresh_world([setup for setup in in_use() if sender in setup.senders]),
         )
         threads = (

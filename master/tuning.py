@@ -271,6 +271,11 @@ class RigTuning:
         with self._turn:
             self._use(lambda: _with_filter(self._setups, trial))
 
+    def renew(self, sender: str) -> None:
+        """As the function `renew`, of the setups in use."""
+        with self._turn:
+            renew(self._setups, self._pipelines, self._world, sender)
+
     def _use(self, get: Callable[[], Sequence[RigSetup]]) -> bool:
         """Have these setups in use, all or none; False if they were."""
         try:
@@ -293,6 +298,24 @@ class RigTuning:
         self._setups = setups
         self._applied += 1
         return True
+
+
+def renew(
+    setups: Sequence[RigSetup], pipelines: Sequence[LivePipeline], world: World | None, sender: str
+) -> None:
+    """Let new solvers take over from all that `sender` feeds: the state of the old ones may be broken.
+
+    Args:
+        setups: Of each hand, as they are in use.
+        pipelines: Of each setup.
+        world: What is made beside the hands; None: nothing is.
+        sender: A camera, an IMU or a tracker.
+    """
+    for setup, pipeline in zip(setups, pipelines, strict=True):
+        if sender in setup.senders:
+            pipeline.renew()
+    if world is not None:
+        world.prepare(setups)()
 
 
 def _with_filter(setups: Sequence[RigSetup], trial: FilterTrial) -> list[RigSetup]:

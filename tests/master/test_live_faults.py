@@ -12,9 +12,8 @@ from common.keys import new_key
 from common.messages import Command, Detections, WristDetections
 from common.zenoh_bus import ZenohBus
 from master.live import LiveSettings, run_live
-from master.rig import load_setups
 from master.stereo.pipeline import SolvedPose
-from master.tuning import LivePipeline
+from master.tuning import LivePipeline, RigFiles
 from slave.uplink import Uplink
 from tests.master.test_live import free_tcp_port
 from tests.network_helpers import detections, free_udp_port, until
@@ -35,8 +34,11 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
 
     monkeypatch.setattr(LivePipeline, "push", faulty)
     key, clock, bus = bytes.fromhex(new_key()), SystemClock(), f"tcp/127.0.0.1:{free_tcp_port()}"
-    settings = LiveSettings(("127.255.255.255", beacon := free_udp_port()), ("127.0.0.1", 0), bus, 5.0)
-    setups = load_setups(root / "calib_json", ("desk", "wrist-left"))
+    files = RigFiles(root / "calib_json", ("desk", "wrist-left"))
+    settings = LiveSettings(
+        ("127.255.255.255", beacon := free_udp_port()), ("127.0.0.1", 0), bus, 5.0, files=files
+    )
+    setups = files.load()
     triple = exact_triple(setups[1], wrist_scene(setups[1]).truth(0.5), 0)
     stop = threading.Event()
     master = threading.Thread(target=run_live, args=(setups, key, settings, stop, list[str]().append))
