@@ -1,4 +1,6 @@
-"""A camera that fails and comes back, on real slaves with simulated cameras: what its slave and the master say.
+"""Measure what a camera that fails and comes back does to a running rig.
+
+The slaves are real, with simulated cameras; it is measured what the slave of the camera and the master say.
 
 `python -m bench.faults_unplugged [--runs 3] [--fault unplugged | raises | frozen]`, for docs/faults.md. The camera is
 unplugged, its driver raises an error of its own, or it repeats one picture, for 3 s; then it takes as long as the retry

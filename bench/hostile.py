@@ -1,4 +1,6 @@
-"""Stolen devices say what they like to a running master, in their own sessions; what others lose by it.
+"""Measure what others lose while stolen devices attack a running master.
+
+The stolen devices send what they like, in their own sessions.
 
 `python -m bench.hostile [--messages 200000] [--per-s 2000] [--devices NAME ...]`: a phase without attack, then each
 device in turn sends its share of hostile messages of every kind (`bench.hostile_messages`). It prints a table and a
@@ -29,7 +31,10 @@ HEAD = (
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What the others may lose by it: share of poses, time without a report [s], lines of the log, memory [MB]."""
+    """The most that the others may lose by an attack.
+
+    Share of poses, time without a report [s], lines of the log per second, memory [MB].
+    """
 
     lost: float = 0.01
     silent_s: float = 3.0
@@ -120,7 +125,10 @@ def _broken(
 
 @contextmanager
 def _asked_by_operators(rig: HostileRig) -> Generator[list[str]]:
-    """Run `check` and `fleet` again and again meanwhile; what is wrong with what they print comes into the list."""
+    """Run `check` and `fleet` again and again until the block ends.
+
+    What is wrong with what they print is added to the list that the block is given.
+    """
     failed: list[str] = []
     closing = threading.Event()
 
@@ -164,9 +172,9 @@ def all_attacked(
     say: Callable[[str], None] = lambda _line: None,
     limits: Limits = LIMITS,
 ) -> list[Outcome]:
-    """Each device in turn sends its share, after a calm phase with all of them connected.
+    """Let each device in turn send its share of the attack.
 
-    It stops when the master has ended.
+    A calm phase with all of them connected comes before. It stops when the master has ended.
     """
     share = messages // len(devices)
     stolen = {name: rig.start_stolen(name, share, per_s, seed + k) for k, name in enumerate(devices)}

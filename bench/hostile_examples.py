@@ -1,4 +1,7 @@
-"""A plausible message of each type that a slave may say: what hostile ones are made from."""
+"""A plausible message of each type that a slave may say.
+
+Hostile messages are made from them.
+"""
 
 import cv2
 import numpy as np
@@ -37,10 +40,16 @@ _UNIT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Speaker:
-    """Makes what one device says. Holds plausible messages of each type, and the number of the newest."""
+    """Make the messages of one device.
+
+    Holds plausible messages of each type, and the number of the newest.
+    """
 
     def __init__(self, name: str, setup: RigSetup | None = None) -> None:
-        """Of a device of a setup; a camera of it sees what the camera of a simulation does."""
+        """Make messages of the device `name`.
+
+        Where it is a camera of `setup`, it sees what the camera of a simulation does.
+        """
         self.bases = examples(name)
         self._frames = frames_of(name, setup)
         self._seq = 0
@@ -63,7 +72,10 @@ class Speaker:
 
 
 def frames_of(name: str, setup: RigSetup | None) -> dict[type[Struct], list[Fields]]:
-    """What the camera of that name sees of a moving hand; nothing of what is no camera."""
+    """Messages of the camera `name` before a moving hand.
+
+    Empty where `name` is no camera of the setup.
+    """
     if setup is None or name not in setup.models:
         return {}
     if setup.wrist_cameras:

@@ -1,4 +1,6 @@
-"""Messages of a hostile sender, made from the message types themselves: whole but for one field, or wrong all over.
+"""Messages of a hostile sender, made from the message types themselves.
+
+They are whole but for one field, or wrong all over.
 
 An `Attack` says how a plausible message of now becomes a hostile one, so a flood can be made before it is sent and
 still be of its moment. `attacks` gives all of one type; `flood` draws from those of many, with a seed.
@@ -89,7 +91,10 @@ def wire(message: Struct) -> Fields:
 
 
 def plausible(kind: type[Struct]) -> Fields:
-    """Something of this type where no example is known: each field the simplest of its own type."""
+    """A message of this type, for types of which no example is known.
+
+    Each field has the simplest value of its own type.
+    """
     info = inspect.type_info(kind)
     assert isinstance(info, inspect.StructType)
     out: Fields = {} if info.tag is None else {"type": info.tag}
@@ -113,7 +118,9 @@ def _simplest(kind: inspect.Type) -> object:
 
 
 def attacks(kind: type[Struct], base: Mapping[str, object], source: random.Random) -> Iterator[Attack]:
-    """Every attack with one message of a type: each field with each hostile value, and what is no message at all.
+    """Every attack with one message of a type.
+
+    Each field takes each hostile value; besides there are bytes that are no message at all.
 
     Raises:
         TypeError: A field has a type whose hostile values are not known.
@@ -207,7 +214,10 @@ def flood(
     count: int,
     seed: int,
 ) -> Iterator[Attack]:
-    """So many attacks, types in these shares; of half of them one field is wrong, of a tenth three, the rest any."""
+    """Draw `count` attacks, with the message types in these shares.
+
+    In half of them one field is wrong, in a tenth three are; the rest is any attack.
+    """
     source = random.Random(seed)
     kinds = list(shares)
     known = all_attacks(kinds, bases, source)

@@ -1,4 +1,6 @@
-"""A running master that honest devices feed while stolen ones say what they like; what is lost by it.
+"""A running master that honest devices feed and stolen devices attack.
+
+The stolen ones say what they like; the rig measures what is lost by it.
 
 One hand before three cameras, of which two are honest; an object with a tracker; a second hand with a wrist device that
 has a camera and an IMU. The master is `phalanx-master run`, each stolen device a process (`bench.hostile_sender`).
@@ -87,7 +89,10 @@ class Phase:
 
 
 class _Reader:
-    """Takes what comes of one stream. Holds a thread and what `keep` makes of each message."""
+    """Receive the messages of one stream.
+
+    Holds a thread and what `keep` makes of each message.
+    """
 
     def __init__(self, inbox: Subscription, keep: Callable[[object], None]) -> None:
         self.inbox, self._keep, self._closing = inbox, keep, threading.Event()
@@ -104,7 +109,9 @@ class _Reader:
 
 
 class HostileRig:
-    """Holds the master, the two honest cameras, and what came over the bus. Close it in any case.
+    """Holds the master, the two honest cameras, and what came over the bus.
+
+    Close it in any case.
 
     Attributes:
         tree: The calibration files of all.
@@ -197,7 +204,10 @@ class HostileRig:
         return end
 
     def lost(self, began_s: float, ended_s: float) -> float:
-        """Share of the periods between two moments in which no pose of the honest hand is; NaN of none."""
+        """Share of the periods between two moments without the honest hand's pose.
+
+        NaN where there is no period.
+        """
         period_ns, first, last = 1e9 / RATE_HZ, round(began_s * RATE_HZ) + 1, round(ended_s * RATE_HZ) - 8
         with self._lock:
             solved = {round((t_ns - self._phase_ns) / period_ns) for t_ns in self._poses_ns}
@@ -213,7 +223,10 @@ class HostileRig:
         )  # fmt: skip
 
     def command(self, *arguments: str) -> tuple[int, bytes]:
-        """Run a command of `phalanx-master` at this master's bus; its exit code and what it wrote."""
+        """Run a command of `phalanx-master` on this master's bus.
+
+        Returns its exit code and what it wrote.
+        """
         done = subprocess.run(
             [sys.executable, "-m", "master", *arguments, "--bus", self.endpoint],
             cwd=ROOT, env=self.environment, capture_output=True, timeout=UP_S, check=False,
@@ -221,7 +234,7 @@ class HostileRig:
         return done.returncode, done.stdout + done.stderr
 
     def _threads(self) -> int:
-        """How many of the master's threads are Python's: they have the name of the process, those of zenoh do not."""
+        """Number of the master's Python threads: unlike zenoh's, named as the process."""
         folder = Path(f"/proc/{self.master.pid}")
         try:
             own = (folder / "comm").read_text()
@@ -230,7 +243,10 @@ class HostileRig:
             return 0
 
     def _waited_s(self) -> float:
-        """How long threads of the master were ready to run and had no processor, since they began [s]."""
+        """Time that threads of the master waited for a processor [s].
+
+        Summed over all threads since they began, while they were ready to run.
+        """
         try:
             tasks = [one / "schedstat" for one in Path(f"/proc/{self.master.pid}/task").iterdir()]
             return 1e-9 * sum(int(one.read_text().split()[1]) for one in tasks)

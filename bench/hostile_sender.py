@@ -1,4 +1,6 @@
-"""A device of the rig that was stolen: it has its own key, a session as any other, and says what it likes in it.
+"""A stolen device of the rig, as a process that attacks the master.
+
+It has its own key, a session as any other, and says what it likes in it.
 
 `python -m bench.hostile_sender NAME TREE RIG BEACON_PORT COUNT PER_S SEED [--endpoint BUS]`, the rig key in
 PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends, and prints what it sent as JSON.
@@ -30,7 +32,10 @@ _OWN, _OTHERS, _SHAKES = 0.6, 0.2, 0.2  # of what it says: its own kinds, those 
 
 
 class HostileUplink(Uplink):
-    """An uplink that seals any body as any kind. Echoes are answered rightly besides, so the session lives."""
+    """An uplink that seals any body as any kind.
+
+    It answers echoes rightly besides, so the session lives.
+    """
 
     def say(self, kind: Kind, body: bytes) -> bool:
         """Send a body in the session; False: there is none, or it does not fit."""
@@ -54,10 +59,16 @@ class HostileUplink(Uplink):
 
 
 class HostileSender:
-    """One device that sends attacks. Holds its link, and the plausible messages that they are made from."""
+    """One device that sends attacks.
+
+    Holds its link, and the plausible messages that they are made from.
+    """
 
     def __init__(self, name: str, key: bytes, port: int, setup: RigSetup, seed: int = 1) -> None:
-        """Listen for the master; of a setup with this camera it says what the camera of a simulation sees."""
+        """Listen for the master.
+
+        Where `name` is a camera of `setup`, it says what the camera of a simulation sees.
+        """
         self.name, self._clock, self._keys = name, SystemClock(), RigKeys(key)
         self.uplink = HostileUplink(name, key, self._clock, port, "127.0.0.1")
         self._hello = self._keys.sealer(self.uplink.session ^ 1)

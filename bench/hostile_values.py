@@ -1,4 +1,6 @@
-"""Values that a hostile sender puts into a field, by the field's type: beyond bounds, absurd, or of another type.
+"""Values that a hostile sender puts into a field, by the field's type.
+
+They are beyond bounds, absurd, or of another type.
 
 `hostile` takes a type as `msgspec.inspect` describes it, so a new field of a known type is attacked without a word
 here, and a field of a type that is not known is an error.
@@ -133,7 +135,10 @@ def _numbers(kind: inspect.IntType | inspect.FloatType, values: tuple[float, ...
 
 
 def _arrays(dtype: np.dtype[np.generic], base: bytes, source: random.Random) -> Iterator[Value]:
-    """Of wrong sizes; of the right size with one entry, or all, hostile; the right entries in other places."""
+    """Hostile values of an array, as bytes.
+
+    Of wrong sizes; of the right size with one entry, or all, hostile; the right entries in other places.
+    """
     item = dtype.itemsize
     for size in dict.fromkeys(
         (0, 1, item, len(base) - item, len(base) + item, len(base) + 1, 48 * item, 49 * item)
@@ -170,7 +175,10 @@ _ANY_DTYPE = {"all like the first", "backwards"}
 def _within_bounds(
     bounds: tuple[float, float], base: object, annotation: object, source: random.Random
 ) -> Iterator[Value]:
-    """Of a number, or of elements of an array, whose field states its bounds: at, just beyond, and anywhere within."""
+    """Values at, just beyond and within the bounds that a field states.
+
+    The field is a number, or an array of which elements are replaced.
+    """
     low, high = bounds
     one = {f"at the bound {bound:g}": bound for bound in bounds}
     one |= {f"beyond the bound {b:g}": float(np.nextafter(b, way)) for b, way in ((low, -inf), (high, inf))}

@@ -69,7 +69,10 @@ def why_refused(endpoint: str, identity: Identity) -> str:
 
 
 def _why_invalid(endpoint: str, identity: Identity) -> str:
-    """Which certificate is not valid by the clock of this machine: that of the rig, or that of who listens."""
+    """Say which certificate is not valid by the clock of this machine.
+
+    It is that of the rig, or that of who listens.
+    """
     now = datetime.now(UTC)
     named = {"the certificate of this rig (ca.pem)": shown(identity.authority.read_bytes())}
     if (there := _shown_there(endpoint)) is not None:
@@ -83,7 +86,10 @@ def _why_invalid(endpoint: str, identity: Identity) -> str:
 
 
 def _why_expired_there(identity: Identity) -> str:
-    """Our certificate is not valid at the time of who listens: is it by our clock, or is the clock there wrong?"""
+    """Say why who listens refused our certificate as not valid now.
+
+    By our clock it is not valid either, or the clock there is wrong.
+    """
     now, own = datetime.now(UTC), shown(identity.certificate.read_bytes())
     whose = f"the certificate of {identity.name!r}"
     if fault := own.invalid_at(now, whose):
@@ -96,7 +102,10 @@ def _why_expired_there(identity: Identity) -> str:
 
 
 def _shown_there(endpoint: str) -> Shown | None:
-    """The certificate of who listens, whatever its validity; None: it could not be read."""
+    """The certificate of who listens, whatever its validity.
+
+    None: it could not be read.
+    """
     try:
         pem = ssl.get_server_certificate((host_of(endpoint), port_of(endpoint)), timeout=_PATIENCE_S)
         return shown(pem.encode("ascii"))

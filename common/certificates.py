@@ -101,7 +101,9 @@ class Shown:
     fingerprint: str
 
     def invalid_at(self, now: datetime, whose: str) -> str:
-        """Say that it is not valid at a time of this machine's clock, and what its validity is; empty: it is valid.
+        """Say why the certificate is not valid at `now`, with its validity.
+
+        Empty: it is valid.
 
         Args:
             now: Time of the clock of this machine, with its zone.

@@ -52,7 +52,10 @@ class LightsError(PhalanxError):
 
 
 class PictureError(PhalanxError):
-    """Bytes that are no picture, or claim another size than they may have. The text goes on behind a name."""
+    """Bytes that are no picture, or claim another size than they may have.
+
+    The text goes on behind a name.
+    """
 
 
 class MessageError(PhalanxError):

@@ -1,4 +1,6 @@
-"""The one way in for JSON files: bounded in size and nesting, no key twice, no NaN, every value of its type.
+"""Read and check JSON files: the only way in for them.
+
+A file is bounded in size and nesting, has no key twice and no NaN, and every value has its type.
 
 msgspec decodes and checks the types. Of two equal keys it keeps the last, and a file of a million brackets ends in a
 RecursionError: the first is looked for after it by a second, untyped pass, the second before it.
@@ -38,7 +40,9 @@ def read_json(path: Path, kind: type[T]) -> T:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Bytes of a file that is meant to be JSON; its size is looked at before anything is read.
+    """Read the bytes of a file that is meant to be JSON.
+
+    Its size is looked at before anything is read.
 
     Raises:
         CalibrationError: It cannot be read, or is too large.
@@ -101,7 +105,10 @@ def _object(pairs: list[tuple[str, object]]) -> dict[str, object]:
 
 
 def _duplicate(value: object) -> str | None:
-    """Path of the first key that stands twice in what `_object` made; None: no key does."""
+    """Path of the first key that stands twice in what `_object` made.
+
+    None: no key does.
+    """
     if isinstance(value, _Repeating):
         return _step(value.key)
     if isinstance(value, dict):
@@ -143,7 +150,10 @@ def _with_keys(text: str, raw: bytes, kind: type[object]) -> str:
 
 
 def _culprit(root: list[object], holder: list[object], at: object, kind: type[object], text: str) -> str:
-    """Key of the map at `holder[at]` whose value gives the error `text`, by halving; the map is left with it alone."""
+    """Key of the map at `holder[at]` whose value gives the error `text`.
+
+    It is found by halving; the map is left with it alone.
+    """
     parts = cast(dict[object, dict[str, object]], holder)
     value = parts[at]
     keys = list(value)
@@ -168,7 +178,10 @@ def _step(key: str) -> str:
 
 
 def _printable(text: str) -> str:
-    """On one line of a terminal: control characters as escapes, the middle of a long text left out."""
+    """Make a text fit for one line of a terminal.
+
+    Control characters become escapes, the middle of a long text is left out.
+    """
     text = "".join(
         c if c.isprintable() else c.encode("unicode_escape").decode() for c in text[: 4 * _MAX_TEXT]
     )

@@ -1,4 +1,4 @@
-"""OpenCV's distortion as a map of normalised points: where it folds, and its inverse.
+"""OpenCV's distortion as a map of normalised points: its fold and its inverse.
 
 It is a polynomial, and beyond some radius it may turn back. There two directions have one pixel, and no pixel beyond
 has a direction at all. The map (x, y) -> (x', y') can be inverted as far from the axis as its Jacobian, a symmetric
@@ -34,7 +34,10 @@ class Lens(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """Where a lens turns back: the pixel, and its distance from the principal point [px]."""
+    """Where a lens turns back.
+
+    The pixel, and its distance from the principal point [px].
+    """
 
     u: float
     v: float
@@ -79,7 +82,10 @@ def _borders(lens: Lens) -> tuple[Float, Float]:
 
 
 def undistorted(lens: Lens, seen: Float) -> Float:
-    """Normalised points (N, 2) of distorted ones (N, 2), by Newton; NaN: none that the lens shows before it folds."""
+    """Normalised points (N, 2) of distorted ones (N, 2), by Newton's method.
+
+    NaN: no point that the lens shows before it folds.
+    """
     r, shown, _ = _radial(lens)
     rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
     length = np.hypot(seen[:, 0], seen[:, 1])
@@ -100,7 +106,9 @@ def undistorted(lens: Lens, seen: Float) -> Float:
 
 
 def contraction(lens: Lens) -> float:
-    """How much of an error each step of the usual iteration leaves, at most, inside the picture; from 1 it diverges.
+    """Largest share of an error that one step of the usual iteration leaves.
+
+    Inside the picture; from 1 on the iteration diverges.
 
     The iteration x <- x' / g(r) of `cv2.undistortPoints` multiplies an error along the radius by -r g'(r) / g(r).
     """
@@ -109,7 +117,10 @@ def contraction(lens: Lens) -> float:
 
 
 def _radial(lens: Lens) -> tuple[Float, Float, Float]:
-    """Radii (R,), what the lens makes of them without tangential terms (R,), and r |g'(r)| / g(r) (R,)."""
+    """Radii, and how the lens distorts them without tangential terms.
+
+    Radii r (R,), distorted radii r g(r) (R,), and r |g'(r)| / g(r) (R,).
+    """
     k1, k2, _, _, k3 = lens.distortion
     r = np.linspace(0.0, _reach(lens), _RADII)
     s = r * r
@@ -125,7 +136,10 @@ def _reach(lens: Lens) -> float:
 
 
 def _within(points: Float, low: Float, high: Float) -> Bool:
-    """Whether points (N, 2) lie in the picture or between it and the axis: further out on their ray is the picture."""
+    """Whether points (N, 2) lie in the picture, or between it and the axis.
+
+    For a point between, the picture is further out on its ray.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         a, b = low / points, high / points
     near, far = np.fmin(a, b), np.fmax(a, b)
@@ -151,7 +165,10 @@ def distorted(lens: Lens, xy: Float) -> Float:
 
 
 def _jacobian(lens: Lens, xy: Float) -> tuple[Float, Float, Float]:
-    """Derivatives (...) of `distorted` at points (..., 2): x' by x, y' by y, and x' by y, which is y' by x."""
+    """Derivatives (...) of `distorted` at points (..., 2).
+
+    x' by x, y' by y, and x' by y, which is y' by x.
+    """
     k1, k2, p1, p2, k3 = lens.distortion
     x, y = xy[..., 0], xy[..., 1]
     s = x * x + y * y

@@ -1,4 +1,6 @@
-"""Bounds of an MCAP file: what a recording of ours can hold; what is beyond them is lost, counted, with its cause.
+"""Bounds of an MCAP file: what a recording of ours can hold.
+
+What is beyond them is lost, and counted with its cause.
 
 A few bytes can claim any size, and zstd packs 4 MiB of zeros into 400 bytes. So each part is bounded, and so is what
 one pass over a file unpacks, by the size of the file: a writer of ours leaves 16 bytes of index for each message.
@@ -28,7 +30,10 @@ _NAMED = 5
 
 
 class WorkBudget:
-    """What one pass over a file may still read and unpack. Holds the bytes and records that are left."""
+    """What one pass over a file may still read and unpack.
+
+    Holds the bytes and records that are left.
+    """
 
     def __init__(self, file_bytes: int) -> None:
         """Of a file of that size."""

@@ -1,4 +1,7 @@
-"""One chunk of an MCAP file, opened within bounds: its sizes are checked before anything is unpacked."""
+"""One chunk of an MCAP file, opened within bounds.
+
+Its sizes are checked before anything is unpacked.
+"""
 
 import io
 import struct

@@ -112,7 +112,9 @@ def read_content(path: Path) -> McapContent:
 def messages_of(
     path: Path, chunks: list[ChunkPlace], losses: Losses
 ) -> Iterator[tuple[ChunkPlace, list[ChunkMessage]]]:
-    """The messages of each chunk, in the order in which they were written; `losses` counts what is broken.
+    """The messages of each chunk, in the order in which they were written.
+
+    `losses` counts what is broken.
 
     Raises:
         RecordingError: The file cannot be read any more.
@@ -137,7 +139,10 @@ def _content(path: Path, fd: int, size: int) -> McapContent:
 
 
 def _walk(fd: int, at: int, end: int) -> Iterator[_Place]:
-    """The records from `at` on, up to the first that does not end before `end`, or that is none."""
+    """The records from `at` on, as far as they are whole.
+
+    The walk stops at the first that does not end before `end`, or that is none.
+    """
     while at + HEAD.size <= end:
         opcode, length = HEAD.unpack(os.pread(fd, HEAD.size, at))
         at += HEAD.size
@@ -162,7 +167,10 @@ def _header(fd: int, place: _Place | None) -> Header | None:
 
 
 def _indexed(fd: int, size: int, profile: str) -> McapContent | None:
-    """By the summary at the end; None: there is none, or it is broken or says what cannot be."""
+    """Content of a file by the summary at its end.
+
+    None: there is no summary, or it is broken or says what cannot be.
+    """
     tail = os.pread(fd, HEAD.size + _FOOTER.size + len(MAGIC), max(size - 37, 0))
     if len(tail) != 37 or tail[:1] != bytes([Opcode.FOOTER]) or tail[-len(MAGIC) :] != MAGIC:
         return None
@@ -266,7 +274,10 @@ def _take_attachment(content: McapContent, fd: int, at: int, length: int, budget
 
 
 def _take_metadata(content: McapContent, fd: int, at: int, length: int, budget: WorkBudget) -> None:
-    """Keep metadata that are printable; they have no check sum, so any byte of them may be another one."""
+    """Keep metadata that are printable.
+
+    They have no check sum, so any byte of them may be another one.
+    """
     try:
         if len(content.metadata) >= METADATA:
             raise RecordingError(f"there are {METADATA} already")

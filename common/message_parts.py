@@ -1,4 +1,6 @@
-"""What messages are made of: their base, names, bounded numbers, arrays of a shape and read-only.
+"""Parts of messages: base, names, bounded numbers, arrays of a fixed shape.
+
+The arrays are read-only.
 
 Every number on the wire has bounds that stand at its field. For a plain number they are msgspec's own `ge` and `le`,
 for an array, and for a number that may be NaN, `within`. They are what a sensor of this kind could measure at all, so
@@ -42,7 +44,10 @@ class Bounds(NamedTuple):
 
 
 def within(low: float, high: float) -> Meta:
-    """Bounds of an array, or of a number that may be NaN: NaN, which is "not observed", is within."""
+    """Bounds of an array, or of a number that may be NaN.
+
+    NaN, which is "not observed", is within.
+    """
     return Meta(extra={"bounds": Bounds(low, high)}, extra_json_schema={"x-minimum": low, "x-maximum": high})
 
 
@@ -93,7 +98,9 @@ def printable(text: str) -> str:
 def freeze(
     message: Message, field: str, dtype: type[np.generic], shape: tuple[int, ...], *, whole: bool = False
 ) -> None:
-    """Give `field` its shape, refuse what is out of its bounds, and make it read-only (copied if it was not).
+    """Check the shape and bounds of an array field, and make it read-only.
+
+    The array is given its shape, and copied if it was writable.
 
     With `whole`, each of its rows is NaN in all or in no element: a point is seen or not.
 

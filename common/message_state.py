@@ -184,7 +184,9 @@ class Still(Message, frozen=True, eq=False, tag=True):
 
 
 def _check_jpeg(jpeg: bytes, most: int) -> None:
-    """Refuse what no camera of ours sends; whoever decodes it compares its size with the camera file as well.
+    """Refuse a JPEG that no camera of ours sends.
+
+    Whoever decodes it compares its size with the camera file as well.
 
     Raises:
         ValueError: Too many bytes, no JPEG, or one that claims too many pixels or scans.

@@ -1,4 +1,6 @@
-"""Width and height of a picture from the header of its file, without a decoder: JPEG, PNG, BMP, TIFF.
+"""Width and height of a picture from the header of its file.
+
+Of JPEG, PNG, BMP and TIFF, without a decoder.
 
 A decoder allocates what the header claims, so 600 bytes can cost gigabytes. Whoever has the bytes of a picture from
 elsewhere compares this size with the one that it may have, and only then decodes (`common.pictures`).
@@ -42,7 +44,9 @@ def size_of(data: bytes) -> Size:
 
 
 def jpeg_size(data: bytes) -> Size:
-    """Width and height [px] in the frame header of a JPEG (ITU-T T.81, B.2.2), baseline or progressive.
+    """Width and height [px] in the frame header of a JPEG.
+
+    As in ITU-T T.81, B.2.2; baseline or progressive.
 
     Raises:
         PictureError: It is no JPEG, its header is cut or odd, a side is not 1 to 16384 px, or it has too many scans.

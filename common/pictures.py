@@ -1,4 +1,7 @@
-"""Decode pictures that come from elsewhere, never larger than they may be: the only place that calls a decoder."""
+"""Decode pictures that come from elsewhere, never larger than they may be.
+
+This is the only place that calls a decoder.
+"""
 
 import cv2
 import numpy as np
@@ -9,7 +12,9 @@ from common.picture_size import Size, size_of
 
 
 def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
-    """The picture of a device, whose size is known: (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
+    """Decode the picture of a device, whose size is known.
+
+    Returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
 
     Args:
         data: A whole file.
@@ -30,7 +35,9 @@ def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
 
 
 def decode_file(data: bytes, *, grey: bool = False) -> Image:
-    """A picture that a person keeps on a disk, of any size up to 16384 x 16384: (H, W, 3) BGR or (H, W), uint8.
+    """Decode a picture that a person keeps on a disk.
+
+    Of any size up to 16384 x 16384 px; returns (H, W, 3) BGR or (H, W), uint8.
 
     Raises:
         PictureError: It is larger, of another kind than JPEG, PNG, BMP and TIFF, or no whole picture.

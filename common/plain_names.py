@@ -1,4 +1,7 @@
-"""Plain names: those that can stand as a part of a path, so that a name out of a file leads nowhere else."""
+"""Plain names: those that can stand as a part of a path.
+
+So a name out of a file leads nowhere else.
+"""
 
 import re
 

@@ -1,4 +1,7 @@
-"""Files in a folder that somebody else made: read within bounds, and never one that is outside of the folder."""
+"""Read files in a folder that somebody else made.
+
+They are read within bounds, and none that is outside of the folder.
+"""
 
 import stat
 from collections.abc import Iterable
@@ -32,7 +35,9 @@ def read_table(folder: Path, name: str) -> str:
 
 
 def refuse_links(folder: Path, names: Iterable[str]) -> None:
-    """Refuse files that symbolic links lead out of a folder, and pipes and devices, whose reading has no end.
+    """Refuse files that links lead out of a folder, and pipes and devices.
+
+    The links are symbolic; reading a pipe or a device has no end.
 
     Args:
         folder: Itself it may be a link.

@@ -16,7 +16,10 @@ class Disk(Protocol):
 
 
 class Output:
-    """What the library writes to: every byte goes to the disk at once, and is counted."""
+    """Where the library writes to.
+
+    Every byte goes to the disk at once, and is counted.
+    """
 
     def __init__(self, disk: Disk) -> None:
         self._disk, self._written = disk, 0

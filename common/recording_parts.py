@@ -1,4 +1,6 @@
-"""What may stand in a recording of messages: names that lead no path elsewhere, messages that fit their channel.
+"""What may stand in a recording of messages.
+
+Its names lead no path elsewhere, and its messages fit their channel.
 
 Names come from the file and become names of files. They are checked once, where a recording is opened or begun.
 """
@@ -72,7 +74,9 @@ def plain_names(where: Path, key: str, text: str) -> tuple[str, ...]:
 
 
 def refuse_misplaced(stream: str, name: str, message: AnyMessage) -> None:
-    """Refuse a message on a channel of another kind or sender, or of a time that cannot be.
+    """Refuse a message that its channel cannot have.
+
+    It is of another kind or sender, or of a time that cannot be.
 
     Raises:
         RecordingError: The text says what, not where.

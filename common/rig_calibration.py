@@ -215,7 +215,9 @@ def check_rig(rig: RigCalibration, where: str) -> None:
 
 
 def check_places(rig: RigCalibration, where: str) -> None:
-    """Refuse two cameras in one place: rays from one point have no intersection that tells a depth.
+    """Refuse two cameras in one place.
+
+    Rays from one point have no intersection that tells a depth.
 
     Raises:
         CalibrationError: With `where` and both cameras.

@@ -1,4 +1,6 @@
-"""The service manager of the system, as a process speaks to it: ready, alive, what it does (sd_notify(3)).
+"""Tell the system's service manager of a process (sd_notify(3)).
+
+That it is ready, that it is alive, and what it does.
 
 Datagrams of `NAME=VALUE` lines go to the socket in `NOTIFY_SOCKET`. Without that variable nobody listens, nothing is
 sent, and a process on a terminal runs as ever.
@@ -52,7 +54,10 @@ def one_line(text: str) -> str:
 
 
 def _address(text: str) -> str | None:
-    """The address of a socket: a path, or `@name` for one without a file. None: nobody listens."""
+    """The address of a socket: a path, or `@name` for one without a file.
+
+    None: nobody listens.
+    """
     if not text:
         return None
     if text[0] == "@":

@@ -1,4 +1,6 @@
-"""Supervise all threads of a process: one that fails ends the process, and who started it starts it again.
+"""Supervise all threads of a process: one that fails ends the process.
+
+Whoever started the process starts it again.
 
 A thread that dies leaves a process that looks alive and does half of its work. So no exception of any thread is lost:
 the process is asked to end as by a stop of the system (SIGTERM), which closes files and devices, and ends with
@@ -67,7 +69,10 @@ def supervised_threads() -> Generator[ThreadSupervisor, None, None]:
 
 
 def until(stopped: Callable[[], bool], work: Callable[[], None]) -> Callable[[], None]:
-    """The same work for a thread, for which to return is to fail unless `stopped` says that it was told to."""
+    """Make `work` a thread's work that fails when it returns too early.
+
+    To return is to fail unless `stopped` says that it was told to.
+    """
 
     def run() -> None:
         work()

@@ -294,7 +294,10 @@ def _plain(error: zenoh.ZError) -> str:
 
 
 def _start(name: str, step: Callable[[], None], ended: Callable[[], bool]) -> threading.Thread:
-    """Repeat `step` on a thread until zenoh closes what it reads from; before `ended` that is a failure."""
+    """Repeat `step` on a thread until zenoh closes what it reads from.
+
+    That is a failure unless `ended` says that it was meant to.
+    """
 
     def run() -> None:
         try:

@@ -210,7 +210,10 @@ def _lines(pipe: IO[bytes], on_line: Callable[[str], None]) -> None:
 
 
 def printable(text: str) -> str:
-    """The text with a question mark for each control character: a device writes to the operator's terminal."""
+    """The text with a question mark for each control character.
+
+    A device writes to the operator's terminal.
+    """
     return "".join(c if c.isprintable() or c == "\t" else "?" for c in text)
 
 

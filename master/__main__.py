@@ -17,7 +17,10 @@ from common.supervisor import supervised_threads
 
 
 def main() -> None:
-    """Run one command; the process ends with 0, 1 (something the user can mend), 2 (wrong usage) or 70 (a fault)."""
+    """Run one command, and end the process with its exit code.
+
+    0 done, 1 something the user can mend, 2 wrong usage, 70 a fault.
+    """
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it tells of its font cache on the first run
     with supervised_threads():

@@ -1,7 +1,8 @@
-"""What a sender may say, given the files of its rig: bounds that the message alone does not know.
+"""Bounds on what a sender may say, given the files of its rig.
 
-`common.messages` refuses what no sensor can measure. Here the picture's size, the number of markers and the rate are
-those of the sender's own files, and times are compared with the clock.
+The message alone does not know these bounds. `common.messages` refuses what no sensor can measure. Here the
+picture's size, the number of markers and the rate are those of the sender's own files, and times are compared
+with the clock.
 """
 
 from collections.abc import Iterable
@@ -36,7 +37,9 @@ Sensed = Detections | TagDetections | ImuSample | TrackerPose
 
 @dataclass(frozen=True, slots=True)
 class SenderLimits:
-    """What the files say of one camera, IMU or tracker; what is None is not known and not checked.
+    """What the files say of one camera, IMU or tracker.
+
+    What is None is not known and not checked.
 
     Attributes:
         picture_px: Width and height.
@@ -50,7 +53,10 @@ class SenderLimits:
 
 
 class Pace:
-    """Token bucket: how many messages of a sender are taken. Holds what is left and when it was last filled."""
+    """Token bucket that bounds how many messages of a sender are taken.
+
+    Holds what is left and when it was last filled.
+    """
 
     def __init__(self, rate_hz: float | None) -> None:
         """Of a sender of this rate by its files; None: they say none."""
@@ -109,6 +115,9 @@ def _points(message: Detections | TagDetections) -> tuple[Float, ...]:
 
 
 def _outside(uv: Float, size: tuple[int, int]) -> bool:
-    """Whether a point (..., 2) is further outside than one picture's size; NaN is not."""
+    """Whether any point (..., 2) is far outside of a picture of this size [px].
+
+    Far: further out than one picture's size. NaN is not.
+    """
     far = np.abs(uv - (0.5 * size[0], 0.5 * size[1])) > (1.5 * size[0], 1.5 * size[1])
     return bool(far.any())

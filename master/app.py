@@ -123,7 +123,10 @@ class RunFigures:
 
 
 class Observed(Generic[SeenT]):
-    """A solver with what is measured of the cameras' messages: rates before it, `watch` once all is out."""
+    """A solver, with measurements of the cameras' messages around it.
+
+    Rates are counted before it; `watch` is called once all is out.
+    """
 
     def __init__(self, solver: Solver[SeenT], rates: CameraRates, watch: Callable[[SeenT], None]) -> None:
         self._solver, self._rates, self._watch = solver, rates, watch

@@ -42,7 +42,7 @@ def command_line() -> typer.Typer:
 
 
 def phalanx_master() -> None:
-    """Turn the detections of several cameras, or of a wrist device, into one hand of 26 joints.
+    """Turn detections of cameras, or of a wrist device, into a hand of 26 joints.
 
     `phalanx-master COMMAND --help` shows its examples.
     """

@@ -1,4 +1,6 @@
-"""A guard round each message: what one makes the solver raise costs its sender a pause, and not the master.
+"""Guard the solver: a message that makes it raise does not end the master.
+
+It costs its sender a pause.
 
 A message that gets past all bounds and still makes something raise is a fault of this program. Then
 
@@ -42,7 +44,10 @@ class Replayed(Solving, Protocol):
 
 
 class SolverGuard:
-    """Push machine before a solver. Holds the last messages, and the thread that replaces what is broken."""
+    """Push machine before a solver.
+
+    Holds the last messages, and the thread that replaces what is broken.
+    """
 
     def __init__(
         self,
@@ -67,7 +72,10 @@ class SolverGuard:
         self._repair: threading.Thread | None = None
 
     def push(self, message: Taken) -> Iterator[Solved]:
-        """Take one message; give what it completes, nothing where its sender is silenced or it cannot be used."""
+        """Take one message; give what it completes.
+
+        That is nothing where its sender is silenced or it cannot be used.
+        """
         sender = sender_of(message)
         if self._quarantine.holds(sender, self._clock.now_ns()):
             return
@@ -103,7 +111,10 @@ class SolverGuard:
 
 
 def culprit(messages: Sequence[Taken], fresh: Callable[[], Replayed]) -> str | None:
-    """The sender without whose messages nothing raises; None: there is no such one, or more than one."""
+    """The sender without whose messages nothing raises.
+
+    None: there is no such one, or more than one.
+    """
     senders = dict.fromkeys(sender_of(message) for message in messages)
     if len(senders) < 2 or not _raises(messages, fresh()):
         return None

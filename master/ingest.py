@@ -159,9 +159,10 @@ class Ingest:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Event -> how often, as `Health.counts` wants it: <sender>.<event>, refused.<reason>, fault.<sender>, queue.*
+        """Event -> how often, as `Health.counts` wants it.
 
-        Of tags <camera>.tags_received and <camera>.tags_late, once there were any.
+        <sender>.<event>, refused.<reason>, fault.<sender>, queue.*; of tags <camera>.tags_received and
+        <camera>.tags_late, once there were any.
         """
         counts = {
             "queue.dropped": self._overflowed,
@@ -200,7 +201,10 @@ class Ingest:
             return away.twins(t_ns), away.versions(t_ns), away.secrets(t_ns)
 
     def marker_counts(self) -> dict[str, MarkerCounts]:
-        """Camera -> how many markers its slave sends lately, where its rig has another number here."""
+        """Camera -> how many markers its slave sent lately and its rig has here.
+
+        Of those cameras alone where the two differ.
+        """
         t_ns = self._clock.now_ns()
         with self._lock:
             return self._link.turned_away.marker_counts(t_ns)

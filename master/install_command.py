@@ -1,4 +1,7 @@
-"""`phalanx-master install`: the master as a service of this user, without root, that starts again by itself."""
+"""`phalanx-master install`: the master as a service of this user.
+
+It needs no root, and the service starts again by itself.
+"""
 
 import getpass
 import os
@@ -29,10 +32,11 @@ def install(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing; print the unit.")] = False,
     uninstall: Annotated[bool, typer.Option("--uninstall", help="Stop the service, and remove it.")] = False,
 ) -> None:
-    """Install `phalanx-master run` as a service of this user, without root: started at login, and again after a fault.
+    """Install `phalanx-master run` as a service of this user, without root.
 
-    All other options are those of `run`, and are checked before anything is written. With other options it is installed
-    again, with the same ones nothing changes. Keys stay where they are: the unit has the path of their folder alone.
+    It is started at login, and again after a fault. All other options are those of `run`, and are checked
+    before anything is written. With other options it is installed again, with the same ones nothing changes.
+    Keys stay where they are: the unit has the path of their folder alone.
 
     `systemctl --user status phalanx-master` shows how it is, `journalctl --user -u phalanx-master` what it said.
 

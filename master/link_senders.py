@@ -1,4 +1,7 @@
-"""Sessions and senders as the master's link keeps them, and whether it takes a message of one."""
+"""Sessions and senders as the master's link keeps them.
+
+Besides, whether it takes a message of a sender.
+"""
 
 from collections import deque
 from collections.abc import Mapping
@@ -44,7 +47,10 @@ class Session:
 
 @dataclass(slots=True)
 class Sender:
-    """What is kept of one camera, IMU or tracker, and the kinds of message that it sends, the main one first."""
+    """What is kept of one camera, IMU or tracker.
+
+    `kinds` are the kinds of message that it sends, the main one first.
+    """
 
     kinds: dict[type[Taken], Counted]
     limits: SenderLimits
@@ -58,7 +64,10 @@ class Sender:
 
     @classmethod
     def of(cls, steps: Mapping[type[Taken], int | None], limits: SenderLimits) -> "Sender":
-        """One that sends these kinds of message; the number of each rises by so much from one to the next."""
+        """A sender of these kinds of message, within these limits.
+
+        The number of each kind rises by the step in `steps` from one message to the next.
+        """
         kinds = {kind: Counted(Sequence(step)) for kind, step in steps.items()}
         return cls(kinds, limits, {kind: Pace(limits.rate_hz) for kind in kinds})
 
@@ -68,14 +77,20 @@ class Sender:
         return next(iter(self.kinds.values()))
 
     def fill(self, counter: int, own: Counted | None = None) -> None:
-        """A datagram came late, of kind `own` or of none: in the gaps of other kinds it is no loss."""
+        """Take note of a datagram that came late.
+
+        It is of kind `own` or of none: in the gaps of other kinds it is no loss.
+        """
         for kind in self.kinds.values():
             if kind is not own:
                 kind.losses.late(counter, 0)
 
 
 def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) -> Refusal | None:
-    """Why a message that came at `now_ns` [ns] is not taken of this sender; None: it is."""
+    """Why a message that came at `now_ns` [ns] is not taken of this sender.
+
+    None: it is taken.
+    """
     kind = type(message)
     if message.session != session.hello.process:
         return Refusal.FOREIGN_SESSION

@@ -110,7 +110,10 @@ class Reporter:
             poses = self._figures.poses
 
     def _looked(self) -> list[str]:
-        """What the monitors of this second found; what senders say may make one fail, but not the report."""
+        """Lines of what the monitors of this second found.
+
+        What senders say may make one fail, but not the report.
+        """
         try:
             if self._tuning is not None:
                 self._tuning.look()

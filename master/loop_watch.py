@@ -1,5 +1,6 @@
-"""The live loop tells the service manager that it goes round: one that hangs is ended by the watchdog, and started
-again.
+"""Tell the service manager that the live loop goes round.
+
+A loop that hangs is ended by the watchdog, and started again.
 
 The loop itself gives the sign, when it asks for the next message, never a thread that would live on while it hangs.
 """
@@ -15,7 +16,10 @@ _FEEDS = 4  # in a period of the watchdog
 
 
 class WatchedLoop(Generic[SeenT]):
-    """A source of messages that shows the manager that it is asked. Holds when the next sign is due."""
+    """A source of messages that shows the manager each time it is asked.
+
+    Holds when the next sign is due.
+    """
 
     def __init__(
         self,

@@ -1,4 +1,6 @@
-"""Senders whose messages made the solver fail: each is counted, logged once with its cause, and silenced for a while.
+"""Silence senders for a while whose messages made the solver fail.
+
+Each failure is counted, and logged once with its cause.
 
 Bounds keep out what cannot be (`common.messages`, `master.admission`). What passes them and still makes something raise
 is a fault of this program; it costs the sender a pause, and the others nothing. The pause doubles with each fault from
@@ -23,7 +25,9 @@ class _Silence:
 
 
 class Quarantine:
-    """Push machine over faults. Holds how often each sender's message failed, and until when it is silenced.
+    """Push machine over faults.
+
+    Holds how often each sender's message failed, and until when it is silenced.
 
     `fault` and `holds` may be called on several threads.
     """
@@ -61,7 +65,10 @@ class Quarantine:
 
 
 def _place(error: Exception) -> str:
-    """Kind and place of an error: the same fault again is not news, whatever numbers its text has."""
+    """Kind and place of an error, by which a fault is known.
+
+    The same fault again is not news, whatever numbers its text has.
+    """
     frames = traceback.extract_tb(error.__traceback__)
     return (
         f"{type(error).__name__} {frames[-1].filename}:{frames[-1].lineno}" if frames else repr(type(error))

@@ -1,4 +1,7 @@
-"""The master as a service of the user who installs it: the text of its unit, and why each line of it is there. Pure."""
+"""The unit that runs the master as a service of the user who installs it.
+
+Its text, and why each line of it is there. Pure.
+"""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -148,7 +148,10 @@ class LivePipeline:
         return self._now.flush()
 
     def renew(self) -> None:
-        """Let a new pipeline of the same setup take over, which has seen nothing of what came until now."""
+        """Let a new pipeline of the same setup take over.
+
+        It has seen nothing of what came until now.
+        """
         take = self.prepare(self._setup)
         self._recent.clear()
         take()

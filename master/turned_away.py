@@ -1,5 +1,7 @@
-"""Who was turned away lately, by name: second processes under one name, slaves of another wire version, slaves
-whose secret is not the one that the master has for their name, and slaves whose rig has other markers.
+"""Who was turned away lately, by name.
+
+Second processes under one name, slaves of another wire version, slaves whose secret is not the one that the
+master has for their name, and slaves whose rig has other markers.
 
 A person who looks for a camera that does not come reads it in the checklist. What is kept is bounded by the names of
 the rig, and forgotten `LATELY_NS` after the last time.
@@ -53,7 +55,10 @@ class TurnedAway:
         self._unproven[name] = t_ns, Away(host, version)
 
     def marker_count(self, name: str, sent: int, expected: int, t_ns: int) -> None:
-        """The slave `name` sent so many markers at `t_ns` [ns], and its rig has another number here."""
+        """The slave `name` sent another number of markers than its rig has here.
+
+        It sent `sent` at `t_ns` [ns]; the rig has `expected`.
+        """
         self._markers[name] = t_ns, MarkerCounts(sent, expected)
 
     def other_version(self, datagram: bytes, host: str, t_ns: int) -> None:
@@ -81,7 +86,10 @@ class TurnedAway:
         return _lately(self._unproven, t_ns)
 
     def marker_counts(self, t_ns: int) -> dict[str, MarkerCounts]:
-        """Name -> how many markers its slave sends, where the rig has another number, as of `t_ns` [ns]."""
+        """Name -> how many markers its slave sent lately and its rig has here.
+
+        Of those names alone where the two differ, as of `t_ns` [ns].
+        """
         return _lately(self._markers, t_ns)
 
 

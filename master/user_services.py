@@ -1,4 +1,7 @@
-"""The services of a user, as `phalanx-master install` needs them: its unit written, started, looked at, and removed."""
+"""The services of a user, as `phalanx-master install` needs them.
+
+Its unit is written, started, looked at, and removed.
+"""
 
 import os
 import subprocess
@@ -52,7 +55,9 @@ class UserServices:
         return (Path(config) if config else Path.home() / ".config") / "systemd/user" / UNIT
 
     def install(self, text: str) -> str:
-        """Write the unit and start it, now and at each login; a line that says what was done.
+        """Write the unit and start it, now and at each login.
+
+        Returns a line that says what was done.
 
         Raises:
             PhalanxError: It does not run; with its last words. It goes on being tried.

@@ -16,7 +16,9 @@ from slave.service import Service
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command; return the exit code: 0 done, 1 something the user can mend, 2 wrong usage.
+    """Run one command; return the exit code.
+
+    0 done, 1 something the user can mend, 2 wrong usage.
 
     Raises:
         SystemExit: With code 70, if a thread or the command itself failed.

@@ -126,11 +126,7 @@ def run(
         show(frame)
         alive()
 
-    while not stop.is_set() and (frame := source.read()) is not None:
-        try:
-            work(frame)
-        except Exception as error:  # noqa: BLE001 - one frame; it is counted and logged
-            tally.failed(frame.seq, error)
+    _each_frame(source, stop, tally, work)
 
 
 def run_wrist(
@@ -171,6 +167,19 @@ def run_wrist(
             show(found.triple.led)
         alive()
 
+    _each_frame(source, stop, tally, work)
+
+
+def _each_frame(
+    source: FrameSource, stop: threading.Event, tally: Tally, work: Callable[[Frame], None]
+) -> None:
+    """Do `work` with every frame until the source ends or `stop` is set.
+
+    What it raises costs that frame alone.
+
+    Raises:
+        CameraError: The camera is gone.
+    """
     while not stop.is_set() and (frame := source.read()) is not None:
         try:
             work(frame)

@@ -1,4 +1,6 @@
-"""Log what a device or a frame failed of, at most one line in ten seconds, and go on.
+"""Log why a device or a frame failed, and go on.
+
+At most one line is written in ten seconds.
 
 What is a `PhalanxError` is said in its own words. Whatever else a driver or a detector raises is a fault in a program:
 it is counted, and logged with its traceback.
@@ -26,7 +28,10 @@ class Closing(Protocol):
 
 
 class Failures:
-    """Holds how many errors were none of ours, when the last line was logged, what was left out, and if any is open."""
+    """Counts and logs the errors of one device or loop.
+
+    Holds how many were none of ours, when the last line was logged, what was left out, and if any is open.
+    """
 
     def __init__(self, of: str, clock: Callable[[], int] = now_ns) -> None:
         """Nothing failed yet.
@@ -42,7 +47,10 @@ class Failures:
         self.raised = 0
 
     def log(self, event: str, error: Exception) -> str:
-        """Count an error, and log `event` with it unless a line is younger than ten seconds; the error in words."""
+        """Count an error, and log `event` with it; return the error in words.
+
+        Nothing is logged where a line is younger than ten seconds.
+        """
         ours = isinstance(error, PhalanxError)
         why = str(error) if ours else f"{type(error).__name__}: {error}"
         self.raised += not ours
@@ -55,7 +63,10 @@ class Failures:
         return why
 
     def ask(self, tell: Callable[[], Mapping[str, ValueT]]) -> dict[str, ValueT]:
-        """What a driver tells of itself; nothing where it raises, so that the reports go on."""
+        """Ask a driver for what it tells of itself.
+
+        Nothing where it raises, so that the reports go on.
+        """
         try:
             return dict(tell())
         except Exception as error:  # noqa: BLE001 - whatever a driver raises is its device's failure
@@ -63,7 +74,10 @@ class Failures:
             return {}
 
     def close(self, source: Closing) -> None:
-        """Give a device back; one that does not let itself be given back is opened again nevertheless, or not there."""
+        """Give a device back, whether or not it lets itself be given back.
+
+        One that does not is opened again nevertheless, or is not there.
+        """
         try:
             source.close()
         except Exception as error:  # noqa: BLE001 - as above

@@ -65,9 +65,10 @@ class Tally:
             self._count(seq)
 
     def failed(self, seq: int, error: Exception) -> None:
-        """Count one frame whose detection, or what follows it, raised an error, and log that now and then.
+        """Count one frame whose work raised an error.
 
-        A frame that was not counted by `frame` or `part` before is one that was dropped.
+        Its detection, or what follows it, raised; the error is logged now and then. A frame that was not
+        counted by `frame` or `part` before is one that was dropped.
         """
         self._failures.log(f"nothing is made of frame {seq}", error)
         with self._lock:
@@ -80,7 +81,10 @@ class Tally:
         self._frames += 1
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: frames, dropped, empty, failed, seen.<name>, and the others."""
+        """Event -> how often since the start.
+
+        frames, dropped, empty, failed, seen.<name>, and the others.
+        """
         with self._lock:
             counts = {"frames": self._frames, "dropped": self._dropped, "empty": self._empty}
             counts["failed"] = self._failed

@@ -58,7 +58,10 @@ class Heard(Protocol):
         ...
 
     def marker_counts(self) -> Mapping[str, MarkerCounts]:
-        """Camera -> how many markers its slave sends lately, where its rig has another number here."""
+        """Camera -> how many markers its slave sent lately and its rig has here.
+
+        Of those cameras alone where the two differ.
+        """
         ...
 
 

@@ -1,4 +1,7 @@
-"""Which previews may be shown: none that claims to be larger than the camera's own picture."""
+"""Decide which previews may be shown, by the size that they claim.
+
+None is shown that claims to be larger than the camera's own picture.
+"""
 
 import time
 from collections.abc import Callable
@@ -13,16 +16,25 @@ _MOST = 64  # cameras: a bus on which names are invented costs no memory
 
 
 class PictureSizes:
-    """Holds the sizes [px] that camera files said last, and why the last preview of a camera was refused."""
+    """Compares the sizes of previews with those of the camera files.
+
+    Holds the sizes [px] that the files said last, and why the last preview of a camera was refused.
+    """
 
     def __init__(self, camera: Callable[[str], CameraCalibration]) -> None:
-        """Compare with what `camera` reads: the file of a camera, or a `CalibrationError` where there is none."""
+        """Compare with the camera files that `camera` reads.
+
+        It gives the file of a camera, or raises a `CalibrationError` where there is none.
+        """
         self._camera = camera
         self._known: dict[str, tuple[float, Size | None]] = {}
         self._refused: dict[str, str] = {}
 
     def fits(self, preview: Preview) -> bool:
-        """Whether it is no larger than its camera's pictures; any that a message may carry where no file says."""
+        """Whether a preview is no larger than its camera's pictures.
+
+        Where no file says their size, any that a message may carry is.
+        """
         width, height = jpeg_size(preview.jpeg)
         most = self._size(preview.camera)
         if most is None or (width <= most[0] and height <= most[1]):

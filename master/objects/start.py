@@ -85,7 +85,10 @@ def two_poses(corners: Float, xy: Float) -> list[tuple[float, Float]]:
 
 
 def _ways(A: Float, turn: Float, corners: Float, flat: Float, xy: Float) -> list[tuple[float, Float]]:
-    """The two turns of a tag of which `A` (2, 2) is the upper left part, as `two_poses` returns them."""
+    """The two poses of a tag whose turn has `A` (2, 2) as upper left part.
+
+    As `two_poses` returns them.
+    """
     left = np.eye(2) - A.T @ A
     b = np.sqrt(np.maximum(np.diagonal(left), 0.0)) * [1.0, 1.0 if left[0, 1] >= 0.0 else -1.0]
     out: list[tuple[float, Float]] = []

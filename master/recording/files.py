@@ -70,7 +70,9 @@ def recorded_setups(recording: MessageRecording) -> tuple[RigSetup, ...]:
 
 
 def unpack(recording: MessageRecording, folder: Path) -> None:
-    """Write the files of a recording, whose names were checked, into a folder, as the calibration tree that they are.
+    """Write the files of a recording into a folder, as a calibration tree.
+
+    Their names were checked before.
 
     Raises:
         RecordingError: One cannot be written.

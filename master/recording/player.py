@@ -240,7 +240,10 @@ class Player:
         return self._solve(world, cast(Taken, one.message), one.name)
 
     def _solve(self, world: World, message: Taken, name: str) -> Iterable[Told]:
-        """What the world makes of a message; nothing of one that it cannot solve, which the recording may hold."""
+        """What the world makes of a message.
+
+        Nothing of one that it cannot solve, which the recording may hold.
+        """
         try:
             return [_plain(solved) for solved in world.push(message)]
         except PhalanxError:

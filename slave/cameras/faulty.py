@@ -59,7 +59,10 @@ class Faults(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Frozen:
-    """The one picture of a camera that is frozen, kept while it is opened again. Holds it, if it is."""
+    """The one picture of a frozen camera, kept while it is opened again.
+
+    Holds it while the camera is frozen.
+    """
 
     def __init__(self) -> None:
         """It is not."""

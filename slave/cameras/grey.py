@@ -92,7 +92,9 @@ def grey(data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: 
 def luma(
     data: npt.NDArray[np.uint8], name: str, size: tuple[int, int], stride: int, *, full_range: bool
 ) -> Image | None:
-    """New image (H, W) of the luma of a colour format, black 0 and white 255; None for a frame that is cut.
+    """New image (H, W) of the luma of a colour format.
+
+    Black is 0 and white 255. None for a frame that is cut.
 
     Args:
         data: (N,) the bytes of the frame.

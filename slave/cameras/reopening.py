@@ -122,8 +122,11 @@ class ReopeningCamera:
         return self._failures.ask(source.figures) if isinstance(source, Tunable) else {}
 
     def counts(self) -> dict[str, int]:
-        """`camera.lost`, `.frozen`: copies of the frame before; `.raised`: what a driver raised that is no error of
-        ours; and the events of all cameras that were opened."""
+        """Event -> how often, of this camera and of all that were opened.
+
+        `camera.lost`; `.frozen`: copies of the frame before; `.raised`: what a driver raised that is no error
+        of ours; and the events of all cameras that were opened.
+        """
         own = {"camera.lost": self.lost, "camera.frozen": self.frozen, "camera.raised": self._failures.raised}
         counts = Counter(own)
         counts.update(self._past)

@@ -92,7 +92,10 @@ def _gauges(system: System) -> Iterator[Finding]:
 
 
 def _memory_limit(system: System) -> Finding:
-    """Whether the kernel keeps the unit's MemoryMax; that of Raspberry Pi OS does so only where it is asked to."""
+    """Whether the kernel keeps the unit's MemoryMax.
+
+    That of Raspberry Pi OS does so only where it is asked to.
+    """
     controllers = system.text("/sys/fs/cgroup/cgroup.controllers")
     if controllers is None:
         return unseen("memory limit", "no control groups of version 2 here")

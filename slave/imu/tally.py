@@ -52,11 +52,17 @@ class SampleTally:
         self._tally.part(seq)
 
     def failed(self, seq: int, error: Exception) -> None:
-        """Count one sample that was left out because of an error, and log that now and then."""
+        """Count one sample that was left out because of an error.
+
+        The error is logged now and then.
+        """
         self._tally.failed(seq, error)
 
     def counts(self) -> dict[str, int]:
-        """Event -> how often since the start: samples, skipped, failed; `lost` … of a real IMU; `fusion.`..."""
+        """Event -> how often since the start.
+
+        samples, skipped, failed; `lost` … of a real IMU; `fusion.`...
+        """
         counts = self._tally.counts()
         found = {"samples": counts["frames"], "skipped": counts["dropped"], "failed": counts["failed"]}
         if self._source is not None:

@@ -102,8 +102,11 @@ class ReopeningTracker:
         self._drop()
 
     def counts(self) -> Mapping[str, int]:
-        """`lost`, `back`; `late`: poses no later than the one before; `raised`: what a driver raised that is no
-        error of ours; the events of all that were opened."""
+        """Event -> how often, of this tracker and of all that were opened.
+
+        `lost`, `back`; `late`: poses no later than the one before; `raised`: what a driver raised that is no
+        error of ours; the events of all that were opened.
+        """
         counts = Counter(self._counts)
         source = self._source
         counts.update(self._failures.ask(source.counts) if isinstance(source, Telling) else {})

@@ -98,7 +98,10 @@ class StillTaker:
     """
 
     def __init__(self, bus: Bus, ingest: Ingest, sizes: Mapping[str, Size]) -> None:
-        """Listen for stills from now on, of cameras whose files say these widths and heights [px]."""
+        """Listen for stills from now on.
+
+        Of the cameras in `sizes`, whose files say these widths and heights [px].
+        """
         self._bus, self._ingest, self._sizes = bus, ingest, dict(sizes)
         self._cameras = tuple(sizes)
         self._feed: Subscription = bus.subscribe("still", depth=4 * len(sizes))

@@ -142,7 +142,9 @@ def places_provenance(result: CamerasResult, tool: str, data: tuple[str, ...]) -
 def write_files(
     out: Path, cameras: Mapping[str, CameraCalibration], rigs: Mapping[str, RigCalibration]
 ) -> list[Path]:
-    """Save files, by their names in the tree; each is replaced whole or not at all, and none where one is impossible.
+    """Save files, by their names in the tree.
+
+    Each is replaced whole or not at all, and none is written where one is impossible.
 
     Raises:
         CalibrationError: A folder or file cannot be written, or what is measured cannot be.
