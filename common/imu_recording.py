@@ -104,17 +104,20 @@ def _sample(where: str, source: str, seq: int, header: Sequence[str], line: Sequ
     def vector(*names: str) -> Float:
         return np.array([values.get(name, np.nan) for name in names])
 
-    return ImuSample(
-        source=source,
-        session=0,
-        seq=seq,
-        t_ns=int(line[0]),
-        gyro_rad_s=vector(*_RATES[:3]),
-        accel_m_s2=vector(*_RATES[3:]),
-        mag_ut=vector(*_FIELD),
-        orientation_wxyz=vector(*_TURN),
-        heading_sigma_rad=drift,
-    )
+    try:
+        return ImuSample(
+            source=source,
+            session=0,
+            seq=seq,
+            t_ns=int(line[0]),
+            gyro_rad_s=vector(*_RATES[:3]),
+            accel_m_s2=vector(*_RATES[3:]),
+            mag_ut=vector(*_FIELD),
+            orientation_wxyz=vector(*_TURN),
+            heading_sigma_rad=drift,
+        )
+    except ValueError as error:
+        raise RecordingError(f"{where}: {error}") from error
 
 
 def _number(where: str, name: str, text: str) -> float:

@@ -200,7 +200,7 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
 
     def __post_init__(self) -> None:
         freeze(self, "position_m", np.float64, (3,), whole=True)
-        freeze(self, "orientation_wxyz", np.float64, (4,), whole=True)
+        freeze(self, "orientation_wxyz", np.float64, (4,))
         refuse_no_turn(self, "orientation_wxyz")
 
 
@@ -232,7 +232,7 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
 
     def __post_init__(self) -> None:
         for field, size in (("gyro_rad_s", 3), ("accel_m_s2", 3), ("mag_ut", 3), ("orientation_wxyz", 4)):
-            freeze(self, field, np.float64, (size,), whole=True)
+            freeze(self, field, np.float64, (size,))
         refuse_no_turn(self, "orientation_wxyz")
         refuse_beyond(self, "heading_sigma_rad")
 

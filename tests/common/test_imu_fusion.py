@@ -176,10 +176,8 @@ def test_a_slow_tilt_is_no_rest(rate_deg_s: float) -> None:
     ("gyro", "accel", "reason"),
     [
         (np.array([0.0, np.nan, 0.0]), G, "fusion.missing"),
-        (np.array([0.0, 1e300, 0.0]), G, "fusion.missing"),
         (np.zeros(3), NONE, "fusion.no_gravity"),
         (np.zeros(3), np.zeros(3), "fusion.no_gravity"),
-        (np.zeros(3), np.array([0.0, -1e300, 0.0]), "fusion.no_gravity"),
     ],
 )
 def test_what_is_no_measurement_is_counted_and_harms_nothing(gyro: Float, accel: Float, reason: str) -> None:

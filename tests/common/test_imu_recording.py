@@ -15,11 +15,11 @@ ROW = "1000,0.1,0.2,0.3,0,0,9.81,20,0,-40,1,0,0,0"
 
 def samples(count: int = 20) -> list[ImuSample]:
     rng = np.random.default_rng(3)
-    nothing = np.full(3, np.nan)
+    nothing, turns = np.full(3, np.nan), rng.normal(size=(count, 4))
     return [
         ImuSample("imu", 0, k, 10**9 + 8_333_333 * k, gyro, accel, nothing, q, np.nan if k < 5 else 0.1 * k)
         for k, (gyro, accel, q) in enumerate(
-            zip(*rng.normal(size=(2, count, 3)), rng.normal(size=(count, 4)), strict=True)
+            zip(*rng.normal(size=(2, count, 3)), turns / np.linalg.norm(turns, axis=1)[:, None], strict=True)
         )
     ]
 
@@ -41,7 +41,7 @@ def test_a_recording_without_an_imu_has_no_sample(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("header", HEADERS, ids=",".join)
 def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path: Path) -> None:
-    row = ["5", *(str(float(k)) for k in range(1, len(header)))]
+    row = ["5", *("0.5" if name.startswith("q") else str(float(k)) for k, name in enumerate(header[1:], 1))]
     (tmp_path / "imu.csv").write_text(f"{','.join(header)}\n{','.join(row)}\n")
     (one,) = read_imu(tmp_path, "palm-imu")
     assert (one.source, one.t_ns) == ("palm-imu", 5)
@@ -61,6 +61,8 @@ def test_field_and_orientation_may_be_left_out(header: tuple[str, ...], tmp_path
         (f"{FULL}\n{ROW.replace('1000', '1.5e3')}\n", r"line 2: t_ns: '1\.5e3' is not an integer"),
         (f"{FULL}\n{ROW.replace('0.2', 'fast')}\n", r"line 2: gy: 'fast' is not a number"),
         (f"{FULL}\n{ROW.replace('9.81', 'inf')}\n", r"line 2: az: 'inf' is not a finite number"),
+        (f"{FULL}\n{ROW.replace('0.2', '300')}\n", r"line 2: gyro_rad_s: 300 is not within -200 \.\.\. 200"),
+        (f"{FULL}\n{ROW.replace('1,0,0,0', '2,0,0,0')}\n", r"line 2: orientation_wxyz: 2 is not within"),
         (f"{FULL},heading_sigma\n{ROW},-0.1\n", r"line 2: heading_sigma: -0\.1 is below 0"),
         (f"{FULL}\n{ROW}\n{ROW}\n", r"line 3: t_ns: 1000 is not after 1000"),
     ],

@@ -39,7 +39,7 @@ MESSAGES: list[tuple[Kind, Handshake]] = [
     (Kind.HELLO, HELLO),
     (Kind.WELCOME, Welcome(A, B, C, A)),
     (Kind.START, Start(-5)),
-    (Kind.STARTED, Started(2**63 - 1)),
+    (Kind.STARTED, Started(2**61)),
     (Kind.ECHO_ASK, EchoAsk(0)),
     (Kind.ECHO_ANSWER, EchoAnswer(1, 2, 3)),
     (Kind.UNPROVEN, Unproven(A, B, apart=True)),

@@ -28,12 +28,12 @@ HAND = "default-right"
 
 def object_pose(k: int, name: str = "cube") -> ObjectPose:
     rng = np.random.default_rng(k)
-    lost = k % 4 == 3
+    lost, turn = k % 4 == 3, rng.normal(size=4)
     return ObjectPose(
         object=name,
-        t_ns=2**62 + k,
+        t_ns=2**60 + k,
         position_m=np.full(3, nan) if lost else rng.normal(size=3),
-        orientation_wxyz=np.full(4, nan) if lost else rng.normal(size=4),
+        orientation_wxyz=np.full(4, nan) if lost else turn / np.linalg.norm(turn),
         cov=rng.normal(size=(6, 6)),
         residual_m=nan if lost else float(rng.uniform()),
         source=int(ObjectSource.NONE if lost else ObjectSource.TAGS),
@@ -49,13 +49,13 @@ def contact(k: int, hand: str = HAND, name: str = "cube") -> Contact:
     rng = np.random.default_rng(k)
     five = rng.normal(size=5)
     return Contact(
-        hand, name, 2**62 + k, five, abs(five), rng.normal(size=(5, 3)), five > 0.0, five[0], k % 2 == 0
+        hand, name, 2**60 + k, five, abs(five), rng.normal(size=(5, 3)), five > 0.0, five[0], k % 2 == 0
     )
 
 
 def gesture(k: int) -> Gesture:
     known = {"distance_m": 0.004, "strength": 0.5, "origin_m": np.array([0.1, 0.2, 0.3])} if k % 2 else {}
-    return Gesture(HAND, 2**62 + k, "pinch", "index", "update", 2**62, 0.25 * (k % 4), **known)  # pyright: ignore[reportArgumentType]
+    return Gesture(HAND, 2**60 + k, "pinch", "index", "update", 2**60, 0.25 * (k % 4), **known)  # pyright: ignore[reportArgumentType]
 
 
 def written(folder: Path) -> list[Told]:
@@ -208,9 +208,9 @@ def test_searched_frames_come_back_with_their_tags_in_order(tmp_path: Path) -> N
         ({"ids": np.array([4, 4, 2], np.uint16)}, "frame 0: ids: must rise"),
         ({"ids": np.array([4, 70000, 2])}, "row or ids: out of range"),
         ({"uv": np.zeros((3, 3, 2))}, r"uv has shape \(3, 3, 2\), expected \(3, 4, 2\)"),
-        ({"uv": np.full((3, 4, 2), np.inf)}, "frame 0: uv: infinite"),
+        ({"uv": np.full((3, 4, 2), np.inf)}, "frame 0: uv: inf is not within"),
         ({"uv": np.full((3, 4, 2), nan)}, "frame 0: uv, sigma_px: a tag that was found"),
-        ({"sigma_px": np.zeros(3)}, "frame 0: uv, sigma_px: a tag that was found"),
+        ({"sigma_px": np.zeros(3)}, "frame 0: sigma_px: 0 is not within"),
         ({"t_ns": np.array([10.0, 20.0, 30.0])}, "tags_left"),
         ({"t_ns": np.array([10, 20])}, r"t_ns has shape \(2,\), expected \(3,\)"),
     ],

@@ -25,7 +25,7 @@ def pairing(
 
 def path(t_s: Float) -> Float:
     """Markers (..., 2, 2) [px] on two parabolas."""
-    t = np.asarray(t_s)[..., None]
+    t = np.asarray(t_s)[..., None] % 1.0  # so that it stays near the picture
     return np.stack(
         [
             np.concatenate([300 + 400 * t - 2000 * t**2, 200 - 150 * t + 900 * t**2], -1),

@@ -177,5 +177,7 @@ def test_what_slaves_were_started_with_needs_a_restart(tree: Path) -> None:
         CalibrationError, match=r"tracker of its objects: none cannot become puck .*: restart the"
     ):
         refuse_restart(old, tracked)
-    with pytest.raises(CalibrationError, match="objects: wand cannot become none while it runs: restart all"):
+    with pytest.raises(
+        CalibrationError, match="objects: wand cannot become none while it runs: give all processes"
+    ):
         refuse_restart(old, with_fields(old, objects=()))

@@ -238,8 +238,8 @@ def test_files_of_the_three_columns_of_the_format_are_enough(
         ({"laser_px": np.zeros((N, 4))}, "laser_px has shape"),
         ({"seq": np.zeros(N - 1, np.int64)}, "t_ns and seq have shapes"),
         ({"t_ns": np.zeros(N)}, "Cannot cast"),
-        ({"tip_sigma_px": np.zeros((N, 5))}, "row 0: tip_sigma_px: must be positive"),
-        ({"laser_uv": np.full((N, 5, 2), np.inf)}, "row 0: laser_uv: infinite"),
+        ({"tip_sigma_px": np.zeros((N, 5))}, "row 0: tip_sigma_px: 0 is not within"),
+        ({"laser_uv": np.full((N, 5, 2), np.inf)}, "row 0: laser_uv: inf is not within"),
         ({"laser_uv": np.full(N, "x")}, "could not convert"),
     ],
 )

@@ -121,7 +121,7 @@ def test_set_changes_what_it_names_and_nothing_else(tuning: CameraTuning, knobs:
     ("verb", "body", "says"),
     [
         ("set", '{"exposure": 9000}', "set: Object contains unknown field `exposure`"),
-        ("set", '{"exposure_us": -1}', r"set: Expected `float` > 0.0 - at `\$.exposure_us`"),
+        ("set", '{"exposure_us": -1}', r"set: Expected `float` >= 0.01 - at `\$.exposure_us`"),
         ("set", '{"colour_gains": [1.0]}', r"set: Expected `array` of length 2"),
         ("set", "", "set: Input data was truncated"),
         ("set", "[" * 2000, "set: "),

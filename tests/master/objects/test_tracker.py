@@ -111,7 +111,7 @@ def test_poses_come_once_and_rise_and_a_new_process_may_have_another_clock() -> 
 
 def test_a_turn_that_is_none_is_counted_and_a_foreign_device_is_an_error() -> None:
     line = TrackerLine(CUBE, RIG)
-    assert not one(line, told(0.0, turn=np.array([0.5, 0.0, 0.0, 0.0]))).tracked
+    assert not one(line, told(0.0, turn=np.array([0.955, 0.0, 0.0, 0.0]))).tracked
     assert not one(line, told(10.0, turn=np.array([1.0, np.nan, 0.0, 0.0]))).tracked
     assert line.counts == {"broken": 1, "lost": 1}
     with pytest.raises(ValueError, match="'other'"):
