@@ -88,7 +88,7 @@ def others() -> list[Message]:
     """A sample of an IMU, and a report with names, counts and odd floats."""
     turn = np.array([0.5, -0.5, 0.5, -0.5])
     sample = ImuSample("imu", 7, 3, -5, np.array([0.1, -0.0, 1e-310]), np.ones(3), np.full(3, np.nan), turn)
-    return [sample, Health("left", 2**63 - 1, 2**62, {"frames": 1}, {"rate_hz": 1 / 3}, "pi-left", "1.2")]
+    return [sample, Health("left", 2**63 - 1, 2**60, {"frames": 1}, {"rate_hz": 1 / 3}, "pi-left", "1.2")]
 
 
 def sealed(messages: list[Message]) -> list[bytes]:
