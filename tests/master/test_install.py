@@ -31,7 +31,8 @@ NEEDS_SYSTEMD = pytest.mark.skipif(
 def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The keys folder of a rig; nothing of keys in the environment."""
     for name in ("PHALANX_KEYS", "PHALANX_RIG_KEY", "PHALANX_OPEN"):
-        monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(name, "")  # of what is not there `delenv` alone undoes nothing
+        monkeypatch.delenv(name)
     make(tmp_path / "keys", ["left"], datetime.now(UTC))
     monkeypatch.chdir(ROOT)
     return tmp_path / "keys"
