@@ -10,12 +10,12 @@ triples: numbers three apart miss nothing, and one more or less, after a frame t
 for in some frames only: their numbers rise as they like, and nothing is missing between two.
 """
 
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 REMEMBERED = 1024
-SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and with time
+SEQ_JUMP, SEQ_PER_S = 100_000, 10_000.0  # numbers rise by no more: at once, and with time besides
 TRIPLE = 3  # frames that become one message of a wrist device
 
 
@@ -59,7 +59,7 @@ class Sequence:
         self._slip = self._step // 2
         self._session: int | None = None
         self.last = -1
-        self._missing: dict[int, None] = {}
+        self._missing: OrderedDict[int, None] = OrderedDict()
 
     @property
     def counts(self) -> CameraCounts:
@@ -75,6 +75,10 @@ class Sequence:
     def follows(self, session: int) -> bool:
         """Whether the last message was of the same slave process."""
         return session == self._session
+
+    def restart(self) -> None:
+        """The next number follows none: nothing between is missing."""
+        self._session = None
 
     def take(self, session: int, seq: int) -> bool:
         """Count frame `seq` of the slave process `session`; whether it is to be used."""
@@ -92,9 +96,9 @@ class Sequence:
         elif self._regular and seq != self.last + self._step:
             skipped = range(self.last + self._step, seq - self._slip, self._step)
             self.lost += len(skipped)
-            self._missing.update(dict.fromkeys(skipped[-REMEMBERED:]))
+            self._missing.update(OrderedDict.fromkeys(skipped[-REMEMBERED:]))
             while len(self._missing) > REMEMBERED:
-                del self._missing[next(iter(self._missing))]
+                self._missing.popitem(last=False)
         self.last = seq
         self._received += 1
         return True
@@ -158,7 +162,7 @@ class Losses:
 class Counted:
     """One kind of message of a sender: its `sequence`, and its `losses`.
 
-    Holds the counter of the newest datagram, and when the last message came.
+    Holds the counter of the newest datagram, when the last message came, and by how much numbers may rise at once.
 
     Attributes:
         newest_ns: Time of the newest message that is used in this session of the link [ns], master's clock.
@@ -169,13 +173,24 @@ class Counted:
         self.newest_ns: int | None = None
         self._counter = 0
         self._came_ns = 0
+        self._rise = float(SEQ_JUMP)
+        self._begins = True  # no message of this session of the link came yet
 
     def plausible(self, session: int, seq: int, t_ns: int) -> bool:
-        """Whether a sender can have got to message `seq` when it came at `t_ns` [ns]."""
-        most = SEQ_JUMP + SEQ_PER_S * (t_ns - self._came_ns) * 1e-9
-        if self.sequence.follows(session) and seq - self.sequence.last > most:
-            return False
-        self._came_ns = t_ns
+        """Whether a sender can have got to message `seq` when it came at `t_ns` [ns].
+
+        The first of a session may have any number: while this machine slept its clock stood still, and the sender
+        went on. Nothing is counted as missing then.
+        """
+        begins, self._begins = self._begins, False
+        most = min(self._rise, SEQ_JUMP) + SEQ_PER_S * (t_ns - self._came_ns) * 1e-9
+        rise = max(seq - self.sequence.last, 0) if self.sequence.follows(session) else 0
+        if rise > most:
+            if not begins:
+                return False
+            self.sequence.restart()
+            rise = 0
+        self._came_ns, self._rise = t_ns, most - rise
         return True
 
     def take(self, session: int, seq: int, counter: int, missing: Callable[[int, int], int]) -> bool:
@@ -202,4 +217,5 @@ class Counted:
         """The counters of the datagrams begin again."""
         self.losses.begin_session()
         self._counter = 0
+        self._begins = True
         self.newest_ns = None

@@ -123,3 +123,35 @@ def test_numbers_that_rise_as_they_like_miss_nothing() -> None:
     ]
     assert counted.sequence.counts == CameraCounts(received=3, late=2)
     assert counted.losses.lost == 0
+
+
+def nothing_missing(_after: int, _before: int) -> int:
+    return 0
+
+
+def test_a_number_that_leaps_again_and_again_has_a_bound_in_time() -> None:
+    counted, t_ns, seq = Counted(Sequence()), 10**12, 0
+    assert counted.plausible(1, seq, t_ns)
+    counted.take(1, seq, 1, nothing_missing)
+    taken = 0
+    for k in range(1000):
+        t_ns += 1_000_000
+        if counted.plausible(1, seq + 2000, t_ns):
+            seq, taken = seq + 2000, taken + 1
+            assert counted.take(1, seq, 2 + k, nothing_missing)
+    assert 50 <= taken <= 60, "100 000 at once, 10 000 in the second"
+
+
+def test_a_sender_that_went_on_while_this_machine_slept_is_taken_at_once() -> None:
+    """A clock of the kernel stands still in suspend; the camera of another machine does not."""
+    counted, t_ns = Counted(Sequence()), 10**12
+    for seq in range(100):
+        assert counted.plausible(7, seq, t_ns + seq)
+        counted.take(7, seq, seq + 1, nothing_missing)
+    slept = 8 * 3600 * 90
+    assert not counted.plausible(7, slept, t_ns + 10**9), "without a new session it is a leap"
+    counted.begin_session()
+    assert counted.plausible(7, slept, t_ns + 2 * 10**9)
+    assert counted.take(7, slept, 1, nothing_missing)
+    assert counted.sequence.lost == 0
+    assert not counted.plausible(7, 2 * slept, t_ns + 3 * 10**9)
