@@ -1,12 +1,14 @@
 """All cameras brought to one instant: which frames belong together, and where each marker was then.
 
 An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent (silent: others
-delivered a dozen frames since its last). It is *complete* when every other camera has delivered a frame at or after
-it, so that tracks can be interpolated; `predict` waits only for those whose next frame is nearer to the instant than
-their last, and carries the others forward, half a period at most. An instant is emitted when it is complete, or when
-the message time has passed its deadline, with whatever there is. Message time is the newest capture time seen: no clock
-is read here, so a replay pairs exactly as the live run did. An instant that still waited for a partner when all cameras
-fell silent, for as long as makes one silent, is *outdated* and left out: nobody asks any more where the hand was then.
+delivered a dozen frames since its last), nor slow (it delivers less than half of its frames, by what others deliver),
+nor behind (its last frame was a dozen periods older than the newest when it came). It is *complete* when every other
+camera has delivered a frame at or after it, so that tracks can be interpolated; `predict` waits only for those whose
+next frame is nearer to the instant than their last, and carries the others forward, half a period at most. An instant
+is emitted when it is complete, or when the message time has passed its deadline, with whatever there is. Message time
+is the newest capture time seen: no clock is read here, so a replay pairs exactly as the live run did. An instant that
+still waited for a partner when all cameras fell silent, for as long as makes one silent, is *outdated* and left out:
+nobody asks any more where the hand was then.
 
 Each marker has its own capture time, t_row0 + row_time v: a rolling shutter sees the finger tips earlier
 than the back of the hand. `master.stereo.tracks` carries each to the instant; a sideways error Dt v would turn into a
@@ -26,6 +28,7 @@ from master.stereo.tracks import SIGHTINGS, Sighting, carry
 
 HISTORY = 8
 SILENT_FRAMES = 12
+_SLOW, _SLOW_FRAMES = 2.2, 4  # times as many frames of others as the files say, between so many of its own
 _REACH_M = 0.5  # where hands are, for what a camera makes of their motion
 
 
@@ -92,6 +95,10 @@ class Pairing:
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
         self._frames = 0  # of all cameras
         self._last = [0] * len(self._names)  # how many those were at each one's last
+        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)  # and before
+        together_hz = sum(frame_rate_hz[name] for name in self._names)
+        self._slow_frames = [_SLOW * together_hz / frame_rate_hz[name] for name in self._names]
+        self._behind = [False] * len(self._names)
         self._awaited = 0  # the camera that was waited for when somebody asked last
         self._pending: deque[int] = deque()
         self._origin_ns: int | None = None
@@ -127,9 +134,13 @@ class Pairing:
                 t_sigma_ns=message.t_sigma_ns,
             )
         )
+        self._behind[index] = self._newest_ns - centre_ns > self._outdated_ns
         self._newest_ns = max(self._newest_ns, centre_ns)
+        if self._silent(index):
+            self._came[index].clear()  # it begins anew
         self._frames += 1
         self._last[index] = self._frames
+        self._came[index].append(self._frames)
         newest_instant = self._pending[-1] if self._pending else self._emitted_ns
         if index == self._leader() and centre_ns > newest_instant:
             self._pending.append(centre_ns)
@@ -148,14 +159,19 @@ class Pairing:
         return marks
 
     def _leader(self) -> int:
-        for camera, seen in enumerate(self._seen):
-            if seen and not self._silent(camera):
-                return camera
-        return 0
+        speak = [camera for camera, seen in enumerate(self._seen) if seen and not self._silent(camera)]
+        if self._continuous:
+            speak = [c for c in speak if not (self._behind[c] or self._slow(c))] or speak
+        return speak[0] if speak else 0
 
     def _silent(self, camera: int) -> bool:
         """Whether others delivered so many frames since its last."""
         return self._frames - self._last[camera] >= self._patience
+
+    def _slow(self, camera: int) -> bool:
+        """Whether it delivers so little, by what others deliver and the rates of the files, that those are to lead."""
+        at = self._came[camera]
+        return len(at) >= _SLOW_FRAMES and at[-1] - at[0] > self._slow_frames[camera] * (len(at) - 1)
 
     def _emit(self, *, flush: bool) -> list[Instant]:
         out: list[Instant] = []

@@ -339,3 +339,17 @@ def test_unrelated_frames_are_never_mixed() -> None:
 def test_a_stranger_is_a_mistake_of_the_caller() -> None:
     with pytest.raises(ValueError, match="stranger"):
         pairing().push(frame("stranger", 0, 0))
+
+
+@pytest.mark.parametrize("what", ["seldom", "old"])
+def test_a_leader_that_hardly_delivers_or_only_what_is_old_leads_no_more(what: str) -> None:
+    """One frame in fifteen, or stamps nearly a second old: the hand is as often there as the other camera's frames."""
+    machine, found = pairing(), list[int]()
+    for k in range(300):
+        left_ns = k * PERIOD - (59 * PERIOD if what == "old" and k > 60 else 0)
+        if what == "old" or k < 60 or k % 15 == 0:
+            found += [instant.t_ns for instant in machine.push(frame("left", k, left_ns))]
+        found += [instant.t_ns for instant in machine.push(frame("right", k, k * PERIOD + 5 * MS))]
+    late = [t_ns for t_ns in found if t_ns > 150 * PERIOD]
+    assert len(late) >= 0.95 * 150
+    assert (np.diff(found) > 0).all()
