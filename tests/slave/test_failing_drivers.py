@@ -247,6 +247,15 @@ def test_only_a_picture_with_contrast_that_is_equal_in_every_byte_is_a_repeated_
     assert [pictures.push(flat.copy()) for _ in range(3)] == [False, True, True]
 
 
+@pytest.mark.parametrize("buffers", [2, 4, 8])
+def test_a_driver_that_hands_the_same_buffers_round_is_found_in_the_third_turn(buffers: int) -> None:
+    rng = np.random.default_rng(2)
+    ring: list[Image] = [rng.integers(0, 255, (48, 64, 3), np.uint8) for _ in range(buffers)]
+    pictures = RepeatedPictures()
+    found = [pictures.push(image.copy()) for _ in range(4) for image in ring]
+    assert found == [False] * (2 * buffers) + [True] * (2 * buffers)
+
+
 class Failing(BlindDetector):
     """A detector that raises in some frames."""
 
