@@ -18,6 +18,7 @@ class CameraPlan:
         size_px: Width and height.
         wrist: It belongs to a wrist device and sends strobed triples.
         hands: Of each hand that it watches, the markers that sit on it.
+        markers: All that its rigs name, those on objects too: what it reports of others is none of the rig's.
     """
 
     name: str
@@ -25,6 +26,7 @@ class CameraPlan:
     size_px: tuple[int, int]
     wrist: bool
     hands: tuple[tuple[str, ...], ...]
+    markers: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,5 +141,7 @@ def plan_of(setups: Iterable[RigSetup]) -> Plan:
             before = cameras[name].hands if name in cameras else ()
             hands = before if wrist else (*before, setup.hand_markers)
             size = file.width_px, file.height_px
-            cameras[name] = CameraPlan(name, file.frame_rate_hz, size, wrist, hands)
+            known = cameras[name].markers if name in cameras else ()
+            markers = tuple(dict.fromkeys((*known, *setup.markers)))
+            cameras[name] = CameraPlan(name, file.frame_rate_hz, size, wrist, hands, markers)
     return Plan(tuple(cameras.values()), tuple(imus), tuple(groups))

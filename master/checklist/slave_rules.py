@@ -57,7 +57,7 @@ class SlaveRules:
         if self._camera is not None:
             yield from _settings(name, said)
             yield from _light(name, said)
-            yield from _collisions(name, said)
+            yield from _collisions(self._camera, said)
             yield from _file(self._camera, said)
         yield from _machine(name, said)
 
@@ -109,8 +109,9 @@ def _light(name: str, said: Said) -> Iterator[Verdict]:
     )
 
 
-def _collisions(name: str, said: Said) -> Iterator[Verdict]:
+def _collisions(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     """Whether two markers share colours, by their ranges or by their looks."""
+    name = camera.name
     for gauge, hues in said.gauges.items():
         if gauge.startswith(OVERLAP):
             pair = tuple(gauge.removeprefix(OVERLAP).split(BETWEEN))
@@ -119,6 +120,8 @@ def _collisions(name: str, said: Said) -> Iterator[Verdict]:
             pair = tuple(gauge.removeprefix(TWIN).split(BETWEEN))
             what = f"{' and '.join(pair)} look alike, {hues:.0f} hues apart"
         else:
+            continue
+        if len(pair) != 2 or not {*camera.markers}.issuperset(pair):
             continue
         yield Verdict(
             "colour_collision",
@@ -134,7 +137,7 @@ def _collisions(name: str, said: Said) -> Iterator[Verdict]:
 def _file(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     """Whether the slave has colours, and a file of the same camera as the master's."""
     name = camera.name
-    bare = tuple(event.removeprefix(UNCOLOURED) for event in said.counts if event.startswith(UNCOLOURED))
+    bare = tuple(marker for marker in camera.markers if UNCOLOURED + marker in said.counts)
     yield Verdict(
         "calibration_absent",
         name,
@@ -162,10 +165,11 @@ def _background(camera: CameraPlan, said: Said) -> Iterator[Verdict]:
     frames = said.grown("frames")
     if not frames:
         return
-    for event in said.counts:
-        if not event.startswith(BESIDE):
+    for marker in camera.markers:
+        event = BESIDE + marker
+        if event not in said.counts:
             continue
-        marker, share = event.removeprefix(BESIDE), (said.grown(event) or 0) / frames
+        share = (said.grown(event) or 0) / frames
         u, v = said.gauges.get(f"{event}.u"), said.gauges.get(f"{event}.v")
         where = "" if u is None or v is None else f", near pixel {u:.0f}, {v:.0f}"
         yield Verdict(

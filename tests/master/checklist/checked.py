@@ -10,8 +10,8 @@ from master.turned_away import Away, MarkerCounts
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
 CAMERAS = (
-    CameraPlan("left", 60.0, (640, 480), False, (MARKERS,)),
-    CameraPlan("right", 60.0, (640, 480), False, (MARKERS,)),
+    CameraPlan("left", 60.0, (640, 480), False, (MARKERS,), MARKERS),
+    CameraPlan("right", 60.0, (640, 480), False, (MARKERS,), MARKERS),
     CameraPlan("wrist", 90.0, (640, 480), True, ()),
 )
 PLAN = Plan(CAMERAS, ("imu",), ((("left", "right"), len(MARKERS)),))

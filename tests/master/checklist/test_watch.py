@@ -382,3 +382,12 @@ def test_of_three_cameras_the_one_that_moved_is_named() -> None:
         ("right", False),
         ("top", True),
     ]
+
+
+def test_what_a_slave_reports_of_invented_markers_costs_nothing_and_hides_nothing() -> None:
+    bench = Bench()
+    assert not any(items for _, items in bench.seconds(12.0))
+    bench.gauges["left"] = {f"overlap.a{k}..b{k}": 1.0 for k in range(250)}
+    bench.counts["left"] = {f"uncalibrated.m{k}": 1 for k in range(100)}
+    bench.per_s["left"] = {f"beside.m{k}": 60.0 for k in range(100)}
+    assert not any(items for _, items in bench.seconds(3.0))
