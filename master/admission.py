@@ -20,16 +20,17 @@ from common.messages import (
     TrackerPose,
     WristDetections,
 )
+from common.pace import Pace
 from master.rig_setup import RigSetup
 from master.sequence import TRIPLE
 
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
-_FASTER = 2.0  # than the rate of the file: settings can be tried live
+_FASTER = 3.0  # than the rate of the file: settings can be tried live
 _ANY_HZ = 10_000.0  # where no file says a rate
-_LEAST_HZ = 60.0
-_IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
-_TRACKER_HZ = 500.0
+_LEAST_HZ = 150.0
+_IMU_FASTER = 4.0 / 3.0  # than its file: a sensor has its own rates, and takes the next that is enough
+_TRACKER_HZ = 1000.0 / 3.0
 _BURST_S = 0.5  # of it may come at once: at the rate of the file, what a second's halt of the network held up
 
 Sensed = Detections | TagDetections | ImuSample | TrackerPose
@@ -52,27 +53,10 @@ class SenderLimits:
     rate_hz: float | None = None
 
 
-class Pace:
-    """Token bucket that bounds how many messages of a sender are taken.
-
-    Holds what is left and when it was last filled.
-    """
-
-    def __init__(self, rate_hz: float | None) -> None:
-        """Of a sender of this rate by its files; None: they say none."""
-        self._per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
-        self._most = self._left = self._per_s * _BURST_S
-        self._t_ns: int | None = None
-
-    def take(self, t_ns: int) -> bool:
-        """Whether a message that came at `t_ns` [ns] is within the rate."""
-        elapsed_ns = 0 if self._t_ns is None else max(t_ns - self._t_ns, 0)
-        self._t_ns = t_ns
-        self._left = min(self._left + self._per_s * elapsed_ns * 1e-9, self._most)
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True
+def pace_of(rate_hz: float | None) -> Pace:
+    """How fast messages of one kind are taken of a sender of this rate by its files; None: they say none."""
+    per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
+    return Pace(per_s, per_s * _BURST_S)
 
 
 def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:

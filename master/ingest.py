@@ -183,6 +183,11 @@ class Ingest:
         counts |= {f"fault.{sender}": n for sender, n in dict(self.quarantine.faults).items()}
         return counts | {f"refused.{reason}": n for reason, n in self.refused.items()}
 
+    def limit(self, limits: Mapping[str, SenderLimits]) -> None:
+        """Take of each sender what its files say now (`admission.limits_of`)."""
+        with self._lock:
+            self._link.limit(limits)
+
     def counts_of(self, sender: str) -> CameraCounts:
         """Return what became of the frames, samples or poses of `sender`.
 

@@ -213,6 +213,11 @@ class MasterLink:
         """Return how often another process took over as `sender` since this master began."""
         return self._senders[sender].restarts
 
+    def limit(self, limits: Mapping[str, SenderLimits]) -> None:
+        """Take of each sender what its files say now."""
+        for name, sender in self._senders.items():
+            sender.limit(limits.get(name, SenderLimits()))
+
     def refused_of(self, sender: str) -> int:
         """Return how many datagrams that `sender` sealed in its sessions were refused."""
         return self._senders[sender].refused

@@ -12,13 +12,14 @@ from typing import TypeAlias
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Opener, Refusal, Sealer
 from common.messages import ImuSample, TrackerPose, restamped
+from common.pace import Pace
 from common.session import Hello
-from master.admission import OLD_NS, Pace, SenderLimits, Sensed, refused
+from master.admission import OLD_NS, SenderLimits, Sensed, pace_of, refused
 from master.sequence import Counted, Sequence
 
 OLD_NONCES = 64
 ASKED = 256  # echoes that wait for an answer; later ones are worth nothing
-AHEAD_NS = 50_000_000  # no time that a slave tells is further ahead than that and the doubt of its clock
+AHEAD_NS = 50_000_000  # by how much the conversion of a time to this clock may be wrong
 _MAX_SIGMA_NS = 1e10
 
 Taken: TypeAlias = Sensed
@@ -69,7 +70,12 @@ class Sender:
         The number of each kind rises by the step in `steps` from one message to the next.
         """
         kinds = {kind: Counted(Sequence(step)) for kind, step in steps.items()}
-        return cls(kinds, limits, {kind: Pace(limits.rate_hz) for kind in kinds})
+        return cls(kinds, limits, {kind: pace_of(limits.rate_hz) for kind in kinds})
+
+    def limit(self, limits: SenderLimits) -> None:
+        """Let it be within other limits from now on."""
+        if limits != self.limits:
+            self.limits, self.paces = limits, {kind: pace_of(limits.rate_hz) for kind in self.kinds}
 
     @property
     def main(self) -> Counted:
@@ -104,14 +110,15 @@ def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) 
 def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, now_ns: int) -> Taken | None:
     """The message with its times on the master's clock; None where they cannot be.
 
-    They cannot while the clock is not known (data before the start), nor where the time is yet to come, is older than
-    `OLD_NS`, or is not after the last of its kind.
+    They cannot while the clock is not known (data before the start), nor where the time is more than `AHEAD_NS` after
+    `now_ns`, is older than `OLD_NS`, or is not after the last of its kind. Nothing was measured after it came: what is
+    ahead by less is of now, and its standard deviation is as large as the error that this shows.
     """
     if clock is None:
         return None
-    t_ns = clock.to_local(message.t_ns)
-    ahead_ns = AHEAD_NS + min(clock.bound_ns, OLD_NS)
-    if not now_ns - OLD_NS <= t_ns <= now_ns + ahead_ns or (
+    told_ns = clock.to_local(message.t_ns)
+    t_ns = min(told_ns, now_ns)
+    if not now_ns - OLD_NS <= told_ns <= now_ns + AHEAD_NS or (
         kind.newest_ns is not None and t_ns <= kind.newest_ns
     ):
         return None
@@ -122,5 +129,5 @@ def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, 
         message,
         t_ns=t_ns,
         ready_t_ns=clock.to_local(message.ready_t_ns),
-        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns)), _MAX_SIGMA_NS),
+        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), told_ns - t_ns), _MAX_SIGMA_NS),
     )

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias, TypeVar
 
+import msgspec
 import pytest
 
 from common.clock import SkewedClock
@@ -491,3 +492,24 @@ def _kind(datagram: bytes) -> Kind:
     header = parse(datagram, RigKeys(KEY).rig_tag)
     assert isinstance(header, Header)
     return header.kind
+
+
+@pytest.mark.parametrize(
+    ("ahead_ms", "taken"), [(-900, True), (0, True), (20, True), (45, True), (200, False), (990, False)]
+)
+def test_no_frame_is_of_the_future_however_the_slave_answers_echoes(ahead_ms: int, taken: bool) -> None:
+    """Late answers make its clock look uncertain; that allows no times that are yet to come."""
+    wires = Wires()
+    master, slave = wires.new_master(("left",)), wires.new_slave("left")
+    assert wires.run(4.0, wires.all_started)
+    wires.run(1.0)
+    told_ns = wires.clock.t_ns + ahead_ms * 1_000_000
+    wires.send(
+        slave, msgspec.structs.replace(detections("left", slave.process, 1), t_ns=told_ns, ready_t_ns=told_ns)
+    )
+    assert len(wires.got) == taken
+    assert master.unsynchronised == (not taken)
+    for frame in wires.got:
+        assert frame.t_ns <= wires.clock.t_ns
+        assert frame.t_ns == pytest.approx(min(told_ns, wires.clock.t_ns), abs=1_000_000)
+        assert frame.t_sigma_ns >= 0.9e6 * max(ahead_ms, 0) - 1e6
