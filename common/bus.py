@@ -6,26 +6,31 @@ same tests run against both. Streams with the path DATAGRAM never come here.
 A subscription holds at most `depth` messages and drops the oldest: who reads too slowly sees
 what is new, and how much was dropped. A message is encoded and decoded by either bus, so
 receivers never share objects and never see one that `common.messages` would refuse.
+Of what devices say so much is taken of each per second (`common.streams`), before it is decoded: one that says more
+costs nobody's time.
 """
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
 from common.errors import BusError, MessageError, PhalanxError
 from common.messages import AnyMessage, Command, Health, Message, decode, encode
+from common.pace import Pace
 from common.streams import STREAMS, Path, key_of, sender_of
 
 Handler = Callable[[Command], Health]
 ANY = "*"
+MOST_SENDERS = 256  # whose rates are told apart; on an open bus names can be invented
 
 
 class Subscription(Protocol):
     """A bounded queue of messages of one stream.
 
     Attributes:
-        dropped: Messages that were pushed out by newer ones before they were read.
+        dropped: Messages that were pushed out by newer ones before they were read, or were too many of one sender.
         refused: Payloads that were not a message of the stream, or of another than who sent them.
     """
 
@@ -94,7 +99,8 @@ class Inbox:
     """The queue behind every subscription: bounded, drops the oldest, decodes on reading.
 
     Holds at most `depth` encoded messages of the type `kind`, each with the name under which it came: who may send
-    under which name is the bus' to say, so what is in a message cannot be another's.
+    under which name is the bus' to say, so what is in a message cannot be another's. Besides, how many of each name
+    may come now.
     """
 
     def __init__(self, stream: str, depth: int, on_close: Callable[["Inbox"], None]) -> None:
@@ -105,7 +111,8 @@ class Inbox:
         """
         if depth < 1:
             raise ValueError(f"depth={depth}: must be at least 1")
-        self._kind = STREAMS[stream].message
+        self._kind, self._most_hz = STREAMS[stream].message, STREAMS[stream].most_hz
+        self._paces: dict[str, Pace] = {}
         self._waiting: deque[tuple[str, bytes]] = deque(maxlen=depth)
         self._changed = threading.Condition()
         self._on_close: Callable[[Inbox], None] | None = on_close
@@ -122,16 +129,24 @@ class Inbox:
         with self._changed:
             if self._on_close is None:
                 return
+            if not self._in_pace(name):
+                self.dropped += 1
+                return
             if len(self._waiting) == self._waiting.maxlen:
                 self.dropped += 1
             self._waiting.append((name, payload))
             self._changed.notify()
 
     def get(self, timeout_s: float) -> Message | None:
-        """Return the oldest waiting message, or None after `timeout_s` or once closed."""
-        while True:
+        """Return the oldest waiting message, or None after `timeout_s` or once closed.
+
+        None also where as many as the queue holds were no message: who sends such keeps nobody waiting.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        for _ in range(self._waiting.maxlen or 1):
             with self._changed:
-                self._changed.wait_for(lambda: self._waiting or self._on_close is None, timeout_s)
+                left_s = max(deadline_s - time.monotonic(), 0.0)
+                self._changed.wait_for(lambda: self._waiting or self._on_close is None, left_s)
                 if not self._waiting:
                     return None
                 name, payload = self._waiting.popleft()
@@ -139,6 +154,16 @@ class Inbox:
             if message is not None and sender_of(message) == name:
                 return message
             self.refused += 1
+        return None
+
+    def _in_pace(self, name: str) -> bool:
+        """Whether one more that came under `name` is within the rate of the stream."""
+        if self._most_hz is None:
+            return True
+        if name not in self._paces and len(self._paces) >= MOST_SENDERS:
+            name = ""
+        pace = self._paces.setdefault(name, Pace(self._most_hz, self._most_hz))
+        return pace.take(time.monotonic_ns())
 
     def close(self) -> None:
         """Receive no more and wake a waiting reader. Safe to call twice."""

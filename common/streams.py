@@ -39,12 +39,14 @@ class Stream:
         path: Datagram or zenoh.
         key: Key on the zenoh bus, with {name} for the sender or target; None for datagrams.
         recorded: Whether the message recorder keeps it.
+        most_hz: Of those streams that devices say on the bus: what is taken of one sender per second.
     """
 
     message: type[Message]
     path: Path
     key: str | None
     recorded: bool
+    most_hz: float | None = None
 
 
 STREAMS = {
@@ -58,13 +60,13 @@ STREAMS = {
     "object": Stream(ObjectPose, Path.ZENOH, "phalanx/object/{name}", True),
     "contact": Stream(Contact, Path.ZENOH, "phalanx/contact/{name}", True),
     "gesture": Stream(Gesture, Path.ZENOH, "phalanx/gesture/{name}", True),
-    "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True),
+    "health": Stream(Health, Path.ZENOH, "phalanx/health/{name}", True, 20.0),
     "checklist": Stream(Checklist, Path.ZENOH, "phalanx/checklist/{name}", True),
     # What came as datagrams, in the order and with the times in which the master solves it, while somebody records;
     # before it a `Backlog` where the master falls behind or has caught up.
     "taken": Stream(Message, Path.ZENOH, "phalanx/taken/{name}", False),
-    "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False),
-    "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False),
+    "preview": Stream(Preview, Path.ZENOH, "phalanx/preview/{name}", False, 60.0),
+    "still": Stream(Still, Path.ZENOH, "phalanx/still/{name}", False, 60.0),
     "command": Stream(Command, Path.ZENOH, "phalanx/command/{name}", False),
 }
 

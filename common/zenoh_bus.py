@@ -131,6 +131,19 @@ class ZenohBus:
             return 0
         return len(self._session.info.peers_zid()) + len(self._session.info.routers_zid())
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """What came on open subscriptions and was of no use.
+
+        `bus.refused`: no message of its stream, or in another's name; `bus.dropped`: too much of one sender.
+        """
+        with self._lock:
+            inboxes = list(self._inboxes)
+        return {
+            "bus.refused": sum(inbox.refused for inbox in inboxes),
+            "bus.dropped": sum(inbox.dropped for inbox in inboxes),
+        }
+
     def publish(self, stream: str, name: str, message: Message) -> None:
         """Send to every matching subscription; dropped when the link is congested.
 
@@ -323,11 +336,11 @@ def _answer(query: zenoh.Query, name: str, handler: Handler) -> None:
     try:
         query.reply(query.key_expr, encode(handler(command)))
     except (PhalanxError, ValueError) as error:
-        query.reply_err(str(error).encode())
+        query.reply_err(str(error).encode(errors="replace"))
     except Exception as error:  # noqa: BLE001
         # A fault in one handler must not make the process deaf to every later command.
         _LOG.exception("command %s of %s failed", command.verb, command.target)
-        query.reply_err(f"internal fault: {error!r}".encode())
+        query.reply_err(f"internal fault: {error!r}".encode(errors="replace"))
 
 
 def _health(command: Command, payload: bytes) -> Health:

@@ -9,6 +9,7 @@ from common.errors import BusError
 from common.messages import Command, Health
 from common.streams import MASTER
 from common.zenoh_bus import ZenohBus
+from master.admission import limits_of
 from master.app import RunFigures, health
 from master.ingest import Ingest
 from master.odd_watch import OddWatch
@@ -55,8 +56,8 @@ class Reporter:
 
     def health(self) -> Health:
         """The report of this moment; of what never happened only `received` is told, to keep it short."""
-        events = self._ingest.counts.items()
-        told = {name: number for name, number in events if number or name.endswith("received")}
+        events = self._ingest.counts | self._bus.counts
+        told = {name: number for name, number in events.items() if number or name.endswith("received")}
         changes = {} if self._tuning is None else self._tuning.counts()
         counts = dict(self._world.counts) | told | changes | self._tap.counts
         times = dict(self._watch.gauges(self._ingest.clock_of)) | (
@@ -118,6 +119,7 @@ class Reporter:
             if self._tuning is not None:
                 self._tuning.look()
                 self._watch.follow(self._tuning.setups)
+                self._ingest.limit(limits_of(self._tuning.setups))
             lines = self._watch.look()
             lines += [line for odd, pipeline in self._odd for line in odd.look(pipeline.counts)]
         except Exception as error:  # noqa: BLE001

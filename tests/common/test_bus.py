@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from common.bus import Bus, Inbox, LoopbackBus
+from common.bus import MOST_SENDERS, Bus, Inbox, LoopbackBus
 from common.errors import BusError
 from common.messages import Command, Health, encode
 from common.zenoh_bus import ZenohBus
@@ -158,3 +158,43 @@ def test_a_foreign_payload_is_counted_and_skipped() -> None:
     inbox.put("left", encode(health("left")))
     assert isinstance(inbox.get(0.0), Health)
     assert inbox.refused == 5
+
+
+def test_of_one_who_reports_without_end_a_few_are_taken_and_of_the_others_all() -> None:
+    inbox = Inbox("health", 64, lambda _: None)
+    for _ in range(1000):
+        inbox.put("flood", encode(health("flood")))
+    for name in ("left", "right"):
+        inbox.put(name, encode(health(name)))
+    got = [message.source for _ in range(64) if isinstance(message := inbox.get(0.0), Health)]
+    assert got[-2:] == ["left", "right"]
+    assert 20 <= len(got) - 2 <= 30
+    assert inbox.dropped == 1000 - (len(got) - 2)
+
+
+def test_names_that_are_invented_share_one_rate_and_no_memory() -> None:
+    inbox = Inbox("health", 8, lambda _: None)
+    for k in range(2000):
+        inbox.put(f"n{k}", b"")
+    assert len(inbox._paces) <= MOST_SENDERS + 1
+    assert inbox.dropped > 1000
+
+
+def test_what_is_no_message_keeps_nobody_waiting() -> None:
+    inbox = Inbox("hand", 16, lambda _: None)
+    ended = threading.Event()
+
+    def junk() -> None:
+        while not ended.wait(0.02):
+            inbox.put("left", b"\xc1")
+
+    sender = threading.Thread(target=junk)
+    sender.start()
+    began = time.monotonic()
+    assert inbox.get(0.2) is None
+    assert inbox.get(0.0) is None
+    took_s = time.monotonic() - began
+    ended.set()
+    sender.join()
+    assert inbox.refused > 0
+    assert took_s < 5.0

@@ -16,6 +16,7 @@ from common.messages import Command, Health, encode
 from tests.hostile_rigs import Rigs, counts, unharmed
 from tests.network_helpers import PATIENCE_S
 
+FLOOD_S = 4.0
 OWNED = "pi\x1b]0;owned\x07\u202e"
 
 
@@ -72,6 +73,18 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
         assert b"Traceback" not in text, text
         for sequence in ("\x1b]", "\x07", "\u202e"):
             assert sequence.encode() not in text, text
+
+
+def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: HostileRig) -> None:
+    body = encode(Health("cam02", 1, 1, {f"n{k}": k for k in range(500)}, {"rate_hz": 30.0}))
+    with unharmed(rig) as rise, on_bus(rig) as session:
+        ended = time.monotonic() + FLOOD_S
+        while time.monotonic() < ended:
+            session.put("phalanx/health/cam02", body, congestion_control=zenoh.CongestionControl.BLOCK)
+        report(session, "cam00", {"version": "heard"})
+        code, said = rig.command("fleet", "--seconds", "1")
+    assert rise["bus.dropped"] > 0, rise
+    assert code == 0, said
 
 
 @pytest.mark.parametrize("verb", ["stop", "report"])
