@@ -99,7 +99,7 @@ def _rise(before: Health | None, after: Health | None) -> dict[str, int]:
     said = {
         name: number - before.counts.get(name, 0)
         for name, number in after.counts.items()
-        if name.startswith(("refused.", "fault.")) or name in ("unsynchronised", "queue.dropped")
+        if name.startswith(("refused.", "fault.", "bus.")) or name in ("unsynchronised", "queue.dropped")
     }
     return {name.removeprefix("refused."): number for name, number in said.items() if number}
 

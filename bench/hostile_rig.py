@@ -216,9 +216,10 @@ class HostileRig:
 
     def start_stolen(self, name: str, count: int, per_s: float, seed: int) -> subprocess.Popen[str]:
         """Start a stolen device; it sends when it is told a line."""
-        place = [name, str(self.tree), STOLEN[name], str(self.port), str(count), str(per_s), str(seed)]
+        place = [name, str(self.tree), STOLEN[name], str(self.port), self.endpoint]
+        attack = [str(count), str(per_s), str(seed)]
         return subprocess.Popen(
-            [sys.executable, "-m", "bench.hostile_sender", *place],
+            [sys.executable, "-m", "bench.hostile_sender", *place, *attack],
             cwd=ROOT, env=self.environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 

@@ -1,9 +1,10 @@
 """A stolen device of the rig, as a process that attacks the master.
 
-It has its own key, a session as any other, and says what it likes in it.
+It has its own key, a session as any other, and says what it likes in it. What devices say on the bus it says there.
 
-`python -m bench.hostile_sender NAME TREE RIG BEACON_PORT COUNT PER_S SEED [--endpoint BUS]`, the rig key in
-PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends, and prints what it sent as JSON.
+`python -m bench.hostile_sender NAME TREE RIG BEACON_PORT BUS COUNT PER_S SEED`, BUS the endpoint of the master's bus,
+the rig key in PHALANX_RIG_KEY. It prints `ready` when it has a session, waits for a line, sends COUNT messages, and
+prints how many of each type as JSON.
 """
 
 import argparse
@@ -12,23 +13,29 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from itertools import islice
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+import msgspec
+import zenoh
 from msgspec import Struct
 
 from bench.hostile_examples import Speaker, own_kinds
 from bench.hostile_messages import SAID, Attack, flood, wire
+from common.bus_settings import settings
 from common.clock import SystemClock
 from common.datagram import MAX_DATAGRAM, OVERHEAD, Address, Kind
 from common.keys import rig_key
+from common.messages import Health, Preview, Still
 from common.session import EchoAnswer, Hello, RigKeys, Started
+from common.streams import key_of
 from master.rig import RigSetup, load_setup
 from slave.uplink import Uplink
 
 _START_S = 60.0
-_OWN, _OTHERS, _SHAKES = 0.6, 0.2, 0.2  # of what it says: its own kinds, those of others, handshakes
+_OWN, _ON_BUS, _OTHERS, _SHAKES = 0.5, 0.2, 0.1, 0.2  # shares of what it says; the last: handshakes
+SPARE = 1.05  # so many more are made, for those that fit into no datagram
+ON_BUS: Mapping[type[Struct], str] = {Health: "health", Preview: "preview", Still: "still"}  # with its stream
 
 
 class HostileUplink(Uplink):
@@ -61,14 +68,18 @@ class HostileUplink(Uplink):
 class HostileSender:
     """One device that sends attacks.
 
-    Holds its link, and the plausible messages that they are made from.
+    Holds its link, its session on the bus, and the plausible messages that they are made from.
     """
 
-    def __init__(self, name: str, key: bytes, port: int, setup: RigSetup, seed: int = 1) -> None:
-        """Listen for the master.
+    def __init__(
+        self, name: str, key: bytes, port: int, setup: RigSetup, endpoint: str, seed: int = 1
+    ) -> None:
+        """Listen for the master, and connect to its bus at `endpoint`.
 
         Where `name` is a camera of `setup`, it says what the camera of a simulation sees.
         """
+        made = settings(None, [endpoint], "client", None)
+        self._bus = zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(made).decode()))
         self.name, self._clock, self._keys = name, SystemClock(), RigKeys(key)
         self.uplink = HostileUplink(name, key, self._clock, port, "127.0.0.1")
         self._hello = self._keys.sealer(self.uplink.session ^ 1)
@@ -78,9 +89,9 @@ class HostileSender:
     def attacks(self, count: int) -> Iterator[Attack]:
         """So many, most of the kinds that such a device says."""
         shakes = (Hello, Started, EchoAnswer)
-        others = [kind for kind in SAID if kind not in (*self._own, *shakes)]
+        others = [kind for kind in SAID if kind not in (*self._own, *ON_BUS, *shakes)]
         shares: dict[type[Struct], float] = {}
-        for kinds, share in ((self._own, _OWN), (others, _OTHERS), (shakes, _SHAKES)):
+        for kinds, share in ((self._own, _OWN), (ON_BUS, _ON_BUS), (others, _OTHERS), (shakes, _SHAKES)):
             shares |= {kind: share / len(kinds) for kind in kinds}
         return flood(shares, self._speaker.bases, count, self._seed)
 
@@ -95,10 +106,17 @@ class HostileSender:
         """Send a plausible message of now with these fields."""
         return self.send(Attack("", kind, changes))
 
-    def send_all(self, attacks: Sequence[Attack], per_s: float) -> None:
-        """Send them at this rate, or as fast as the machine gives."""
+    def close(self) -> None:
+        """End its session, and leave the bus."""
+        self.uplink.close()
+        self._bus.close()
+
+    def send_all(self, attacks: Sequence[Attack], count: int, per_s: float) -> None:
+        """Send `count` of them at this rate, or as fast as the machine gives."""
         began = time.monotonic()
         for k, attack in enumerate(attacks):
+            if self.sent.total() - self.sent["unsent"] >= count:
+                return
             self.send(attack)
             if k % 16 == 15:
                 time.sleep(max(0.0, (k + 1) / per_s - (time.monotonic() - began)))
@@ -114,6 +132,10 @@ class HostileSender:
         if kind is Hello:
             fits = len(body) <= MAX_DATAGRAM - OVERHEAD
             return fits and self.uplink.throw(self._hello.seal(Kind.HELLO, body))
+        if kind in ON_BUS:  # it waits where the link is full: nothing is dropped on this side
+            key, waits = key_of(ON_BUS[kind], self.name), zenoh.CongestionControl.BLOCK
+            self._bus.put(key, body, congestion_control=waits)
+            return True
         if kind is Started:
             return self.uplink.say(Kind.STARTED, body)
         return self.uplink.say(Kind.ECHO_ANSWER if kind is EchoAnswer else Kind.DATA, body)
@@ -126,23 +148,24 @@ def main() -> None:
     parser.add_argument("tree", type=Path)
     parser.add_argument("rig")
     parser.add_argument("port", type=int)
+    parser.add_argument("bus")
     parser.add_argument("count", type=int)
     parser.add_argument("per_s", type=float)
     parser.add_argument("seed", type=int)
     options = parser.parse_args()
-    setup = load_setup(options.tree, options.rig)
-    sender = HostileSender(options.name, rig_key(os.environ, None), options.port, setup, options.seed)
-    attacks = list(islice(sender.attacks(options.count), options.count))
+    setup, key = load_setup(options.tree, options.rig), rig_key(os.environ, None)
+    sender = HostileSender(options.name, key, options.port, setup, options.bus, options.seed)
+    attacks = list(sender.attacks(round(SPARE * options.count)))
     if not sender.uplink.wait_for_start(_START_S):
         raise SystemExit("no master: does it have this device, this key and this beacon port?")
     print("ready", flush=True)
     sys.stdin.readline()
     began = time.monotonic()
-    sender.send_all(attacks, options.per_s)
+    sender.send_all(attacks, options.count, options.per_s)
     seconds = time.monotonic() - began
     said = {"seconds": seconds, **sender.sent}
     print(json.dumps(said), flush=True)
-    sender.uplink.close()
+    sender.close()
 
 
 if __name__ == "__main__":

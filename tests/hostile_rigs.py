@@ -48,12 +48,12 @@ def losing(rig: HostileRig) -> float:
 def stolen(rig: HostileRig, name: str) -> Generator[HostileSender]:
     """A stolen device with a session whose clock is known."""
     setup = load_setup(rig.tree, STOLEN[name])
-    sender = HostileSender(name, bytes.fromhex(rig.key), rig.port, setup)
+    sender = HostileSender(name, bytes.fromhex(rig.key), rig.port, setup, rig.endpoint)
     try:
         assert sender.uplink.wait_for_start(PATIENCE_S)
         yield sender
     finally:
-        sender.uplink.close()
+        sender.close()
 
 
 @contextmanager
