@@ -65,14 +65,16 @@ def open_chunk(data: bytes, budget: WorkBudget) -> OpenedChunk:
 def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
     if chunk.compression not in ("", "zstd"):  # not ours; the library unpacks lz4 without any bound
         raise RecordingError(f"compression {chunk.compression[:16]!r}: must be zstd or none")
-    packed = chunk.compression == "zstd"
+    packed, claimed = chunk.compression == "zstd", chunk.uncompressed_size
     size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
-    if max(size, chunk.uncompressed_size) > CHUNK_BYTES:
-        raise RecordingError(f"{max(size, chunk.uncompressed_size)} bytes unpacked, at most {CHUNK_BYTES}")
-    if size != chunk.uncompressed_size:  # also -1, where the frame does not say
-        raise RecordingError(f"claims {chunk.uncompressed_size} bytes unpacked, its data {size}")
-    budget.take(size)
-    content = zstandard.decompress(chunk.data, max_output_size=size) if packed else chunk.data
+    if max(size, claimed) > CHUNK_BYTES:
+        raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {CHUNK_BYTES}")
+    if size not in (claimed, -1):  # -1: the frame does not say, as of a writer that packs while it writes
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {size}")
+    budget.take(claimed)
+    content = zstandard.decompress(chunk.data, max_output_size=claimed) if packed and claimed else chunk.data
+    if len(content) != claimed:
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {len(content)}")
     if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
         raise RecordingError("its check sum does not fit")
     return content

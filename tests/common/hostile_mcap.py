@@ -60,6 +60,13 @@ def chunk(
     return Chunk(compression, packed, last_ns, first_ns, zlib.crc32(content), said)
 
 
+def streamed(content: bytes, size: int) -> Chunk:
+    """A chunk whose frame does not say how large it is unpacked, as of writers that pack while they write."""
+    packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    packed = packer.compress(content) + packer.flush()
+    return Chunk("zstd", packed, 1_000_000_000, 1_000_000_000, zlib.crc32(content), size)
+
+
 def wide_channel(keys: int, number: int = 1) -> Channel:
     """A channel of ours with so many keys more, each of a few bytes."""
     one = channel(number)

@@ -23,6 +23,7 @@ from tests.common.hostile_mcap import (
     chunk,
     message,
     record,
+    streamed,
     tiny_messages,
     wide_channel,
 )
@@ -196,6 +197,14 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "a size that lies": (
         lambda _: HostileMcap().about(DESK).add(chunk(bytes(1 << 20), size=100), [channel()]).cut(),
         {INFO: "claims 100 bytes unpacked, its data 1048576"},
+    ),
+    "a size that lies of a frame that does not say its own": (
+        lambda _: HostileMcap().about(DESK).add(streamed(bytes(1 << 20), 1 << 22), [channel()]).cut(),
+        {INFO: "claims 4194304 bytes unpacked, its data 1048576"},
+    ),
+    "more than it says in a frame that does not say": (
+        lambda _: HostileMcap().about(DESK).add(streamed(bytes(1 << 22), 1 << 20), [channel()]).cut(),
+        {INFO: r"chunk at byte \d+: broken"},
     ),
     "lz4": (
         lambda _: HostileMcap().about(DESK).add(chunk(bytes(99), compression="lz4"), [channel()]).cut(),
