@@ -149,6 +149,12 @@ def test_options_are_those_of_run_with_absolute_paths_and_no_key(keys: Path) -> 
         (["--poses", "x.npz"], "--poses: "),
         (["--summary", "x.json"], "--summary: "),
         (["--rig", "desk"], "no rig key"),
+        (["--rig", "desk", "--beacon", "192.168.1.255"], "--beacon '192.168.1.255': expected ADDRESS:PORT"),
+        (["--rig", "desk", "--bind", "0.0.0.0:65536"], "--bind '0.0.0.0:65536': expected ADDRESS:PORT"),
+        (["--rig", "desk", "--bus", "udp/127.0.0.1:47802"], "must begin with tcp/"),
+        (["--rig", "desk", "--bus", "tcp/0.0.0.0:47802"], "neither encrypted nor authenticated"),
+        (["--rig", "desk", "--bus", "tls/0.0.0.0"], "--bus 'tls/0.0.0.0': expected a port at its end"),
+        (["--rig", "desk", "--bus", "tls/0.0.0.0:47802"], "no keys: give --keys DIR"),
     ],
 )
 def test_what_could_not_run_is_refused_before_anything_is_written(
