@@ -66,6 +66,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),
+        ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
         ("phalanx-master run", "phalanx run", "not executable"),
     ],
 )
@@ -97,7 +98,7 @@ def test_the_unit_starts_again_and_is_bounded(tmp_path: Path) -> None:
     said = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
     assert (said["Type"], said["Restart"], said["RestartSec"]) == ("notify", "on-failure", "100ms")
     assert said["StartLimitIntervalSec"] == "0"
-    assert (said["MemoryMax"], said["TasksMax"]) == ("1G", "256")
+    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("1G", "0", "256")
 
 
 @pytest.mark.parametrize(
