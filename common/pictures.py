@@ -8,13 +8,13 @@ import numpy as np
 
 from common.arrays import Image
 from common.errors import PictureError
-from common.picture_size import Size, size_of
+from common.picture_size import Size, is_jpeg_or_png, size_of
 
 
 def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
     """Decode the picture of a device, whose size is known.
 
-    Returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
+    JPEG or PNG, as our own programs write them; returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
 
     Args:
         data: A whole file.
@@ -22,8 +22,10 @@ def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
         grey: Whether one channel is wanted.
 
     Raises:
-        PictureError: It has another size, or is no whole picture. Another size costs no memory.
+        PictureError: It has another size, is of another kind, or no whole picture. Another size costs no memory.
     """
+    if not is_jpeg_or_png(data):  # of other kinds more than their size would have to be looked at
+        raise PictureError("is no JPEG or PNG")
     found = size_of(data)
     if found != size:
         raise PictureError(f"is {found[0]}x{found[1]} px, the camera file says {size[0]}x{size[1]}")
