@@ -1,5 +1,6 @@
 """No picture is decoded that claims another size than it may have; no bytes raise anything but a `PictureError`."""
 
+import os
 import re
 import subprocess
 import sys
@@ -13,11 +14,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import MessageError, PictureError
+from common.errors import MessageError, PhalanxError, PictureError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still, decode, encode
 from common.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
 from common.pictures import decode as picture
-from common.pictures import decode_file
+from common.pictures import decode_file, read_picture
+from master.calibrate.cameras.image_sets import image_sets
+from master.calibrate.wrist.lit_views import load_grey
+from slave.cameras.replay import read_png
 from tests.picture_helpers import TINY, claiming, hostile, many_scans, tiled
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -127,6 +131,30 @@ def test_changed_bytes_never_give_another_size_or_another_error(
     except PictureError:
         return
     assert (image.shape, image.dtype) == ((24, 32, 3), np.uint8)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "any": read_picture,
+    "frame": lambda path: read_png(path, (480, 640)),
+    "grey file": load_grey,
+    "file": lambda path: [load() for _, one in image_sets(path.parent, ["left"]) for load in one.values()],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_file_that_claims_a_terabyte_is_not_read(reader: str, tmp_path: Path) -> None:
+    path = tmp_path / "left.png"
+    path.touch()
+    os.truncate(path, 1 << 40)  # takes no room on the disk
+    with pytest.raises(PhalanxError, match="has 1099511627776 bytes, at most 268435456"):
+        READERS[reader](path)
+
+
+@pytest.mark.parametrize("reader", ["any", "frame", "grey file"])
+def test_a_pipe_is_no_picture_and_is_not_waited_for(reader: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left.png")
+    with pytest.raises(PhalanxError, match="is no plain file"):
+        READERS[reader](tmp_path / "left.png")
 
 
 TILE = 16_384
