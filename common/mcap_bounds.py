@@ -10,8 +10,10 @@ from dataclasses import dataclass, field
 
 from common.errors import RecordingError
 
-CHUNK_BYTES = 4 << 20  # unpacked; ours is closed at 512 KiB, and a message has less than 1 MiB
-CHUNK_RECORDS = 16_384  # ours has 7,400 at most: each takes 70 bytes or more
+# Unpacked: a writer closes a chunk with the message that takes it past its target. Ours is 512 KiB, that of the tools
+# for MCAP that cut and convert files up to 4 MiB; a message has less than 1 MiB.
+CHUNK_BYTES = (4 << 20) + (1 << 20)
+CHUNK_RECORDS = CHUNK_BYTES // 70  # 74,898: a message of ours takes 70 bytes or more
 CHANNEL_BYTES = 4096
 CHANNELS = 1024
 ATTACHMENT_BYTES = 4 << 20  # of one file of calibration

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk
 
 from common.errors import RecordingError
-from common.mcap_bounds import BEYOND, CHANNEL_BYTES, CHUNK_BYTES, CHUNK_RECORDS, WorkBudget
+from common.mcap_bounds import BEYOND, CHANNEL_BYTES, CHANNELS, CHUNK_BYTES, CHUNK_RECORDS, WorkBudget
 from common.message_parts import MAX_TIME_NS
 
 HEAD = struct.Struct("<BQ")  # of every record: what it is, and the length of what follows
@@ -34,9 +34,14 @@ class ChunkMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class OpenedChunk:
-    """What is in a chunk, in the order of writing."""
+    """What is in a chunk, in the order of writing.
 
-    channels: list[Channel] = field(default_factory=list[Channel])
+    Attributes:
+        channels: By their number, as they stand there: a chunk repeats them, and only who wants them reads them.
+        messages: All of them.
+    """
+
+    channels: dict[int, bytes] = field(default_factory=dict[int, bytes])
     messages: list[ChunkMessage] = field(default_factory=list[ChunkMessage])
 
 
@@ -60,14 +65,16 @@ def open_chunk(data: bytes, budget: WorkBudget) -> OpenedChunk:
 def _unpacked(chunk: Chunk, budget: WorkBudget) -> bytes:
     if chunk.compression not in ("", "zstd"):  # not ours; the library unpacks lz4 without any bound
         raise RecordingError(f"compression {chunk.compression[:16]!r}: must be zstd or none")
-    packed = chunk.compression == "zstd"
+    packed, claimed = chunk.compression == "zstd", chunk.uncompressed_size
     size = zstandard.frame_content_size(chunk.data) if packed else len(chunk.data)
-    if max(size, chunk.uncompressed_size) > CHUNK_BYTES:
-        raise RecordingError(f"{max(size, chunk.uncompressed_size)} bytes unpacked, at most {CHUNK_BYTES}")
-    if size != chunk.uncompressed_size:  # also -1, where the frame does not say
-        raise RecordingError(f"claims {chunk.uncompressed_size} bytes unpacked, its data {size}")
-    budget.take(size)
-    content = zstandard.decompress(chunk.data, max_output_size=size) if packed else chunk.data
+    if max(size, claimed) > CHUNK_BYTES:
+        raise RecordingError(f"{max(size, claimed)} bytes unpacked, at most {CHUNK_BYTES}")
+    if size not in (claimed, -1):  # -1: the frame does not say, as of a writer that packs while it writes
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {size}")
+    budget.take(claimed)
+    content = zstandard.decompress(chunk.data, max_output_size=claimed) if packed and claimed else chunk.data
+    if len(content) != claimed:
+        raise RecordingError(f"claims {claimed} bytes unpacked, its data {len(content)}")
     if chunk.uncompressed_crc not in (0, zlib.crc32(content)):
         raise RecordingError("its check sum does not fit")
     return content
@@ -88,7 +95,10 @@ def _walked(content: bytes, budget: WorkBudget) -> OpenedChunk:
             if opcode == Opcode.MESSAGE:
                 opened.messages.append(_message(content, at, length))
             elif opcode == Opcode.CHANNEL:
-                opened.channels.append(read_channel(content[at : at + length]))
+                number = int.from_bytes(content[at : at + min(length, 2)], "little")
+                opened.channels.setdefault(number, content[at : at + length])
+                if len(opened.channels) > CHANNELS:
+                    raise RecordingError(f"more than {CHANNELS} channels")
             at += length
     finally:
         budget.take_records(count)  # also of a chunk that is refused: it was work
@@ -108,9 +118,11 @@ def read_channel(data: bytes) -> Channel:
     """Read the content of a channel record.
 
     Raises:
-        RecordingError: It is too long.
-        McapError, ValueError, struct.error: It is broken.
+        RecordingError: It is too long or broken.
     """
     if len(data) > CHANNEL_BYTES:
         raise RecordingError(f"a channel of {len(data)} bytes, at most {CHANNEL_BYTES}")
-    return Channel.read(stream(data))
+    try:
+        return Channel.read(stream(data))
+    except BROKEN as error:
+        raise RecordingError(f"broken: {error or type(error).__name__}") from error

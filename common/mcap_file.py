@@ -72,6 +72,7 @@ class McapContent:
         counts: Number of a channel -> messages in it.
         attachments: Those that are whole.
         metadata: Those that are whole, by name.
+        metadata_met: How many there are, also those that are not kept.
         cut: It has no end: it broke off, or its end is broken.
         losses: What cannot be read, as far as that is known.
     """
@@ -82,18 +83,21 @@ class McapContent:
     counts: Counter[int] = field(default_factory=Counter[int])
     attachments: list[Attachment] = field(default_factory=list[Attachment])
     metadata: dict[str, dict[str, str]] = field(default_factory=dict[str, dict[str, str]])
+    metadata_met: int = 0
     cut: bool = False
     losses: Losses = field(default_factory=Losses)
 
-    def add_channel(self, channel: Channel) -> None:
-        """Keep a channel.
+    def add_channel(self, number: int, data: bytes) -> None:
+        """Keep a channel; one that is there already is not read again.
 
         Raises:
-            RecordingError: There are too many.
+            RecordingError: It is too long or broken, or there are too many.
         """
-        self.channels[channel.id] = channel
-        if len(self.channels) > CHANNELS:
+        if number in self.channels:
+            return
+        if len(self.channels) >= CHANNELS:
             raise RecordingError(f"more than {CHANNELS} channels")
+        self.channels[number] = read_channel(data)
 
 
 def read_content(path: Path) -> McapContent:
@@ -197,7 +201,7 @@ def _take_summary(content: McapContent, fd: int, opcode: int, data: bytes, budge
         McapError, ValueError, struct.error: It is broken.
     """
     if opcode == Opcode.CHANNEL:
-        content.add_channel(read_channel(data))
+        content.add_channel(int.from_bytes(data[:2], "little"), data)
     elif opcode == Opcode.STATISTICS:
         content.counts.update(Statistics.read(stream(data)).channel_message_counts)
     elif opcode == Opcode.CHUNK_INDEX:
@@ -233,8 +237,8 @@ def _take_chunk(content: McapContent, at: int, length: int, opened: OpenedChunk 
     if opened is None:
         return
     try:
-        for channel in opened.channels:
-            content.add_channel(channel)
+        for number, data in opened.channels.items():
+            content.add_channel(number, data)
     except RecordingError as error:
         content.losses.add(f"chunk at byte {at}: {error}")
         return
@@ -279,7 +283,8 @@ def _take_metadata(content: McapContent, fd: int, at: int, length: int, budget: 
     They have no check sum, so any byte of them may be another one.
     """
     try:
-        if len(content.metadata) >= METADATA:
+        content.metadata_met += 1  # not by their names: one may stand in the index many times
+        if content.metadata_met > METADATA:
             raise RecordingError(f"there are {METADATA} already")
         if length > METADATA_BYTES:
             raise RecordingError(f"{length} bytes, at most {METADATA_BYTES}")

@@ -22,8 +22,14 @@ _JPEG, _PNG, _BMP = b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM"
 _TIFF = {b"II*\0": "little", b"MM\0*": "big"}
 _TABLES = (0xC4, 0xC8, 0xCC)  # in the range of frame headers, but none
 _ALONE = (0x00, 0x01, *range(0xD0, 0xDB))  # without a length, or past the header: SOI, EOI, SOS
-_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
+_TIFF_WIDTH, _TIFF_HEIGHT, _TILE_WIDTH, _TILE_HEIGHT = 256, 257, 322, 323
 _TIFF_BYTES = {3: 2, 4: 4}  # SHORT, LONG: the kinds that a size may have
+_TILE_PX = 1024  # a tile may be larger than a small picture, up to this
+
+
+def is_jpeg_or_png(data: bytes) -> bool:
+    """Whether a file is of one of the two kinds that programs of ours write: JPEG and PNG."""
+    return data.startswith((_JPEG, _PNG))
 
 
 def size_of(data: bytes) -> Size:
@@ -96,7 +102,7 @@ def _bmp_size(data: bytes) -> Size:
 
 
 def _tiff_size(data: bytes) -> Size:
-    """From the first directory of a TIFF (6.0, section 2)."""
+    """From the first directory of a TIFF (6.0, section 2); a tile is decoded as a whole, so it is bounded as well."""
     order = "little" if data[:2] == b"II" else "big"
 
     def number(at: int, count: int) -> int:
@@ -106,8 +112,14 @@ def _tiff_size(data: bytes) -> Size:
     found = dict[int, int]()
     for at in range(directory + 2, directory + 2 + 12 * number(directory, 2), 12):
         tag, width = number(at, 2), _TIFF_BYTES.get(number(at + 2, 2))
-        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT) and width is not None and tag not in found:
+        if tag in (_TIFF_WIDTH, _TIFF_HEIGHT, _TILE_WIDTH, _TILE_HEIGHT) and tag not in found:
+            if width is None:
+                raise PictureError("is a TIFF whose header is cut or odd")
             found[tag] = number(at + 8, width)
-    if len(found) < 2:
+    if not {_TIFF_WIDTH, _TIFF_HEIGHT} <= found.keys():
         raise PictureError("is a TIFF whose header is cut or odd")
-    return found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
+    size = found[_TIFF_WIDTH], found[_TIFF_HEIGHT]
+    tile = found.get(_TILE_WIDTH, 0), found.get(_TILE_HEIGHT, 0)
+    if any(of_tile > max(of_all + 15, _TILE_PX) for of_tile, of_all in zip(tile, size, strict=True)):
+        raise PictureError(f"is a TIFF of {size[0]}x{size[1]} px in tiles of {tile[0]}x{tile[1]}")
+    return size

@@ -3,18 +3,23 @@
 This is the only place that calls a decoder.
 """
 
+import stat
+from pathlib import Path
+
 import cv2
 import numpy as np
 
 from common.arrays import Image
 from common.errors import PictureError
-from common.picture_size import Size, size_of
+from common.picture_size import Size, is_jpeg_or_png, size_of
+
+MAX_FILE_BYTES = 256 << 20  # of one picture: 64 megapixels of 32 bits, not packed
 
 
 def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
     """Decode the picture of a device, whose size is known.
 
-    Returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
+    JPEG or PNG, as our own programs write them; returns (H, W, 3) BGR or (H, W), uint8, as the sensor has it.
 
     Args:
         data: A whole file.
@@ -22,8 +27,10 @@ def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
         grey: Whether one channel is wanted.
 
     Raises:
-        PictureError: It has another size, or is no whole picture. Another size costs no memory.
+        PictureError: It has another size, is of another kind, or no whole picture. Another size costs no memory.
     """
+    if not is_jpeg_or_png(data):  # of other kinds more than their size would have to be looked at
+        raise PictureError("is no JPEG or PNG")
     found = size_of(data)
     if found != size:
         raise PictureError(f"is {found[0]}x{found[1]} px, the camera file says {size[0]}x{size[1]}")
@@ -32,6 +39,21 @@ def decode(data: bytes, size: Size, *, grey: bool = False) -> Image:
     if image.shape[1::-1] != size:  # of a JPEG with two frame headers, should a decoder ever take the second
         raise PictureError(f"is not of the size {size[0]}x{size[1]} that it claims")
     return image
+
+
+def read_picture(path: Path) -> bytes:
+    """The bytes of a file of a picture, before anybody knows what is in it.
+
+    Raises:
+        OSError: It cannot be read.
+        PictureError: It is no plain file, or too large: a file may claim any size and take no room on the disk.
+    """
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise PictureError("is no plain file")
+    if about.st_size > MAX_FILE_BYTES:
+        raise PictureError(f"has {about.st_size} bytes, at most {MAX_FILE_BYTES}")
+    return path.read_bytes()
 
 
 def decode_file(data: bytes, *, grey: bool = False) -> Image:

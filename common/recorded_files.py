@@ -4,12 +4,16 @@ They are read within bounds, and none that is outside of the folder.
 """
 
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path, PurePath
 
+from common.arrays import Float
 from common.errors import RecordingError
+from common.npz import read_npz
 
+TRUTH = "truth.npz"
 _TABLE_BYTES = 256 << 20  # a row has some 45 bytes; three cameras at 90 Hz write 44 MB of them an hour
+_TRUTH_BYTES = 256 << 20  # unpacked; a frame has some 3 kB: 20 minutes at 60 Hz
 
 
 def read_table(folder: Path, name: str) -> str:
@@ -32,6 +36,30 @@ def read_table(folder: Path, name: str) -> str:
         raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise RecordingError(f"{path}: not a table of text: {error}") from error
+
+
+def has_truth(folder: Path) -> bool:
+    """Whether a folder has exact values; a link that leads nowhere counts, and is refused when it is read."""
+    path = folder / TRUTH
+    return path.is_symlink() or path.exists()
+
+
+def read_truth(
+    folder: Path, names: Sequence[str] = (), fix: str = "", also: Iterable[str] = ()
+) -> dict[str, Float]:
+    """The exact values of a rendered recording, by name.
+
+    Args:
+        folder: The recording.
+        names: Which must be there.
+        fix: Said after the error: what the user can do.
+        also: Which are read as well where they are there.
+
+    Raises:
+        RecordingError: It is missing, broken, too large, no plain file, leads out of the folder, or lacks a name.
+    """
+    refuse_links(folder, [TRUTH])
+    return read_npz(folder / TRUTH, names, fix, also, most_bytes=_TRUTH_BYTES)
 
 
 def refuse_links(folder: Path, names: Iterable[str]) -> None:

@@ -16,7 +16,7 @@ from common.errors import PhalanxError
 from common.keys import ENVIRONMENT, FOLDER, OPEN, keys_folder, link_key
 from master.key_options import command_of as run_with_keys
 from master.rig import load_setups
-from master.run_command import run
+from master.run_command import checked_ends, run
 from master.service_unit import unit_text
 from master.user_services import UserServices
 
@@ -82,6 +82,7 @@ def command_of(words: Sequence[str]) -> list[str]:
         raise PhalanxError(
             f"--{one}: a service that starts again would write over it; beside the service use phalanx-master record"
         )
+    checked_ends(values["beacon"], values["bind"], values["bus"])
     load_setups(values["calibration"], values["rig"], values["hand"])
     if ENVIRONMENT in os.environ and "key_file" not in given:
         raise PhalanxError(

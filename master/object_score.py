@@ -8,7 +8,7 @@ import numpy as np
 from common.arrays import Float, Int
 from common.errors import RecordingError
 from common.geometry import matrix_to_rotation_vector, quaternion_to_matrix, rotation_vector_to_matrix
-from common.npz import read_npz
+from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.told_files import ObjectPoses
 
 _NEAR_NS = 100_000_000  # between truths farther apart nothing is interpolated
@@ -50,21 +50,21 @@ def load_object_truth(folder: Path, name: str) -> ObjectTruth | None:
     """Truth of an object of a rendered recording; None where the folder holds none.
 
     Raises:
-        RecordingError: truth.npz is broken, or its arrays do not fit together.
+        RecordingError: truth.npz is broken, leads out of the folder, or its arrays do not fit together.
     """
-    path = folder / "truth.npz"
-    if not path.exists():
+    if not has_truth(folder):
         return None
-    data = read_npz(path)
-    if f"object_{name}" not in data or "t_ref" not in data:
+    key = f"object_{name}"
+    data = read_truth(folder, also=(key, "t_ref"))
+    if key not in data or "t_ref" not in data:
         return None
-    poses = data[f"object_{name}"]
-    if poses.shape != (len(data["t_ref"]), 4, 4):
-        raise RecordingError(
-            f"{path}: object_{name} has shape {poses.shape}, expected ({len(data['t_ref'])}, 4, 4)"
-        )
-    t_ns = _FIRST_NS + np.round(1e9 * data["t_ref"]).astype(np.int64)
-    return ObjectTruth(t_ns, poses.astype(np.float64))
+    try:
+        poses, t_s = (data[one].astype(np.float64) for one in (key, "t_ref"))
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{folder / TRUTH}: {key}: {error}") from error
+    if t_s.ndim != 1 or poses.shape != (t_s.size, 4, 4):
+        raise RecordingError(f"{folder / TRUTH}: {key} has shape {poses.shape}, expected ({t_s.size}, 4, 4)")
+    return ObjectTruth(_FIRST_NS + np.round(1e9 * t_s).astype(np.int64), poses)
 
 
 def errors(poses: ObjectPoses, truth: ObjectTruth) -> tuple[Float, Float]:

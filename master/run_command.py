@@ -6,7 +6,11 @@ from typing import Annotated
 
 import typer
 
-from common.keys import link_key
+from common.certificates import MASTER
+from common.datagram import Address
+from common.endpoints import check, encrypted, port_of
+from common.errors import BusError
+from common.keys import access_of, link_key
 from master.live import LiveSettings, run_live
 from master.options import (
     CALIB_JSON,
@@ -78,8 +82,7 @@ def run(
     """
     setups = load_setups(calibration, rig, hand)
     settings = LiveSettings(
-        address(beacon, "--beacon"),
-        address(bind, "--bind"),
+        *checked_ends(beacon, bind, bus),
         bus,
         start_timeout_s,
         poses,
@@ -88,3 +91,19 @@ def run(
         record,
     )
     run_live(setups, link_key(os.environ, key_file), settings, stop_on_signals(), say)
+
+
+def checked_ends(beacon: str, bind: str, bus: str) -> tuple[Address, Address]:
+    """Where the beacon goes and where datagrams come; the bus is checked as well.
+
+    Raises:
+        PhalanxError: One of them is malformed; the bus would leave the machine as plain text, or its keys are missing.
+    """
+    addresses = address(beacon, "--beacon"), address(bind, "--bind")
+    access = access_of(os.environ, MASTER)
+    check(bus, access.open)
+    if port_of(bus) == 0:
+        raise BusError(f"--bus {bus!r}: expected a port at its end, for example tls/0.0.0.0:47802")
+    if encrypted(bus):
+        access.identity()
+    return addresses

@@ -13,12 +13,14 @@ import numpy as np
 from common.arrays import Bool, Code, Float, Int
 from common.errors import RecordingError
 from common.hand_model import FINGER_JOINTS
-from common.npz import read_npz
+from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 
 _MATCH_NS = 1_000_000
 _FOLLOWS_NS = 100_000_000  # longer apart, two poses are no step
 _HAND_OVER_NS = 200_000_000
+_OF_HAND = ("t_ref", "joints", "angles", "paint_centroid", "frac")  # arrays of a truth
+_OF_SWEEP = ("depth", "center", "frac")
 _FINGER_OF_JOINT = np.full(26, -1)
 for _f, _joints in enumerate(FINGER_JOINTS):
     _FINGER_OF_JOINT[list(_joints)] = _f
@@ -51,16 +53,17 @@ def load_truth(folder: Path, shown: Bool) -> Truth | None:
         shown: (M,) markers found most often; a sweep of the depth shows a single flat one.
 
     Raises:
-        RecordingError: truth.npz is broken or lacks an array.
+        RecordingError: truth.npz is broken, lacks an array, or leads out of the folder.
     """
-    path = folder / "truth.npz"
-    if not path.exists():
+    if not has_truth(folder):
         return None
-    data = read_npz(path)
+    data = read_truth(folder, also=(*_OF_SWEEP, *_OF_HAND))
     try:
-        return _sweep(data, shown) if "depth" in data else _hand(data)
+        truth = _sweep(data, shown) if "depth" in data else _hand(data)
+        _check(truth, len(shown))
+        return truth
     except (KeyError, ValueError, IndexError, TypeError) as error:
-        raise RecordingError(f"{path}: not the truth of a marker recording: {error}") from error
+        raise RecordingError(f"{folder / TRUTH}: not the truth of a marker recording: {error}") from error
 
 
 def score(poses: Poses, truth: Truth, fingers: tuple[int, ...]) -> dict[str, float]:
@@ -169,25 +172,44 @@ def _match(t_ns: Int, truth_ns: Int) -> tuple[Int, Int]:
     return rows, nearest[rows]
 
 
+def _check(truth: Truth, markers: int) -> None:
+    """Refuse arrays that do not fit together.
+
+    Raises:
+        ValueError: Naming the array, its shape and what is expected.
+    """
+    n = len(truth.t_ns)
+    cameras = truth.visible.shape[1] if truth.visible.ndim == 3 else 1
+    for name, array, shape in (
+        ("t_ref", truth.t_ns, (max(n, 1),)),
+        ("joints", truth.joints_m, (n, 25, 3)),
+        ("angles", truth.pip_rad, (n, 4)),
+        ("paint_centroid", truth.markers_m, (n, markers, 3)),
+        ("frac", truth.visible, (n, cameras, markers)),
+    ):
+        if array.shape != shape:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+
+
 def _hand(data: dict[str, Float]) -> Truth:
-    angles = data["angles"]
+    exact = {name: data[name].astype(np.float64) for name in _OF_HAND}
     return Truth(
-        t_ns=np.round(1e9 * (1.0 + data["t_ref"])).astype(np.int64),
-        joints_m=data["joints"],
-        pip_rad=angles[:, [7, 11, 15, 19]],
-        markers_m=data["paint_centroid"],
-        visible=data["frac"],
+        t_ns=np.round(1e9 * (1.0 + exact["t_ref"])).astype(np.int64),
+        joints_m=exact["joints"],
+        pip_rad=exact["angles"][:, [7, 11, 15, 19]],
+        markers_m=exact["paint_centroid"],
+        visible=exact["frac"],
     )
 
 
 def _sweep(data: dict[str, Float], shown: Bool) -> Truth:
     """One flat marker moved along the axis in steps of a second; there is no hand."""
-    n = len(data["depth"])
-    centre = np.where(shown[None, :, None], data["center"][:, None], np.nan)
+    depth, centre, seen = (data[name].astype(np.float64) for name in _OF_SWEEP)
+    n = depth.size if depth.ndim == 1 else 0
     return Truth(
         t_ns=1_000_000_000 * (1 + np.arange(n)),
-        joints_m=np.full((n, 25, 3), np.nan),
-        pip_rad=np.full((n, 4), np.nan),
-        markers_m=centre,
-        visible=np.where(shown, data["frac"][:, :, None], 0.0),
+        joints_m=np.broadcast_to(np.nan, (n, 25, 3)),
+        pip_rad=np.broadcast_to(np.nan, (n, 4)),
+        markers_m=np.where(shown[None, :, None], centre[:, None], np.nan),
+        visible=np.where(shown, seen[:, :, None], 0.0),
     )

@@ -39,8 +39,10 @@ TimeoutStopSec=10
 TimeoutAbortSec=2
 
 # 130 MB at its start, 159 MB after an hour with three cameras (docs/soak.md); 14 threads, and one for each processor
-# that numpy uses. What asks for more is ended and started again, before the machine is out of memory or of processes.
+# that numpy uses. What asks for more is ended and started again, before the machine is out of memory or of processes;
+# without the second line it would be swapped instead, and go on slowly.
 MemoryMax=1G
+MemorySwapMax=0
 TasksMax=256
 LimitCORE=0
 

@@ -14,7 +14,7 @@ from common.errors import RecordingError
 from common.frame_recording import FrameRecording, Illumination
 from common.hand_model import FINGER_JOINTS, FINGERS
 from common.messages import FINGER_COUNT, Level, WristDetections
-from common.npz import read_npz
+from common.recorded_files import TRUTH, has_truth, read_truth
 from master.outputs.poses import Poses
 from master.score import put
 from master.wrist.setup import WristSetup
@@ -31,6 +31,7 @@ _STRAIGHT_RAD = np.radians(
 )  # up to here the laser tells the flexion; from about 95 degrees its point stands still
 _MATCH_NS = 5_000_000  # less than half the time from one frame to the next
 _OF_WRIST = "wrist_"
+_ARRAYS = ("t_ns", "laser_pt", "laser_len_vis", "tip_uv", "tip_visible", "joints", "angles")
 _LOG = logging.getLogger(__name__)
 
 
@@ -83,22 +84,21 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     keys begin with `wrist_`.
 
     Raises:
-        RecordingError: truth.npz is broken, or lacks an array.
+        RecordingError: truth.npz is broken, lacks an array, or leads out of the folder.
     """
-    path = recording.folder / "truth.npz"
-    if not path.exists():
+    if not has_truth(recording.folder):
         return None
-    data = read_npz(path)
-    if recording.manifest.kind == "both":
-        data = {
-            name.removeprefix(_OF_WRIST): array for name, array in data.items() if name.startswith(_OF_WRIST)
-        }
+    path = recording.folder / TRUTH
+    prefix = _OF_WRIST if recording.manifest.kind == "both" else ""
+    found = read_truth(recording.folder, also=[prefix + name for name in _ARRAYS])
+    data = {name.removeprefix(prefix): array for name, array in found.items()}
     rows = [row.t_ns for row in recording.frames_of(camera) if row.illumination is Illumination.LASER]
-    if "t_ns" not in data and "laser_pt" in data and len(data["laser_pt"]) != len(rows):
+    points = len(np.atleast_1d(data["laser_pt"])) if "laser_pt" in data else len(rows)
+    if "t_ns" not in data and points != len(rows):
         _LOG.warning(
             "%s: nothing is scored: it has %d rows and no t_ns, camera %s has %d laser frames",
             path,
-            len(data["laser_pt"]),
+            points,
             camera,
             len(rows),
         )
@@ -106,12 +106,12 @@ def load_wrist_truth(recording: FrameRecording, camera: str) -> WristTruth | Non
     try:
         return WristTruth(
             t_ns=data["t_ns"].astype(np.int64) if "t_ns" in data else np.array(rows, np.int64),
-            laser_m=data["laser_pt"],
-            laser_seen_m=data["laser_len_vis"],
-            tip_uv=data["tip_uv"],
+            laser_m=data["laser_pt"].astype(np.float64),
+            laser_seen_m=data["laser_len_vis"].astype(np.float64),
+            tip_uv=data["tip_uv"].astype(np.float64),
             tip_visible=np.asarray(data["tip_visible"], np.bool_),
-            joints_m=data["joints"],
-            pip_rad=data["angles"][:, [3, 7, 11, 15, 19]],
+            joints_m=data["joints"].astype(np.float64),
+            pip_rad=data["angles"].astype(np.float64)[:, [3, 7, 11, 15, 19]],
         )
     except (KeyError, ValueError, IndexError, TypeError) as error:
         raise RecordingError(

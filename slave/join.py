@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 
 from common.calibration import RigCalibration
-from common.errors import RecordingError
+from common.errors import PictureError, RecordingError
 from common.frame_recording import (
     MAX_TIME_NS,
     FrameRecording,
@@ -26,6 +26,7 @@ from common.frame_recording import (
 from common.frame_writing import RecordingWriter, refuse_occupied
 from common.imu_recording import IMU, read_imu, write_imu
 from common.messages import ImuSample
+from common.pictures import read_picture
 from slave.progress import megabytes
 
 TRUTH = "truth.npz"
@@ -131,9 +132,11 @@ def _write(
     try:
         for done, (t_ns, row, path) in enumerate(frames, start=1):
             try:
-                png = path.read_bytes()
+                png = read_picture(path)
             except OSError as error:
                 raise RecordingError(f"{path}: cannot read: {error.strerror}") from error
+            except PictureError as error:
+                raise RecordingError(f"{path}: {error}") from error
             writer.add(row.camera, row.seq, t_ns, row.illumination, png)
             progress(done, len(frames))
     finally:

@@ -23,7 +23,10 @@ from master.outputs.poses import Poses
 
 GAP_S = 0.25  # without a pose: longer than that nobody knows how the hand went
 _GAP_POSES = 3.0  # of a source that is as slow as that all the time
-MOST_FRAMES = 1_000_000  # 4.6 hours at 60 Hz; each takes some kB while it is made
+# A frame takes 7 kB while it is made, so one late pose must not cost what it likes. There may be a break of ten minutes
+# at 60 Hz, and 16 frames for each pose (of poses at 15 Hz, 240 frames/s).
+FREE_FRAMES, FRAMES_OF_POSE = 36_000, 16
+MOST_FRAMES = 1_000_000  # 4.6 hours at 60 Hz
 _DENSE, _MOST_HZ = 10.0, 1000.0  # per cent of the steps
 _UNIT = 0.5  # a quaternion shorter than that is none
 _STRAIGHT = 1e-7
@@ -170,9 +173,11 @@ def resample(motion: Motion, rate_hz: float) -> Motion:
         RecordingError: That would be more frames than fit in memory.
     """
     count = 1 + int((motion.t_ns[-1] - motion.t_ns[0]) * 1e-9 * rate_hz + 1e-6)
-    if count > MOST_FRAMES:
+    most = min(FREE_FRAMES + FRAMES_OF_POSE * len(motion), MOST_FRAMES)
+    if count > most:
         raise RecordingError(
-            f"{count} frames at {rate_hz:g} Hz, at most {MOST_FRAMES}: export one part, with --from and --until"
+            f"{count} frames at {rate_hz:g} Hz, at most {most} of {len(motion)} poses: export one part, with --from and"
+            " --until, or at a lower --rate"
         )
     t_ns = motion.t_ns[0] + np.round(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
     passed = cast(Int, np.searchsorted(motion.t_ns, t_ns, side="right"))

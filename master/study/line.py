@@ -18,7 +18,8 @@ from common.calibration import HandProfile, RigCalibration, save
 from common.errors import PhalanxError, RecordingError
 from common.frame_recording import MANIFEST, open_recording
 from common.hand_model import HandModel
-from common.npz import read_npz, write_npz
+from common.npz import write_npz
+from common.recorded_files import TRUTH, read_truth
 from master.outputs.files import load_poses
 from master.outputs.poses import Poses
 from master.rig import RigSetup
@@ -73,7 +74,7 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
         RecordingError: It has no truth with these, or the file cannot be written.
     """
     names = ("t_ns", "laser_uv", "laser_len_vis", "laser_xyz", "tip_uv", "tip_xyz", "tip_visible")
-    truth = read_npz(folder / "truth.npz", names, "only a simulated recording has exact inputs")
+    truth = read_truth(folder, names, "only a simulated recording has exact inputs")
     recording = open_recording(folder)
     lens = recording.manifest.cameras[camera].intrinsics
     if lens is None:
@@ -98,7 +99,7 @@ def write_exact(folder: Path, camera: str, out: Path) -> None:
             },
         )
     except KeyError as error:
-        raise RecordingError(f"{folder / 'truth.npz'}: t_ns: no frame at {error}") from error
+        raise RecordingError(f"{folder / TRUTH}: t_ns: no frame at {error}") from error
     except OSError as error:
         raise RecordingError(f"{out}: cannot write: {error.strerror}") from error
 

@@ -10,7 +10,7 @@ from common.arrays import Bool, Float
 from common.errors import RecordingError
 from common.frame_recording import FrameRecording
 from common.hand_model import FINGER_JOINTS
-from common.npz import read_npz
+from common.recorded_files import read_truth
 from common.sim.motion import POSES
 from master.outputs.poses import Poses
 from master.study.session import COLUMNS, TRIALS, Held
@@ -117,8 +117,8 @@ def held_in(folder: Path, truth: WristTruth) -> list[Held]:
     path = folder / TRIALS
     if path.exists():
         return read_trials(path)
-    data = read_npz(folder / "truth.npz")
-    if "label" not in data or len(data["label"]) != len(truth.t_ns):
+    data = read_truth(folder, also=["label"])
+    if "label" not in data or data["label"].shape != truth.t_ns.shape:
         raise RecordingError(
             f"{folder}: nothing says which pose was held when: it needs {TRIALS} with the columns"
             f" {','.join(COLUMNS)}, or the key label in truth.npz with a name for each triple"

@@ -9,7 +9,7 @@ from common.camera_settings import figures, same_exposed
 from common.clock import Clock
 from common.errors import CameraError, PictureError, RecordingError
 from common.frame_recording import FrameRow, Manifest, open_recording
-from common.pictures import decode
+from common.pictures import decode, read_picture
 from slave.cameras.source import Frame
 
 GAP_NS = 600_000_000_000  # longer than that it does not wait for the next frame
@@ -118,7 +118,7 @@ def read_png(path: Path, size: tuple[int, int], *, grey: bool = False) -> Image:
         CameraError: Missing, no image, or of another size; the text names the file.
     """
     try:
-        return decode(path.read_bytes(), (size[1], size[0]), grey=grey)
+        return decode(read_picture(path), (size[1], size[0]), grey=grey)
     except OSError as error:
         raise CameraError(f"{path}: cannot read: {error.strerror}") from error
     except PictureError as error:

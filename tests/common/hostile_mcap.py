@@ -60,6 +60,20 @@ def chunk(
     return Chunk(compression, packed, last_ns, first_ns, zlib.crc32(content), said)
 
 
+def streamed(content: bytes, size: int) -> Chunk:
+    """A chunk whose frame does not say how large it is unpacked, as of writers that pack while they write."""
+    packer = zstandard.ZstdCompressor(write_content_size=False).compressobj()
+    packed = packer.compress(content) + packer.flush()
+    return Chunk("zstd", packed, 1_000_000_000, 1_000_000_000, zlib.crc32(content), size)
+
+
+def wide_channel(keys: int, number: int = 1) -> Channel:
+    """A channel of ours with so many keys more, each of a few bytes."""
+    one = channel(number)
+    one.metadata |= {f"{key:02x}": "" for key in range(keys)}
+    return one
+
+
 def tiny_messages(size: int) -> bytes:
     """So many bytes of messages without data, and their channel."""
     return record(channel()) + record(message(b"")) * (size // TINY)
@@ -74,9 +88,13 @@ class HostileMcap:
 
     def about(self, values: Mapping[str, str]) -> "HostileMcap":
         """Add the metadata that says what the recording is of."""
-        at, one = len(self.data), record(Metadata("phalanx", dict(values)))
+        return self.note("phalanx", values)
+
+    def note(self, name: str, values: Mapping[str, str], times: int = 1) -> "HostileMcap":
+        """Add metadata of a name; as many rows about them as wanted stand in the index."""
+        at, one = len(self.data), record(Metadata(name, dict(values)))
         self.data += one
-        self.index += record(MetadataIndex(at, len(one), "phalanx"))
+        self.index += record(MetadataIndex(at, len(one), "")) * times
         return self
 
     def attach(self, name: str, content: bytes) -> "HostileMcap":

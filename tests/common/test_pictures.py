@@ -1,8 +1,10 @@
 """No picture is decoded that claims another size than it may have; no bytes raise anything but a `PictureError`."""
 
+import os
 import re
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,12 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.errors import MessageError, PictureError
+from common.errors import MessageError, PhalanxError, PictureError
 from common.messages import MAX_PREVIEW_BYTES, MAX_STILL_BYTES, Preview, Still, decode, encode
 from common.picture_size import MAX_SCANS, MAX_SIDE_PX, jpeg_size, size_of
 from common.pictures import decode as picture
-from common.pictures import decode_file
-from tests.picture_helpers import TINY, claiming, hostile, many_scans
+from common.pictures import decode_file, read_picture
+from master.calibrate.cameras.image_sets import image_sets
+from master.calibrate.wrist.lit_views import load_grey
+from slave.cameras.replay import read_png
+from tests.picture_helpers import TINY, claiming, hostile, many_scans, tiled
 
 ROOT = Path(__file__).resolve().parents[2]
 SIGNATURES = (
@@ -35,6 +40,7 @@ REAL = {
     ].tobytes()
     for kind in ("jpg", "png", "bmp", "tiff")
 }
+OURS = ("jpg", "png")  # what a device or a recording of ours may have
 
 
 @pytest.mark.parametrize("kind", REAL)
@@ -42,7 +48,11 @@ REAL = {
 def test_the_size_of_what_opencv_writes(kind: str, shape: tuple[int, ...]) -> None:
     data = cv2.imencode(f".{kind}", np.full(shape, 90, np.uint8))[1].tobytes()
     assert size_of(data) == (shape[1], shape[0])
-    assert picture(data, (shape[1], shape[0])).shape == (*shape[:2], 3)
+    if kind in OURS:
+        assert picture(data, (shape[1], shape[0])).shape == (*shape[:2], 3)
+    else:
+        with pytest.raises(PictureError, match="is no JPEG or PNG"):
+            picture(data, (shape[1], shape[0]))
     assert decode_file(data, grey=True).shape == shape[:2]
 
 
@@ -83,7 +93,7 @@ def test_what_is_no_picture_or_an_absurd_one_is_refused(data: bytes, says: str) 
         size_of(data)
     with pytest.raises(PictureError, match=says):
         decode_file(data)
-    with pytest.raises(PictureError, match=says):
+    with pytest.raises(PictureError, match=f"{says}|is no JPEG or PNG"):
         picture(data, (16, 16))
 
 
@@ -109,9 +119,7 @@ def test_random_bytes_have_a_size_or_are_refused(head: bytes, tail: bytes) -> No
     assert 1 <= height <= MAX_SIDE_PX
 
 
-@given(
-    st.sampled_from(sorted(REAL)), st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=6)
-)
+@given(st.sampled_from(OURS), st.lists(st.tuples(st.integers(0, 2000), st.integers(0, 255)), max_size=6))
 def test_changed_bytes_never_give_another_size_or_another_error(
     kind: str, changes: list[tuple[int, int]]
 ) -> None:
@@ -123,6 +131,55 @@ def test_changed_bytes_never_give_another_size_or_another_error(
     except PictureError:
         return
     assert (image.shape, image.dtype) == ((24, 32, 3), np.uint8)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "any": read_picture,
+    "frame": lambda path: read_png(path, (480, 640)),
+    "grey file": load_grey,
+    "file": lambda path: [load() for _, one in image_sets(path.parent, ["left"]) for load in one.values()],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_file_that_claims_a_terabyte_is_not_read(reader: str, tmp_path: Path) -> None:
+    path = tmp_path / "left.png"
+    path.touch()
+    os.truncate(path, 1 << 40)  # takes no room on the disk
+    with pytest.raises(PhalanxError, match="has 1099511627776 bytes, at most 268435456"):
+        READERS[reader](path)
+
+
+@pytest.mark.parametrize("reader", ["any", "frame", "grey file"])
+def test_a_pipe_is_no_picture_and_is_not_waited_for(reader: str, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left.png")
+    with pytest.raises(PhalanxError, match="is no plain file"):
+        READERS[reader](tmp_path / "left.png")
+
+
+TILE = 16_384
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("tile", [(TILE, TILE - 16), (TILE, 16), (16, TILE), (1040, 1024), (2**31, 2**31)])
+def test_a_tile_larger_than_the_picture_is_refused(tile: tuple[int, int], order: str) -> None:
+    data = tiled((640, 480), tile, b"", order)
+    with pytest.raises(PictureError, match=f"TIFF of 640x480 px in tiles of {tile[0]}x{tile[1]}"):
+        decode_file(data)
+    with pytest.raises(PictureError, match="is no JPEG or PNG"):
+        picture(data, (640, 480))
+
+
+@pytest.mark.parametrize("tile", [(16, 16), (256, 256), (1024, 1024)])
+def test_a_tiff_of_tiles_is_read(tile: tuple[int, int]) -> None:
+    side = max(tile)
+    assert decode_file(tiled((side - 3, side - 5), tile), grey=True).shape == (side - 5, side - 3)
+
+
+def test_a_tile_whose_size_is_of_an_odd_kind_is_refused() -> None:
+    data = tiled((640, 480), (TILE, TILE), b"", kind=16)  # LONG8, which libtiff takes
+    with pytest.raises(PictureError, match="TIFF whose header is cut or odd"):
+        decode_file(data)
 
 
 @pytest.mark.parametrize("make", [lambda: Preview("left", 5, TINY), lambda: Still("left", 1, 5, TINY)])
@@ -194,6 +251,15 @@ def test_630_bytes_that_claim_gigabytes_cost_nothing(way: str, tmp_path: Path) -
     path = tmp_path / "attack.jpg"
     path.write_bytes(claiming(30_000, 30_000))
     assert path.stat().st_size < 700
+    memory_mb, time_s = cost(way, path)
+    assert memory_mb < 16.0
+    assert time_s < 0.2
+
+
+@pytest.mark.parametrize("way", ["device", "recording", "file", "grey file"])
+def test_a_tile_of_gigabytes_costs_nothing(way: str, tmp_path: Path) -> None:
+    path = tmp_path / "attack.tiff"
+    path.write_bytes(tiled((640, 480), (TILE, TILE - 16), zlib.compress(bytes(TILE * (TILE - 16)), 9)))
     memory_mb, time_s = cost(way, path)
     assert memory_mb < 16.0
     assert time_s < 0.2

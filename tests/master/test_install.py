@@ -67,6 +67,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
     [
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("MemoryMax=1G", "MemoryMax=1X", "Invalid memory limit"),
+        ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
         ("phalanx-master run", "phalanx run", "not executable"),
     ],
 )
@@ -98,7 +99,7 @@ def test_the_unit_starts_again_and_is_bounded(tmp_path: Path) -> None:
     said = dict(re.findall(r"^(\w+)=(.*)$", text_of(tmp_path), re.MULTILINE))
     assert (said["Type"], said["Restart"], said["RestartSec"]) == ("notify", "on-failure", "100ms")
     assert said["StartLimitIntervalSec"] == "0"
-    assert (said["MemoryMax"], said["TasksMax"]) == ("1G", "256")
+    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("1G", "0", "256")
 
 
 @pytest.mark.parametrize(
@@ -150,6 +151,12 @@ def test_options_are_those_of_run_with_absolute_paths_and_no_key(keys: Path) -> 
         (["--poses", "x.npz"], "--poses: "),
         (["--summary", "x.json"], "--summary: "),
         (["--rig", "desk"], "no rig key"),
+        (["--rig", "desk", "--beacon", "192.168.1.255"], "--beacon '192.168.1.255': expected ADDRESS:PORT"),
+        (["--rig", "desk", "--bind", "0.0.0.0:65536"], "--bind '0.0.0.0:65536': expected ADDRESS:PORT"),
+        (["--rig", "desk", "--bus", "udp/127.0.0.1:47802"], "must begin with tcp/"),
+        (["--rig", "desk", "--bus", "tcp/0.0.0.0:47802"], "neither encrypted nor authenticated"),
+        (["--rig", "desk", "--bus", "tls/0.0.0.0"], "--bus 'tls/0.0.0.0': expected a port at its end"),
+        (["--rig", "desk", "--bus", "tls/0.0.0.0:47802"], "no keys: give --keys DIR"),
     ],
 )
 def test_what_could_not_run_is_refused_before_anything_is_written(

@@ -1,5 +1,6 @@
 """Recordings of single cameras become one of the rig only where they belong together."""
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from common.frame_recording import Illumination, Manifest, RecordedClock, open_r
 from common.frame_writing import RecordingWriter, encode_png
 from common.imu_recording import read_imu, write_imu
 from common.messages import ImuSample
+from common.pictures import MAX_FILE_BYTES
 from slave.__main__ import main
 from slave.join import join_recordings
 from slave.offline import detect_recording
@@ -270,3 +272,10 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     shutil.rmtree(out)
     with pytest.raises(SystemExit, match="2"):
         main(["join", "-o", str(out)])
+
+
+def test_a_frame_that_claims_to_be_huge_is_not_read(tmp_path: Path) -> None:
+    parts = [part(tmp_path, "left"), part(tmp_path, "right")]
+    os.truncate(parts[1] / open_recording(parts[1]).rows[1].file, MAX_FILE_BYTES + 1)  # takes no room
+    with pytest.raises(RecordingError, match=r"right/.*\.png: has 268435457 bytes, at most 268435456"):
+        join_recordings(parts, tmp_path / "wave")

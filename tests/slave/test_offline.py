@@ -105,7 +105,7 @@ def test_wrong_camera_broken_frame_and_unwritable_file(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot write"):
         save_detections(tmp_path, detect_recording(folder, "left"))
     (folder / "1.png").write_bytes(b"junk")
-    with pytest.raises(CameraError, match=r"1\.png: is no JPEG, PNG"):
+    with pytest.raises(CameraError, match=r"1\.png: is no JPEG or PNG"):
         detect_recording(folder, "left")
 
 

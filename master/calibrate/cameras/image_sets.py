@@ -10,7 +10,7 @@ import numpy as np
 from common.arrays import Image
 from common.errors import PictureError, RecordingError
 from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.pictures import decode_file
+from common.pictures import decode_file, read_picture
 from master.calibrate.cameras.views import ImageSet
 
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -98,11 +98,9 @@ def _natural(name: str) -> tuple[tuple[int, str], ...]:
 
 def _load(file: Path) -> Image:
     try:
-        raw = file.read_bytes()
+        return decode_file(read_picture(file))
     except OSError as error:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
-    try:
-        return decode_file(raw)
     except PictureError as error:
         raise RecordingError(f"{file}: is no image: it {error}") from error
 

@@ -15,7 +15,7 @@ from common.arrays import Float, Int
 from common.errors import CalibrationError, RecordingError
 from common.frame_recording import FrameRecording
 from common.messages import MarkerDetections
-from common.npz import read_npz
+from common.recorded_files import TRUTH, has_truth, read_truth
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import column, rows_of
 from master.recorded import recorded_detections
@@ -86,15 +86,16 @@ def by_truth(recording: FrameRecording, pairs: Pairs) -> Sweep | None:
     """Each pair at the distance that truth.npz of a rendered recording gives; None where it has no `depth`.
 
     Raises:
-        RecordingError: truth.npz is broken, or has another number of frames.
+        RecordingError: truth.npz is broken, leads out of the folder, or has another number of frames.
     """
-    path = recording.folder / "truth.npz"
-    if not path.is_file():
-        return None
-    truth = read_npz(path)
+    truth = read_truth(recording.folder, also=["depth"]) if has_truth(recording.folder) else {}
     if "depth" not in truth:
         return None
-    depth = np.asarray(truth["depth"], np.float64)
+    path = recording.folder / TRUTH
+    try:
+        depth = truth["depth"].astype(np.float64)
+    except (ValueError, TypeError) as error:
+        raise RecordingError(f"{path}: depth: {error}") from error
     frames = recording.frames_of(recording.manifest.marker_rig().cameras[0])
     if depth.shape != (len(frames),):
         raise RecordingError(f"{path}: depth has shape {depth.shape}, frames.csv {len(frames)} frames")

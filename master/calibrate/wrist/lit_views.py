@@ -11,7 +11,7 @@ import numpy as np
 from common.arrays import Image
 from common.errors import PictureError, RecordingError
 from common.frame_recording import MANIFEST, FrameRow, Illumination, open_recording
-from common.pictures import decode_file
+from common.pictures import decode_file, read_picture
 
 MOST_VIEWS = 60  # more of the same motion adds time, not knowledge
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
@@ -115,10 +115,8 @@ def load_grey(file: Path) -> Image:
         RecordingError: The file cannot be read, or is no image.
     """
     try:
-        raw = file.read_bytes()
+        return decode_file(read_picture(file), grey=True)
     except OSError as error:
         raise RecordingError(f"{file}: cannot read: {error.strerror}") from error
-    try:
-        return decode_file(raw, grey=True)
     except PictureError as error:
         raise RecordingError(f"{file}: is no image: it {error}") from error

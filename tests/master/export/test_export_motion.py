@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from common.arrays import Float
 from common.errors import RecordingError
 from common.hand_model import TIPS, WRIST
-from master.export.motion import Motion, complete, local, resample, slerp, world
+from master.export.motion import FRAMES_OF_POSE, FREE_FRAMES, Motion, complete, local, resample, slerp, world
 from master.export.skeleton import ORDER, PARENT
 from tests.master.export.made import BEGIN_NS, REST, STEP_NS, poses_of, positions, stacked
 
@@ -95,6 +95,21 @@ def test_over_a_gap_the_hand_stands_still() -> None:
     assert len(frames) == 11
     np.testing.assert_allclose(frames.position_m[1:], np.broadcast_to(one.position_m, (10, 26, 3)), atol=1e-9)
     assert frames.held.all(axis=1).tolist() == [False] + [True] * 10
+
+
+def late(seconds: int, poses: int = 30) -> Motion:
+    """Poses of which the last comes so much later."""
+    *first, last = stacked(poses_of(8, poses))
+    return complete([*first, replace(last, t_ns=last.t_ns + seconds * 1_000_000_000)], REST)
+
+
+def test_a_late_pose_costs_no_more_frames_than_its_poses_and_a_break_of_ten_minutes() -> None:
+    most = FREE_FRAMES + 30 * FRAMES_OF_POSE
+    with pytest.raises(
+        RecordingError, match=rf"\d+ frames at 1000 Hz, at most {most} of 30 poses: .*--until"
+    ):
+        resample(late(99), 1000.0)
+    assert FREE_FRAMES < len(resample(late(600), 60.0)) <= most
 
 
 def test_poses_out_of_order_are_put_in_order_and_of_two_at_once_the_later_stays() -> None:

@@ -17,7 +17,16 @@ from common.streams import sender_of
 from master.recording.files import carried_files
 from master.tuning import RigFiles
 from tests.commands import command
-from tests.common.hostile_mcap import HostileMcap, channel, chunk, message, record, tiny_messages
+from tests.common.hostile_mcap import (
+    HostileMcap,
+    channel,
+    chunk,
+    message,
+    record,
+    streamed,
+    tiny_messages,
+    wide_channel,
+)
 from tests.master.export.made import RIGHT, poses_of
 from tests.master.recording.recorded_run import scene
 
@@ -106,6 +115,9 @@ def jumped(made: Made, to_ns: int) -> bytes:
 
 FULL = record(channel()) + record(message(b"")) * (CHUNK_RECORDS - 1)  # as many as a chunk may have
 WIDE = record(channel()) + record(message(b"\xc4" * (1 << 20), number=1)) * 3  # and as much
+WIDE_CHANNEL = record(wide_channel(370)) * 1030 + record(message(b""))
+WIDE_CHANNELS = b"".join(record(wide_channel(370, number)) for number in range(1030))
+MANY_KEYS = {f"{key:04x}": "" for key in range(1250)}  # 15 kB
 
 ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] = {
     "rig of NUL": (
@@ -145,6 +157,22 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "sender outside": (lambda _: named("../../x"), {EXPORT: r"channel 1: name: '\.\./\.\./x'"}),
     "sender of NUL": (lambda _: named("left\0"), {INFO: r"channel 1: name: 'left\\x00'"}),
     "sender of an escape": (lambda _: named("\x1b]0;x\x07"), {INFO: r"channel 1: name: '\\x1b"}),
+    "metadata often in the index": (
+        lambda made: seen(made.mcap().note("phalanx", MANY_KEYS, 2000)),
+        {INFO: "metadata at byte .* there are 16 already"},
+    ),
+    "a chunk of wide channels": (
+        lambda _: bomb(HostileMcap().about(DESK), WIDE_CHANNEL).cut(),
+        {INFO: "more than a file of this size can hold"},
+    ),
+    "a chunk of wide channels, none twice": (
+        lambda _: bomb(HostileMcap().about(DESK), WIDE_CHANNELS).cut(),
+        {INFO: "more than 1024 channels"},
+    ),
+    "channels too wide": (
+        lambda _: bomb(HostileMcap().about(DESK), record(wide_channel(500)) + record(message(b""))).cut(),
+        {INFO: r"chunk at byte \d+: a channel of \d+ bytes, at most 4096"},
+    ),
     "channels without end": (lambda _: many_channels(), {INFO: "more than 1024 channels"}),
     "64 MiB of tiny messages": (
         lambda _: bomb(HostileMcap().about(DESK), tiny_messages(63 << 20)).ended({1: 1}),
@@ -169,6 +197,14 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "a size that lies": (
         lambda _: HostileMcap().about(DESK).add(chunk(bytes(1 << 20), size=100), [channel()]).cut(),
         {INFO: "claims 100 bytes unpacked, its data 1048576"},
+    ),
+    "a size that lies of a frame that does not say its own": (
+        lambda _: HostileMcap().about(DESK).add(streamed(bytes(1 << 20), 1 << 22), [channel()]).cut(),
+        {INFO: "claims 4194304 bytes unpacked, its data 1048576"},
+    ),
+    "more than it says in a frame that does not say": (
+        lambda _: HostileMcap().about(DESK).add(streamed(bytes(1 << 22), 1 << 20), [channel()]).cut(),
+        {INFO: r"chunk at byte \d+: broken"},
     ),
     "lz4": (
         lambda _: HostileMcap().about(DESK).add(chunk(bytes(99), compression="lz4"), [channel()]).cut(),
@@ -198,7 +234,7 @@ ATTACKS: dict[str, tuple[Callable[[Made], bytes], dict[tuple[str, ...], str]]] =
     "poses a hundred years apart": (
         lambda made: made.poses(),
         {
-            ("export", "--to", "bvh"): r"\d+ frames at .* Hz, at most 1000000: export one part",
+            ("export", "--to", "bvh"): r"\d+ frames at .* Hz, at most 36064 of 4 poses: export one part",
             EXPORT: "4 rows",
         },
     ),

@@ -58,6 +58,7 @@ def test_systemd_has_nothing_to_say_about_the_unit(tmp_path: Path) -> None:
         ("WatchdogSec", "WatchdogSek", "Unknown key 'WatchdogSek'"),
         ("char-i2c", "chor-i2c", "chor-i2c"),
         ("MemoryMax=70%", "MemoryMax=170%", "Invalid memory limit"),
+        ("MemorySwapMax=0", "MemorySwapMax=none", "Invalid memory limit"),
         ("current/bin/phalanx-slave $PHALANX_COMMAND", "current/bin/phalanx", "not executable"),
     ],
 )
@@ -103,7 +104,7 @@ def test_the_unit_waits_for_the_slave_and_watches_its_loop() -> None:
     # A hang is found after at most a watchdog's period, ended within the abort's, and then the slave starts again.
     assert int(said["WatchdogSec"]) + int(said["TimeoutAbortSec"]) <= 7
     assert said["RestartSec"] == "500ms"
-    assert (said["MemoryMax"], said["TasksMax"]) == ("70%", "256")
+    assert (said["MemoryMax"], said["MemorySwapMax"], said["TasksMax"]) == ("70%", "0", "256")
     assert "MemoryDenyWriteExecute" not in said  # numba
     credentials = [value.split(":") for key, value in settings(UNIT.read_text()) if key == "LoadCredential"]
     assert [name for name, _ in credentials] == [
