@@ -18,8 +18,10 @@ import numpy as np
 
 from common.arrays import Bool, Float
 
-_DIRECTIONS, _RADII = 64, 256
+_DIRECTIONS, _RADII = 360, 256
+_COARSE = 48  # directions and radii where what is looked for has a wide margin
 _STEPS = 12  # of Newton: quadratic from a start within a thousandth, slower where the picture is shrunk
+_PARTS, _PART_STEPS = 32, 2  # of the way from the axis, and of Newton in each
 _LEAST = 0.01  # eigenvalue: a pixel there covers a hundred times the angle of one on the axis
 _REACH = 9.0 / 4.0 * 1.1  # a tenth more for the tangential terms
 
@@ -61,15 +63,17 @@ def fold_of(lens: Lens) -> Fold | None:
     first = np.where(bad.any(axis=0), bad.argmax(axis=0), 0)
     turns = np.flatnonzero(first)
     if len(turns) == 0:
-        return None
+        return None  # nowhere around the picture
     before, at = shrunk[first[turns] - 1, turns], shrunk[first[turns], turns]
     share = (before - _LEAST) / (before - at)
     r = radii[first[turns] - 1] + share * (radii[1] - radii[0])
     seen = distorted(lens, r[:, None] * ways[turns])
-    inside = _within(seen, low, high)
-    if not inside.any():
+    inside = seen[_within(seen, low, high)]
+    if not len(inside):  # between two of the directions a fold may still cut off the tip of a corner
+        inside = corners[np.isnan(undistorted(lens, corners)).any(axis=1)]
+    if not len(inside):
         return None
-    pixels = seen[inside] * lens.focal_px
+    pixels = inside * lens.focal_px
     nearest = pixels[np.hypot(*pixels.T).argmin()]
     u, v = (nearest + lens.centre_px).tolist()
     return Fold(u, v, float(np.hypot(*nearest)))
@@ -84,25 +88,48 @@ def _borders(lens: Lens) -> tuple[Float, Float]:
 def undistorted(lens: Lens, seen: Float) -> Float:
     """Normalised points (N, 2) of distorted ones (N, 2), by Newton's method.
 
-    NaN: no point that the lens shows before it folds.
+    Where it does not arrive at once, and the point is in the picture, it goes there from the axis in small steps. NaN:
+    no point that the lens shows before it folds.
     """
-    r, shown, _ = _radial(lens)
+    r, shown = _radial(lens)
     rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
     length = np.hypot(seen[:, 0], seen[:, 1])
-    enough = 1e-10 * _reach(lens)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
-        xy = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
-        for _ in range(_STEPS):
-            off_x, off_y = off = (seen - distorted(lens, xy)).T
-            if not (np.abs(off) > enough).any():
-                break
-            xx, yy, mixed = _jacobian(lens, xy)
-            det = xx * yy - mixed * mixed
-            xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
-        settled = (np.abs(seen - distorted(lens, xy)) <= enough).all(axis=1)
-        settled &= _least_eigenvalue(lens, xy) > 0.0
+        xy = _newton(lens, seen, seen * np.where(length > 0.0, ratio, 1.0)[:, None], _STEPS)
+        settled = _settled(lens, seen, xy)
+        low, high = _borders(lens)
+        rest = np.flatnonzero(~settled & ((seen >= low) & (seen <= high)).all(axis=1))
+        if len(rest):
+            way = np.zeros((len(rest), 2))
+            for part in np.linspace(0.0, 1.0, _PARTS + 1)[1:]:
+                way = _newton(lens, part * seen[rest], way, _PART_STEPS)
+            xy[rest] = _newton(lens, seen[rest], way, _STEPS)
+            settled[rest] = _settled(lens, seen[rest], xy[rest])
     return np.where(settled[:, None], xy, np.nan)
+
+
+def _newton(lens: Lens, seen: Float, start: Float, steps: int) -> Float:
+    """Points (N, 2) nearer than `start` to those whose distorted ones are `seen` (N, 2)."""
+    xy = start.copy()
+    for _ in range(steps):
+        off_x, off_y = off = (seen - distorted(lens, xy)).T
+        if not (np.abs(off) > _enough(lens)).any():
+            break
+        xx, yy, mixed = _jacobian(lens, xy)
+        det = xx * yy - mixed * mixed
+        xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
+    return xy
+
+
+def _settled(lens: Lens, seen: Float, xy: Float) -> Bool:
+    """Whether points (N, 2) are those of `seen` (N, 2), before the lens folds."""
+    near = (np.abs(seen - distorted(lens, xy)) <= _enough(lens)).all(axis=1)
+    return near & (_least_eigenvalue(lens, xy) > 0.0)
+
+
+def _enough(lens: Lens) -> float:
+    return 1e-10 * _reach(lens)
 
 
 def contraction(lens: Lens) -> float:
@@ -110,23 +137,28 @@ def contraction(lens: Lens) -> float:
 
     Inside the picture; from 1 on the iteration diverges.
 
-    The iteration x <- x' / g(r) of `cv2.undistortPoints` multiplies an error along the radius by -r g'(r) / g(r).
+    With x' = g(r) x + t(x), the iteration x <- (x' - t(x)) / g(r) of `cv2.undistortPoints` multiplies an error by
+    1 - J / g, where J is the Jacobian of the distortion, tangential terms t among it.
     """
-    _, shown, left = _radial(lens)
-    return float(left[shown <= _reach(lens) / _REACH].max())
+    angles = np.linspace(0.0, math.tau, _COARSE, endpoint=False)
+    xy = np.linspace(0.0, _reach(lens), _COARSE)[:, None, None] * np.stack(
+        [np.cos(angles), np.sin(angles)], axis=-1
+    )
+    k1, k2, _, _, k3 = lens.distortion
+    s = (xy * xy).sum(axis=-1)
+    g = np.maximum(1.0 + s * (k1 + s * (k2 + s * k3)), 1e-9)
+    xx, yy, mixed = _jacobian(lens, xy)
+    left = np.abs(1.0 - 0.5 * (xx + yy) / g) + np.hypot(0.5 * (xx - yy), mixed) / g
+    inside = np.linalg.norm(distorted(lens, xy), axis=-1) <= _reach(lens) / _REACH
+    return float(left[inside].max())
 
 
-def _radial(lens: Lens) -> tuple[Float, Float, Float]:
-    """Radii, and how the lens distorts them without tangential terms.
-
-    Radii r (R,), distorted radii r g(r) (R,), and r |g'(r)| / g(r) (R,).
-    """
+def _radial(lens: Lens) -> tuple[Float, Float]:
+    """Radii (R,), and radii as the lens distorts them without tangential terms (R,)."""
     k1, k2, _, _, k3 = lens.distortion
     r = np.linspace(0.0, _reach(lens), _RADII)
     s = r * r
-    g = 1.0 + s * (k1 + s * (k2 + s * k3))
-    rise = 2.0 * s * (k1 + s * (2.0 * k2 + 3.0 * s * k3))
-    return r, r * g, np.abs(rise) / np.maximum(g, 1e-9)
+    return r, r * (1.0 + s * (k1 + s * (k2 + s * k3)))
 
 
 def _reach(lens: Lens) -> float:

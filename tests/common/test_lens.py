@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from common.arrays import Float
@@ -71,6 +71,7 @@ coefficients = st.tuples(
 
 
 @given(coefficients, st.floats(280.0, 900.0))
+@example((-0.1875, 0.03125, 0.0, 0.03125, 0.0), 280.0)
 def test_every_pixel_of_a_lens_that_does_not_fold_has_one_direction(
     distortion: tuple[float, float, float, float, float], focal: float
 ) -> None:
@@ -88,6 +89,7 @@ def test_every_pixel_of_a_lens_that_does_not_fold_has_one_direction(
         ((-0.3, 0.1, 0.0, 0.0, 0.05), 350.0),
         ((-0.5, 0.2, 0.0, 0.0, 0.0), 350.0),
         ((3.0, 0.0, 0.0, 0.0, 0.0), 500.0),
+        ((-0.1875, 0.03125, 0.0, 0.03125, 0.0), 280.0),  # by its tangential terms
     ],
 )
 def test_the_way_back_is_found_where_opencvs_iteration_diverges(
