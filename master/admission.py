@@ -26,11 +26,13 @@ from master.sequence import TRIPLE
 
 READY_NS = 10_000_000_000  # between the exposure of a frame and the slave's having it
 OLD_NS = 1_000_000_000  # no message is older when it comes: it would be of no use
-_FASTER = 3.0  # than the rate of the file: settings can be tried live
+_FASTER = (
+    2.0  # than the rate of the file: settings can be tried live; each message costs milliseconds of solving
+)
 _ANY_HZ = 10_000.0  # where no file says a rate
-_LEAST_HZ = 150.0
-_IMU_FASTER = 4.0 / 3.0  # than its file: a sensor has its own rates, and takes the next that is enough
-_TRACKER_HZ = 1000.0 / 3.0
+_LEAST_HZ = 60.0
+_IMU_FASTER = 2.0  # than its file: a sensor has its own rates, and takes the next that is enough
+_TRACKER_HZ = 500.0
 _BURST_S = 0.5  # of it may come at once: at the rate of the file, what a second's halt of the network held up
 
 Sensed = Detections | TagDetections | ImuSample | TrackerPose

@@ -9,6 +9,7 @@ import pytest
 from common.datagram import Refusal
 from common.messages import MarkerDetections, TagDetections, WristDetections
 from master.admission import READY_NS, SenderLimits, limits_of, pace_of, refused
+from master.link_senders import Sender
 from master.rig import load_setups
 from tests.network_helpers import detections, triple
 
@@ -53,19 +54,22 @@ def test_a_camera_sends_as_many_markers_as_its_rig_has() -> None:
     assert refused(detections("left", 1, 0), SenderLimits()) is None
 
 
-def test_three_times_the_rate_of_the_file_passes_and_more_does_not() -> None:
+def test_twice_the_rate_of_the_file_passes_and_more_does_not() -> None:
     pace = pace_of(60.0)
-    assert all(pace.take(k * S // 179) for k in range(1000))
+    assert all(pace.take(k * S // 119) for k in range(1000))
     fast = pace_of(60.0)
     taken = sum(fast.take(k * S // 1000) for k in range(10_000))
-    assert taken == pytest.approx(10 * 180 + 90, abs=2)
+    assert taken == pytest.approx(10 * 120 + 60, abs=2)
     assert fast.take(11 * S)  # and it recovers by itself
 
 
-def test_a_rate_that_is_tried_live_passes() -> None:
-    """30 frames a second by the file, then 90 by a command to the running camera, which no file says."""
-    pace = pace_of(30.0)
-    assert all(pace.take(k * S // 90) for k in range(1000))
+def test_a_changed_file_changes_what_is_taken() -> None:
+    sender = Sender.of({MarkerDetections: 1}, SenderLimits((640, 480), 6, 30.0))
+    sender.limit(SenderLimits((640, 480), 6, 90.0))
+    assert all(sender.paces[MarkerDetections].take(k * S // 90) for k in range(1000))
+    kept = sender.paces[MarkerDetections]
+    sender.limit(SenderLimits((640, 480), 6, 90.0))
+    assert sender.paces[MarkerDetections] is kept, "the same limits give no new burst"
 
 
 def test_the_limits_are_those_of_the_files() -> None:
