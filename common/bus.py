@@ -18,8 +18,8 @@ from typing import Protocol
 
 from common.errors import BusError, MessageError, PhalanxError
 from common.messages import AnyMessage, Command, Health, Message, decode, encode
-from common.pace import Pace
 from common.streams import STREAMS, Path, key_of, sender_of
+from common.token_bucket import TokenBucket
 
 Handler = Callable[[Command], Health]
 ANY = "*"
@@ -112,7 +112,7 @@ class Inbox:
         if depth < 1:
             raise ValueError(f"depth={depth}: must be at least 1")
         self._kind, self._most_hz = STREAMS[stream].message, STREAMS[stream].most_hz
-        self._paces: dict[str, Pace] = {}
+        self._buckets: dict[str, TokenBucket] = {}
         self._waiting: deque[tuple[str, bytes]] = deque(maxlen=depth)
         self._changed = threading.Condition()
         self._on_close: Callable[[Inbox], None] | None = on_close
@@ -129,7 +129,7 @@ class Inbox:
         with self._changed:
             if self._on_close is None:
                 return
-            if not self._in_pace(name):
+            if not self._within_rate(name):
                 self.dropped += 1
                 return
             if len(self._waiting) == self._waiting.maxlen:
@@ -156,14 +156,14 @@ class Inbox:
             self.refused += 1
         return None
 
-    def _in_pace(self, name: str) -> bool:
+    def _within_rate(self, name: str) -> bool:
         """Whether one more that came under `name` is within the rate of the stream."""
         if self._most_hz is None:
             return True
-        if name not in self._paces and len(self._paces) >= MOST_SENDERS:
+        if name not in self._buckets and len(self._buckets) >= MOST_SENDERS:
             name = ""
-        pace = self._paces.setdefault(name, Pace(self._most_hz, self._most_hz))
-        return pace.take(time.monotonic_ns())
+        bucket = self._buckets.setdefault(name, TokenBucket(self._most_hz, self._most_hz))
+        return bucket.take(time.monotonic_ns())
 
     def close(self) -> None:
         """Receive no more and wake a waiting reader. Safe to call twice."""

@@ -20,7 +20,7 @@ from common.messages import (
     TrackerPose,
     WristDetections,
 )
-from common.pace import Pace
+from common.token_bucket import TokenBucket
 from master.rig_setup import RigSetup
 from master.sequence import TRIPLE
 
@@ -55,10 +55,10 @@ class SenderLimits:
     rate_hz: float | None = None
 
 
-def pace_of(rate_hz: float | None) -> Pace:
+def bucket_of(rate_hz: float | None) -> TokenBucket:
     """How fast messages of one kind are taken of a sender of this rate by its files; None: they say none."""
     per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
-    return Pace(per_s, per_s * _BURST_S)
+    return TokenBucket(per_s, per_s * _BURST_S)
 
 
 def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:

@@ -12,9 +12,9 @@ from typing import TypeAlias
 from common.clock_offset import ClockEstimate, OffsetEstimator
 from common.datagram import Address, Opener, Refusal, Sealer
 from common.messages import ImuSample, TrackerPose, restamped
-from common.pace import Pace
 from common.session import Hello
-from master.admission import OLD_NS, SenderLimits, Sensed, pace_of, refused
+from common.token_bucket import TokenBucket
+from master.admission import OLD_NS, SenderLimits, Sensed, bucket_of, refused
 from master.sequence import Counted, Sequence
 
 OLD_NONCES = 64
@@ -55,7 +55,7 @@ class Sender:
 
     kinds: dict[type[Taken], Counted]
     limits: SenderLimits
-    paces: dict[type[Taken], Pace]
+    buckets: dict[type[Taken], TokenBucket]
     live: Session | None = None
     pending: Session | None = None
     old_nonces: deque[bytes] = field(default_factory=lambda: deque[bytes](maxlen=OLD_NONCES))
@@ -70,12 +70,12 @@ class Sender:
         The number of each kind rises by the step in `steps` from one message to the next.
         """
         kinds = {kind: Counted(Sequence(step)) for kind, step in steps.items()}
-        return cls(kinds, limits, {kind: pace_of(limits.rate_hz) for kind in kinds})
+        return cls(kinds, limits, {kind: bucket_of(limits.rate_hz) for kind in kinds})
 
     def limit(self, limits: SenderLimits) -> None:
         """Let it be within other limits from now on."""
         if limits != self.limits:
-            self.limits, self.paces = limits, {kind: pace_of(limits.rate_hz) for kind in self.kinds}
+            self.limits, self.buckets = limits, {kind: bucket_of(limits.rate_hz) for kind in self.kinds}
 
     @property
     def main(self) -> Counted:
@@ -100,7 +100,7 @@ def not_admitted(message: Taken, session: Session, sender: Sender, now_ns: int) 
     kind = type(message)
     if message.session != session.hello.process:
         return Refusal.FOREIGN_SESSION
-    if not sender.paces[kind].take(now_ns):
+    if not sender.buckets[kind].take(now_ns):
         return Refusal.RATE
     if (why := refused(message, sender.limits)) is not None:
         return why
@@ -116,9 +116,9 @@ def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, 
     """
     if clock is None:
         return None
-    told_ns = clock.to_local(message.t_ns)
-    t_ns = min(told_ns, now_ns)
-    if not now_ns - OLD_NS <= told_ns <= now_ns + AHEAD_NS or (
+    stamped_ns = clock.to_local(message.t_ns)
+    t_ns = min(stamped_ns, now_ns)
+    if not now_ns - OLD_NS <= stamped_ns <= now_ns + AHEAD_NS or (
         kind.newest_ns is not None and t_ns <= kind.newest_ns
     ):
         return None
@@ -129,5 +129,5 @@ def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, 
         message,
         t_ns=t_ns,
         ready_t_ns=clock.to_local(message.ready_t_ns),
-        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), told_ns - t_ns), _MAX_SIGMA_NS),
+        t_sigma_ns=min(hypot(message.t_sigma_ns, clock.sigma_at(t_ns), stamped_ns - t_ns), _MAX_SIGMA_NS),
     )

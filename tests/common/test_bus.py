@@ -176,7 +176,7 @@ def test_names_that_are_invented_share_one_rate_and_no_memory() -> None:
     inbox = Inbox("health", 8, lambda _: None)
     for k in range(2000):
         inbox.put(f"n{k}", b"")
-    assert len(inbox._paces) <= MOST_SENDERS + 1
+    assert len(inbox._buckets) <= MOST_SENDERS + 1
     assert inbox.dropped > 1000
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from common.datagram import Refusal
 from common.messages import MarkerDetections, TagDetections, WristDetections
-from master.admission import READY_NS, SenderLimits, limits_of, pace_of, refused
+from master.admission import READY_NS, SenderLimits, bucket_of, limits_of, refused
 from master.link_senders import Sender
 from master.rig import load_setups
 from tests.network_helpers import detections, triple
@@ -55,9 +55,9 @@ def test_a_camera_sends_as_many_markers_as_its_rig_has() -> None:
 
 
 def test_twice_the_rate_of_the_file_passes_and_more_does_not() -> None:
-    pace = pace_of(60.0)
-    assert all(pace.take(k * S // 119) for k in range(1000))
-    fast = pace_of(60.0)
+    bucket = bucket_of(60.0)
+    assert all(bucket.take(k * S // 119) for k in range(1000))
+    fast = bucket_of(60.0)
     taken = sum(fast.take(k * S // 1000) for k in range(10_000))
     assert taken == pytest.approx(10 * 120 + 60, abs=2)
     assert fast.take(11 * S)  # and it recovers by itself
@@ -66,10 +66,10 @@ def test_twice_the_rate_of_the_file_passes_and_more_does_not() -> None:
 def test_a_changed_file_changes_what_is_taken() -> None:
     sender = Sender.of({MarkerDetections: 1}, SenderLimits((640, 480), 6, 30.0))
     sender.limit(SenderLimits((640, 480), 6, 90.0))
-    assert all(sender.paces[MarkerDetections].take(k * S // 90) for k in range(1000))
-    kept = sender.paces[MarkerDetections]
+    assert all(sender.buckets[MarkerDetections].take(k * S // 90) for k in range(1000))
+    kept = sender.buckets[MarkerDetections]
     sender.limit(SenderLimits((640, 480), 6, 90.0))
-    assert sender.paces[MarkerDetections] is kept, "the same limits give no new burst"
+    assert sender.buckets[MarkerDetections] is kept, "the same limits give no new burst"
 
 
 def test_the_limits_are_those_of_the_files() -> None:

@@ -1,7 +1,7 @@
 """Limit how often something may happen: a token bucket."""
 
 
-class Pace:
+class TokenBucket:
     """Token bucket that bounds how many messages are taken.
 
     Holds how many may come now, and when it was last asked.
