@@ -21,7 +21,7 @@ MOST_OVER = 1 << 20
 POSES = poses_of(1, 4)
 MESSAGES: dict[str, tuple[str, Sequence[Message], int]] = {
     "hands": ("hand", POSES, 4000),
-    "the smallest": ("taken", [Backlog("m", 0, 0)], 150_000),
+    "the smallest": ("taken", [Backlog("m", 0, 0)], 80_000),
 }
 
 
