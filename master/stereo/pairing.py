@@ -94,8 +94,8 @@ class Pairing:
         self.outdated = 0
         self._seen: tuple[deque[Sighting], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
         self._frames = 0  # of all cameras
-        self._last = [0] * len(self._names)  # how many those were at each one's last
-        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)  # and before
+        # How many those were at the last ones of each.
+        self._came: tuple[deque[int], ...] = tuple(deque(maxlen=HISTORY) for _ in self._names)
         together_hz = sum(frame_rate_hz[name] for name in self._names)
         self._slow_frames = [_SLOW * together_hz / frame_rate_hz[name] for name in self._names]
         self._behind = [False] * len(self._names)
@@ -139,7 +139,6 @@ class Pairing:
         if self._silent(index):
             self._came[index].clear()  # it begins anew
         self._frames += 1
-        self._last[index] = self._frames
         self._came[index].append(self._frames)
         newest_instant = self._pending[-1] if self._pending else self._emitted_ns
         if index == self._leader() and centre_ns > newest_instant:
@@ -159,17 +158,25 @@ class Pairing:
         return marks
 
     def _leader(self) -> int:
-        speak = [camera for camera, seen in enumerate(self._seen) if seen and not self._silent(camera)]
-        if self._continuous:
-            speak = [c for c in speak if not (self._behind[c] or self._slow(c))] or speak
-        return speak[0] if speak else 0
+        first: int | None = None
+        for camera, came in enumerate(self._came):
+            if not came or self._silent(camera):
+                continue
+            if not (self._continuous and (self._behind[camera] or self._slow(camera))):
+                return camera
+            first = camera if first is None else first
+        return first or 0
 
     def _silent(self, camera: int) -> bool:
         """Whether others delivered so many frames since its last."""
-        return self._frames - self._last[camera] >= self._patience
+        came = self._came[camera]
+        return self._frames - (came[-1] if came else 0) >= self._patience
 
     def _slow(self, camera: int) -> bool:
-        """Whether it delivers so little, by what others deliver and the rates of the files, that those are to lead."""
+        """Whether a camera delivers too little to lead.
+
+        By what others deliver and the rates of the files.
+        """
         at = self._came[camera]
         return len(at) >= _SLOW_FRAMES and at[-1] - at[0] > self._slow_frames[camera] * (len(at) - 1)
 
