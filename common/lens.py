@@ -94,42 +94,36 @@ def undistorted(lens: Lens, seen: Float) -> Float:
     r, shown = _radial(lens)
     rising = int(np.argmax(np.append(np.diff(shown) <= 0.0, True))) + 1
     length = np.hypot(seen[:, 0], seen[:, 1])
+    enough = 1e-10 * _reach(lens)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         ratio = np.interp(length, shown[:rising], r[:rising]) / length  # but for tangential terms
-        xy = _newton(lens, seen, seen * np.where(length > 0.0, ratio, 1.0)[:, None], _STEPS)
-        settled = _settled(lens, seen, xy)
-        low, high = _borders(lens)
-        rest = np.flatnonzero(~settled & ((seen >= low) & (seen <= high)).all(axis=1))
-        if len(rest):
+        start = seen * np.where(length > 0.0, ratio, 1.0)[:, None]
+        xy, settled = _newton(lens, seen, start, _STEPS, enough)
+        if not settled.all():
+            low, high = _borders(lens)
+            rest = np.flatnonzero(~settled & ((seen >= low) & (seen <= high)).all(axis=1))
             way = np.zeros((len(rest), 2))
-            for part in np.linspace(0.0, 1.0, _PARTS + 1)[1:]:
-                way = _newton(lens, part * seen[rest], way, _PART_STEPS)
-            xy[rest] = _newton(lens, seen[rest], way, _STEPS)
-            settled[rest] = _settled(lens, seen[rest], xy[rest])
+            for part in np.linspace(0.0, 1.0, _PARTS + 1)[1:] if len(rest) else ():
+                way, _ = _newton(lens, part * seen[rest], way, _PART_STEPS, enough)
+            xy[rest], settled[rest] = _newton(lens, seen[rest], way, _STEPS, enough)
     return np.where(settled[:, None], xy, np.nan)
 
 
-def _newton(lens: Lens, seen: Float, start: Float, steps: int) -> Float:
-    """Points (N, 2) nearer than `start` to those whose distorted ones are `seen` (N, 2)."""
+def _newton(lens: Lens, seen: Float, start: Float, steps: int, enough: float) -> tuple[Float, Bool]:
+    """Go from `start` (N, 2) to the points whose distorted ones are `seen`.
+
+    Returns them (N, 2), and which have arrived (N,): nearer than `enough`, before the lens folds.
+    """
     xy = start.copy()
     for _ in range(steps):
         off_x, off_y = off = (seen - distorted(lens, xy)).T
-        if not (np.abs(off) > _enough(lens)).any():
+        if not (np.abs(off) > enough).any():
             break
         xx, yy, mixed = _jacobian(lens, xy)
         det = xx * yy - mixed * mixed
         xy += np.stack([yy * off_x - mixed * off_y, xx * off_y - mixed * off_x], axis=-1) / det[:, None]
-    return xy
-
-
-def _settled(lens: Lens, seen: Float, xy: Float) -> Bool:
-    """Whether points (N, 2) are those of `seen` (N, 2), before the lens folds."""
-    near = (np.abs(seen - distorted(lens, xy)) <= _enough(lens)).all(axis=1)
-    return near & (_least_eigenvalue(lens, xy) > 0.0)
-
-
-def _enough(lens: Lens) -> float:
-    return 1e-10 * _reach(lens)
+    near = (np.abs(seen - distorted(lens, xy)) <= enough).all(axis=1)
+    return xy, near & (_least_eigenvalue(lens, xy) > 0.0)
 
 
 def contraction(lens: Lens) -> float:
