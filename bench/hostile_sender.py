@@ -38,6 +38,12 @@ SPARE = 1.05  # so many more are made, for those that fit into no datagram
 ON_BUS: Mapping[type[Struct], str] = {Health: "health", Preview: "preview", Still: "still"}  # with its stream
 
 
+def raw_bus(endpoint: str) -> zenoh.Session:
+    """A session on the bus, in which any bytes can be put under any key."""
+    made = settings(None, [endpoint], "client", None)
+    return zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(made).decode()))
+
+
 class HostileUplink(Uplink):
     """An uplink that seals any body as any kind.
 
@@ -78,8 +84,7 @@ class HostileSender:
 
         Where `name` is a camera of `setup`, it says what the camera of a simulation sees.
         """
-        made = settings(None, [endpoint], "client", None)
-        self._bus = zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(made).decode()))
+        self._bus = raw_bus(endpoint)
         self.name, self._clock, self._keys = name, SystemClock(), RigKeys(key)
         self.uplink = HostileUplink(name, key, self._clock, port, "127.0.0.1")
         self._hello = self._keys.sealer(self.uplink.session ^ 1)

@@ -4,14 +4,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Generator, Mapping
-from contextlib import contextmanager
 
 import msgspec
 import pytest
 import zenoh
 
 from bench.hostile_rig import ROOT, HostileRig
-from common.bus_settings import settings
+from bench.hostile_sender import raw_bus
 from common.messages import Command, Health, encode
 from tests.hostile_rigs import Rigs, counts, unharmed
 from tests.network_helpers import PATIENCE_S
@@ -25,14 +24,6 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Generator[HostileRig]:
     made = Rigs(tmp_path_factory.mktemp("hostile"))
     yield made.well()
     made.close()
-
-
-@contextmanager
-def on_bus(rig: HostileRig) -> Generator[zenoh.Session]:
-    """Somebody on the bus who puts bytes there as he likes."""
-    made = settings(None, [rig.endpoint], "client", None)
-    with zenoh.open(zenoh.Config.from_json5(msgspec.json.encode(made).decode())) as session:
-        yield session
 
 
 def report(session: zenoh.Session, name: str, changes: Mapping[str, object]) -> None:
@@ -49,7 +40,7 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
         ("-m", "master", "fleet", "--seconds", "1"),
         ("-m", "deploy", "fleet"),
     )
-    with unharmed(rig), on_bus(rig) as session:
+    with unharmed(rig), raw_bus(rig.endpoint) as session:
         running = [
             subprocess.Popen(
                 [sys.executable, *command, "--bus", rig.endpoint],
@@ -77,7 +68,7 @@ def test_what_a_device_says_of_itself_reaches_no_terminal(rig: HostileRig) -> No
 
 def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: HostileRig) -> None:
     body = encode(Health("cam02", 1, 1, {f"n{k}": k for k in range(500)}, {"rate_hz": 30.0}))
-    with unharmed(rig) as rise, on_bus(rig) as session:
+    with unharmed(rig) as rise, raw_bus(rig.endpoint) as session:
         ended = time.monotonic() + FLOOD_S
         while time.monotonic() < ended:
             session.put("phalanx/health/cam02", body, congestion_control=zenoh.CongestionControl.BLOCK)
@@ -91,7 +82,7 @@ def test_a_device_that_reports_without_end_keeps_nobody_from_being_heard(rig: Ho
 def test_a_command_for_another_that_comes_under_the_masters_key_is_not_obeyed(
     rig: HostileRig, verb: str
 ) -> None:
-    with unharmed(rig), on_bus(rig) as session:
+    with unharmed(rig), raw_bus(rig.endpoint) as session:
         replies = list(
             session.get("phalanx/command/master", payload=encode(Command("left", verb)), timeout=5.0)
         )
@@ -104,7 +95,7 @@ def test_a_command_for_another_that_comes_under_the_masters_key_is_not_obeyed(
     "payload", [b"", b"\xc1", b"\x91" * 10_000, encode(Command("master", "no-such-verb"))]
 )
 def test_a_command_that_is_none_is_refused(rig: HostileRig, payload: bytes) -> None:
-    with unharmed(rig), on_bus(rig) as session:
+    with unharmed(rig), raw_bus(rig.endpoint) as session:
         replies = list(session.get("phalanx/command/master", payload=payload, timeout=5.0))
     assert all(reply.ok is None for reply in replies)
     assert counts(rig)["poses"] > 0
