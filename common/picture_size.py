@@ -28,7 +28,7 @@ _TILE_PX = 1024  # a tile may be larger than a small picture, up to this
 
 
 def is_jpeg_or_png(data: bytes) -> bool:
-    """Whether a file is of one of the two kinds that programs of ours write: JPEG and PNG."""
+    """Whether a file is JPEG or PNG, the kinds that our own programs write."""
     return data.startswith((_JPEG, _PNG))
 
 
@@ -102,7 +102,10 @@ def _bmp_size(data: bytes) -> Size:
 
 
 def _tiff_size(data: bytes) -> Size:
-    """From the first directory of a TIFF (6.0, section 2); a tile is decoded as a whole, so it is bounded as well."""
+    """From the first directory of a TIFF (6.0, section 2).
+
+    A tile is decoded as a whole, so it is bounded as well.
+    """
     order = "little" if data[:2] == b"II" else "big"
 
     def number(at: int, count: int) -> int:

@@ -39,7 +39,10 @@ def read_table(folder: Path, name: str) -> str:
 
 
 def has_truth(folder: Path) -> bool:
-    """Whether a folder has exact values; a link that leads nowhere counts, and is refused when it is read."""
+    """Whether a folder has exact values.
+
+    A link that leads nowhere counts, and is refused when it is read.
+    """
     path = folder / TRUTH
     return path.is_symlink() or path.exists()
 

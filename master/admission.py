@@ -56,7 +56,10 @@ class SenderLimits:
 
 
 def bucket_of(rate_hz: float | None) -> TokenBucket:
-    """How fast messages of one kind are taken of a sender of this rate by its files; None: they say none."""
+    """How many messages of one kind may come from a sender.
+
+    `rate_hz` is that of its files; None: they say none.
+    """
     per_s = _ANY_HZ if rate_hz is None else max(_FASTER * rate_hz, _LEAST_HZ)
     return TokenBucket(per_s, per_s * _BURST_S)
 
