@@ -31,15 +31,15 @@ class Passing(Generic[T]):
             self._changed.notify_all()
 
     def following(self, count: int, timeout_s: float) -> Iterator[T]:
-        """Up to `count` items that go by from now on; a watcher who is late misses some.
+        """Up to `count` items that go by from now on; a watcher who is late misses some, which do not count.
 
         Raises:
             CameraError: None came for `timeout_s` [s].
         """
-        return self._after(self._count, self._count + count, timeout_s)
+        return self._after(self._count, count, timeout_s)
 
-    def _after(self, last: int, end: int, timeout_s: float) -> Iterator[T]:
-        while last < end:
+    def _after(self, last: int, count: int, timeout_s: float) -> Iterator[T]:
+        for _ in range(count):
             with self._changed:
                 if not self._changed.wait_for(lambda seen=last: self._count > seen, timeout_s):
                     raise CameraError(
