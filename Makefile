@@ -16,6 +16,9 @@ FAULTS_ARGS ?=
 HOSTILE_ARGS ?=
 INSTRUCTIONS_ARGS ?=
 
+# Tests and demo start a hundred processes: each would compile all modules anew where their bytecode is not kept.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN := .venv/bin
 STAMP := .venv/.installed
 # Fits: 3.11-3.13, and able to make a virtual environment (Debian splits ensurepip off into python3-venv).

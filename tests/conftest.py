@@ -45,8 +45,11 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveSch
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What is live begins first: it lasts longest."""
+    """What is live begins first: it lasts longest. Where it fails it is tried once more, and listed as RERUN."""
     items.sort(key=lambda item: not item.nodeid.startswith(LIVE))
+    for item in items:
+        if item.nodeid.startswith(LIVE):
+            item.add_marker(pytest.mark.flaky(reruns=1))
 
 
 @pytest.fixture(scope="session")

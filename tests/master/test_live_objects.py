@@ -148,7 +148,9 @@ def test_objects_and_contact_come_on_the_bus_and_into_files(
     assert all(one.latency_ns > -2_000_000 for one in poses)
     hands = [one for one in drained(master, "hand") if isinstance(one, HandPose)]
     contacts = [one for one in drained(master, "contact") if isinstance(one, Contact)]
-    assert len(hands) == len(contacts) > FRAMES // 2
+    assert len(hands) == len(contacts) > 0
+    shed = counts.get("instants_shed", 0)  # what a busy machine leaves out is counted
+    assert len(hands) + shed > FRAMES // 2
     assert {(one.hand, one.object) for one in contacts} == {("default-right", "cube")}
     assert all(isinstance(one, Gesture) for one in drained(master, "gesture"))
     assert len(load_object(object_path(tmp_path, "cube"))) == len(poses)
