@@ -65,7 +65,7 @@ hosts-tools: emulator ## what the tests with whole machines need; without root i
 	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
 
 test: check browser emulator ## check, then all tests
-	@$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+	@$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
 test-bare: ## the gate on a Debian that has git, make and python3-venv alone, and is thrown away; as root, 30 min
 	$(call apt,the gate on a bare Debian,mmdebstrap debian-archive-keyring,mmdebstrap)

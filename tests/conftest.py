@@ -31,6 +31,8 @@ LIVE = (
     "tests/master/export/test_export_gltf.py",
 )
 
+BEHIND = 10  # niceness of what is not
+
 
 class LiveScheduling(LoadFileScheduling):
     """Each file goes to one worker whole, and all that is live goes to the same one."""
@@ -50,6 +52,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.startswith(LIVE):
             item.add_marker(pytest.mark.flaky(reruns=1))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let what is live have the processor first: there are more workers than cores, and its clock runs on."""
+    if "PYTEST_XDIST_WORKER" in os.environ and not item.nodeid.startswith(LIVE) and os.nice(0) < BEHIND:
+        os.nice(BEHIND)
 
 
 @pytest.fixture(scope="session")
