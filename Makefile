@@ -64,8 +64,8 @@ emulator: ## what checks the service and runs aarch64 programs in the tests; wit
 hosts-tools: emulator ## what the tests with whole machines need; without root it says what to install
 	$(call apt,the tests with whole machines,qemu-system-arm qemu-system-x86 qemu-utils systemd-container rsync openssh-client iproute2 tcpdump kmod,qemu-system-aarch64 qemu-system-x86_64 systemd-nspawn rsync ssh ip tcpdump depmod)
 
-test: check browser emulator ## check, then all tests
-	@$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
+test: check browser emulator ## check, then all tests; one that fails is tried once more, and listed
+	@$(BIN)/python -m pytest -n 3 --reruns 1 --dist loadfile --no-loadscope-reorder $(TEST_ARGS)
 
 test-bare: ## the gate on a Debian that has git, make and python3-venv alone, and is thrown away; as root, 30 min
 	$(call apt,the gate on a bare Debian,mmdebstrap debian-archive-keyring,mmdebstrap)

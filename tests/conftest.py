@@ -27,6 +27,8 @@ LIVE = (
     "tests/aarch64/",
     "tests/docs/examples/",
     "tests/master/console/",
+    "tests/master/test_installed_master.py",
+    "tests/master/test_live",
     "tests/master/web/test_page.py",
     "tests/master/export/test_export_gltf.py",
 )
@@ -47,11 +49,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveSch
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What is live begins first: it lasts longest. Where it fails it is tried once more, and listed as RERUN."""
+    """What is live begins first: it lasts longest."""
     items.sort(key=lambda item: not item.nodeid.startswith(LIVE))
-    for item in items:
-        if item.nodeid.startswith(LIVE):
-            item.add_marker(pytest.mark.flaky(reruns=1))
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -58,7 +58,14 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
             if seq % 3 == 0:
                 ends["wrist"].send(msgspec.structs.replace(triple, exposure_us=exposure_us, **changes))
             stop.wait(0.02)
+        return counts()
+
+    def counts() -> dict[str, int]:
         return asker.ask(Command("master", "report"), 5.0).counts
+
+    def right_hand(found: dict[str, int]) -> int:
+        """Instants of the other hand: solved, or left out by a busy master."""
+        return found["default-right.poses"] + found.get("default-right.instants_shed", 0)
 
     try:
         assert all(end.wait_for_start(60.0) for end in ends.values())
@@ -67,7 +74,7 @@ def test_a_fault_of_one_hands_solver_costs_its_sender_a_pause_and_the_other_hand
         during = sent(12, POISON_US)
         assert during["fault.wrist"] == 1, "the first is a fault, all others of this second are refused"
         assert during["refused.faulty"] >= 1
-        assert during["default-right.poses"] - before["default-right.poses"] >= 6
+        assert until(lambda: right_hand(counts()) - right_hand(before) >= 6)
         assert not any(name in during for name in ("fault.left", "fault.right"))
 
         def well() -> bool:
