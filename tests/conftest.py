@@ -33,7 +33,7 @@ LIVE = (
     "tests/master/export/test_export_gltf.py",
 )
 
-BEHIND = 10  # niceness of what is not
+BEHIND = 10  # niceness of the workers whose tests are not live
 
 
 class LiveScheduling(LoadFileScheduling):

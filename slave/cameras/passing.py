@@ -1,4 +1,7 @@
-"""Watch from another thread what the camera loop reads: its frames go by, nobody holds them up."""
+"""Watch from another thread what the camera loop reads.
+
+Its frames go by; nobody holds them up.
+"""
 
 import threading
 from collections.abc import Iterator
@@ -31,7 +34,9 @@ class Passing(Generic[T]):
             self._changed.notify_all()
 
     def following(self, count: int, timeout_s: float) -> Iterator[T]:
-        """Up to `count` items that go by from now on; a watcher who is late misses some, which do not count.
+        """Wait for `count` items that go by from now on.
+
+        A watcher who is late misses some; those do not count.
 
         Raises:
             CameraError: None came for `timeout_s` [s].
