@@ -36,7 +36,7 @@ ONLY_IN: dict[str, tuple[str, ...]] = {
     "imufusion": ("common/imu_fusion.py",),
     "picamera2": ("slave/cameras/picamera2*.py",),
     "libcamera": ("slave/cameras/picamera2*.py",),
-    "numba": ("slave/markers/fast*.py",),
+    "numba": ("common/kernels.py", "slave/markers/fast*.py"),
     "openvr": ("slave/objects/openvr*.py",),
     "pylsl": ("master/send/lsl*.py",),
     "pythonosc": ("master/send/osc*.py",),
@@ -54,6 +54,7 @@ DISTRIBUTION = {
 SYSTEM = frozenset({"picamera2", "libcamera"})
 # Files of common that the slave never loads may use what only the PC has.
 PC_ONLY = {
+    "common/kernels.py": frozenset({"numba"}),
     "common/recording.py": frozenset({"mcap"}),
     "common/recording_parts.py": frozenset({"mcap"}),
     "common/mcap_file.py": frozenset({"mcap"}),
