@@ -7,7 +7,11 @@ import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}  # a division by 0 gives infinity, as in numpy
+_OPTIONS = {
+    "cache": True,
+    "nogil": True,
+    "error_model": "numpy",
+}  # a division by 0 gives infinity, as in numpy
 
 
 def kernel(function: F) -> F:

@@ -1,396 +1,180 @@
-"""The palm from all markers: a six-number fit in which the fingers count as far as hands bend them.
+"""The palm of an instant: from the last one where that explains the markers, else from several starts."""
 
-Where three markers lie on the back they fix the palm. With one, its turn is open: every finger reaches its tip from
-many palms, and what tells them apart is how hands bend. So the fit has the fingers' free angles beside the palm's six
-numbers, with their posture prior; only the palm is taken from it, the fingers are solved by FABRIK afterwards.
-
-Levenberg-Marquardt on the stacked residuals (Madsen, Nielsen, Tingleff 2004, algorithm 3.16), angles within their
-limits by holding those that the next step would carry across (projected Newton, Bertsekas 1982).
-"""
-
-from math import cos, exp, sin, sqrt
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
-from common.kernels import kernel
-from common.hand_model import CHAINS, HandModel
+from common.arrays import Bool, Float
+from common.geometry import fit_rigid
+from common.hand_model import HandModel
+from master.fabrik.hand_tables import HandTables, Mounts, covariances
+from master.fabrik.palm_kernel import PalmPrior, fit
+from master.ik.attached import Attached
+from master.ik.hand import EXPLAINED, determined
+from master.ik.hidden import HiddenFingers
 from master.ik.parameters import HandParameters
+from master.ik.priors import AnglePrior, Priors, hidden_belief
 
-MAX_ITERATIONS = 30
-
-
-class HandTables(NamedTuple):
-    """A hand profile as flat arrays.
-
-    Attributes:
-        swing: (3, 5, 4, 3, 3) as `HandModel.swing`.
-        tip_turn: (5, 3, 3) rest rotation of the tip in the frame of the joint before it.
-        root_m: (5, 3) first joint of each chain, palm frame [m].
-        bone_m: (5, 3, 3) bones in the frames of their joints [m].
-        abduction_axis: (5, 3) palm frame.
-        complete: (20, n) all angles by the free ones.
-        low, high: (n,) [rad] limits of the free angles.
-    """
-
-    swing: Float
-    tip_turn: Float
-    root_m: Float
-    bone_m: Float
-    abduction_axis: Float
-    complete: Float
-    low: Float
-    high: Float
-
-    @classmethod
-    def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
-        """Lay out a hand."""
-        axis = np.zeros((5, 3))
-        axis[:, 1] = model.side_sign
-        axis[0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
-        return cls(
-            np.ascontiguousarray(model.swing),
-            np.ascontiguousarray(model.turn[:, 2]),
-            np.ascontiguousarray(model.rest_position_m[CHAINS[:, 0]]),
-            np.ascontiguousarray(model.bone_m),
-            axis,
-            parameters.complete,
-            parameters.low,
-            parameters.high,
-        )
+_ENOUGH = 1e-3  # of half chi square that a further step may gain
+_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
+_ABOVE_M = 0.05  # a point above the wrist stands for "the back of the hand faces the cameras"
+_ABOVE_WEIGHT, _PALM_WEIGHT = 0.3, 3.0
+_LEAST_AGE_S = 1e-3
 
 
-class Mounts(NamedTuple):
-    """Where M markers sit: chain (-1: the palm), joint of the chain, and place in that joint's frame (M, 3) [m]."""
-
-    finger: Int
-    level: Int
-    offset_m: Float
-
-
-class PalmPrior(NamedTuple):
-    """What is known before the markers of this frame.
+@dataclass(frozen=True, slots=True, eq=False)
+class Palm:
+    """The palm, with the angles of the fingers that go best with it.
 
     Attributes:
-        normal, pull: (n, n), (n,) of the angles: cost x' normal x / 2 - pull' x.
-        T: (4, 4) predicted palm.
-        weight: (6,) one per standard deviation of its turn [rad] and shift [m]; 0: nothing is predicted.
-        facing: (3,) unit vector along which the back of the hand looks.
-        facing_weight: One per standard deviation; 0: not known.
+        T: (4, 4) [m], rig frame.
+        x: (n,) [rad] free angles.
+        cov: (6 + n, 6 + n) covariance of turn [rad], shift [m] and x by this instant alone.
+        cost: Half chi square, priors included.
+        surprise: (M,) chi square of each marker; 0: not seen.
     """
 
-    normal: Float
-    pull: Float
     T: Float
-    weight: Float
-    facing: Float
-    facing_weight: float
+    x: Float
+    cov: Float
+    cost: float
+    surprise: Float
 
 
-@kernel
-def chains(tables: HandTables, angles: Float, R: Float, P: Float) -> None:
-    """Write joint rotations R (5, 4, 3, 3) and places P (5, 4, 3) [m], palm frame, of angles (20,) [rad]."""
-    local = np.empty((3, 3))
-    frame = np.empty((3, 3))
-    for f in range(5):
-        for k in range(4):
-            c, s = cos(angles[4 * f + k]), sin(angles[4 * f + k])
-            for i in range(3):
-                for j in range(3):
-                    local[i, j] = (
-                        tables.swing[0, f, k, i, j] + c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
-                    )
-            if k == 0:
-                frame[:, :] = local
-                continue
-            for i in range(3):
-                a, b, d = frame[i, 0], frame[i, 1], frame[i, 2]
-                for j in range(3):
-                    frame[i, j] = a * local[0, j] + b * local[1, j] + d * local[2, j]
-                    R[f, k - 1, i, j] = frame[i, j]
-        for i in range(3):
-            for j in range(3):
-                R[f, 3, i, j] = (
-                    frame[i, 0] * tables.tip_turn[f, 0, j]
-                    + frame[i, 1] * tables.tip_turn[f, 1, j]
-                    + frame[i, 2] * tables.tip_turn[f, 2, j]
-                )
-            P[f, 0, i] = tables.root_m[f, i]
-        for k in range(3):
-            for i in range(3):
-                P[f, k + 1, i] = (
-                    P[f, k, i]
-                    + R[f, k, i, 0] * tables.bone_m[f, k, 0]
-                    + R[f, k, i, 1] * tables.bone_m[f, k, 1]
-                    + R[f, k, i, 2] * tables.bone_m[f, k, 2]
-                )
+class PalmFitter:
+    """Fits the palm of one hand. Holds no state between calls."""
 
+    def __init__(self, model: HandModel, markers: tuple[str, ...], priors: Priors | None = None) -> None:
+        """Prepare what is the same in every frame.
 
-@kernel
-def place(mounts: Mounts, m: int, R: Float, P: Float, out: Float) -> None:
-    """Write where marker m sits in the palm frame (3,) [m]."""
-    f, l = mounts.finger[m], mounts.level[m]
-    for i in range(3):
-        out[i] = mounts.offset_m[m, i]
-        if f >= 0:
-            out[i] = (
-                P[f, l, i]
-                + R[f, l, i, 0] * mounts.offset_m[m, 0]
-                + R[f, l, i, 1] * mounts.offset_m[m, 1]
-                + R[f, l, i, 2] * mounts.offset_m[m, 2]
-            )
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self.model, self.priors = model, priors or Priors()
+        self.parameters = HandParameters.of(model)
+        self.tables = HandTables.of(model, self.parameters)
+        self.attached = Attached.markers(model, self.parameters, markers)
+        self._mounts = Mounts.of(self.attached)
+        self._on_finger = self.attached.on_finger[:, 0]
+        habits = AnglePrior.of(model, self.parameters, self.priors)
+        self._normal, self._pull = np.ascontiguousarray(habits.normal[0]), np.ascontiguousarray(habits.pull[0])
+        bent = np.zeros((len(_BENDS_RAD), 5, 4))
+        bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (0.6, 1.0))[:, None]
+        self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
+        self._shapes_m = self.attached.place(model.chains(self.parameters.angles(self._postures)))
+        self._model_m2 = self.priors.model_m**2 * np.eye(3)
+        self._finger_of_free = self.parameters.free // 4
 
+    def __call__(
+        self,
+        points_m: Float,
+        cov_m2: Float,
+        facing: Float | None,
+        last: Palm | None = None,
+        age_s: float = 0.0,
+        hidden: HiddenFingers | None = None,
+    ) -> Palm | None:
+        """Fit the palm of one instant.
 
-@kernel
-def slopes(tables: HandTables, f: int, level: int, point: Float, R: Float, P: Float, out: Float) -> None:
-    """Write the derivatives (n, 3) [m/rad] of a point of finger f, palm frame, by the free angles."""
-    n = tables.complete.shape[1]
-    for c in range(n):
-        for i in range(3):
-            out[c, i] = 0.0
-    for k in range(min(level, 2) + 2):
-        if k == 0:
-            ax, ay, az = tables.abduction_axis[f, 0], tables.abduction_axis[f, 1], tables.abduction_axis[f, 2]
-            j = 0
-        else:
-            j = k - 1
-            ax, ay, az = -R[f, j, 0, 0], -R[f, j, 1, 0], -R[f, j, 2, 0]
-        x, y, z = point[0] - P[f, j, 0], point[1] - P[f, j, 1], point[2] - P[f, j, 2]
-        tx, ty, tz = ay * z - az * y, az * x - ax * z, ax * y - ay * x
-        for c in range(n):
-            share = tables.complete[4 * f + k, c]
-            if share != 0.0:
-                out[c, 0] += share * tx
-                out[c, 1] += share * ty
-                out[c, 2] += share * tz
+        Args:
+            points_m: Cap centroids (M, 3) [m], rig frame; NaN: not seen.
+            cov_m2: (M, 3, 3) [m^2].
+            facing: (3,) unit vector along which the back looks; None: nothing known.
+            last: The palm a moment ago; None: nothing is known of it.
+            age_s: How long ago that was [s].
+            hidden: Where fingers that are not seen are believed to be; None: curled out of sight.
 
+        Returns:
+            The palm; None where there is no last one and too few markers, or none at all.
+        """
+        seen = np.isfinite(points_m[:, 0])
+        if not seen.any():
+            return None
+        information = np.zeros((len(points_m), 3, 3))
+        information[seen] = np.linalg.inv(cov_m2[seen] + self._model_m2)
+        best = None
+        if last is not None:
+            prior = self._expected(last, age_s, seen, facing, hidden)
+            best = self._fit(points_m, information, seen, prior, last.T, last.x)
+            if not (best.surprise > EXPLAINED).any():
+                return best
+        if not determined(points_m[seen], facing, None):
+            return best
+        prior = self._unexpected(seen, facing, hidden)
+        for T, x in zip(*self._starts(points_m, seen, facing), strict=True):
+            found = self._fit(points_m, information, seen, prior, T, x)
+            if best is None or found.cost < best.cost:
+                best = found
+        return best
 
-@kernel
-def linearise(
-    tables: HandTables,
-    mounts: Mounts,
-    prior: PalmPrior,
-    points: Float,
-    information: Float,
-    seen: Bool,
-    T: Float,
-    x: Float,
-    gradient: Float,
-    normal: Float,
-) -> float:
-    """Return half the sum of squared residuals; write its gradient (6 + n,) and Gauss-Newton normal matrix."""
-    n = x.shape[0]
-    angles = np.empty(20)
-    for a in range(20):
-        total = 0.0
-        for c in range(n):
-            total += tables.complete[a, c] * x[c]
-        angles[a] = total
-    R, P = np.empty((5, 4, 3, 3)), np.empty((5, 4, 3))
-    chains(tables, angles, R, P)
-    gradient[:] = 0.0
-    normal[:, :] = 0.0
-    cost = 0.0
-    for i in range(n):
-        total = 0.0
-        for j in range(n):
-            normal[6 + i, 6 + j] = prior.normal[i, j]
-            total += prior.normal[i, j] * x[j]
-        gradient[6 + i] = total - prior.pull[i]
-        cost += (0.5 * total - prior.pull[i]) * x[i]
-    point, arm, off, pull = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    by_x = np.empty((n, 3))
-    J, WJ, used = np.empty((6 + n, 3)), np.empty(3), np.empty(6 + n, np.int64)
-    for m in range(mounts.finger.shape[0]):
-        if not seen[m]:
-            continue
-        place(mounts, m, R, P, point)
-        for i in range(3):
-            arm[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2]
-            off[i] = arm[i] + T[i, 3] - points[m, i]
-        J[:6, :] = 0.0
-        J[0, 1], J[0, 2] = -arm[2], arm[1]  # by the turn: axis x arm
-        J[1, 0], J[1, 2] = arm[2], -arm[0]
-        J[2, 0], J[2, 1] = -arm[1], arm[0]
-        J[3, 0], J[4, 1], J[5, 2] = 1.0, 1.0, 1.0
-        count = 6
-        for i in range(6):
-            used[i] = i
-        f = mounts.finger[m]
-        if f >= 0:
-            slopes(tables, f, mounts.level[m], point, R, P, by_x)
-            for c in range(n):
-                if by_x[c, 0] != 0.0 or by_x[c, 1] != 0.0 or by_x[c, 2] != 0.0:
-                    for i in range(3):
-                        J[count, i] = T[i, 0] * by_x[c, 0] + T[i, 1] * by_x[c, 1] + T[i, 2] * by_x[c, 2]
-                    used[count] = 6 + c
-                    count += 1
-        for i in range(3):
-            pull[i] = (
-                information[m, i, 0] * off[0] + information[m, i, 1] * off[1] + information[m, i, 2] * off[2]
-            )
-            cost += 0.5 * pull[i] * off[i]
-        for a in range(count):
-            gradient[used[a]] += J[a, 0] * pull[0] + J[a, 1] * pull[1] + J[a, 2] * pull[2]
-            for i in range(3):
-                WJ[i] = (
-                    information[m, i, 0] * J[a, 0] + information[m, i, 1] * J[a, 1] + information[m, i, 2] * J[a, 2]
-                )
-            for b in range(count):
-                normal[used[a], used[b]] += WJ[0] * J[b, 0] + WJ[1] * J[b, 1] + WJ[2] * J[b, 2]
-    w2 = prior.facing_weight * prior.facing_weight
-    if w2 > 0.0:
-        # dorsal - facing, with the derivative of the palm's +y by a turn: axis x y
-        yx, yy, yz = T[0, 1], T[1, 1], T[2, 1]
-        dx, dy, dz = yx - prior.facing[0], yy - prior.facing[1], yz - prior.facing[2]
-        cost += 0.5 * w2 * (dx * dx + dy * dy + dz * dz)
-        gradient[0] += w2 * (yy * dz - yz * dy)
-        gradient[1] += w2 * (yz * dx - yx * dz)
-        gradient[2] += w2 * (yx * dy - yy * dx)
-        normal[0, 0] += w2 * (yy * yy + yz * yz)
-        normal[1, 1] += w2 * (yx * yx + yz * yz)
-        normal[2, 2] += w2 * (yx * yx + yy * yy)
-        normal[0, 1] -= w2 * yx * yy
-        normal[1, 0] -= w2 * yx * yy
-        normal[0, 2] -= w2 * yx * yz
-        normal[2, 0] -= w2 * yx * yz
-        normal[1, 2] -= w2 * yy * yz
-        normal[2, 1] -= w2 * yy * yz
-    if prior.weight[0] > 0.0:
-        step = np.empty(6)
-        for i in range(3):
-            j, k = (i + 1) % 3, (i + 2) % 3
-            turned = 0.0  # sine of the angle times the axis, of T prior.T'
-            for c in range(3):
-                turned += T[k, c] * prior.T[j, c] - T[j, c] * prior.T[k, c]
-            step[i] = 0.5 * turned
-            step[3 + i] = T[i, 3] - prior.T[i, 3]
-        for i in range(6):
-            w2 = prior.weight[i] * prior.weight[i]
-            cost += 0.5 * w2 * step[i] * step[i]
-            gradient[i] += w2 * step[i]
-            normal[i, i] += w2
-    return cost
-
-
-@kernel
-def solve(A: Float, b: Float, held: Bool, L: Float, out: Float) -> bool:
-    """Write the solution (n,) of A out = b by Cholesky, `held` unknowns 0; False where A is not positive definite."""
-    n = b.shape[0]
-    for j in range(n):
-        total = 1.0 if held[j] else A[j, j]
-        for k in range(j):
-            total -= L[j, k] * L[j, k]
-        if not total > 0.0:
-            return False
-        L[j, j] = sqrt(total)
-        for i in range(j + 1, n):
-            total = 0.0 if held[i] or held[j] else A[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = total / L[j, j]
-    for i in range(n):
-        total = 0.0 if held[i] else b[i]
-        for k in range(i):
-            total -= L[i, k] * out[k]
-        out[i] = total / L[i, i]
-    for i in range(n - 1, -1, -1):
-        total = out[i]
-        for k in range(i + 1, n):
-            total -= L[k, i] * out[k]
-        out[i] = total / L[i, i]
-    return True
-
-
-@kernel
-def rotate_by(step: Float, T: Float, out: Float) -> None:
-    """Write T (4, 4) turned by a rotation vector step[:3] [rad] in front, and shifted by step[3:6] [m]."""
-    x, y, z = step[0], step[1], step[2]
-    angle = sqrt(x * x + y * y + z * z)
-    a = sin(angle) / angle if angle > 1e-9 else 1.0
-    b = (1.0 - cos(angle)) / (angle * angle) if angle > 1e-5 else 0.5
-    r = np.empty((3, 3))
-    r[0, 0], r[0, 1], r[0, 2] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    r[1, 0], r[1, 1], r[1, 2] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
-    r[2, 0], r[2, 1], r[2, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = r[i, 0] * T[0, j] + r[i, 1] * T[1, j] + r[i, 2] * T[2, j]
-        out[i, 3] = T[i, 3] + step[3 + i]
-
-
-@kernel
-def fit(
-    tables: HandTables,
-    mounts: Mounts,
-    prior: PalmPrior,
-    points: Float,
-    information: Float,
-    seen: Bool,
-    T: Float,
-    x: Float,
-    normal: Float,
-    tolerance: float,
-) -> tuple[float, int]:
-    """Descend from T (4, 4) and x (n,), both in place, to the least cost; return it and the iterations.
-
-    Args:
-        tables, mounts, prior: The hand, its markers, what is known of it.
-        points: (M, 3) [m], rig frame.
-        information: (M, 3, 3) [1/m^2] inverse covariances.
-        seen: (M,).
-        T, x: Start, and then the end.
-        normal: (6 + n, 6 + n) Gauss-Newton normal matrix at the end.
-        tolerance: Of half chi square that a further step may gain.
-    """
-    n = x.shape[0]
-    size = 6 + n
-    gradient, trial_gradient = np.empty(size), np.empty(size)
-    trial_normal, damped, L = np.empty((size, size)), np.empty((size, size)), np.zeros((size, size))
-    step, downhill, held = np.empty(size), np.empty(size), np.zeros(size, np.bool_)
-    T_new, x_new = T.copy(), x.copy()
-    cost = linearise(tables, mounts, prior, points, information, seen, T, x, gradient, normal)
-    damping, growth = 1e-4, 2.0
-    iterations = 0
-    while iterations < MAX_ITERATIONS:
-        iterations += 1
-        damped[:, :] = normal
-        for i in range(size):
-            damped[i, i] *= 1.0 + damping
-            downhill[i] = -gradient[i]
-            held[i] = False
-            if i >= 6:
-                c = i - 6
-                held[i] = (x[c] <= tables.low[c] and downhill[i] < 0.0) or (x[c] >= tables.high[c] and downhill[i] > 0.0)
-        if not solve(damped, downhill, held, L, step):
-            damping, growth = damping * growth, 2.0 * growth
-            continue
-        hoped = 0.0
-        for i in range(size):
-            if not held[i]:
-                hoped += 0.5 * downhill[i] * step[i]
-        if hoped < tolerance and damping <= 1e-3:
-            break
-        rotate_by(step, T, T_new)
-        for c in range(n):
-            x_new[c] = min(max(x[c] + step[6 + c], tables.low[c]), tables.high[c])
-        there = linearise(
-            tables, mounts, prior, points, information, seen, T_new, x_new, trial_gradient, trial_normal
+    def _fit(self, points: Float, information: Float, seen: Bool, prior: PalmPrior, T: Float, x: Float) -> Palm:
+        T, x = np.array(T, np.float64, order="C"), x.copy()
+        size = 6 + len(x)
+        normal, surprise = np.empty((size, size)), np.zeros(len(points))
+        cost, _ = fit(
+            self.tables, self._mounts, prior, points, information, seen, T, x, normal, surprise, _ENOUGH
         )
-        gain = cost - there
-        if gain > 0.0:
-            T[:, :] = T_new
-            x[:] = x_new
-            cost = there
-            gradient[:] = trial_gradient
-            normal[:, :] = trial_normal
-            damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / hoped - 1.0) ** 3), 1e-9)
-            growth = 2.0
-            if gain < tolerance:
-                break
-        else:
-            damping, growth = damping * growth, 2.0 * growth
-            if damping > 1e6:
-                break
-    return cost, iterations
+        alone = normal.reshape(-1)[:: size + 1]
+        alone[:6] -= prior.palm_weight**2
+        walked = self._shown(seen)[self._finger_of_free]
+        alone[6:][walked] -= prior.weight[walked] ** 2
+        alone += self.parameters.anywhere
+        scale = max(1.0, float(surprise.sum()) / (3.0 * int(seen.sum())))
+        return Palm(T, x, scale * np.linalg.inv(normal), cost, surprise)
+
+    def _shown(self, seen: Bool) -> Bool:
+        """(5,) which fingers have a marker that is seen."""
+        shown = np.zeros(5, np.bool_)
+        shown[self.attached.finger[seen & self._on_finger]] = True
+        return shown
+
+    def _expected(
+        self, last: Palm, age_s: float, seen: Bool, facing: Float | None, hidden: HiddenFingers | None
+    ) -> PalmPrior:
+        """The prior where the last palm is known: what is seen moves on from there."""
+        x, shown = last.x, self._shown(seen)
+        weight = np.full(len(x), 1.0 / (self.priors.walk_rad_s * max(age_s, _LEAST_AGE_S)))
+        if hidden is not None and not shown.all():
+            unseen = ~shown[self._finger_of_free]
+            weight = np.where(unseen, 1.0 / hidden.sigma_rad[self._finger_of_free], weight)
+            x = np.where(unseen, self.parameters.of_angles(hidden.angles_rad), x)
+        return self._prior(x, weight, last.T, self.priors.palm_weight(age_s), facing)
+
+    def _unexpected(self, seen: Bool, facing: Float | None, hidden: HiddenFingers | None) -> PalmPrior:
+        """The prior where no last palm is known."""
+        fingers = frozenset(self.attached.finger[seen & self._on_finger].tolist())
+        known = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
+        weight, mean = hidden_belief(self.parameters, self.priors, fingers, known)
+        return self._prior(mean, weight, np.eye(4), np.zeros(6), facing)
+
+    def _prior(
+        self, x: Float, weight: Float, T: Float, palm_weight: Float, facing: Float | None
+    ) -> PalmPrior:
+        known = facing is not None
+        return PalmPrior(
+            self._normal,
+            self._pull,
+            x,
+            weight,
+            T,
+            palm_weight,
+            facing if known else np.zeros(3),
+            1.0 / self.priors.facing if known else 0.0,
+        )
+
+    def _starts(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
+        """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
+        weight = np.where(self._on_finger[seen], 1.0, _PALM_WEIGHT)
+        observed, expected = points[seen], self._shapes_m[:, seen]
+        if facing is not None:
+            above = expected.mean(axis=1, keepdims=True) + np.array([0.0, _ABOVE_M, 0.0])
+            observed = np.vstack([observed, observed.mean(axis=0) + _ABOVE_M * facing])
+            expected = np.concatenate([expected, above], axis=1)
+            weight = np.append(weight, _ABOVE_WEIGHT)
+        return fit_rigid(observed, expected, weight), self._postures
+
+    def covariances(self, palm: Palm) -> tuple[Float, Float]:
+        """Of the joints (26, 3, 3) [m^2], and of the last phalanges' directions (5, 3, 3) [rad^2]."""
+        cov, tilt = np.empty((26, 3, 3)), np.empty((5, 3, 3))
+        covariances(self.tables, palm.T, palm.x, palm.cov, cov, tilt)
+        return cov, tilt

@@ -1,158 +1,246 @@
-"""The card: both slaves' centroids at one instant, disparity, depth, 1 €, palm, FABRIK per finger: a hand."""
+"""The card: both slaves' centroids at one instant, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
 
-from collections.abc import Callable
+Push machine without clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
+"""
+
 from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, HandJoints, HandModel
-from master.fabrik.palm import HandTables, Mounts, PalmPrior, fit
+from common.arrays import Float
+from common.camera_model import CameraModel
+from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
+from common.messages import MarkerDetections, Source
+from master.fabrik.estimate import HandEstimate, MarkerPositions, SolvedHand
+from master.fabrik.palm import Palm, PalmFitter
+from master.fabrik.triangulate import Triangulate
 from master.filters import PointFilter
-from master.ik.attached import Attached
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
-from master.ik.parameters import HandParameters
-from master.ik.priors import AnglePrior, Priors, hidden_belief
-from common.geometry import fit_rigid, skew
+from master.ik.hand import EXPLAINED
+from master.ik.hidden import FingerMemory
+from master.stereo.pairing import Instant, Pairing
 
-_FORGET_S = 0.5
-_GATE = 16.3
-_BENDS = (0.1, 0.7, 1.3)
+FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
+_ON_TARGET_M = 1e-4
+_ITERATIONS = 10  # the seed is on the target; what it cannot reach, iterations improve little
+_FIT_M2 = (3e-3) ** 2 * np.eye(3)  # of a finger's marker as the palm's fit has it
+_DRIFT_M_S = 0.3  # of a hand that is held
+_TURN_RAD_S = 2.0  # of a finger's end, beyond what the fit of the last instant knew
+_PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
+_PALM_MARKERS = 3
+_NATURAL = 1.0  # the line knows no hand without habits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HandEstimate:
-    t_ns: int
-    T_rig_palm: Float
-    angles_rad: Float
-    joints: HandJoints
-    cov_m2: Float
-    seen: Bool  # (5,)
-    residual_m: Float  # (5,)
-    iterations: Int
-    reached: Bool
-    cost: float
+class _Finger:
+    """A finger that carries a marker: which of the markers it is, its closed form and FABRIK."""
+
+    finger: int
+    marker: int
+    closed_form: FingerSolver
+    fabrik: Fabrik
 
 
-class LineSolver:
-    def __init__(self, model: HandModel, markers: tuple[str, ...], *, continuous: bool = True) -> None:
-        self.model, self.markers = model, markers
-        self.parameters = HandParameters.of(model)
-        self.tables = HandTables.of(model, self.parameters)
-        attached = Attached.markers(model, self.parameters, markers)
-        self._attached = attached
-        self.mounts = Mounts(
-            np.where(attached.on_finger[:, 0], attached.finger, -1), attached.level, np.ascontiguousarray(attached.offset_m)
-        )
-        self._priors = Priors()
-        self._prior = AnglePrior.of(model, self.parameters, self._priors)
-        self._fingers = []
-        for m, name in enumerate(markers):
-            mount = model.mount(name)
-            if mount.finger is not None:
-                closed = FingerSolver.of(model, mount.finger, mount.offset_m)
-                self._fingers.append((m, mount.finger, closed, Fabrik.of(closed.chain, 1e-4, 10, 0)))
-        bent = np.zeros((len(_BENDS), 5, 4))
-        bent[:, 1:, 1:3] = np.multiply.outer(_BENDS, (0.6, 1.0))[:, None]
-        self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
-        self._shapes = attached.place(model.chains(self.parameters.angles(self._postures)))
-        self._continuous = continuous
-        self.last: HandEstimate | None = None
-        self._T = np.eye(4)
-        self._x = np.zeros(len(self.parameters.free))
-        n = 6 + len(self._x)
-        self._normal = np.empty((n, n))
-        self.hypothesis = 0
-        self.calls = 0
+class FabrikSolver:
+    """Solves the hand of a rig by the card's line."""
 
-    def solve(self, t_ns: int, points: Float, cov: Float, facing: Float | None) -> HandEstimate | None:
+    def __init__(
+        self,
+        cameras: dict[str, CameraModel],
+        model: HandModel,
+        markers: tuple[str, ...],
+        hand_markers: tuple[str, ...],
+        *,
+        sync: Pairing,
+        triangulate: Triangulate,
+        one_euro: PointFilter | None,
+        palm: PalmFitter,
+    ) -> None:
+        """Join the parts.
+
+        Args:
+            cameras: In the rig's order.
+            model: The hand.
+            markers: Names in the order of every marker array.
+            hand_markers: Those of them that are on this hand.
+            sync: Brings cameras to one instant.
+            triangulate: Centroids to points by the rig's depth model.
+            one_euro: Filter of the points; None: instants are unrelated, nothing is filtered or remembered.
+            palm: Fits the palm from the hand's markers.
+        """
+        self._model, self._sync, self._triangulate = model, sync, triangulate
+        self._one_euro, self._palm = one_euro, palm
+        self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
+        self._centres = np.array([camera.centre for camera in cameras.values()])
+        self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
+        self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
+        mounts = [model.mount(name) for name in hand_markers]
+        self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
+        self._fingers = [
+            _Finger(
+                mount.finger,
+                m,
+                form := FingerSolver.of(model, mount.finger, mount.offset_m),
+                Fabrik.of(form.chain, tolerance_m=_ON_TARGET_M, max_iterations=_ITERATIONS, restarts=0),
+            )
+            for m, mount in enumerate(mounts)
+            if mount.finger is not None
+        ]
+        self._cap_marker = self._on_hand[[finger.marker for finger in self._fingers]]
+        self._cap_finger = np.array([finger.finger for finger in self._fingers], np.int64)
+        self._count = len(markers)
+        self._memory = FingerMemory(model)
+        self._last: SolvedHand | None = None
+        self._last_palm: Palm | None = None
+        self._last_ns = self._seen_ns = -(2**62)
+
+    def push(self, message: MarkerDetections) -> list[HandEstimate]:
+        """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
+        return [self.solve(instant) for instant in self._sync.push(message)]
+
+    def flush(self) -> list[HandEstimate]:
+        """At the end of a recording: the hands that still wait for a camera."""
+        return [self.solve(instant) for instant in self._sync.flush()]
+
+    def solve(self, instant: Instant, near: SolvedHand | None = None) -> HandEstimate:
+        """Solve one instant.
+
+        Args:
+            instant: What the cameras see of it.
+            near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
+        """
+        last, age_s = self._recent(instant.t_ns)
+        seen_as = near or last
+        markers = self.positions(instant, seen_as, age_s)
+        if seen_as is None and (first := self._fit(markers.points_m, markers.cov_m2, instant, None, 0.0)):
+            self._memory = FingerMemory(self._model)
+            markers = self.positions(instant, self._hand_of(first), 0.0)
+        smooth = markers.points_m
+        if self._one_euro is not None:
+            smooth = self._one_euro.push(instant.t_ns, smooth, markers.noise_m2)
+        palm = self._fit(smooth, markers.cov_m2, instant, last, age_s)
+        return self._estimate(instant, markers, smooth, palm)
+
+    def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
+        """The last hand, if it still says anything, and how long ago it held [s]."""
+        age_s = (t_ns - self._last_ns) * 1e-9
+        if self._one_euro is None or self._last is None or not 0.0 < age_s <= FORGET_S:
+            return None, 0.0
+        return self._last, age_s
+
+    def positions(self, instant: Instant, hand: SolvedHand | None, age_s: float) -> MarkerPositions:
+        """Triangulate the markers of an instant, their caps seen as on a hand of `age_s` ago; None: no hand is known."""
+        ahead, tilt = np.full((self._count, 3), np.nan), np.zeros((self._count, 3, 3))
+        if hand is not None:
+            ahead[self._cap_marker] = -hand.joints.rotation[TIPS[self._cap_finger], :, 2]
+            tilt[self._cap_marker] = hand.tilt_cov_rad2[self._cap_finger] + (_TURN_RAD_S * age_s) ** 2 * np.eye(3)
+        return self._triangulate(instant.uv, instant.sigma_px, instant.area, ahead, tilt)
+
+    def _fit(
+        self, points: Float, cov: Float, instant: Instant, last: SolvedHand | None, age_s: float
+    ) -> Palm | None:
+        """The palm of an instant; `last` as of `_recent`."""
+        points, cov = points[self._on_hand], cov[self._on_hand]
         seen = np.isfinite(points[:, 0])
-        age_s = np.inf if self.last is None else (t_ns - self.last.t_ns) * 1e-9
-        information = np.zeros((len(points), 3, 3))
-        information[seen] = np.linalg.inv(cov[seen] + self._priors.model_m**2 * np.eye(3))
-        best = None
-        if self._continuous and 0.0 < age_s <= _FORGET_S:
-            best = self._fit(points, information, seen, facing, self._T, self._x, age_s)
-        if best is None or self._surprised(best, points, information, seen):
-            for T, x in self._starts(points, seen, facing):
-                found = self._fit(points, information, seen, facing, T, x, np.inf)
-                if best is None or found[0] < best[0]:
-                    best = found
-        if best is None:
-            return None
-        cost, T, x, normal = best
-        self._T, self._x = T, x
-        return self._fingers_of(t_ns, points, cov, seen, cost, T, x, normal)
+        facing = self.facing(points, instant.area) if seen[self._on_palm].any() else None
+        if last is None:
+            return self._palm(points, cov, facing)
+        shown = frozenset(one.finger for one in self._fingers if seen[one.marker])
+        hidden = self._memory.belief(instant.t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
+        return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
 
-    def _surprised(self, found, points, information, seen):
-        _, T, x, _ = found
-        local = self._attached.place(self.model.chains(self.parameters.angles(x)))
-        off = (local @ T[:3, :3].T + T[:3, 3] - points)[seen]
-        return bool((np.einsum("mi,mij,mj->m", off, information[seen], off) > _GATE).any())
+    def facing(self, points: Float, area_px2: Float) -> Float:
+        """Unit vector (3,) from what is seen of the hand to the cameras that see the back of it.
 
-    def _starts(self, points, seen, facing):
-        if seen.sum() < 2 or (seen.sum() == 2 and facing is None):
-            return
-        weight = np.where(self._attached.on_finger[seen, 0], 1.0, 3.0)
-        observed, expected = points[seen], self._shapes[:, seen]
-        if facing is not None:
-            above = expected.mean(axis=1, keepdims=True) + np.array([0.0, 0.05, 0.0])
-            observed = np.vstack([observed, observed.mean(axis=0) + 0.05 * facing])
-            expected, weight = np.concatenate([expected, above], axis=1), np.append(weight, 0.3)
-        for T, x in zip(fit_rigid(observed, expected, weight), self._postures, strict=True):
-            yield T, x
+        A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras,
+        weighed by what each sees, add up to where it faces, as far as they tell.
 
-    def _fit(self, points, information, seen, facing, T, x, age_s):
-        h = self.hypothesis
-        normal, pull = self._prior.normal[h].copy(), self._prior.pull[h].copy()
-        fingers = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
-        warm = np.isfinite(age_s)
-        weight = np.zeros(6)
-        if warm:
-            w = np.full(len(x), 1.0 / (self._priors.walk_rad_s * max(age_s, 1e-3)))
-            hidden = ~np.isin(self.parameters.free // 4, list(fingers))
-            w[hidden] = 1.0 / np.radians(10.0)
-            normal.reshape(-1)[:: len(x) + 1] += w * w
-            pull += w * w * x
-            weight = self._priors.palm_weight(age_s)
-        else:
-            w, mean = hidden_belief(self.parameters, self._priors, fingers, None)
-            normal.reshape(-1)[:: len(x) + 1] += w * w
-            pull += w * w * mean
-        prior = PalmPrior(
-            normal,
-            pull,
-            np.ascontiguousarray(T),
-            weight,
-            np.zeros(3) if facing is None else facing,
-            0.0 if facing is None else 1.0 / self._priors.facing,
-        )
-        T, x = np.ascontiguousarray(T).copy(), x.copy()
-        out = np.empty_like(self._normal)
-        cost, _ = fit(self.tables, self.mounts, prior, points, information, seen, T, x, out, 1e-3)
-        self.calls += 1
-        return cost, T, x, out
+        Args:
+            points: (H, 3) [m] markers of the hand; NaN: not placed.
+            area_px2: (C, M) of all markers.
+        """
+        found = points[np.isfinite(points[:, 0])]
+        if not len(found):
+            return self._ahead
+        back = self._centres - found.mean(axis=0)
+        distance = np.linalg.norm(back, axis=1)
+        shown = np.nansum(area_px2[:, self._on_hand[self._on_palm]], axis=1) * (distance / self._focal_px) ** 2
+        towards = (shown if shown.any() else np.ones(len(shown))) @ (back / distance[:, None])
+        length = float(np.linalg.norm(towards))
+        return towards / length if length > 0.0 else back[0] / distance[0]
 
-    def _fingers_of(self, t_ns, points, cov, seen, cost, T, x, normal):
-        angles = self.parameters.angles(x)
-        residual, reached, iterations = np.full(5, np.nan), np.zeros(5, np.bool_), np.zeros(5, np.int64)
-        R = T[:3, :3]
-        local = (points - T[:3, 3]) @ R
-        for m, finger, closed, fabrik in self._fingers:
-            if not seen[m]:
+    def _hand_of(self, palm: Palm) -> SolvedHand:
+        """The hand as the palm's fit has it."""
+        angles = self._model.clamp(self._palm.parameters.angles(palm.x))
+        joints = self._model.joints(palm.T, self._model.chains(angles))
+        cov, tilt = self._palm.covariances(palm)
+        return SolvedHand(palm.T, angles, joints, cov, tilt, np.zeros((5, 3, 3)))
+
+    def _estimate(
+        self, instant: Instant, markers: MarkerPositions, smooth: Float, palm: Palm | None
+    ) -> HandEstimate:
+        """Bring the fingers of a palm onto their markers; without a palm the last hand is held."""
+        points = smooth[self._on_hand]
+        seen, reached = np.zeros(5, np.bool_), np.zeros(5, np.bool_)
+        residual, iterations = np.full(5, np.nan), np.zeros(5, np.int64)
+        explained = np.zeros(5, np.bool_)
+        facing = self.facing(points, instant.area)
+        valid, tracked = np.zeros(26, np.bool_), np.zeros(26, np.bool_)
+        source = np.full(26, Source.HELD, np.uint8)
+        if palm is None:
+            hand = self._held(instant.t_ns)
+            valid[:] = hand is not None
+            return HandEstimate(
+                instant.t_ns, markers, smooth, facing, hand, valid, tracked, source, seen, residual, iterations, reached
+            )
+        fitted = self._hand_of(palm)
+        R, origin = palm.T[:3, :3], palm.T[:3, 3]
+        targets = (points - origin) @ R
+        places = self._palm.attached.place(self._model.chains(fitted.angles_rad))
+        angles = fitted.angles_rad.copy()
+        gain = _FIT_M2 @ np.linalg.inv(_FIT_M2 + np.nan_to_num(R.T @ markers.cov_m2[self._on_hand] @ R))
+        targets = places + (gain @ (targets - places)[..., None])[..., 0]
+        for one in self._fingers:
+            m, f = one.marker, one.finger
+            target = tuple(targets[m].tolist())
+            if not np.isfinite(target[0]):
                 continue
-            target = tuple(local[m].tolist())
-            if finger == 0:
-                a, f, pip, dip = angles[0].tolist()
-            else:
-                a, f, pip, dip = closed.solve(target)[:4]
-            found = fabrik.solve(target, ((a, f), (pip,), (dip,)), closed.root)
-            residual[finger], reached[finger], iterations[finger] = found.residual_m, found.reached, found.iterations
-            if found.reached:
-                angles[finger] = [v for joint in found.angles for v in joint]
-        angles = self.model.clamp(angles)
-        joints = self.model.joints(T, self.model.chains(angles))
-        hand = HandEstimate(t_ns, T, angles, joints, np.zeros((26, 3, 3)), ~np.isnan(residual), residual, iterations, reached, cost)
-        self.last = hand
-        return hand
+            seen[f] = True
+            a, flexion, pip, dip = angles[f].tolist()
+            if f != 0:
+                a, flexion, pip, dip = one.closed_form.solve(target)[:4]
+            found = one.fabrik.solve(target, ((a, flexion), (pip,), (dip,)), one.closed_form.root)
+            reached[f], iterations[f], residual[f] = found.reached, found.iterations, found.residual_m
+            explained[f] = palm.surprise[m] < EXPLAINED
+            angles[f] = [angle for joint in found.angles for angle in joint]
+        angles = self._model.clamp(angles)
+        joints = self._model.joints(palm.T, self._model.chains(angles))
+        off = joints.position_m - fitted.joints.position_m
+        cov = fitted.cov_m2 + off[:, :, None] * off[:, None, :]
+        hand = SolvedHand(palm.T, angles, joints, cov, fitted.tilt_cov_rad2, fitted.tilt_walk_rad2_s2)
+        count = int(np.isfinite(points[:, 0]).sum())
+        placed = count >= _PALM_MARKERS or (count == 2 and np.isfinite(points[self._on_palm, 0]).any())
+        valid[:] = True
+        tracked[(CHAINS if placed else TIPS)[explained]] = True
+        source[CHAINS[seen]] = Source.SOLVED
+        source[TIPS[seen]] = Source.MEASURED
+        if placed:
+            tracked[_PALM_JOINTS], source[_PALM_JOINTS] = True, Source.SOLVED
+        last, age_s = self._recent(instant.t_ns)
+        if last is not None:
+            self._memory.moved(last.angles_rad, angles, age_s)
+        self._last, self._last_palm, self._last_ns = hand, palm, instant.t_ns
+        return HandEstimate(
+            instant.t_ns, markers, smooth, facing, hand, valid, tracked, source, seen, residual, iterations, reached
+        )
+
+    def _held(self, t_ns: int) -> SolvedHand | None:
+        """The last hand while it says anything, as much less sure as it may have moved."""
+        last, age_s = self._recent(t_ns)
+        if last is None:
+            return None
+        cov = last.cov_m2 + (_DRIFT_M_S * age_s) ** 2 * np.eye(3)
+        return SolvedHand(
+            last.T_rig_palm, last.angles_rad, last.joints, cov, last.tilt_cov_rad2, last.tilt_walk_rad2_s2
+        )

@@ -12,23 +12,32 @@ before the law is asked. On the axis, and for parallel cameras without distortio
 which the right camera must see the marker is tabulated: a marker whose rows disagree is two things, and dropped.
 
 A camera sees the side of a painted finger tip that faces it, so the centroid is up to half a radius off that of the
-cap; by how much follows from the direction in which the finger pointed in the last frame (`CapView`).
+cap; by how much follows from the direction in which the finger pointed a moment ago (`master.stereo.caps`).
 
-Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigma_u / f, and what the law's fit left.
+Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigma_u / f, and what the law's fit left;
+and by how far the point moves where the finger points elsewhere within one standard deviation.
 """
 
-from math import acos, sqrt
+from collections.abc import Callable
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Float
 from common.camera_model import CameraModel
 from common.kernels import kernel
+from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
+from master.fabrik.estimate import MarkerPositions
+from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw, PowerLaw
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
+_LAW_TURNS = 3  # each leaves a thousandth of the correction off the axis
+_ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing tells where the finger points
+_RELIEF_M2 = (0.4e-3) ** 2  # a flat marker on a back that is not flat
+_RADIUS = 0.1  # relative error of a profile's radii
 
 
 class DisparityTables(NamedTuple):
@@ -37,17 +46,24 @@ class DisparityTables(NamedTuple):
     Attributes:
         power: Whether D = k x^z; else D = k / (x - z).
         k, z: Of the law.
+        law_error: Relative standard deviation of the law.
+        row_sigma_px: Standard deviation of the difference of rows that the geometry leaves.
+        row_limit: Most of its chi square.
         cell_px: (2,) width and height of a cell.
         table: (GRID + 1, GRID + 1, 6) at each corner (row, column): a, b of the disparity off the axis, a, b of the
             difference of rows, and x, y of the undistorted ray.
         R, centre: (3, 3), (3,) the left camera in the rig.
         camera_R: (2, 3, 3) rotations rig -> camera, for what each sees of a cap.
+        centres: (2, 3) [m].
         focal_px: (2,).
     """
 
     power: bool
     k: float
     z: float
+    law_error: float
+    row_sigma_px: float
+    row_limit: float
     cell_px: Float
     table: Float
     R: Float
@@ -57,21 +73,24 @@ class DisparityTables(NamedTuple):
     focal_px: Float
 
 
-def disparity_tables(cameras: tuple[CameraModel, ...], law: DepthLaw) -> DisparityTables:
-    """Tabulate the pair's geometry over the left image."""
+def disparity_tables(
+    cameras: tuple[CameraModel, ...], law: DepthLaw, law_error: float, row_sigma_px: float, row_limit: float
+) -> DisparityTables:
+    """Tabulate the geometry of the first two cameras over the left image; arguments as of `DisparityTables`."""
     left, right = cameras[:2]
     u = np.linspace(0.0, left.width_px, GRID + 1)
     v = np.linspace(0.0, left.height_px, GRID + 1)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = left.undistort(uv)
-    axis = left.matrix[:2, 2]
+    axis_px = float(left.matrix[0, 2])
     design = np.stack([np.ones_like(_DEPTHS_M), 1.0 / _DEPTHS_M], axis=1)
     table = np.empty((len(uv), 6))
     disparity, rows = np.empty((len(_DEPTHS_M), len(uv))), np.empty((len(_DEPTHS_M), len(uv)))
-    for k, depth in enumerate(_DEPTHS_M):
-        seen = right.project(_rig(left, np.concatenate([xy, np.ones((len(xy), 1))], axis=1) * depth))
-        on_axis = right.project(_rig(left, np.array([[0.0, 0.0, depth]])))[0]
-        disparity[k] = (uv[:, 0] - seen[:, 0]) - (axis[0] - on_axis[0])
+    rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
+    for k, depth_m in enumerate(_DEPTHS_M):
+        seen = right.project(_rig(left, rays * depth_m))
+        on_axis_px = float(right.project(_rig(left, np.array([[0.0, 0.0, depth_m]])))[0, 0])
+        disparity[k] = (uv[:, 0] - seen[:, 0]) - (axis_px - on_axis_px)
         rows[k] = uv[:, 1] - seen[:, 1]
     solve = np.linalg.pinv(design)
     table[:, :2], table[:, 2:4], table[:, 4:] = (solve @ disparity).T, (solve @ rows).T, xy
@@ -80,6 +99,9 @@ def disparity_tables(cameras: tuple[CameraModel, ...], law: DepthLaw) -> Dispari
         isinstance(law, PowerLaw),
         first,
         second,
+        law_error,
+        row_sigma_px,
+        row_limit,
         np.array([left.width_px / GRID, left.height_px / GRID]),
         table.reshape(GRID + 1, GRID + 1, 6),
         np.ascontiguousarray(left.T_rig_camera[:3, :3]),
@@ -92,19 +114,6 @@ def disparity_tables(cameras: tuple[CameraModel, ...], law: DepthLaw) -> Dispari
 
 def _rig(camera: CameraModel, points: Float) -> Float:
     return points @ camera.T_rig_camera[:3, :3].T + camera.centre
-
-
-class CapTables(NamedTuple):
-    """How the painted cap of each of M markers looks from all sides.
-
-    Attributes:
-        row: (M,) row of `looks`; -1: flat, its centroid is what is seen.
-        looks: (K, A + 1, 3) over the angle between finger and sight, 0 to pi: shift of the seen centroid along the
-            finger and towards the eye [m], and the area seen.
-    """
-
-    row: Int
-    looks: Float
 
 
 @kernel
@@ -125,19 +134,91 @@ def metres_per_pixel(tables: DisparityTables, depth_m: float) -> float:
 
 
 @kernel
-def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float) -> None:
-    """Write the seen centroid of a cap less its own (3,) [m], for unit vectors along the finger and to the eye."""
-    cosine = ahead[0] * back[0] + ahead[1] * back[1] + ahead[2] * back[2]
-    cosine = min(max(cosine, -1.0), 1.0)
-    last = caps.looks.shape[1] - 1
-    place = acos(cosine) * (last / np.pi)
-    low = min(int(place), last - 1)
-    part = place - low
-    along = (1.0 - part) * caps.looks[row, low, 0] + part * caps.looks[row, low + 1, 0]
-    towards = (1.0 - part) * caps.looks[row, low, 1] + part * caps.looks[row, low + 1, 1]
-    towards /= max(sqrt(1.0 - cosine * cosine), 1e-9)
-    for i in range(3):
-        out[i] = along * ahead[i] + towards * (back[i] - cosine * ahead[i])
+def place_centroids(
+    tables: DisparityTables, u: float, v: float, right_u: float, right_v: float, ray: Float, point: Float
+) -> tuple[float, float]:
+    """Return the depth [m] and by how much the rows disagree [px]; write the ray (3,) of depth 1 and the point (3,).
+
+    Args:
+        tables: The pair.
+        u, v: Centroid in the left image [px].
+        right_u, right_v: In the right one.
+        ray, point: Written, rig frame; not where the depth is NaN.
+    """
+    across, down = u / tables.cell_px[0], v / tables.cell_px[1]
+    last = tables.table.shape[0] - 2
+    i, j = min(max(int(down), 0), last), min(max(int(across), 0), last)
+    q, p = across - j, down - i
+    cell = np.empty(6)
+    for c in range(6):
+        upper = (1.0 - q) * tables.table[i, j, c] + q * tables.table[i, j + 1, c]
+        lower = (1.0 - q) * tables.table[i + 1, j, c] + q * tables.table[i + 1, j + 1, c]
+        cell[c] = (1.0 - p) * upper + p * lower
+    disparity = u - right_u
+    z = depth(tables, disparity)
+    for _ in range(_LAW_TURNS):
+        z = depth(tables, disparity - cell[0] - cell[1] / z)
+    if not np.isfinite(z):
+        return np.nan, np.nan
+    for k in range(3):
+        ray[k] = tables.R[k, 0] * cell[4] + tables.R[k, 1] * cell[5] + tables.R[k, 2]
+        point[k] = tables.centre[k] + z * ray[k]
+    return z, v - right_v - cell[2] - cell[3] / z
+
+
+@kernel
+def cap_bias(
+    tables: DisparityTables, caps: CapTables, row: int, ahead: Float, point: Float, bias: Float, shown: Float
+) -> None:
+    """Write by how much each camera sees a cap's centroid off its own (2, 2) [px], and the area it shows (2,) [m^2].
+
+    Args:
+        tables, caps: The pair and the markers.
+        row: The marker's in `caps.looks`.
+        ahead: (3,) unit vector in which the finger points, rig frame.
+        point: (3,) [m] about where the cap is, rig frame.
+        bias, shown: Written.
+    """
+    back, shift = np.empty(3), np.empty(3)
+    here, there = np.empty(3), np.empty(3)
+    for c in range(2):
+        length = 0.0
+        for k in range(3):
+            back[k] = tables.centres[c, k] - point[k]
+            length += back[k] * back[k]
+        length = sqrt(length)
+        for k in range(3):
+            back[k] /= length
+        shown[c] = seen_shift(caps, row, ahead, back, shift)
+        for i in range(3):
+            here[i] = there[i] = 0.0
+            for k in range(3):
+                here[i] -= tables.camera_R[c, i, k] * back[k] * length
+                there[i] += tables.camera_R[c, i, k] * (shift[k] - back[k] * length)
+        bias[c, 0] = tables.focal_px[c] * (there[0] / there[2] - here[0] / here[2])
+        bias[c, 1] = tables.focal_px[c] * (there[1] / there[2] - here[1] / here[2])
+
+
+@kernel
+def _across(ahead: Float, tilt: Float, out: Float) -> None:
+    """Write two directions across `ahead` (2, 3), each as long as the tilt (3, 3) [rad^2] is unsure about it [rad]."""
+    least = 0
+    for k in range(1, 3):
+        if abs(ahead[k]) < abs(ahead[least]):
+            least = k
+    i, j = (least + 1) % 3, (least + 2) % 3
+    length = sqrt(ahead[i] * ahead[i] + ahead[j] * ahead[j])
+    out[0, least], out[0, i], out[0, j] = 0.0, -ahead[j] / length, ahead[i] / length
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        out[1, k] = ahead[a] * out[0, b] - ahead[b] * out[0, a]
+    for t in range(2):
+        variance = 0.0
+        for a in range(3):
+            for b in range(3):
+                variance += out[t, a] * tilt[a, b] * out[t, b]
+        for k in range(3):
+            out[t, k] *= sqrt(max(variance, 0.0))
 
 
 @kernel
@@ -146,100 +227,129 @@ def triangulate(
     caps: CapTables,
     uv: Float,
     sigma_px: Float,
+    area_px2: Float,
     ahead: Float,
-    law_error: float,
+    tilt: Float,
     points: Float,
     cov: Float,
-    rows_px: Float,
+    noise: Float,
+    apart: Float,
 ) -> None:
-    """Write the points (M, 3) [m] of markers, their covariances, and by how much their rows disagree (M,) [px].
+    """Write points (M, 3) [m], covariances and their noise part (M, 3, 3) [m^2], and which rows disagree (M,).
 
     Args:
         tables, caps: The pair and the markers.
         uv: (2, M, 2) centroids [px]; NaN: not seen.
-        sigma_px: (2, M).
+        sigma_px, area_px2: (2, M).
         ahead: (M, 3) unit vectors in which the fingers point, rig frame; NaN: not known, what is seen is taken.
-        law_error: Relative standard deviation of the law.
-        points, cov, rows_px: Written; NaN where a camera does not see the marker or the disparity is none.
+        tilt: (M, 3, 3) [rad^2] covariance of these.
+        points, cov, noise, apart: Written; NaN where a camera does not see the marker or the disparity is none.
     """
-    bias, shift, back, ray = np.empty((2, 2)), np.empty(3), np.empty(3), np.empty(3)
-    by = np.empty((3, 3))
+    ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    bias, shown, tilted = np.zeros((2, 2)), np.empty(2), np.empty((2, 3))
+    whole, variance, by = np.empty(2), np.empty(2), np.empty((3, 3))
     for m in range(uv.shape[1]):
         points[m, :] = np.nan
         cov[m, :, :] = np.nan
-        rows_px[m] = np.nan
+        noise[m, :, :] = np.nan
+        apart[m] = False
         if not np.isfinite(uv[0, m, 0] + uv[0, m, 1] + uv[1, m, 0] + uv[1, m, 1]):
             continue
         bias[:, :] = 0.0
+        whole[:] = 0.0
         row = caps.row[m]
-        turns = 2 if row >= 0 and np.isfinite(ahead[m, 0]) else 1
-        z, rows, x, y = np.nan, 0.0, 0.0, 0.0
-        for turn in range(turns):
-            u, v = uv[0, m, 0] - bias[0, 0], uv[0, m, 1] - bias[0, 1]
-            right_u, right_v = uv[1, m, 0] - bias[1, 0], uv[1, m, 1] - bias[1, 1]
-            across, down = u / tables.cell_px[0], v / tables.cell_px[1]
-            i = min(max(int(down), 0), tables.table.shape[0] - 2)
-            j = min(max(int(across), 0), tables.table.shape[1] - 2)
-            q, p = across - j, down - i
-            w00, w01, w10, w11 = (1.0 - p) * (1.0 - q), (1.0 - p) * q, p * (1.0 - q), p * q
-            a = w00 * tables.table[i, j, 0] + w01 * tables.table[i, j + 1, 0]
-            a += w10 * tables.table[i + 1, j, 0] + w11 * tables.table[i + 1, j + 1, 0]
-            b = w00 * tables.table[i, j, 1] + w01 * tables.table[i, j + 1, 1]
-            b += w10 * tables.table[i + 1, j, 1] + w11 * tables.table[i + 1, j + 1, 1]
-            rows = w00 * tables.table[i, j, 2] + w01 * tables.table[i, j + 1, 2]
-            rows += w10 * tables.table[i + 1, j, 2] + w11 * tables.table[i + 1, j + 1, 2]
-            rows_b = w00 * tables.table[i, j, 3] + w01 * tables.table[i, j + 1, 3]
-            rows_b += w10 * tables.table[i + 1, j, 3] + w11 * tables.table[i + 1, j + 1, 3]
-            x = w00 * tables.table[i, j, 4] + w01 * tables.table[i, j + 1, 4]
-            x += w10 * tables.table[i + 1, j, 4] + w11 * tables.table[i + 1, j + 1, 4]
-            y = w00 * tables.table[i, j, 5] + w01 * tables.table[i, j + 1, 5]
-            y += w10 * tables.table[i + 1, j, 5] + w11 * tables.table[i + 1, j + 1, 5]
-            disparity = u - right_u
-            z = depth(tables, disparity)
-            for _ in range(3):  # each leaves a thousandth
-                z = depth(tables, disparity - a - b / z)
-            if not np.isfinite(z):
-                break
-            rows = v - right_v - rows - rows_b / z
-            for k in range(3):
-                ray[k] = tables.R[k, 0] * x + tables.R[k, 1] * y + tables.R[k, 2]
-                points[m, k] = tables.centre[k] + z * ray[k]
-            if turn + 1 < turns:
-                for c in range(2):
-                    length = 0.0
-                    for k in range(3):
-                        back[k] = tables.centres[c, k] - points[m, k]
-                        length += back[k] * back[k]
-                    length = sqrt(length)
-                    here_x = here_y = here_z = shift_x = shift_y = shift_z = 0.0
-                    for k in range(3):
-                        here_x -= tables.camera_R[c, 0, k] * back[k]
-                        here_y -= tables.camera_R[c, 1, k] * back[k]
-                        here_z -= tables.camera_R[c, 2, k] * back[k]
-                    for k in range(3):
-                        back[k] /= length
-                    seen_shift(caps, row, ahead[m], back, shift)
-                    for k in range(3):
-                        shift_x += tables.camera_R[c, 0, k] * shift[k]
-                        shift_y += tables.camera_R[c, 1, k] * shift[k]
-                        shift_z += tables.camera_R[c, 2, k] * shift[k]
-                    there = here_z + shift_z
-                    bias[c, 0] = tables.focal_px[c] * ((here_x + shift_x) / there - here_x / here_z)
-                    bias[c, 1] = tables.focal_px[c] * ((here_y + shift_y) / there - here_y / here_z)
+        known = row >= 0 and np.isfinite(ahead[m, 0])
+        z, rows = place_centroids(tables, uv[0, m, 0], uv[0, m, 1], uv[1, m, 0], uv[1, m, 1], ray, point)
         if not np.isfinite(z):
-            points[m, :] = np.nan
             continue
-        rows_px[m] = rows
+        spread2 = 0.0
+        if known:
+            cap_bias(tables, caps, row, ahead[m], point, bias, whole)
+            for k in range(3):
+                aim[k] = point[k]
+            z, rows = place_centroids(
+                tables,
+                uv[0, m, 0] - bias[0, 0],
+                uv[0, m, 1] - bias[0, 1],
+                uv[1, m, 0] - bias[1, 0],
+                uv[1, m, 1] - bias[1, 1],
+                ray,
+                point,
+            )
+            for k in range(3):
+                by[k, 0] = _RADIUS * (point[k] - aim[k])
+            for a in range(3):
+                points[m, a] = point[a]
+                for b in range(3):
+                    cov[m, a, b] = by[a, 0] * by[b, 0]
+            _across(ahead[m], tilt[m], tilted)
+            for t in range(2):
+                length = 0.0
+                for k in range(3):
+                    aim[k] = ahead[m, k] + tilted[t, k]
+                    length += aim[k] * aim[k]
+                for k in range(3):
+                    aim[k] /= sqrt(length)
+                cap_bias(tables, caps, row, aim, point, bias, shown)
+                for c in range(2):
+                    whole[c] = max(whole[c], shown[c])
+                place_centroids(
+                    tables,
+                    uv[0, m, 0] - bias[0, 0],
+                    uv[0, m, 1] - bias[0, 1],
+                    uv[1, m, 0] - bias[1, 0],
+                    uv[1, m, 1] - bias[1, 1],
+                    by[2],
+                    off,
+                )
+                for a in range(3):
+                    for b in range(3):
+                        cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
+        else:
+            spread2 = _ANYHOW_M2 if row >= 0 else _RELIEF_M2
+            for a in range(3):
+                points[m, a] = point[a]
+                for b in range(3):
+                    cov[m, a, b] = spread2 if a == b else 0.0
+        radius = caps.radius_m[row] if row >= 0 else 0.0
+        hidden_part(area_px2[:, m], z / tables.focal_px, whole, radius, variance)
+        rows2 = tables.row_sigma_px * tables.row_sigma_px + sigma_px[0, m] ** 2 + sigma_px[1, m] ** 2
+        if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):
+            points[m, :] = np.nan
+            cov[m, :, :] = np.nan
+            apart[m] = True
+            continue
         per_px, scale = metres_per_pixel(tables, z), z / tables.focal_px[0]
         for k in range(3):  # derivatives by u of the left camera, v of it, and u of the right one
             by[k, 0] = scale * tables.R[k, 0] - per_px * ray[k]
             by[k, 1] = scale * tables.R[k, 1]
             by[k, 2] = per_px * ray[k]
-        left2, right2, law2 = sigma_px[0, m] ** 2, sigma_px[1, m] ** 2, (law_error * z) ** 2
-        for k in range(3):
-            for l in range(3):
-                cov[m, k, l] = (
-                    left2 * (by[k, 0] * by[l, 0] + by[k, 1] * by[l, 1])
-                    + right2 * by[k, 2] * by[l, 2]
-                    + law2 * ray[k] * ray[l]
+        left2, right2 = sigma_px[0, m] ** 2 + variance[0], sigma_px[1, m] ** 2 + variance[1]
+        law2 = (tables.law_error * z) ** 2
+        for a in range(3):
+            for b in range(3):
+                noise[m, a, b] = (
+                    left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
                 )
+                cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
+
+
+class DepthTriangulator:
+    """Triangulates the markers of a rig by its depth law. Holds no state between calls."""
+
+    def __init__(self, tables: DisparityTables, caps: CapModel) -> None:
+        """Triangulate these markers with this pair."""
+        self._tables, self._caps, self._views = tables, caps, CapTables.of(caps)
+
+    def __call__(
+        self, uv: Float, sigma_px: Float, area_px2: Float, ahead: Float, tilt: Float
+    ) -> MarkerPositions:
+        """Positions of M markers; arguments as of `triangulate`, of the rig's first two cameras."""
+        count = uv.shape[1]
+        points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
+        noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
+        triangulate(self._tables, self._views, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)
+        return MarkerPositions(points, cov, noise, apart)
+
+
+Triangulate = Callable[[Float, Float, Float, Float, Float], MarkerPositions]

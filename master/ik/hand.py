@@ -161,7 +161,7 @@ class HandSolver:
         seen = seen_markers(points_m, cov_m2)
         if others is not None:
             orientation = others.palm
-        if last is None and not _determined(points_m[seen], facing, orientation):
+        if last is None and not determined(points_m[seen], facing, orientation):
             return None
         shown = frozenset(self._attached.finger[seen & self._attached.on_finger[:, 0]].tolist())
         if others is not None:
@@ -353,7 +353,7 @@ def seen_markers(points_m: Float, cov_m2: Float) -> Bool:
     return np.asarray(np.isfinite(points_m.sum(axis=1) + cov_m2.reshape(-1, 9).sum(axis=1)))
 
 
-def _determined(points: Float, facing: Float | None, orientation: Orientation | None) -> bool:
+def determined(points: Float, facing: Float | None, orientation: Orientation | None) -> bool:
     """Whether points (N, 3) fix a hand: not all in one line, or in a line across `facing`.
 
     What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an

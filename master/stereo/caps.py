@@ -24,12 +24,12 @@ _HEXAGON = sqrt(2.0) * np.stack([f(np.arange(6) * np.pi / 3) for f in (np.cos, n
 _LEAST_TILT_2 = 1e-30  # [rad^2]
 _MOST_TILT = 2.0  # tangent of the tilt of a sigma point: it stays on its side
 _BENT_RAD = np.radians(135.0)  # away from the eye: a cap still shows a strip of its side
-_FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or partly hidden
-_LEAST_SHARE = 0.8  # of what a whole cap shows: where its radius is a tenth smaller than the profile says
-_ALIKE = 0.9  # of the share that another camera sees: what edges of two blobs of 200 px do not explain
+FLAT_SHARE = 0.6  # a flat marker that shows less is tilted by 53 degrees, or partly hidden
+LEAST_SHARE = 0.8  # of what a whole cap shows: where its radius is a tenth smaller than the profile says
+ALIKE = 0.9  # of the share that another camera sees: what edges of two blobs of 200 px do not explain
 # What hides a part from one camera is near to the sight of the others too, and may hide as much from all as none of
 # them can tell: the lesser hidden share by the larger, of 20 rendered caps, is 0.16 in the mean and 0.28 rms.
-_REACH = 0.2
+REACH = 0.2
 _SPECK_M2 = 1e-9
 
 
@@ -51,6 +51,8 @@ class CapModel:
 
     Attributes:
         on_finger: (M,) markers that are caps.
+        looks: (K, A + 1, 3) of the K caps, in the order of the markers, see `_looks`.
+        radius_m: (K,).
     """
 
     def __init__(self, model: HandModel, markers: tuple[str, ...]) -> None:
@@ -74,8 +76,8 @@ class CapModel:
             self._joint.append(mount.joint)
             self._finger.append(mount.finger)
             self._marker.append(index)
-        self._table = np.array(tables)  # (K, _ANGLES + 1, 3)
-        self._radius = np.array([model.radius_m[joint] for joint in self._joint])
+        self.looks = np.array(tables).reshape(-1, _ANGLES + 1, 3)
+        self.radius_m = np.array([model.radius_m[joint] for joint in self._joint])
         self._row = np.arange(len(self._joint))
         self.on_finger = np.zeros(len(markers), np.bool_)
         self.on_finger[self._marker] = True
@@ -177,15 +179,15 @@ class CapModel:
         size_m2 = area_px2 / scale**2
         best_m2 = np.fmax.reduce(size_m2, axis=0)
         share = size_m2 / best_m2
-        doubt = np.where(share < _FLAT_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
+        doubt = np.where(share < FLAT_SHARE, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
         if self._joint:
             k = self._marker
             shows = size_m2[:, k] / np.maximum(whole_m2[..., k], _SPECK_M2)  # (T, C, K)
-            hidden = np.maximum(1.0 - shows.max(axis=0) / _LEAST_SHARE, 0.0)
+            hidden = np.maximum(1.0 - shows.max(axis=0) / LEAST_SHARE, 0.0)
             alike = (shows / np.fmax.reduce(shows, axis=1)[:, None]).max(axis=0)
-            hidden = np.maximum(hidden, np.where(alike < _ALIKE, 1.0 - alike, 0.0))
-            hidden = np.maximum(hidden, _REACH * np.fmax.reduce(hidden, axis=0))
-            doubt[:, k] = hidden * self._radius * scale[:, k]
+            hidden = np.maximum(hidden, np.where(alike < ALIKE, 1.0 - alike, 0.0))
+            hidden = np.maximum(hidden, REACH * np.fmax.reduce(hidden, axis=0))
+            doubt[:, k] = hidden * self.radius_m * scale[:, k]
         return np.nan_to_num(doubt)
 
     def _ahead(self, joints: HandJoints) -> Float:
@@ -197,7 +199,7 @@ class CapModel:
         place = np.nan_to_num(angle) * (_ANGLES / np.pi)
         low = np.minimum(place.astype(np.int64), _ANGLES - 1)
         part = (place - low)[..., None]
-        return (1.0 - part) * self._table[self._row, low] + part * self._table[self._row, low + 1]
+        return (1.0 - part) * self.looks[self._row, low] + part * self.looks[self._row, low + 1]
 
 
 def _looks(points: Float, normals: Float, areas: Float) -> Float:

@@ -1,0 +1,75 @@
+"""What the line makes of one instant: marker positions, and the hand."""
+
+from dataclasses import dataclass
+
+from common.arrays import Bool, Code, Float, Int
+from common.hand_model import HandJoints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MarkerPositions:
+    """The M markers of a rig at one instant.
+
+    Attributes:
+        points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it, or what they see is not one thing.
+        cov_m2: (M, 3, 3) [m^2].
+        noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one instant to the next.
+        apart: (M,) what two cameras see is not one thing.
+    """
+
+    points_m: Float
+    cov_m2: Float
+    noise_m2: Float
+    apart: Bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolvedHand:
+    """A hand's pose and how well it is known.
+
+    Attributes:
+        T_rig_palm: (4, 4).
+        angles_rad: (5, 4), inside the limits.
+        joints: Forward kinematics of the two.
+        cov_m2: (26, 3, 3) [m^2] covariance of the joint positions.
+        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone.
+        tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much that is expected to grow, by the time squared.
+    """
+
+    T_rig_palm: Float
+    angles_rad: Float
+    joints: HandJoints
+    cov_m2: Float
+    tilt_cov_rad2: Float
+    tilt_walk_rad2_s2: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HandEstimate:
+    """The hand of the line at one instant.
+
+    Attributes:
+        t_ns: The instant.
+        markers: Positions as triangulated.
+        smooth_m: (M, 3) [m] after the 1 € filter.
+        facing: (3,) unit vector from the hand to the cameras that see its back.
+        solution: The hand; None: none is known.
+        valid, tracked, source: (26,) as of `HandPose`.
+        seen: (5,) fingers whose marker was placed now.
+        residual_m: (5,) distance of the finger's marker from its place on the hand; NaN: not seen.
+        iterations: (5,) of FABRIK.
+        reached: (5,) FABRIK brought the marker onto its target.
+    """
+
+    t_ns: int
+    markers: MarkerPositions
+    smooth_m: Float
+    facing: Float
+    solution: SolvedHand | None
+    valid: Bool
+    tracked: Bool
+    source: Code
+    seen: Bool
+    residual_m: Float
+    iterations: Int
+    reached: Bool
