@@ -103,6 +103,7 @@ class RigCalibration(Part, frozen=True):
     `objects`: files of the objects that are tracked; their markers are free ones. `T_rig_tracking`: where the frame of
     a system whose devices track themselves (Lighthouse) lies in the rig. `gestures`: file of what counts as a gesture;
     null: as calib_json/gestures/default.json has it.
+    `solver`: whose hand is published: that of the card's line (fabrik), or that which the estimator makes from there.
     `other_hands`: hands of its markers besides `hand`; each marker is that of the hand whose file mounts it.
     `T_world_rig`: where the rig lies in the frame that several rigs share; null: its frame is that one.
     `stamp_offset_us`: how much later the frames of a camera were taken than their stamps say.
@@ -129,6 +130,7 @@ class RigCalibration(Part, frozen=True):
     depth_model: Literal["power_law", "affine_disparity", "stereo"] = "stereo"
     power_law: PowerLawCalibration | None = None
     affine_disparity: AffineDisparityCalibration | None = None
+    solver: Literal["estimator", "fabrik"] = "estimator"
     pairing: Literal["interpolate", "predict"] = "interpolate"
     filter: FilterCalibration = FilterCalibration()
     volume: Volume | None = None

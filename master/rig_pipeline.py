@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from math import nan
+from math import nan, sqrt
 from typing import Protocol, cast
 
 import numpy as np
@@ -11,18 +11,26 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
+from master.fabrik.palm import PalmFitter
+from master.fabrik.solver import FabrikSolver
+from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.filters import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
 from master.ik.hand_filter import HandFilter
 from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
-from master.stereo.depth import depth_law
+from master.stereo.caps import CapModel
+from master.stereo.depth import depth_law, law_misfit
+from master.stereo.locate import CapLocator
+from master.stereo.misfit import RIG_PX, limits
 from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
-from master.stereo.place import CalibrationResidual
+from master.stereo.place import CalibrationResidual, Placement
 from master.wrist.pipeline import WristPipeline
 
+_LAW_MISFIT = 0.02  # most by which a law of depth and the cameras' places may differ where both are used
+_MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
 _LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
 
 
@@ -64,12 +72,55 @@ def _hand_filter(setup: RigSetup) -> HandFilter:
     return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
 
 
+def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> FabrikSolver:
+    """The card's line of a marker rig.
+
+    Args:
+        setup: The rig.
+        stage: Measures the stages.
+        continuous: False: every frame is an unrelated pose; no filter, no memory.
+
+    Raises:
+        CalibrationError: The depth model does not fit the rig, or the estimator cannot start from it.
+    """
+    rig, cameras = setup.rig, tuple(setup.models.values())
+    rates = {name: setup.cameras[name].frame_rate_hz for name in setup.models}
+    caps, residual = CapModel(setup.hand, rig.markers), CalibrationResidual.of(rig)
+    law = depth_law(rig, cameras)
+    triangulate: Triangulate
+    if law is None:
+        triangulate = CapLocator(cameras, caps, Placement(cameras, residual))
+    else:
+        off, depth_m = law_misfit(law, cameras, rig.volume)
+        if off > _LAW_MISFIT and rig.solver == "estimator":
+            raise CalibrationError(
+                f"rig {rig.name!r}: depth_model {rig.depth_model!r} is {1e2 * off:.1f} % off the cameras' places at"
+                f" {depth_m:.2f} m, and solver 'estimator' needs both to agree within {1e2 * _LAW_MISFIT:.0f} %:"
+                " calibrate the cameras and the depth again, or set solver to 'fabrik', which takes the depth alone"
+            )
+        row_px = np.hypot(
+            sqrt(2.0) * RIG_PX, 0.0 if off <= _LAW_MISFIT else cameras[0].matrix[1, 1] * _MOUNTED_RAD
+        )
+        tables = disparity_tables(cameras, law, residual.law, float(row_px), float(limits(2)[2]))
+        triangulate = DepthTriangulator(tables, caps)
+    return FabrikSolver(
+        setup.models,
+        setup.hand,
+        rig.markers,
+        setup.hand_markers,
+        sync=Pairing(setup.models, rates, policy=rig.pairing, continuous=continuous),
+        triangulate=triangulate,
+        one_euro=_point_filter(setup) if continuous else None,
+        palm=PalmFitter(setup.hand, setup.hand_markers),
+        stage=stage,
+    )
+
+
 def build_pipeline(
     setup: RigSetup,
     stage: Stage,
     *,
     continuous: bool = True,
-    tracker: HandTracker | None = None,
     others: OtherSensors | None = None,
     counts: Counter[str] | None = None,
     shed: Callable[[], bool] = never,
@@ -80,32 +131,34 @@ def build_pipeline(
         setup: The rig.
         stage: Measures the stages.
         continuous: False: every frame is an unrelated pose; no filter, no memory.
-        tracker: Tracks the hand; None: a new one, which takes most of the time.
         others: What else watches the hand; None: nothing does.
         counts: Counted into; None: counts of its own.
         shed: Asked for each instant whether it is left out.
 
     Raises:
-        CalibrationError: The depth model does not fit the rig, or it is no marker rig.
+        CalibrationError: The depth model or the solver does not fit the rig, or it is no marker rig.
     """
+    rig = setup.rig
     if not setup.has_markers:
-        raise CalibrationError(f"rig {setup.rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
-    rates = {name: setup.cameras[name].frame_rate_hz for name in setup.models}
+        raise CalibrationError(f"rig {rig.name!r}: kind is 'wrist', this needs a rig of 'markers'")
+    refine = rig.solver == "estimator"
+    if not refine and (others is not None or rig.imu is not None):
+        beside = "an IMU" if others is None else "a wrist device"
+        raise CalibrationError(
+            f"rig {rig.name!r}: solver 'fabrik' knows markers alone, but {beside} watches this hand too: set solver to"
+            " 'estimator'"
+        )
     return MarkerPipeline(
         setup.models,
         setup.hand,
-        setup.rig.markers,
-        pairing=Pairing(setup.models, rates, policy=setup.rig.pairing, continuous=continuous),
-        law=depth_law(setup.rig),
-        residual=CalibrationResidual.of(setup.rig),
-        smooth=_point_filter(setup) if continuous else None,
-        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous)
-        if tracker is None
-        else tracker,
-        steady=_hand_filter(setup) if continuous else None,
-        stamp_offset_us=setup.rig.stamp_offset_us,
-        volume=setup.rig.volume,
-        imu=setup.rig.imu,
+        rig.markers,
+        line=line_of(setup, stage, continuous=continuous),
+        residual=CalibrationResidual.of(rig),
+        tracker=HandTracker(setup.hand, setup.hand_markers, continuous=continuous) if refine else None,
+        steady=_hand_filter(setup) if continuous and refine else None,
+        stamp_offset_us=rig.stamp_offset_us,
+        volume=rig.volume,
+        imu=rig.imu,
         others=others,
         counts=counts,
         stage=stage,
@@ -118,21 +171,20 @@ def pipeline_of(
     stage: Stage,
     *,
     continuous: bool = True,
-    tracker: HandTracker | None = None,
     shed: Callable[[], bool] = never,
 ) -> Pipeline:
     """The pipeline of a rig of either kind, or of both; arguments and errors as of `build_pipeline`.
 
-    A wrist device alone has no tracker. What is pushed is of cameras of these rigs: the link refuses one that sends
+    What is pushed is of cameras of these rigs: the link refuses one that sends
     what those of the other kind do.
     """
     if setup.wrist is None:
-        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, tracker=tracker, shed=shed))
+        return cast(Pipeline, build_pipeline(setup, stage, continuous=continuous, shed=shed))
     try:
         if setup.has_markers:
             side = WristSide.of(setup.wrist, counts := Counter[str](), stage, continuous=continuous)
             markers = build_pipeline(
-                setup, stage, continuous=continuous, tracker=tracker, others=side, counts=counts, shed=shed
+                setup, stage, continuous=continuous, others=side, counts=counts, shed=shed
             )
             return FusedPipeline(
                 markers, side, min(setup.cameras[name].frame_rate_hz for name in setup.models)

@@ -24,7 +24,6 @@ from common.errors import CalibrationError, PhalanxError
 from common.messages import Detections, Name
 from common.watching import WatchedFiles
 from master.hurry import never
-from master.ik.tracker import HandTracker
 from master.needs_restart import refuse_other_hands, refuse_restart
 from master.rig import Pipeline, RigSetup, load_setups, pipeline_of
 from master.rig_objects import gestures_file
@@ -113,8 +112,7 @@ class LivePipeline:
         """
         self._stage, self._shed = stage, shed
         self._setup: RigSetup = setup
-        self._tracker = _new_tracker(setup)
-        self._now = pipeline_of(setup, stage, tracker=self._tracker, shed=shed)
+        self._now = pipeline_of(setup, stage, shed=shed)
         per_frame = _told_per_frame(setup)
         self._close = _CLOSE_FRAMES * per_frame
         self._recent: deque[tuple[int, Detections | _Turn]] = deque(maxlen=_WARM_FRAMES * per_frame)
@@ -171,18 +169,13 @@ class LivePipeline:
             CalibrationError: As `change`.
         """
         stage = _WhenOpen(self._stage)
-        if self._tracker is not None and _hand(setup) == _hand(self._setup):
-            setup = replace(setup, hand=self._setup.hand)
-            tracker = self._tracker.fresh()
-        else:
-            tracker = _new_tracker(setup)
         # What it is shown to warm up has been solved by the other already: nothing of it is left out.
-        new = pipeline_of(setup, stage, tracker=tracker, shed=lambda: stage.open and self._shed())
+        new = pipeline_of(setup, stage, shed=lambda: stage.open and self._shed())
 
         def take() -> None:
             shown = self._warm(new)
             stage.open = True
-            self._setup, self._tracker = setup, tracker
+            self._setup = setup
             self._next.append((new, shown))
 
         return take
@@ -352,15 +345,6 @@ def _show(pipeline: Pipeline, told: Detections | _Turn) -> list[SolvedPose]:
         pipeline.push_orientation(told.t_ns, told.orientation_wxyz, told.heading_sigma_rad)
         return []
     return pipeline.push(told)
-
-
-def _new_tracker(setup: RigSetup) -> HandTracker | None:
-    """The tracker of the hand's markers; a wrist device alone has none."""
-    return HandTracker(setup.hand, setup.hand_markers) if setup.has_markers else None
-
-
-def _hand(setup: RigSetup) -> tuple[object, ...]:
-    return setup.hand.profile, setup.hand_markers
 
 
 def _content(setup: RigSetup) -> tuple[object, ...]:

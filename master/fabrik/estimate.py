@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from common.arrays import Bool, Code, Float, Int
 from common.hand_model import HandJoints
 
@@ -11,7 +13,8 @@ class MarkerPositions:
     """The M markers of a rig at one instant.
 
     Attributes:
-        points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it, or what they see is not one thing.
+        points_m: Centroids (M, 3) [m], rig frame; NaN: fewer than two cameras see it,
+            or what they see is not one thing.
         cov_m2: (M, 3, 3) [m^2].
         noise_m2: (M, 3, 3) [m^2] the part of it that may differ from one instant to the next.
         apart: (M,) what two cameras see is not one thing.
@@ -73,3 +76,8 @@ class HandEstimate:
     residual_m: Float
     iterations: Int
     reached: Bool
+
+    @property
+    def solved(self) -> bool:
+        """Whether the hand is solved from this instant, not held from an earlier one."""
+        return self.solution is not None and bool(np.isfinite(self.residual_m).any() or self.tracked.any())

@@ -57,7 +57,10 @@ class PalmFitter:
         self._mounts = Mounts.of(self.attached)
         self._on_finger = self.attached.on_finger[:, 0]
         habits = AnglePrior.of(model, self.parameters, self.priors)
-        self._normal, self._pull = np.ascontiguousarray(habits.normal[0]), np.ascontiguousarray(habits.pull[0])
+        self._normal, self._pull = (
+            np.ascontiguousarray(habits.normal[0]),
+            np.ascontiguousarray(habits.pull[0]),
+        )
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (0.6, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
@@ -107,7 +110,9 @@ class PalmFitter:
                 best = found
         return best
 
-    def _fit(self, points: Float, information: Float, seen: Bool, prior: PalmPrior, T: Float, x: Float) -> Palm:
+    def _fit(
+        self, points: Float, information: Float, seen: Bool, prior: PalmPrior, T: Float, x: Float
+    ) -> Palm:
         T, x = np.array(T, np.float64, order="C"), x.copy()
         size = 6 + len(x)
         normal, surprise = np.empty((size, size)), np.zeros(len(points))

@@ -56,7 +56,7 @@ def linearise(
     normal: Float,
     surprise: Float,
 ) -> float:
-    """Return half the sum of squared residuals; write its gradient, Gauss-Newton normal matrix, and the markers' part."""
+    """Return half the sum of squared residuals; write its gradient, normal matrix and markers' part."""
     n = x.shape[0]
     angles, by = np.empty(20), np.empty((20, n))
     angles_of(tables, x, angles, by)
@@ -251,7 +251,17 @@ def fit(
         for c in range(n):
             x_new[c] = min(max(x[c] + step[6 + c], tables.low[c]), tables.high[c])
         there = linearise(
-            tables, mounts, prior, points, information, seen, T_new, x_new, trial_gradient, trial_normal, trial_surprise
+            tables,
+            mounts,
+            prior,
+            points,
+            information,
+            seen,
+            T_new,
+            x_new,
+            trial_gradient,
+            trial_normal,
+            trial_surprise,
         )
         gain = cost - there
         if gain > 0.0:

@@ -3,6 +3,8 @@
 Push machine without clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
 """
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,12 +23,12 @@ from master.ik.hand import EXPLAINED
 from master.ik.hidden import FingerMemory
 from master.stereo.pairing import Instant, Pairing
 
+Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _ON_TARGET_M = 1e-4
 _ITERATIONS = 10  # the seed is on the target; what it cannot reach, iterations improve little
 _FIT_M2 = (3e-3) ** 2 * np.eye(3)  # of a finger's marker as the palm's fit has it
 _DRIFT_M_S = 0.3  # of a hand that is held
-_TURN_RAD_S = 2.0  # of a finger's end, beyond what the fit of the last instant knew
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
 _NATURAL = 1.0  # the line knows no hand without habits
@@ -56,6 +58,7 @@ class FabrikSolver:
         triangulate: Triangulate,
         one_euro: PointFilter | None,
         palm: PalmFitter,
+        stage: Stage = lambda name: nullcontext(),
     ) -> None:
         """Join the parts.
 
@@ -68,10 +71,11 @@ class FabrikSolver:
             triangulate: Centroids to points by the rig's depth model.
             one_euro: Filter of the points; None: instants are unrelated, nothing is filtered or remembered.
             palm: Fits the palm from the hand's markers.
+            stage: Opens a timer by stage name.
         """
-        self._model, self._sync, self._triangulate = model, sync, triangulate
-        self._one_euro, self._palm = one_euro, palm
-        self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
+        self._model, self.sync, self._triangulate = model, sync, triangulate
+        self._one_euro, self._palm, self._stage = one_euro, palm, stage
+        self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
         self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
@@ -87,9 +91,6 @@ class FabrikSolver:
             for m, mount in enumerate(mounts)
             if mount.finger is not None
         ]
-        self._cap_marker = self._on_hand[[finger.marker for finger in self._fingers]]
-        self._cap_finger = np.array([finger.finger for finger in self._fingers], np.int64)
-        self._count = len(markers)
         self._memory = FingerMemory(model)
         self._last: SolvedHand | None = None
         self._last_palm: Palm | None = None
@@ -97,11 +98,11 @@ class FabrikSolver:
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
-        return [self.solve(instant) for instant in self._sync.push(message)]
+        return [self.solve(instant) for instant in self.sync.push(message)]
 
     def flush(self) -> list[HandEstimate]:
         """At the end of a recording: the hands that still wait for a camera."""
-        return [self.solve(instant) for instant in self._sync.flush()]
+        return [self.solve(instant) for instant in self.sync.flush()]
 
     def solve(self, instant: Instant, near: SolvedHand | None = None) -> HandEstimate:
         """Solve one instant.
@@ -111,16 +112,24 @@ class FabrikSolver:
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
         """
         last, age_s = self._recent(instant.t_ns)
-        seen_as = near or last
-        markers = self.positions(instant, seen_as, age_s)
-        if seen_as is None and (first := self._fit(markers.points_m, markers.cov_m2, instant, None, 0.0)):
-            self._memory = FingerMemory(self._model)
-            markers = self.positions(instant, self._hand_of(first), 0.0)
-        smooth = markers.points_m
-        if self._one_euro is not None:
-            smooth = self._one_euro.push(instant.t_ns, smooth, markers.noise_m2)
-        palm = self._fit(smooth, markers.cov_m2, instant, last, age_s)
-        return self._estimate(instant, markers, smooth, palm)
+        seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
+        with self._stage("triangulate"):
+            markers = self._triangulate(*pixels, seen_as, age_s)
+            if seen_as is None and (first := self._fit(markers.points_m, markers.cov_m2, instant, None, 0.0)):
+                self._memory = FingerMemory(self._model)
+                markers = self._triangulate(*pixels, self._hand_of(first), 0.0)
+        with self._stage("filter"):
+            smooth = markers.points_m
+            if self._one_euro is not None:
+                smooth = self._one_euro.push(instant.t_ns, smooth, markers.noise_m2)
+        with self._stage("fabrik"):
+            palm = self._fit(smooth, markers.cov_m2, instant, last, age_s)
+            return self._estimate(instant, markers, smooth, palm)
+
+    def peek(self, instant: Instant, points: Float, cov: Float) -> SolvedHand | None:
+        """The hand by some points (M, 3) [m] of an instant, and nothing remembered; None: they are too few."""
+        palm = self._fit(points, cov, instant, None, 0.0)
+        return None if palm is None else self._hand_of(palm)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """The last hand, if it still says anything, and how long ago it held [s]."""
@@ -129,19 +138,11 @@ class FabrikSolver:
             return None, 0.0
         return self._last, age_s
 
-    def positions(self, instant: Instant, hand: SolvedHand | None, age_s: float) -> MarkerPositions:
-        """Triangulate the markers of an instant, their caps seen as on a hand of `age_s` ago; None: no hand is known."""
-        ahead, tilt = np.full((self._count, 3), np.nan), np.zeros((self._count, 3, 3))
-        if hand is not None:
-            ahead[self._cap_marker] = -hand.joints.rotation[TIPS[self._cap_finger], :, 2]
-            tilt[self._cap_marker] = hand.tilt_cov_rad2[self._cap_finger] + (_TURN_RAD_S * age_s) ** 2 * np.eye(3)
-        return self._triangulate(instant.uv, instant.sigma_px, instant.area, ahead, tilt)
-
     def _fit(
         self, points: Float, cov: Float, instant: Instant, last: SolvedHand | None, age_s: float
     ) -> Palm | None:
         """The palm of an instant; `last` as of `_recent`."""
-        points, cov = points[self._on_hand], cov[self._on_hand]
+        points, cov = points[self.on_hand], cov[self.on_hand]
         seen = np.isfinite(points[:, 0])
         facing = self.facing(points, instant.area) if seen[self._on_palm].any() else None
         if last is None:
@@ -165,7 +166,7 @@ class FabrikSolver:
             return self._ahead
         back = self._centres - found.mean(axis=0)
         distance = np.linalg.norm(back, axis=1)
-        shown = np.nansum(area_px2[:, self._on_hand[self._on_palm]], axis=1) * (distance / self._focal_px) ** 2
+        shown = np.nansum(area_px2[:, self.on_hand[self._on_palm]], axis=1) * (distance / self._focal_px) ** 2
         towards = (shown if shown.any() else np.ones(len(shown))) @ (back / distance[:, None])
         length = float(np.linalg.norm(towards))
         return towards / length if length > 0.0 else back[0] / distance[0]
@@ -181,7 +182,7 @@ class FabrikSolver:
         self, instant: Instant, markers: MarkerPositions, smooth: Float, palm: Palm | None
     ) -> HandEstimate:
         """Bring the fingers of a palm onto their markers; without a palm the last hand is held."""
-        points = smooth[self._on_hand]
+        points = smooth[self.on_hand]
         seen, reached = np.zeros(5, np.bool_), np.zeros(5, np.bool_)
         residual, iterations = np.full(5, np.nan), np.zeros(5, np.int64)
         explained = np.zeros(5, np.bool_)
@@ -192,14 +193,25 @@ class FabrikSolver:
             hand = self._held(instant.t_ns)
             valid[:] = hand is not None
             return HandEstimate(
-                instant.t_ns, markers, smooth, facing, hand, valid, tracked, source, seen, residual, iterations, reached
+                instant.t_ns,
+                markers,
+                smooth,
+                facing,
+                hand,
+                valid,
+                tracked,
+                source,
+                seen,
+                residual,
+                iterations,
+                reached,
             )
         fitted = self._hand_of(palm)
         R, origin = palm.T[:3, :3], palm.T[:3, 3]
         targets = (points - origin) @ R
         places = self._palm.attached.place(self._model.chains(fitted.angles_rad))
         angles = fitted.angles_rad.copy()
-        gain = _FIT_M2 @ np.linalg.inv(_FIT_M2 + np.nan_to_num(R.T @ markers.cov_m2[self._on_hand] @ R))
+        gain = _FIT_M2 @ np.linalg.inv(_FIT_M2 + np.nan_to_num(R.T @ markers.cov_m2[self.on_hand] @ R))
         targets = places + (gain @ (targets - places)[..., None])[..., 0]
         for one in self._fingers:
             m, f = one.marker, one.finger
@@ -232,7 +244,18 @@ class FabrikSolver:
             self._memory.moved(last.angles_rad, angles, age_s)
         self._last, self._last_palm, self._last_ns = hand, palm, instant.t_ns
         return HandEstimate(
-            instant.t_ns, markers, smooth, facing, hand, valid, tracked, source, seen, residual, iterations, reached
+            instant.t_ns,
+            markers,
+            smooth,
+            facing,
+            hand,
+            valid,
+            tracked,
+            source,
+            seen,
+            residual,
+            iterations,
+            reached,
         )
 
     def _held(self, t_ns: int) -> SolvedHand | None:

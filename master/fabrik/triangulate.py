@@ -18,17 +18,16 @@ Covariance by the derivatives: along the sight |dD/dx| sigma_x, across it D sigm
 and by how far the point moves where the finger points elsewhere within one standard deviation.
 """
 
-from collections.abc import Callable
 from math import sqrt
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.kernels import kernel
 from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
-from master.fabrik.estimate import MarkerPositions
+from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.stereo.caps import CapModel
 from master.stereo.depth import DepthLaw, PowerLaw
 
@@ -233,7 +232,7 @@ def triangulate(
     points: Float,
     cov: Float,
     noise: Float,
-    apart: Float,
+    apart: Bool,
 ) -> None:
     """Write points (M, 3) [m], covariances and their noise part (M, 3, 3) [m^2], and which rows disagree (M,).
 
@@ -334,6 +333,23 @@ def triangulate(
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
 
 
+class Triangulate(Protocol):
+    """Positions of the M markers of one instant by the depth model of a rig: the law, or the rays of all cameras."""
+
+    def __call__(
+        self, uv: Float, sigma_px: Float, area_px2: Float, hand: SolvedHand | None, age_s: float
+    ) -> MarkerPositions:
+        """Triangulate.
+
+        Args:
+            uv: (C, M, 2) centroids [px]; NaN: not seen.
+            sigma_px, area_px2: (C, M).
+            hand: A hand of `age_s` [s] ago, which tells what side of each cap is seen; None: nothing tells.
+            age_s: Its age.
+        """
+        ...
+
+
 class DepthTriangulator:
     """Triangulates the markers of a rig by its depth law. Holds no state between calls."""
 
@@ -342,14 +358,15 @@ class DepthTriangulator:
         self._tables, self._caps, self._views = tables, caps, CapTables.of(caps)
 
     def __call__(
-        self, uv: Float, sigma_px: Float, area_px2: Float, ahead: Float, tilt: Float
+        self, uv: Float, sigma_px: Float, area_px2: Float, hand: SolvedHand | None, age_s: float
     ) -> MarkerPositions:
-        """Positions of M markers; arguments as of `triangulate`, of the rig's first two cameras."""
+        """As `Triangulate`; only the first two cameras count."""
         count = uv.shape[1]
+        if hand is None:
+            ahead, tilt = np.full((count, 3), np.nan), np.zeros((count, 3, 3))
+        else:
+            ahead, tilt = self._caps.pointing(hand, age_s)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         triangulate(self._tables, self._views, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)
         return MarkerPositions(points, cov, noise, apart)
-
-
-Triangulate = Callable[[Float, Float, Float, Float, Float], MarkerPositions]

@@ -14,8 +14,9 @@ import numpy as np
 
 from common.arrays import Bool, Float, Int
 from common.geometry import fit_rigid, skew
-from common.hand_model import CHAINS, HandJoints, HandModel
+from common.hand_model import CHAINS, HandModel
 from common.messages import Level
+from master.fabrik.estimate import SolvedHand
 from master.ik.attached import Attached
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
@@ -36,18 +37,10 @@ _EYE = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HandSolution:
-    """A solved hand.
+class HandSolution(SolvedHand):
+    """A hand solved by least squares; its `cov_m2` is of this instant alone, of a tracker by the past as well.
 
     Attributes:
-        T_rig_palm: (4, 4).
-        angles_rad: (5, 4), inside the limits.
-        joints: Forward kinematics of the two.
-        cov_m2: (26, 3, 3) [m^2] covariance of the joint positions: of this solver by this instant alone
-            (`master.ik.certainty`), of a tracker by the past as well (`master.ik.doubt`).
-        tilt_cov_rad2: (5, 3, 3) [rad^2] covariance of the directions of the last phalanges, by this instant alone
-            (`master.ik.certainty`).
-        tilt_walk_rad2_s2: (5, 3, 3) [rad^2/s^2] by how much the fit expects that to grow, by the time squared.
         residual_m: (M,) distance of each marker from its place on the model [m]; NaN: not seen.
         cost: Half the sum of squared weighted residuals, of the likeliest hypothesis.
         iterations: Steps taken.
@@ -55,17 +48,11 @@ class HandSolution:
         alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
             instant alone.
         moved: (26, 3, 6 + n) derivatives of the joint positions by these.
-        x: (n,) free angles that the fit ended with, before a finger is brought onto its cap.
+        x: (n,) free angles that the fit ended with.
         scale: By how much the misfit of the instant has scaled `alone`.
         others: What other sensors said, as the fit took it; None: nothing.
     """
 
-    T_rig_palm: Float
-    angles_rad: Float
-    joints: HandJoints
-    cov_m2: Float
-    tilt_cov_rad2: Float
-    tilt_walk_rad2_s2: Float
     residual_m: Float
     cost: float
     iterations: int
@@ -91,7 +78,7 @@ class _Told:
     hidden: tuple[Float, Float] | None
     facing: Float | None
     enough: float
-    near: HandSolution | None
+    near: SolvedHand | None
     orientation: Orientation | None
     others: SensedHand | None
 
@@ -130,7 +117,7 @@ class HandSolver:
         hidden: tuple[Float, Float] | None = None,
         facing: Float | None = None,
         enough: float = ENOUGH,
-        near: HandSolution | None = None,
+        near: SolvedHand | None = None,
         orientation: Orientation | None = None,
         age_s: Float | None = None,
         others: SensedHand | None = None,
@@ -269,7 +256,7 @@ class HandSolver:
     def _seed_of(self, last: HandSolution) -> tuple[Float, Float]:
         return last.T_rig_palm[None], self.parameters.of_angles(last.angles_rad)[None]
 
-    def _seed_near(self, hand: HandSolution, told: _Told) -> tuple[Float, Float]:
+    def _seed_near(self, hand: SolvedHand, told: _Told) -> tuple[Float, Float]:
         known = np.isin(self.parameters.free // 4, list(told.shown))
         x = np.where(known, self.parameters.of_angles(hand.angles_rad), self._natural)
         return hand.T_rig_palm[None], self._as_told(x[None], told.others)

@@ -18,7 +18,7 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, Quaternion
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix
-from master.ik.hand import HandSolution
+from master.fabrik.estimate import SolvedHand
 from master.ik.orientation_samples import OrientationSamples
 from master.ik.palm import Orientation
 
@@ -52,7 +52,7 @@ class OrientationTrack:
         """Take one sample: quaternion (4,), IMU axes -> its world; see `OrientationSamples.push`."""
         self._samples.push(t_ns, orientation_wxyz, heading_sigma_rad)
 
-    def at(self, t_ns: int, near: HandSolution | None) -> Orientation | None:
+    def at(self, t_ns: int, near: SolvedHand | None) -> Orientation | None:
         """The palm's orientation at an instant; None where no sample is near enough.
 
         Args:

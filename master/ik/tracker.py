@@ -9,7 +9,6 @@ what is seen at once.
 The bits are those of XR_EXT_hand_tracking: an active hand has all joints valid; tracked is what is seen now.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +18,7 @@ from common.calibration import Volume
 from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import HandPose, Source
+from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.ik.arcs import Arcs
 from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
@@ -39,7 +39,6 @@ _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_BY_MARKERS = 3
 _OBSERVED_M = 0.010  # standard deviation, all axes together
 _SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
-_GLANCE = 0.01  # half chi square that a first look may leave: less than a millimetre where markers are
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,15 +102,6 @@ class HandTracker:
         self._oriented: Orientation | None = None
         self._forget()
 
-    def fresh(self) -> "HandTracker":
-        """A tracker of the same hand that has seen nothing yet; shares the tables of its fingers, which take 0.4 s."""
-        other = copy(self)
-        other._solver = HandSolver(self.model, self.markers, self._solver.priors)
-        other.last, other._last_ns, other._seen_ns = None, 0, None
-        other._told_ns, other._oriented = np.full(6, _NEVER_NS), None
-        other._forget()
-        return other
-
     def _forget(self) -> None:
         self._memory = FingerMemory(self.model)
         self.doubt = JointDoubt(self.parameters, self._solver.priors, self._arcs)
@@ -132,6 +122,7 @@ class HandTracker:
         measured: Bool | None = None,
         orientation: Orientation | None = None,
         others: SensedHand | None = None,
+        start: SolvedHand | None = None,
     ) -> TrackedHand:
         """Solve one instant.
 
@@ -143,6 +134,8 @@ class HandTracker:
             measured: (M,) markers whose point was measured, not put on the ray of a single camera; None: all.
             orientation: The palm's orientation as an IMU has it; None: not known.
             others: Palm and fingers as other sensors have them, in place of `orientation`; None: there are none.
+            start: A hand solved otherwise from the same instant: the fit begins there where there is no last hand, or
+                where that leaves markers unexplained which this one explains; None: there is none.
         """
         seen = seen_markers(points_m, cov_m2)
         if others is not None:
@@ -168,12 +161,18 @@ class HandTracker:
             hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, known)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
         age_s = self._ages_s(t_ns, dt_s, told)
-        solution = self._solve(points_m, cov_m2, before, dt_s, held, facing, orientation, age_s, others)
-        if solution is not None and last is not None:
-            fresh = self._afresh(solution, points_m, cov_m2, held, facing, orientation, others)
-            if fresh is not None:
-                solution, last = fresh, None  # the leap was no motion
-                self._forget()
+
+        def solve(known: HandSolution | None) -> HandSolution | None:
+            return self._solve(points_m, cov_m2, known, dt_s, held, facing, orientation, age_s, others, start)
+
+        solution = solve(before)
+        if solution is not None and last is not None and start is not None:
+            worst_m = self._unexplained_m(solution, points_m, cov_m2)
+            if worst_m > 2.0 * self._unexplained_m(start, points_m, cov_m2):
+                fresh = solve(None)
+                if fresh is not None and worst_m > 2.0 * self._unexplained_m(fresh, points_m, cov_m2):
+                    solution, last = fresh, None  # the leap was no motion
+                    self._forget()
         if solution is not None:
             solution = self._refine(
                 solution, points_m, cov_m2, frozenset() if others is None else others.fingers
@@ -201,12 +200,22 @@ class HandTracker:
         orientation: Orientation | None,
         age_s: Float,
         others: SensedHand | None,
+        start: SolvedHand | None,
     ) -> HandSolution | None:
         """The fit; once more where markers contradict what is told of a finger, which counts less then."""
 
         def fit(told: SensedHand | None) -> HandSolution | None:
             return self._solver.solve(
-                points_m, cov_m2, last, dt_s, held, facing, orientation=orientation, age_s=age_s, others=told
+                points_m,
+                cov_m2,
+                last,
+                dt_s,
+                held,
+                facing,
+                near=start,
+                orientation=orientation,
+                age_s=age_s,
+                others=told,
             )
 
         found = fit(others)
@@ -240,52 +249,14 @@ class HandTracker:
         self._told_ns = np.where(told, t_ns, self._told_ns)
         return ages
 
-    def _afresh(
-        self,
-        found: HandSolution,
-        points_m: Float,
-        cov_m2: Float,
-        hidden: tuple[Float, Float] | None,
-        facing: Float | None,
-        orientation: Orientation | None,
-        others: SensedHand | None,
-    ) -> HandSolution | None:
-        """The hand without the last pose, which may have led into the wrong valley; None: `found` is no worse.
-
-        Asked only where a marker is farther off than its noise explains: half a cap seen may be centimetres off.
-        """
-        worst_m = self._unexplained_m(found, points_m, cov_m2)
-        if worst_m <= _BAD_FIT_M:
-            return None
-        fresh = self._solver.solve(
-            points_m, cov_m2, None, 0.0, hidden, facing, orientation=orientation, others=others
-        )
-        if fresh is None or self._unexplained_m(fresh, points_m, cov_m2) >= 0.5 * worst_m:
-            return None
-        return fresh
-
-    def _unexplained_m(self, solution: HandSolution, points_m: Float, cov_m2: Float) -> float:
+    def _unexplained_m(self, hand: SolvedHand, points_m: Float, cov_m2: Float) -> float:
         """The largest distance [m] of a marker from its place on the hand that its noise does not explain."""
-        far = np.flatnonzero(solution.residual_m > _BAD_FIT_M)
+        off = points_m - self._attached.on(hand.joints)
+        far = np.flatnonzero(np.vecdot(off, off) > _BAD_FIT_M**2)  # NaN is not: not seen
         if not len(far):
             return 0.0
-        off = points_m[far] - self._attached.on(solution.joints)[far]
-        surprise = surprise_of(off, cov_m2[far])
-        return float(np.max(solution.residual_m[far], where=surprise > EXPLAINED, initial=0.0))
-
-    def peek(
-        self, points_m: Float, cov_m2: Float, towards_cameras: Float, *, curled: bool = True
-    ) -> HandSolution | None:
-        """Solve one instant and remember nothing; of the last pose nothing is believed. Arguments as `push`.
-
-        Args:
-            points_m, cov_m2, towards_cameras: As in `push`.
-            curled: Whether a finger without a marker is believed curled out of sight; else anywhere natural.
-        """
-        seen = seen_markers(points_m, cov_m2)
-        facing = towards_cameras if (seen & self._on_palm).any() else None
-        hidden = None if curled else (np.zeros((5, 4)), np.full(5, np.inf))
-        return self._solver.solve(points_m, cov_m2, None, 0.0, hidden, facing, _GLANCE, self.last)
+        surprise = surprise_of(off[far], cov_m2[far])
+        return float(np.sqrt(np.vecdot(off[far], off[far]).max(where=surprise > EXPLAINED, initial=0.0)))
 
     def _palm_rests(self, seen: Bool, orientation: Orientation | None) -> int:
         """What tells at this instant where the palm is and how it is turned; 0: nothing does."""
@@ -337,7 +308,7 @@ class HandTracker:
 
 
 def pose_of(
-    hand: TrackedHand,
+    hand: TrackedHand | HandEstimate,
     model: HandModel,
     t_ns: int,
     markers_m: Float,
@@ -345,7 +316,7 @@ def pose_of(
     markers_cov_m2: Float,
     volume: Volume | None = None,
 ) -> HandPose:
-    """The message for one tracked hand; all NaN and not valid where nothing has been solved yet."""
+    """The message for one hand; all NaN and not valid where nothing has been solved yet."""
     solution = hand.solution
     if solution is None:
         nan = np.full(26, np.nan)

@@ -16,6 +16,7 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import cross
 from common.hand_model import HandJoints, HandModel
+from master.fabrik.estimate import SolvedHand
 from master.stereo.together import together
 
 _RINGS, _SPOKES = 16, 48
@@ -31,6 +32,9 @@ ALIKE = 0.9  # of the share that another camera sees: what edges of two blobs of
 # them can tell: the lesser hidden share by the larger, of 20 rendered caps, is 0.16 in the mean and 0.28 rms.
 REACH = 0.2
 _SPECK_M2 = 1e-9
+TURN_RAD_S = (
+    2.0  # standard deviation of how fast a finger end turns: a fist closes in a second, and mostly rests
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,6 +110,17 @@ class CapModel:
         tilted = ahead + around.transpose(2, 0, 1)
         tilted /= np.sqrt(np.vecdot(tilted, tilted))[..., None]
         return np.concatenate([ahead[None], tilted])
+
+    def pointing(self, hand: SolvedHand, age_s: float) -> tuple[Float, Float]:
+        """Where the caps of a hand of `age_s` [s] ago point, and how surely.
+
+        Returns:
+            Unit vectors (M, 3), rig frame, and their covariances (M, 3, 3) [rad^2]; NaN and 0 for markers without cap.
+        """
+        ahead, tilt = np.full((len(self.on_finger), 3), np.nan), np.zeros((len(self.on_finger), 3, 3))
+        ahead[self._marker] = self._ahead(hand.joints)
+        tilt[self._marker] = hand.tilt_cov_rad2[self._finger] + (TURN_RAD_S * age_s) ** 2 * np.eye(3)
+        return ahead, tilt
 
     def anyhow(self, points_m: Float, cameras: tuple[CameraModel, ...]) -> Float:
         """Directions (5, K, 3) of the K caps at (M, 3) [m] while no hand is known: towards the cameras, and four bent

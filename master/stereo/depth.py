@@ -10,17 +10,24 @@ Every law maps both ways and gives its own sensitivity |dD/dx|, of which the err
 stereo model is `master.stereo.triangulate`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from math import isfinite, pi, tan
 from typing import Protocol
 
 import numpy as np
 
 from common.arrays import Float
-from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration
+from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration, Volume
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from common.geometry import transform
+
+PARALLEL_RAD = np.radians(3.0)
+"""Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
+ALIKE = 0.05
+"""Most by which their focal lengths may differ, and the slope of their baseline against the image rows."""
+_DEPTHS_M = (0.35, 1.0)
 
 
 class DepthLaw(Protocol):
@@ -110,40 +117,89 @@ def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDispari
     return AffineDisparity(baseline_m * width_px / (2.0 * tan(fov_rad / 2.0)), 0.0)
 
 
-def depth_law(rig: RigCalibration) -> DepthLaw | None:
+def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> DepthLaw | None:
     """The law the rig file asks for; None when it asks for full stereo triangulation.
 
+    Args:
+        rig: The rig file.
+        cameras: Its cameras, in its order.
+
     Raises:
-        CalibrationError: The named law has no numbers, or the rig has not exactly two cameras.
+        CalibrationError: The named law has no numbers, or the rig is not one pair of parallel cameras.
     """
-    if rig.depth_model == "stereo":
+    model = rig.depth_model
+    if model == "stereo":
         return None
     if len(rig.cameras) != 2:
         raise CalibrationError(
-            f"rig {rig.name!r}: depth_model {rig.depth_model!r} needs two cameras, cameras has"
-            f" {len(rig.cameras)}: use 'stereo'"
+            f"rig {rig.name!r}: depth_model {model!r} needs two cameras, cameras has {len(rig.cameras)}: use 'stereo'"
         )
-    if rig.depth_model == "power_law" and rig.power_law is not None:
-        return PowerLaw.of(rig.power_law)
-    if rig.depth_model == "affine_disparity" and rig.affine_disparity is not None:
-        return AffineDisparity.of(rig.affine_disparity)
-    raise CalibrationError(f"rig {rig.name!r}: depth_model is {rig.depth_model!r} but the key is missing")
+    law: DepthLaw | None = None
+    if model == "power_law" and rig.power_law is not None:
+        law = PowerLaw.of(rig.power_law)
+    if model == "affine_disparity" and rig.affine_disparity is not None:
+        law = AffineDisparity.of(rig.affine_disparity)
+    if law is None:
+        raise CalibrationError(
+            f"rig {rig.name!r}: depth_model is {model!r} but the key {model!r} is missing: fit it with"
+            " `phalanx-master calibrate depth`, or use 'stereo'"
+        )
+    if crooked := _crooked(*cameras[:2]):
+        raise CalibrationError(
+            f"rig {rig.name!r}: depth_model {model!r} needs parallel cameras side by side, but {crooked}: turn them,"
+            " or use 'stereo'"
+        )
+    return law
 
 
-def position_at_depth(camera: CameraModel, uv: Float, depth: Float) -> Float:
-    """Where a centroid of the reference camera is, given its depth: the undistorted ray, scaled.
+def _crooked(left: CameraModel, right: CameraModel) -> str:
+    """What keeps raw disparity from being a measure of depth; empty: nothing.
+
+    Beyond these bounds the disparity of one depth changes by more over the image than a law fitted on the axis and the
+    correction off it (`master.fabrik.triangulate`) take.
+    """
+    R = left.T_rig_camera[:3, :3].T
+    turn = R @ right.T_rig_camera[:3, :3]
+    x, y, z = R @ (right.centre - left.centre)
+    turned = float(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    focal = left.matrix[1, 1] / right.matrix[1, 1]
+    if turned > PARALLEL_RAD:
+        return (
+            f"{right.name!r} is turned by {np.degrees(turned):.1f} degrees against {left.name!r},"
+            f" at most {np.degrees(PARALLEL_RAD):.0f} are allowed"
+        )
+    if x <= 0.0:
+        return f"{right.name!r} is not to the right of {left.name!r}: name the left one first in 'cameras'"
+    if max(abs(y), abs(z)) > ALIKE * x:
+        off_mm = 1e3 * max(abs(y), abs(z))
+        return (
+            f"their baseline of {1e3 * x:.0f} mm is off the image rows by {off_mm:.0f} mm,"
+            f" at most {1e2 * ALIKE:.0f} % are allowed"
+        )
+    if abs(focal - 1.0) > ALIKE or left.height_px != right.height_px:
+        return f"their focal lengths differ by {1e2 * abs(focal - 1.0):.0f} %, or their heights do"
+    return ""
+
+
+def law_misfit(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
+    """Largest relative difference of the law from the cameras' own geometry on the axis, and its depth [m].
 
     Args:
-        camera: The camera to whose axis the depth belongs.
-        uv: Centroids (..., 2) [px], distorted image. NaN: not seen.
-        depth: Depth along the camera's optical axis (...) [m]. NaN: unknown.
-
-    Returns:
-        Points (..., 3) [m], rig frame, right-handed; a row is all NaN where uv or depth is.
+        law: Of the first two cameras.
+        cameras: In the rig's order.
+        volume: Whose depths are asked; None: usual ones.
     """
-    xy = camera.undistort(uv)
-    z = np.asarray(depth, dtype=np.float64)[..., None]
-    return transform(camera.T_rig_camera, np.concatenate([xy * z, z + 0.0 * xy[..., :1]], axis=-1))
+    left, right = cameras[:2]
+    low_m, high_m = _DEPTHS_M
+    if volume is not None:
+        corners = np.array(list(product(*zip(volume.low_m, volume.high_m, strict=True))))
+        ahead = (corners - left.centre) @ left.T_rig_camera[:3, 2]
+        low_m, high_m = max(float(ahead.min()), 0.1 * float(ahead.max())), float(ahead.max())
+    depth = np.linspace(low_m, high_m, 9)
+    on_axis = depth[:, None] * left.T_rig_camera[:3, 2] + left.centre
+    off = np.abs(law.depth((left.project(on_axis) - right.project(on_axis))[:, 0]) / depth - 1.0)
+    worst = int(np.nan_to_num(off, nan=np.inf).argmax())
+    return float(np.nan_to_num(off[worst], nan=np.inf)), float(depth[worst])
 
 
 @dataclass(frozen=True, slots=True)

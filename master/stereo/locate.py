@@ -29,14 +29,11 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from master.ik.hand import HandSolution
-from master.stereo.caps import CapLook, CapModel
+from master.fabrik.estimate import MarkerPositions, SolvedHand
+from master.stereo.caps import TURN_RAD_S, CapLook, CapModel
 from master.stereo.odd_camera import odd_camera
 from master.stereo.place import Placement
 
-TURN_RAD_S = (
-    2.0  # standard deviation of how fast a finger end turns: a fist closes in a second, and mostly rests
-)
 _RADIUS = 0.1  # relative error of a profile's radii: 0.8 mm
 _RELIEF_M = 0.4e-3  # 16 mm of paint on a back with 50 mm radius of curvature bulge by 0.6 mm
 # Of the variance of whole caps' centroids, rendered and detected: 0.7 of all together, 0.8 by medians, but of single
@@ -46,23 +43,15 @@ _ALIKE, _ALIKE_PX = 0.75, 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Located:
-    """The markers of one instant.
+class Located(MarkerPositions):
+    """The markers of one instant by the rays of all cameras.
 
     Attributes:
-        points: Cap centroids (M, 3) [m]; NaN: not seen by two cameras, or their rays do not meet.
-        cov: (M, 3, 3) [m^2].
-        noise: (M, 3, 3) [m^2] the part of `cov` that may differ from one instant to the next, and between cameras.
-        repeated: (M, 3, 3) [m^2] what is to be added to `cov` for a fit that starts at the same hand.
-        apart: (M,) the rays do not meet.
-        left_out: (C, M) sightings without which they do.
+        repeated: (M, 3, 3) [m^2] what is to be added to `cov_m2` for a fit that starts at the same hand.
+        left_out: (C, M) sightings without which rays of three or more cameras meet.
     """
 
-    points: Float
-    cov: Float
-    noise: Float
     repeated: Float
-    apart: Bool
     left_out: Bool
 
 
@@ -81,10 +70,8 @@ class CapLocator:
         uv: Float,
         sigma_px: Float,
         area_px2: Float,
-        hand: HandSolution | None,
+        hand: SolvedHand | None,
         age_s: float,
-        *,
-        as_seen: bool = False,
     ) -> Located:
         """Locate the markers of one instant.
 
@@ -92,17 +79,16 @@ class CapLocator:
             uv: (C, M, 2) [px]; NaN: not seen.
             sigma_px: (C, M).
             area_px2: (C, M).
-            hand: The hand known so far; None: a cap may point anywhere where it is seen.
+            hand: The hand known so far; None: the markers may be on anything, so what is seen of them is taken for
+                their centroid, and the whole correction for doubt.
             age_s: How long ago it was so [s].
-            as_seen: Nothing tells of a hand, so the markers may be on something flat: what is seen of them is taken
-                for their centroid, and the whole correction for doubt.
         """
-        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
+        found = self._once(uv, sigma_px, area_px2, hand, age_s)
         if not found.left_out.any():
             return found
         out = found.left_out
         uv, area_px2 = np.where(out[..., None], np.nan, uv), np.where(out, np.nan, area_px2)
-        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
+        found = self._once(uv, sigma_px, area_px2, hand, age_s)
         return replace(found, left_out=out & ~found.apart)
 
     def _once(
@@ -110,15 +96,13 @@ class CapLocator:
         uv: Float,
         sigma_px: Float,
         area_px2: Float,
-        hand: HandSolution | None,
+        hand: SolvedHand | None,
         age_s: float,
-        *,
-        as_seen: bool,
     ) -> Located:
         """As `__call__`, but `left_out` is only told, not yet left out."""
         points = self._place.roughly(uv, sigma_px)
         look = self.look(points, hand, age_s)
-        if as_seen:
+        if hand is None:
             look.bias_px[0] = 0.0
         doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2)
         caps_uv, sure_px = uv - look.bias_px[0], np.hypot(sigma_px, doubt)
@@ -137,7 +121,7 @@ class CapLocator:
             left_out = odd_camera(self._place, caps_uv, sure_px, apart)
             placed.points[apart], cov[apart] = np.nan, np.nan
         repeated = tilted * (self._unsure(hand, age_s) - 1.0)[:, None, None]
-        return Located(placed.points, cov, placed.cov, repeated, apart, left_out)
+        return Located(placed.points, cov, placed.cov, apart, repeated, left_out)
 
     def _alike(self, gain: Float, sigma_px: Float, doubt_px: Float) -> Float:
         """What it changes in covariances (M, 3, 3) that cameras err alike, as if the marker were elsewhere.
@@ -154,7 +138,7 @@ class CapLocator:
         step = gain @ self._axes
         return shared[:, None, None] * (step @ step.swapaxes(1, 2) - gain @ gain.swapaxes(1, 2))
 
-    def look(self, points: Float, hand: HandSolution | None, age_s: float) -> CapLook:
+    def look(self, points: Float, hand: SolvedHand | None, age_s: float) -> CapLook:
         """How caps at (M, 3) [m] look: as the hand has them, and tilted as far as it is unsure."""
         if hand is None:
             ahead = self._caps.anyhow(points, self._cameras)
@@ -163,7 +147,7 @@ class CapLocator:
             ahead = self._caps.tilted(hand.joints, hand.tilt_cov_rad2 + turned)
         return self._caps.look(ahead, points, self._cameras)
 
-    def _unsure(self, hand: HandSolution | None, age_s: float) -> Float:
+    def _unsure(self, hand: SolvedHand | None, age_s: float) -> Float:
         """By how much the variance of the tilt is larger to the hand fit than to us (M,)."""
         if hand is None:
             return np.ones(len(self._caps.on_finger))

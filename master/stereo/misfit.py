@@ -4,10 +4,6 @@ Rays of one point meet but for noise, so the squared miss in units of its standa
 distributed: 2 C numbers of C cameras less the 3 of the point. For two cameras it is the distance from the epipolar
 line. What exceeds the quantile that noise exceeds once in a million is not one point (`LIMIT`: 4.9 standard
 deviations for two cameras).
-
-A rig whose depth comes from a law on raw disparities has no epipolar geometry to trust: its law contains how the
-cameras are misaligned, its poses do not. Where its cameras are nearly parallel, side by side and alike, rows are still
-epipolar lines but for that misalignment, and the difference of rows is tested. Other such rigs have no test.
 """
 
 from math import erfc, exp, gamma, sqrt
@@ -15,15 +11,11 @@ from math import erfc, exp, gamma, sqrt
 import numpy as np
 
 from common.arrays import Float
-from common.camera_model import CameraModel
 
 RIG_PX = 0.85
 """Standard deviation per axis of what lens, mount and calibration leave at one marker: two sure cameras may miss each
 other by 6 px before a marker is dropped. Cheap lenses fit to about half a pixel, and a mount gives way when touched."""
 _ONE_IN = 1e-6
-_MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
-_PARALLEL_RAD = np.radians(3.0)
-_ALIKE = 0.05  # largest relative difference of focal lengths, and slope of the baseline
 
 
 def chi_square_survival(x: float, degrees: int) -> float:
@@ -62,27 +54,3 @@ def misfit_of_rays(error_px2: Float, sigma_px: Float) -> Float:
         sigma_px: (C, M) standard deviations per axis; NaN where not seen.
     """
     return (error_px2 / (np.nan_to_num(sigma_px.T, nan=1.0) ** 2 + RIG_PX**2)).sum(axis=1)
-
-
-def misfit_of_rows(uv: Float, sigma_px: Float, row_sigma_px: float) -> Float:
-    """Chi square (M,) of the difference of rows of two cameras; NaN where one does not see the marker.
-
-    Args:
-        uv: (2, M, 2) [px].
-        sigma_px: (2, M).
-        row_sigma_px: What `row_sigma` gave.
-    """
-    return (uv[0, :, 1] - uv[1, :, 1]) ** 2 / (sigma_px[0] ** 2 + sigma_px[1] ** 2 + row_sigma_px**2)
-
-
-def row_sigma(cameras: tuple[CameraModel, ...]) -> float:
-    """Standard deviation [px] of the difference of rows of one point in two cameras; inf where rows tell nothing."""
-    one, other = cameras[:2]
-    turn = one.T_rig_camera[:3, :3].T @ other.T_rig_camera[:3, :3]
-    x, y, z = np.abs(one.T_rig_camera[:3, :3].T @ (other.centre - one.centre))
-    turned = np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0))
-    focal = one.matrix[1, 1], other.matrix[1, 1]
-    alike = abs(focal[0] / focal[1] - 1.0) <= _ALIKE and one.height_px == other.height_px
-    if turned > _PARALLEL_RAD or max(y, z) > _ALIKE * x or not alike:
-        return float(np.inf)
-    return float(np.hypot(sqrt(2.0) * RIG_PX, focal[0] * _MOUNTED_RAD))

@@ -1,4 +1,4 @@
-"""The marker rig's straight line: detections -> one instant -> 3D caps -> hand, and filtered caps.
+"""The marker rig: centroids -> one instant -> the card's line -> its hand, or the estimator's that starts from it.
 
 `MarkerPipeline` is a push machine without clock, socket or thread: live and offline runs push the same messages
 and get the same poses. It is built from calibration by `master.rig`.
@@ -18,7 +18,8 @@ from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
-from master.filters import PointFilter
+from master.fabrik.estimate import HandEstimate
+from master.fabrik.solver import FabrikSolver
 from master.ik.hand import HandSolution
 from master.ik.hand_filter import HandFilter
 from master.ik.orientation import OrientationTrack
@@ -26,10 +27,9 @@ from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
-from master.stereo.depth import DepthLaw
 from master.stereo.drift import DepthDrift
 from master.stereo.locate import CapLocator, Located
-from master.stereo.pairing import Instant, Pairing
+from master.stereo.pairing import Instant
 from master.stereo.place import EXACT, CalibrationResidual, Placement, ray_covariance
 from master.stereo.rivals import RivalChooser
 from master.stereo.whereabouts import HandBelief, Past
@@ -62,7 +62,7 @@ class SolvedPose:
 
 
 class MarkerPipeline:
-    """Push machine. Holds pairing, filters and tracker, each with its own state."""
+    """Push machine. Holds pairing, line, tracker and filter, each with its own state."""
 
     def __init__(
         self,
@@ -70,11 +70,9 @@ class MarkerPipeline:
         model: HandModel,
         markers: tuple[str, ...],
         *,
-        pairing: Pairing,
-        law: DepthLaw | None = None,
+        line: FabrikSolver,
         residual: CalibrationResidual = EXACT,
-        smooth: PointFilter | None = None,
-        tracker: HandTracker,
+        tracker: HandTracker | None,
         steady: HandFilter | None = None,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
@@ -90,12 +88,10 @@ class MarkerPipeline:
             cameras: In the rig's order.
             model: The hand.
             markers: Names in the order of every marker array.
-            pairing: Brings cameras to one instant.
-            law: Depth from disparity of the first two cameras; None: triangulate all cameras.
+            line: Brings the cameras to one instant, and solves it first.
             residual: What the calibration is known to leave.
-            smooth: 1 € filter of the caps; None: frames are unrelated, nothing is filtered.
-            tracker: Solves the hand from its own markers, some or all of these.
-            steady: Filters the solved hand; None: as `smooth`.
+            tracker: Refines the hand from its own markers, some or all of these; None: the line's hand is published.
+            steady: Filters the refined hand; None: frames are unrelated, nothing is filtered.
             stamp_offset_us: Camera -> how much later its frames really are than their stamps; added to them.
             volume: What the rig states, or None; joints say whether they lie in it.
             imu: On the palm; its orientation is used where the rig says how it is mounted and how its world lies.
@@ -107,11 +103,12 @@ class MarkerPipeline:
         self.model, self.markers = model, markers
         self.counts: Counter[str] = Counter() if counts is None else counts
         self._names, self._cameras = tuple(cameras), tuple(cameras.values())
-        self._pairing, self._smooth, self._tracker, self._steady = pairing, smooth, tracker, steady
+        self._line, self._tracker, self._steady = line, tracker, steady
         self._lens_shift = LensShift(self._cameras)
-        self._place = Placement(self._cameras, law, residual)
+        self._place = Placement(self._cameras, residual)
         self._choose = RivalChooser(self._cameras, self._place)
-        self._on_hand = np.array([markers.index(name) for name in tracker.markers], np.int64)
+        self._on_hand = line.on_hand
+        self._hand_markers = tuple(markers[int(m)] for m in self._on_hand)
         self._past, self._believe = Past(len(markers)), HandBelief(model, markers, self._on_hand)
         self._caps = CapModel(model, markers)
         self._located = CapLocator(self._cameras, self._caps, self._place)
@@ -123,16 +120,15 @@ class MarkerPipeline:
         self._late_ns = {name: round(1e3 * us) for name, us in (stamp_offset_us or {}).items()}
         self._centres = np.array([camera.centre for camera in self._cameras])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in self._cameras])
-        self._on_palm = np.array([model.mount(name).joint is None for name in tracker.markers], np.bool_)
 
     def push(self, message: MarkerDetections) -> list[SolvedPose]:
         """Take one camera's detections; return the poses they complete, oldest first."""
         if late_ns := self._late_ns.get(message.camera):
             message = restamped(message, t_ns=message.t_ns + late_ns)
         with self._stage("pairing"):
-            instants = self._pairing.push(message)
-        if self._pairing.outdated:
-            self.counts["instants_outdated"] = self._pairing.outdated
+            instants = self._line.sync.push(message)
+        if self._line.sync.outdated:
+            self.counts["instants_outdated"] = self._line.sync.outdated
         return self._solved(instants)
 
     def blind(self, t_ns: int, ready_t_ns: int) -> SolvedPose | None:
@@ -153,7 +149,7 @@ class MarkerPipeline:
 
     def flush(self) -> list[SolvedPose]:
         """At the end of a recording: the poses that still wait for a camera."""
-        return self._solved(self._pairing.flush())
+        return self._solved(self._line.sync.flush())
 
     def _solved(self, instants: list[Instant]) -> list[SolvedPose]:
         """Poses of instants later than the last one; others are counted: cameras came back with old frames."""
@@ -170,38 +166,64 @@ class MarkerPipeline:
         return poses
 
     def _solve(self, instant: Instant) -> SolvedPose:
-        last, age_s = self._tracker.recent(instant.t_ns)
-        near = last
+        last, age_s = (None, 0.0) if self._tracker is None else self._tracker.recent(instant.t_ns)
         with self._stage("triangulate"):
             if self._lens_shift.any:
                 instant = replace(instant, uv=self._lens_shift.centres(instant.uv, instant.area))
             instant = self._without_rivals(instant)
-            found = self._locate(instant, last, age_s)
-        if last is None:
-            # The caps' tilt is not known yet: a first solution tells it.
-            with self._stage("hand"):
-                near = self._tracker.peek(
-                    *self._with_rays(instant, found.points, found.cov, None, 0.0),
-                    self._towards(found.points, instant),
-                )
+        line = self._line.solve(instant, last)
+        hand: HandEstimate | TrackedHand = line
+        if self._tracker is not None:
+            hand = self._refined(self._tracker, instant, line, last, age_s)
+        else:
+            self._count("apart", line.markers.apart)
+            self.counts["epipolar_misfits"] += int(line.markers.apart.sum())
+        markers = line.markers
+        pose = pose_of(
+            hand, self.model, instant.t_ns, line.smooth_m, markers.points_m, markers.cov_m2, self._volume
+        )
+        self._past.saw(instant.t_ns, markers.points_m)
+        self.counts["poses"] += 1
+        self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
+        self.counts["instants_with_missing_camera"] += int(instant.missing.any())
+        return SolvedPose(pose, instant.ready_t_ns)
+
+    def _refined(
+        self,
+        tracker: HandTracker,
+        instant: Instant,
+        line: HandEstimate,
+        last: HandSolution | None,
+        age_s: float,
+    ) -> TrackedHand:
+        """The hand that explains the pixels of one instant best, from the line's hand or the last one `age_s` ago."""
+        near = last or line.solution
+        found = line.markers
+        if not isinstance(found, Located):  # the line triangulates by a law of disparity
             with self._stage("triangulate"):
-                found = self._locate(instant, near, 0.0, as_seen=near is None)
-        raw, cov, apart = found.points, found.cov, found.apart
-        with self._stage("filter"):
-            markers = raw if self._smooth is None else self._smooth.push(instant.t_ns, raw, found.noise)
+                found = self._located(instant.uv, instant.sigma_px, instant.area, near, age_s)
         with self._stage("hand"):
             # The covariances are those of the points before the filter, which do not lag: the fit takes these.
-            aims = self._with_rays(instant, raw, cov + found.repeated, last, age_s)
-            measured = np.isfinite(raw[self._on_hand, 0])
+            points, cov = found.points_m, found.cov_m2
+            aims = self._with_rays(instant, points, cov + found.repeated, last, age_s)
+            measured = np.isfinite(points[self._on_hand, 0])
             turned = None if self._orientation is None else self._orientation.at(instant.t_ns, near)
             told = None if self._others is None else self._others.at(instant.t_ns)
-            hand = self._tracker.push(
-                instant.t_ns, *aims, self._towards(raw, instant), measured, turned, told
+            hand = tracker.push(
+                instant.t_ns,
+                *aims,
+                line.facing,
+                measured,
+                turned,
+                told,
+                line.solution if line.solved else None,
             )
             if self._others is not None:
                 self._others.solved(instant.t_ns, hand, told)
             if self._steady is not None:
-                hand = self._steady.push(instant.t_ns, hand, found.noise[self._on_hand], raw[self._on_hand])
+                hand = self._steady.push(
+                    instant.t_ns, hand, found.noise_m2[self._on_hand], points[self._on_hand]
+                )
             on_hand = np.isfinite(instant.uv[:, self._on_hand, 0])
             hand = self._drift.push(
                 instant.t_ns,
@@ -210,17 +232,11 @@ class MarkerPipeline:
                 seen=bool(on_hand.any()),
                 sight=self._sight(hand, on_hand),
             )
-            pose = pose_of(hand, self.model, instant.t_ns, markers, raw, cov, self._volume)
-        if self._smooth is not None:
-            self._past.saw(instant.t_ns, raw)
-        self._count("apart", apart)
+        self._count("apart", found.apart)
+        self.counts["epipolar_misfits"] += int(found.apart.sum())
         if found.left_out.any():
             self._count_left_out(found, instant)
-        self.counts["epipolar_misfits"] += int(apart.sum())
-        self.counts["poses"] += 1
-        self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
-        self.counts["instants_with_missing_camera"] += int(instant.missing.any())
-        return SolvedPose(pose, instant.ready_t_ns)
+        return hand
 
     def _without_rivals(self, instant: Instant) -> Instant:
         """The instant with one place for each marker; the usual one has no rival and is passed on."""
@@ -231,8 +247,7 @@ class MarkerPipeline:
             return replace(instant, rival_uv=None)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | first.apart(instant.uv))[:, None], np.nan, first.points)
-        hand = clear[self._on_hand], first.cov[self._on_hand], self._towards(clear, instant)
-        others = self._tracker.peek(*hand, curled=False)
+        others = self._line.peek(instant, clear, first.cov)
         chosen = self._choose(
             instant.uv,
             instant.sigma_px,
@@ -254,17 +269,12 @@ class MarkerPipeline:
 
     def _count_left_out(self, found: Located, instant: Instant) -> None:
         """Count what was left out of each camera, and instants at which that is most of what it sees."""
-        sees = np.isfinite(instant.uv[..., 0]) & np.isfinite(found.points[:, 0])
+        sees = np.isfinite(instant.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
         for c in np.flatnonzero(found.left_out.any(axis=1)):
             self.counts[f"left_out.{self._names[c]}"[:_NAME]] += int(found.left_out[c].sum())
             if mostly[c]:
                 self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1
-
-    def _locate(
-        self, instant: Instant, hand: HandSolution | None, age_s: float, *, as_seen: bool = False
-    ) -> Located:
-        return self._located(instant.uv, instant.sigma_px, instant.area, hand, age_s, as_seen=as_seen)
 
     def _with_rays(
         self, instant: Instant, points: Float, cov: Float, last: HandSolution | None, age_s: float
@@ -310,25 +320,5 @@ class MarkerPipeline:
     def _caps_of(self, hand: HandSolution) -> Float:
         """Where a hand has its markers (M, 3) [m]; NaN: those on no hand."""
         points = np.full((len(self.markers), 3), np.nan)
-        points[self._on_hand] = self.model.marker_points(hand.joints, self._tracker.markers)
+        points[self._on_hand] = self.model.marker_points(hand.joints, self._hand_markers)
         return points
-
-    def _towards(self, points: Float, instant: Instant) -> Float:
-        """Unit vector (3,) from what is seen of the hand to the cameras that see the back of it.
-
-        A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras,
-        weighed by what each sees, add up to where it faces, as far as they tell.
-        """
-        found = points[self._on_hand]
-        found = found[np.isfinite(found[:, 0])]
-        if not len(found):
-            return -self._cameras[0].T_rig_camera[:3, 2]
-        back = self._centres - found.mean(axis=0)
-        distance = np.linalg.norm(back, axis=1)
-        shown = (
-            np.nansum(instant.area[:, self._on_hand[self._on_palm]], axis=1)
-            * (distance / self._focal_px) ** 2
-        )
-        towards = (shown if shown.any() else np.ones(len(shown))) @ (back / distance[:, None])
-        length = float(np.linalg.norm(towards))
-        return towards / length if length > 0.0 else back[0] / distance[0]

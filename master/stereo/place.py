@@ -1,7 +1,4 @@
-"""From pixels to points by the depth model of the rig, and whether the rays of each marker meet.
-
-The one place that knows both models: triangulation by all cameras, or a law of disparity on the first two.
-"""
+"""From pixels to points by the rays of all cameras, and whether the rays of each marker meet."""
 
 from dataclasses import dataclass
 from math import pi, sqrt
@@ -11,8 +8,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.calibration import RigCalibration
 from common.camera_model import CameraModel
-from master.stereo.depth import DepthLaw, position_at_depth
-from master.stereo.misfit import limits, misfit_of_rays, misfit_of_rows, row_sigma
+from master.stereo.misfit import limits, misfit_of_rays
 from master.stereo.triangulate import Triangulator
 
 
@@ -72,57 +68,29 @@ EXACT = CalibrationResidual()
 
 
 class Placement:
-    """The depth model of one rig. Holds no state between calls."""
+    """Triangulates by the cameras of one rig. Holds no state between calls."""
 
-    def __init__(
-        self,
-        cameras: tuple[CameraModel, ...],
-        law: DepthLaw | None,
-        residual: CalibrationResidual = EXACT,
-    ) -> None:
+    def __init__(self, cameras: tuple[CameraModel, ...], residual: CalibrationResidual = EXACT) -> None:
         """Prepare what is the same in every frame.
 
         Args:
             cameras: In the rig's order.
-            law: Depth from disparity of the first two cameras; None: triangulate all cameras.
             residual: What the calibration is known to leave.
         """
-        self._cameras, self._law, self._residual = cameras, law, residual
+        self._cameras, self._residual = cameras, residual
         self._triangulator = Triangulator.of(cameras)
         self._limits = limits(len(cameras))
-        self._row_sigma_px = row_sigma(cameras)
 
     def __call__(self, uv: Float, sigma_px: Float) -> Placed:
         """Place markers seen at (C, M, 2) [px] with standard deviations (C, M) [px]; NaN: not seen."""
         sure_px = np.hypot(sigma_px, self._residual.rays_px)
-        if self._law is not None:
-            return self._by_law(self._law, uv, sigma_px, sure_px)
         found = self._triangulator.triangulate(uv, sure_px)
         misfit = misfit_of_rays(found.error_px2, sigma_px)
         return Placed(found.points, found.covariance, found.gain, misfit, self._limits[found.views])
 
     def roughly(self, uv: Float, sigma_px: Float) -> Float:
         """Points (M, 3) [m], good enough to tell from which side each camera looks at them; as `__call__`."""
-        if self._law is not None:
-            return position_at_depth(self._cameras[0], uv[0], self._law.depth(uv[0, :, 0] - uv[1, :, 0]))
         return self._triangulator.roughly(uv, sigma_px)
-
-    def _by_law(self, law: DepthLaw, uv: Float, sigma_px: Float, sure_px: Float) -> Placed:
-        camera = self._cameras[0]
-        depth = law.depth(uv[0, :, 0] - uv[1, :, 0])
-        points = position_at_depth(camera, uv[0], depth)
-        ray = (points - camera.centre) / depth[:, None]
-        gain = np.zeros((len(points), 3, 2 * len(uv)))
-        across = camera.T_rig_camera[:3, :2] / camera.matrix[[0, 1], [0, 1]]
-        gain[:, :, :2] = depth[:, None, None] * across
-        per_px = law.metres_per_pixel(depth)[:, None] * ray  # less for more disparity
-        gain[:, :, 0] -= per_px
-        gain[:, :, 2] += per_px
-        noise = gain[:, :, :4] * np.repeat(sure_px[:2].T, 2, axis=1)[:, None]
-        misplaced = self._residual.law * (points - camera.centre)
-        cov = noise @ noise.swapaxes(1, 2) + misplaced[:, :, None] * misplaced[:, None, :]
-        misfit = misfit_of_rows(uv, sigma_px, self._row_sigma_px)
-        return Placed(points, cov, gain, misfit, np.full(len(points), self._limits[2]))
 
     def put(self, points: Float, markers: Int, view: Int, uv: Float, near: Float) -> None:
         """Put markers on the rays of single cameras: `points` (M, 3) is changed.

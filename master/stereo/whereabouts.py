@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import HandModel
-from master.ik.hand import HandSolution
+from master.fabrik.estimate import SolvedHand
 from master.stereo.rivals import Belief
 
 _PLACE_M = 0.01  # a cap is expected no better than this
@@ -50,7 +50,7 @@ class HandBelief:
         joints = [model.mount(name).joint for name in self._names]
         self._joint = np.array([0 if joint is None else joint for joint in joints], np.int64)  # 0: the palm
 
-    def __call__(self, hand: HandSolution | None, clear: Float) -> Belief:
+    def __call__(self, hand: SolvedHand | None, clear: Float) -> Belief:
         """Beliefs about all markers of the rig; NaN for those on no hand.
 
         Args:

@@ -12,7 +12,6 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
 from master.stereo.blob_bias import LensShift
-from master.stereo.depth import depth_law
 from master.stereo.pairing import Instant, Pairing
 from master.stereo.place import CalibrationResidual, Placement
 
@@ -75,12 +74,12 @@ def seen_by(
         names: Of the beads.
 
     Raises:
-        CalibrationError: As `rows_of`; the rig's depth model does not fit it.
+        CalibrationError: As `rows_of`.
     """
     rows = rows_of(rig, names)
     cameras = tuple(models.values())
     pairing, shift = Pairing(dict(models), dict(frame_rate_hz)), LensShift(cameras)
-    place = Placement(cameras, depth_law(rig), CalibrationResidual.of(rig))
+    place = Placement(cameras, CalibrationResidual.of(rig))
     late_ns = {camera: round(1e3 * us) for camera, us in rig.stamp_offset_us.items()}
     moved = (replace(one, t_ns=one.t_ns + late_ns.get(one.camera, 0)) for one in messages)
     instants = [instant for one in moved for instant in pairing.push(one)] + pairing.flush()
