@@ -20,7 +20,7 @@ from master.filters import PointFilter
 from master.ik.fabrik import Fabrik
 from master.ik.finger import FingerSolver
 from master.ik.hand import EXPLAINED
-from master.ik.hidden import FingerMemory
+from master.ik.hidden import FingerMemory, HiddenFingers
 from master.stereo.pairing import Instant, Pairing
 
 Stage = Callable[[str], AbstractContextManager[None]]
@@ -32,6 +32,7 @@ _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
 _NATURAL = 1.0  # the line knows no hand without habits
+_ANYWHERE = HiddenFingers(np.zeros((5, 4)), np.full(5, np.inf), np.zeros(5), np.ones(5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,9 +127,18 @@ class FabrikSolver:
             palm = self._fit(smooth, markers.cov_m2, instant, last, age_s)
             return self._estimate(instant, markers, smooth, palm)
 
-    def peek(self, instant: Instant, points: Float, cov: Float) -> SolvedHand | None:
-        """The hand by some points (M, 3) [m] of an instant, and nothing remembered; None: they are too few."""
-        palm = self._fit(points, cov, instant, None, 0.0)
+    def peek(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
+        """The hand by points alone, and nothing remembered; a finger that is not seen may be anywhere natural.
+
+        Args:
+            points, cov: (M, 3) [m] and (M, 3, 3) [m^2] of all markers; NaN: not placed.
+            area_px2: (C, M) as the cameras see them.
+
+        Returns:
+            The hand; None: the points are too few.
+        """
+        points, cov = points[self.on_hand], cov[self.on_hand]
+        palm = self._palm(points, cov, self._facing_of(points, area_px2), hidden=_ANYWHERE)
         return None if palm is None else self._hand_of(palm)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
@@ -144,12 +154,16 @@ class FabrikSolver:
         """The palm of an instant; `last` as of `_recent`."""
         points, cov = points[self.on_hand], cov[self.on_hand]
         seen = np.isfinite(points[:, 0])
-        facing = self.facing(points, instant.area) if seen[self._on_palm].any() else None
+        facing = self._facing_of(points, instant.area)
         if last is None:
             return self._palm(points, cov, facing)
         shown = frozenset(one.finger for one in self._fingers if seen[one.marker])
         hidden = self._memory.belief(instant.t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
         return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
+
+    def _facing_of(self, points: Float, area_px2: Float) -> Float | None:
+        """As `facing`; None: nothing of the back is seen."""
+        return self.facing(points, area_px2) if np.isfinite(points[self._on_palm, 0]).any() else None
 
     def facing(self, points: Float, area_px2: Float) -> Float:
         """Unit vector (3,) from what is seen of the hand to the cameras that see the back of it.

@@ -165,11 +165,11 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
     focal = left.matrix[1, 1] / right.matrix[1, 1]
     if turned > PARALLEL_RAD:
         return (
-            f"{right.name!r} is turned by {np.degrees(turned):.1f} degrees against {left.name!r},"
+            f"the second is turned by {np.degrees(turned):.1f} degrees against the first,"
             f" at most {np.degrees(PARALLEL_RAD):.0f} are allowed"
         )
     if x <= 0.0:
-        return f"{right.name!r} is not to the right of {left.name!r}: name the left one first in 'cameras'"
+        return "the second is not to the right of the first: name the left one first in 'cameras'"
     if max(abs(y), abs(z)) > ALIKE * x:
         off_mm = 1e3 * max(abs(y), abs(z))
         return (

@@ -247,7 +247,7 @@ class MarkerPipeline:
             return replace(instant, rival_uv=None)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | first.apart(instant.uv))[:, None], np.nan, first.points)
-        others = self._line.peek(instant, clear, first.cov)
+        others = self._line.peek(clear, first.cov, instant.area)
         chosen = self._choose(
             instant.uv,
             instant.sigma_px,

@@ -5,7 +5,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.calibration import AffineDisparityCalibration, PowerLawCalibration, RigCalibration
+from common.calibration import (
+    AffineDisparityCalibration,
+    PowerLawCalibration,
+    RigCalibration,
+    Volume,
+)
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import axis_rotation, rigid
@@ -16,10 +21,11 @@ from master.stereo.depth import (
     depth_law,
     error_budget,
     ideal_law,
-    position_at_depth,
+    law_misfit,
     tolerable_skew_s,
 )
 
+Vector = tuple[float, float, float]
 KALBFLEISCH = PowerLaw(k_m=45.433, z=-1.035)
 FOV_RAD = np.radians(62.5)
 LAWS = [KALBFLEISCH, AffineDisparity(37.7, 2.5), ideal_law(0.075, FOV_RAD, 640)]
@@ -102,26 +108,6 @@ def test_affine_law_absorbs_a_yaw_of_the_right_camera() -> None:
     assert np.abs(fitted.depth(disparity) / points[:, 2] - 1.0).max() < 2e-3
 
 
-@given(st.floats(0.2, 2.0), st.floats(-0.3, 0.3), st.floats(-0.2, 0.2))
-def test_position_from_centroid_and_depth(z: float, x: float, y: float) -> None:
-    matrix = np.array([[503.0, 0, 319.5], [0, 503.0, 239.5], [0, 0, 1.0]])
-    distortion = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])
-    camera = CameraModel(
-        matrix, distortion, rigid(axis_rotation(0, 0.2), np.array([0.1, 0.2, 0.3])), 640, 480, 0
-    )
-    in_camera = np.array([x * z, y * z, z])
-    point = in_camera @ camera.T_rig_camera[:3, :3].T + camera.centre
-    assert position_at_depth(camera, camera.project(point), np.array(z)) == pytest.approx(point, abs=1e-6)
-
-
-def test_position_is_nan_as_a_row() -> None:
-    camera = CameraModel(np.diag([500.0, 500.0, 1.0]), np.zeros(5), np.eye(4), 640, 480, 0.0)
-    uv = np.array([[1.0, 2.0], [np.nan, np.nan], [3.0, 4.0]])
-    out = position_at_depth(camera, uv, np.array([0.5, 0.5, np.nan]))
-    assert np.isnan(out).all(axis=1).tolist() == [False, True, True]
-    assert np.isfinite(out[0]).all()
-
-
 def _rig(**parts: object) -> RigCalibration:
     known: dict[str, object] = {
         "version": 1, "name": "desk", "kind": "markers", "cameras": ("left", "right"), "hand": "h",
@@ -132,14 +118,62 @@ def _rig(**parts: object) -> RigCalibration:
     return RigCalibration(**(known | parts))  # pyright: ignore[reportArgumentType]
 
 
+def camera(
+    turn: tuple[int, float] = (0, 0.0), at: Vector = (0.075, 0.0, 0.0), f: float = 500.0
+) -> CameraModel:
+    """A camera of the pair, turned about an axis by an angle [deg]."""
+    matrix = np.array([[f, 0.0, 319.5], [0.0, f, 239.5], [0.0, 0.0, 1.0]])
+    pose = rigid(axis_rotation(turn[0], np.radians(turn[1])), np.array(at))
+    return CameraModel(matrix, np.zeros(5), pose, 640, 480, 0.0)
+
+
+LEFT, RIGHT = camera(at=(0.0, 0.0, 0.0)), camera()
+
+
 def test_the_rig_file_chooses_the_law() -> None:
-    assert depth_law(_rig(depth_model="stereo")) is None
-    assert depth_law(_rig(depth_model="power_law")) == KALBFLEISCH
-    assert depth_law(_rig(depth_model="affine_disparity")) == AffineDisparity(37.7, 2.5)
+    pair = (LEFT, RIGHT)
+    assert depth_law(_rig(depth_model="stereo"), pair) is None
+    assert depth_law(_rig(depth_model="power_law"), pair) == KALBFLEISCH
+    assert depth_law(_rig(depth_model="affine_disparity"), pair) == AffineDisparity(37.7, 2.5)
     with pytest.raises(CalibrationError, match="two cameras"):
-        depth_law(_rig(depth_model="power_law", cameras=("a", "b", "c")))
-    with pytest.raises(CalibrationError, match="key is missing"):
-        depth_law(_rig(depth_model="power_law", power_law=None))
+        depth_law(_rig(depth_model="power_law", cameras=("a", "b", "c")), (*pair, RIGHT))
+    with pytest.raises(CalibrationError, match=r"key 'power_law' is missing.*calibrate depth"):
+        depth_law(_rig(depth_model="power_law", power_law=None), pair)
+
+
+@pytest.mark.parametrize(
+    ("right", "why"),
+    [
+        (camera((1, 5.0)), r"turned by 5\.0 degrees .* at most 3"),
+        (camera((2, -3.2)), r"turned by 3\.2 degrees"),
+        (camera(at=(0.075, 0.02, 0.0)), "75 mm is off the image rows by 20 mm"),
+        (camera(at=(0.075, 0.0, -0.006)), "off the image rows by 6 mm"),
+        (camera(at=(-0.075, 0.0, 0.0)), "name the left one first in 'cameras'"),
+        (camera(at=(0.0, 0.075, 0.0)), "name the left one first"),
+        (camera(f=540.0), "focal lengths differ by 7 %"),
+    ],
+)
+def test_cameras_that_are_not_parallel_side_by_side_have_no_law(right: CameraModel, why: str) -> None:
+    for model in ("power_law", "affine_disparity"):
+        with pytest.raises(CalibrationError, match=f"'desk': depth_model '{model}' .*{why}.*use 'stereo'"):
+            depth_law(_rig(depth_model=model), (LEFT, right))
+        assert depth_law(_rig(depth_model="stereo"), (LEFT, right)) is None
+
+
+def test_cameras_at_the_bound_have_a_law() -> None:
+    for right in (camera((1, 2.9)), camera((2, -2.9)), camera(at=(0.075, 0.0036, 0.0)), camera(f=520.0)):
+        assert depth_law(_rig(depth_model="power_law"), (LEFT, right)) == KALBFLEISCH
+
+
+def test_a_law_is_held_against_the_geometry_where_it_is_farthest_off() -> None:
+    exact, far = AffineDisparity(37.5, 0.0), AffineDisparity(37.5, 2.0)
+    volume = Volume(low_m=(-0.1, -0.1, 0.5), high_m=(0.1, 0.1, 0.75))
+    assert law_misfit(exact, (LEFT, RIGHT), volume)[0] < 1e-9
+    off, depth_m = law_misfit(far, (LEFT, RIGHT), volume)
+    assert depth_m == pytest.approx(0.75)
+    assert off == pytest.approx(1.0 / (1.0 - 2.0 / 50.0) - 1.0)  # 50 px at 0.75 m
+    assert law_misfit(far, (LEFT, RIGHT), None)[1] == pytest.approx(1.0)
+    assert law_misfit(AffineDisparity(37.5, 60.0), (LEFT, RIGHT), volume)[0] == np.inf
 
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0, 640), (0.075, 0.0, 640), (0.075, 4.0, 640), (np.nan, 1.0, 640)])

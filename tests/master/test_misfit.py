@@ -2,15 +2,12 @@
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from common.camera_model import CameraModel
-from common.geometry import rigid
-from master.stereo.depth import PowerLaw
-from master.stereo.misfit import RIG_PX, chi_square_quantile, chi_square_survival, limits, row_sigma
+from master.stereo.misfit import RIG_PX, chi_square_quantile, chi_square_survival, limits
 from master.stereo.place import Placement
-from tests.hand_helpers import camera_file, camera_models, rig_file
+from tests.hand_helpers import camera_models, rig_file
 
 PAIR = tuple(camera_models(rig_file()).values())
 THREE = tuple(camera_models(rig_file(("left", "right", "top"))).values())
@@ -39,7 +36,7 @@ def test_noise_gives_the_distribution_the_limit_is_made_of(
     exact = np.stack([camera.project(points) for camera in cameras])
     sigma = 0.3
     noise = rng.normal(0.0, np.hypot(sigma, RIG_PX), exact.shape)
-    placed = Placement(cameras, None)(exact + noise, np.full(exact.shape[:2], sigma))
+    placed = Placement(cameras)(exact + noise, np.full(exact.shape[:2], sigma))
     assert placed.misfit.mean() == pytest.approx(degrees, rel=0.08)
     assert (placed.misfit > chi2.isf(0.01, degrees)).mean() == pytest.approx(0.01, abs=0.006)
     assert (placed.misfit <= placed.limit).all()
@@ -49,50 +46,15 @@ def test_a_camera_that_sees_something_else_is_told_from_noise() -> None:
     points = np.tile([0.02, 0.01, 0.5], (3, 1))
     uv = np.stack([camera.project(points) for camera in PAIR])
     uv[1, :, 1] += [0.0, 5.0, 7.0]  # limit: 4.9 sqrt(2 (0.1^2 + 0.85^2)) = 5.9 px
-    placed = Placement(PAIR, None)(uv, np.full((2, 3), 0.1))
+    placed = Placement(PAIR)(uv, np.full((2, 3), 0.1))
     assert (placed.misfit <= placed.limit).tolist() == [True, True, False]
-    doubtful = Placement(PAIR, None)(uv, np.full((2, 3), 2.0))
+    doubtful = Placement(PAIR)(uv, np.full((2, 3), 2.0))
     assert (doubtful.misfit <= doubtful.limit).all()
 
 
 def test_a_marker_of_one_camera_has_neither_point_nor_misfit() -> None:
     uv = np.full((2, 1, 2), np.nan)
     uv[0, 0] = 320.0, 240.0
-    placed = Placement(PAIR, None)(uv, np.where(np.isnan(uv[..., 0]), np.nan, 0.1))
+    placed = Placement(PAIR)(uv, np.where(np.isnan(uv[..., 0]), np.nan, 0.1))
     assert np.isnan(placed.misfit).all()
     assert np.isnan(placed.points).all()
-
-
-# -- rigs with a law of disparity ----------------------------------------------------------------------------------
-
-
-def turned(axis: str, degrees: float, at: tuple[float, float, float] = (0.075, 0.0, 0.0)) -> CameraModel:
-    R = Rotation.from_euler(axis, degrees, degrees=True).as_matrix()
-    return CameraModel.of(camera_file("right"), rigid(R, np.array(at)))
-
-
-def test_rows_of_a_parallel_pair_are_compared_as_far_as_half_a_degree_of_pitch_allows() -> None:
-    sigma = row_sigma(PAIR)
-    assert sigma == pytest.approx(np.hypot(np.sqrt(2) * 0.85, 500.0 * np.radians(0.5)))
-    place = Placement(PAIR, PowerLaw(37.5, -1.0))
-    uv = np.array([[[340.0, 240.0]] * 3, [[265.0, 240.0]] * 3])
-    uv[1, :, 1] += [0.0, 15.0, 30.0]
-    placed = place(uv, np.full((2, 3), 0.1))
-    assert (placed.misfit <= placed.limit).tolist() == [True, True, False]
-    np.testing.assert_allclose(placed.points[:, 2], 0.5)
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        turned("y", 5.0),
-        turned("z", 5.0),
-        turned("x", 0.0, (0.075, 0.02, 0.0)),
-        turned("x", 0.0, (0.0, 0.075, 0.0)),
-    ],
-)
-def test_rows_of_cameras_that_are_not_parallel_side_by_side_tell_nothing(other: CameraModel) -> None:
-    assert row_sigma((PAIR[0], other)) == np.inf
-    uv = np.array([[[340.0, 140.0]], [[265.0, 340.0]]])
-    placed = Placement((PAIR[0], other), PowerLaw(37.5, -1.0))(uv, np.full((2, 1), 0.1))
-    assert placed.misfit.tolist() == [0.0]

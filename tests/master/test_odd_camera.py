@@ -119,7 +119,7 @@ def test_nothing_is_left_out_where_rays_meet_or_two_cameras_disagree() -> None:
 
 
 def odd(file: RigCalibration, uv: Float) -> Bool:
-    place, sigma = Placement(tuple(camera_models(file).values()), None), np.full(uv.shape[:2], 0.1)
+    place, sigma = Placement(tuple(camera_models(file).values())), np.full(uv.shape[:2], 0.1)
     return odd_camera(place, uv, sigma, place(uv, sigma).apart(uv))
 
 
@@ -157,7 +157,7 @@ def test_of_three_side_by_side_one_that_is_off_sideways_is_not_told() -> None:
     row = rig_file(THREE)
     uv = np.stack([camera.project(TRUTH) for camera in camera_models(row).values()])
     uv[1, :, 0] += 15.0
-    place, sigma = Placement(tuple(camera_models(row).values()), None), np.full(uv.shape[:2], 0.1)
+    place, sigma = Placement(tuple(camera_models(row).values())), np.full(uv.shape[:2], 0.1)
     assert place(uv, sigma).apart(uv).all()
     assert not odd(row, uv).any()
     uv[1] += [-15.0, 15.0]  # up or down it is

@@ -247,7 +247,7 @@ def test_unrelated_frames_are_not_filtered(exact_run: SyntheticRun) -> None:
 def test_every_stage_is_measured(exact_run: SyntheticRun) -> None:
     stages = StageTimes()
     solve_all(build_pipeline(exact_run.setup, stages), exact_run.messages[:8])
-    assert set(stages.mean_us()) == {"pairing", "triangulate", "filter", "hand"}
+    assert set(stages.mean_us()) == {"pairing", "triangulate", "filter", "fabrik", "hand"}
     assert all(value > 0 for value in stages.mean_us().values())
 
 

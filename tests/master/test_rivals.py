@@ -45,7 +45,7 @@ def choose(
     hand: Belief = NO_IDEA,
 ) -> Chosen:
     sigmas = [np.where(np.isnan(uv[..., 0]), np.nan, SIGMA_PX) for uv in (first, second)]
-    return RivalChooser(cameras, Placement(cameras, None))(first, sigmas[0], second, sigmas[1], hand, past)
+    return RivalChooser(cameras, Placement(cameras))(first, sigmas[0], second, sigmas[1], hand, past)
 
 
 def near(point: Float, spread_m: float = 0.02) -> Belief:
@@ -184,14 +184,14 @@ def test_a_marker_is_expected_where_it_was_and_what_is_old_is_forgotten() -> Non
 def test_a_hand_that_the_others_show_has_each_marker_within_its_covariance() -> None:
     """Natural hands, one finger in doubt: what is believed of it covers where it is, and is no wider than a hand."""
     rng = np.random.default_rng(3)
-    tracker, believe = HandTracker(RIGHT, MARKERS), HandBelief(RIGHT, MARKERS, np.arange(6))
+    line, believe = line_of(setup_of(rig_file()), StageTimes()), HandBelief(RIGHT, MARKERS, np.arange(6))
     squared: list[float] = []
     for trial in range(40):
         doubtful = trial % 6
         true = RIGHT.marker_points(RIGHT.forward(palm(rng.uniform(-20, 20, 3)), natural_angles(rng)), MARKERS)
         clear = true.copy()
         clear[doubtful] = np.nan
-        belief = believe(tracker.peek(clear, small_cov(), FACING, curled=False), clear)
+        belief = believe(line.peek(clear, small_cov(), np.full((2, 6), 100.0)), clear)
         off = true[doubtful] - belief.points[doubtful]
         squared.append(float(off @ np.linalg.solve(belief.cov[doubtful], off)))
         assert np.sqrt(np.trace(belief.cov[doubtful])) < 0.2

@@ -77,7 +77,7 @@ def test_a_run_is_written_scored_and_repeated_byte_by_byte(tmp_path: Path, short
         assert isinstance(stored[key], float)
     assert stored["joint_mm"] < 6.0
     assert stored["marker_mm"] < 3.0
-    assert set(stored["stage_us"]) == {"pairing", "triangulate", "filter", "hand", "gestures"}
+    assert set(stored["stage_us"]) == {"pairing", "triangulate", "filter", "fabrik", "hand", "gestures"}
     assert stored["counts"]["poses"] == 10
 
 
