@@ -22,7 +22,6 @@ from common.messages import HandPose, Source
 from master.ik.arcs import Arcs
 from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
-from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
@@ -33,6 +32,7 @@ from master.volume import inside
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
+_MODEL_M2 = 1e-3**2 * np.eye(3)  # bones and caps are known to about 1 mm
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
@@ -87,7 +87,6 @@ class HandTracker:
         self._solver = HandSolver(model, markers, priors)
         self.parameters = self._solver.parameters
         self._arcs = Arcs(model, self.parameters, markers)
-        self._refine = FingerRefiner(model, markers)
         self._elsewhere = MarkerCheck(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
@@ -104,7 +103,7 @@ class HandTracker:
         self._forget()
 
     def fresh(self) -> "HandTracker":
-        """A tracker of the same hand that has seen nothing yet; shares the tables of its fingers, which take 0.4 s."""
+        """A tracker of the same hand that has seen nothing yet; shares what was prepared for the hand."""
         other = copy(self)
         other._solver = HandSolver(self.model, self.markers, self._solver.priors)
         other.last, other._last_ns, other._seen_ns = None, 0, None
@@ -175,9 +174,6 @@ class HandTracker:
                 solution, last = fresh, None  # the leap was no motion
                 self._forget()
         if solution is not None:
-            solution = self._refine(
-                solution, points_m, cov_m2, frozenset() if others is None else others.fingers
-            )
             cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
             solution = replace(solution, cov_m2=cov)
             if last is not None:
@@ -270,7 +266,7 @@ class HandTracker:
         if not len(far):
             return 0.0
         off = points_m[far] - self._attached.on(solution.joints)[far]
-        surprise = surprise_of(off, cov_m2[far])
+        surprise = np.vecdot(off, np.linalg.solve(cov_m2[far] + _MODEL_M2, off[..., None])[..., 0])
         return float(np.max(solution.residual_m[far], where=surprise > EXPLAINED, initial=0.0))
 
     def peek(

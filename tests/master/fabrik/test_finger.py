@@ -17,9 +17,7 @@ from common.calibration import Couplings, HandProfile, load
 from common.hand_model import FINGERS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.ik.bounded import Four
-from master.ik.finger import NOT_SEEN, FingerSolver
-from master.ik.finger_table import FingerSolution
+from master.fabrik.finger import NOT_SEEN, FingerSolution, FingerSolver, Four
 
 Preset = Literal["K", "D"]
 DEGREE = math.pi / 180
@@ -151,13 +149,12 @@ def test_corners_of_the_limits_are_hit(finger: int, shares: tuple[float, ...], s
     assert _inside(model, finger, found)
 
 
-def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
+def test_reported_residual_is_true() -> None:
     rng = np.random.default_rng(4)
     for finger in range(5):
         model, solver = _model("right", "K"), _solver("right", "K", finger)
-        straight = solver.reachable(solver.forward((0.0, 0.0, 0.4, 0.4 * solver.ratio)))
-        assert straight is not None
-        assert straight.residual_m < 0.5e-6
+        straight = solver.solve(solver.forward((0.0, 0.0, 0.4, 0.4 * solver.ratio)))
+        assert straight.residual_m < 1e-12  # closed form, no search
         for _ in range(60):
             target = _target(np.array(solver.root) + rng.normal(0.0, 0.06, 3))
             found = solver.solve(target)
@@ -169,7 +166,7 @@ def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
 
 @pytest.mark.parametrize("finger", [1, 4])
 def test_a_finger_out_of_plane_near_the_pole_is_hit(datasets: Path, finger: int) -> None:
-    # at the abduction's pole an error of the tables would grow without bound
+    # at the abduction's pole an error of the PIP would grow without bound
     model = HandModel.of(load(datasets / "hands" / "webxr-right.json", HandProfile))
     solver, rng = _prepared(model, finger), np.random.default_rng(11)
     near_pole = 0
