@@ -11,16 +11,16 @@ from functools import partial
 import numpy as np
 
 from bench import peers_mink, peers_scipy
-from bench.hand_draws import Draw, bench_model, draw, posed
+from bench.hand_draws import MARKERS, Draw, bench_model, draw, posed
 from bench.hand_score import Score, score
 from bench.peers_paper import Angles, Fingers, PaperFingers, closed_form, finger_solvers, tips_in_palm
 from bench.row import Row, median_us
 from common.camera_model import CameraModel
 from common.geometry import axis_rotation, rigid
 from common.hand_model import HandModel
-from master.ik.fabrik import Fabrik, solve_finger
-from master.ik.finger import FingerSolver
-from master.ik.vectors import Vector
+from master.fabrik.fabrik import Fabrik
+from master.fabrik.finger import Finger, FingerSolver
+from master.fabrik.rotations import Vector
 from master.stereo.triangulate import Triangulator
 
 HANDS = 2000
@@ -77,7 +77,7 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     fingers = finger_solvers(model)
     out: dict[str, Fingers] = {
         CLOSED: partial(closed_form, fingers),
-        SEEDED: _seeded(fingers),
+        SEEDED: _seeded(model),
         RESTARTED: _from_rest(fingers, 3),
         FROM_REST: _from_rest(fingers, 0),
         PAPER: PaperFingers(fingers).push,
@@ -91,12 +91,14 @@ def ways(model: HandModel) -> dict[str, Fingers]:
     return out
 
 
-def _seeded(fingers: Sequence[FingerSolver]) -> Fingers:
-    prepared = [Fabrik.of(solver.chain) for solver in fingers]
+def _seeded(model: HandModel) -> Fingers:
+    fingers = [Finger.of(model, f, model.mount(name).offset_m) for f, name in enumerate(MARKERS[:5])]
 
     def way(tips: Sequence[Vector]) -> Angles:
-        found = [solve_finger(f, solver, tip) for f, solver, tip in zip(prepared, fingers, tips, strict=True)]
-        return [[q for joint in one.angles for q in joint] for one in found]
+        angles = np.full((5, 4), np.nan)
+        for finger, tip, row in zip(fingers, tips, angles, strict=True):
+            finger.solve(np.array(tip), row)
+        return angles.tolist()
 
     return way
 

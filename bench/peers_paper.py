@@ -16,10 +16,10 @@ from bench.hand_draws import BACK, FACING_ROTATION, MARKERS
 from common.arrays import Float
 from common.geometry import rigid
 from common.hand_model import HandModel
-from master.ik.chain_result import Pose
-from master.ik.fabrik import Fabrik
-from master.ik.finger import FingerSolver
-from master.ik.vectors import Vector, as_vector
+from master.fabrik.chain import Pose
+from master.fabrik.fabrik import Fabrik
+from master.fabrik.finger import FingerSolver
+from master.fabrik.rotations import Vector, as_vector
 
 Angles = Sequence[Sequence[float]]  # (5, 4) [rad]
 Fingers = Callable[[Sequence[Vector]], Angles]  # five tips [m] in the palm frame -> angles

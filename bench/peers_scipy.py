@@ -9,10 +9,10 @@ from bench.hand_draws import MARKERS, Noise
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
-from master.ik.finger import FingerSolver
+from master.fabrik.finger import FingerSolver
+from master.fabrik.rotations import Vector
 from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
-from master.ik.vectors import Vector
 
 _INSIDE_RAD = 1e-6  # it refuses a start on a bound, and bounds that leave no room
 _IN_MM = 1e3  # metres make its gradient tolerance end too early

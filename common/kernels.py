@@ -21,3 +21,9 @@ def kernel(function: F) -> F:
     lock is released while it runs.
     """
     return cast(F, cast(Any, numba).njit(**_OPTIONS)(function))
+
+
+def inner(function: F) -> F:
+    """As `kernel`, for a function that only kernels call: it compiles in half the time, and Python cannot call it."""
+    alone = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return cast(F, cast(Any, numba).njit(**_OPTIONS, **alone)(function))

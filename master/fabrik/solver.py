@@ -5,7 +5,6 @@ Push machine without clock, socket or thread. It holds what joins the cameras in
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,11 +13,10 @@ from common.camera_model import CameraModel
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.fabrik.estimate import HandEstimate, MarkerPositions, SolvedHand
+from master.fabrik.finger import Finger
 from master.fabrik.palm import Palm, PalmFitter
 from master.fabrik.triangulate import Triangulate
 from master.filters import PointFilter
-from master.ik.fabrik import Fabrik
-from master.ik.finger import FingerSolver
 from master.ik.hand import EXPLAINED
 from master.ik.hidden import FingerMemory, HiddenFingers
 from master.stereo.pairing import Instant, Pairing
@@ -26,23 +24,12 @@ from master.stereo.pairing import Instant, Pairing
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _ON_TARGET_M = 1e-4
-_ITERATIONS = 10  # the seed is on the target; what it cannot reach, iterations improve little
 _FIT_M2 = (3e-3) ** 2 * np.eye(3)  # of a finger's marker as the palm's fit has it
 _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
 _NATURAL = 1.0  # the line knows no hand without habits
 _ANYWHERE = HiddenFingers(np.zeros((5, 4)), np.full(5, np.inf), np.zeros(5), np.ones(5))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Finger:
-    """A finger that carries a marker: which of the markers it is, its closed form and FABRIK."""
-
-    finger: int
-    marker: int
-    closed_form: FingerSolver
-    fabrik: Fabrik
 
 
 class FabrikSolver:
@@ -82,16 +69,11 @@ class FabrikSolver:
         self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
         mounts = [model.mount(name) for name in hand_markers]
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
-        self._fingers = [
-            _Finger(
-                mount.finger,
-                m,
-                form := FingerSolver.of(model, mount.finger, mount.offset_m),
-                Fabrik.of(form.chain, tolerance_m=_ON_TARGET_M, max_iterations=_ITERATIONS, restarts=0),
-            )
+        self._fingers = {
+            m: (mount.finger, Finger.of(model, mount.finger, mount.offset_m, _ON_TARGET_M))
             for m, mount in enumerate(mounts)
             if mount.finger is not None
-        ]
+        }
         self._memory = FingerMemory(model)
         self._last: SolvedHand | None = None
         self._last_palm: Palm | None = None
@@ -157,7 +139,7 @@ class FabrikSolver:
         facing = self._facing_of(points, instant.area)
         if last is None:
             return self._palm(points, cov, facing)
-        shown = frozenset(one.finger for one in self._fingers if seen[one.marker])
+        shown = frozenset(f for m, (f, _) in self._fingers.items() if seen[m])
         hidden = self._memory.belief(instant.t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
         return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
 
@@ -227,19 +209,10 @@ class FabrikSolver:
         angles = fitted.angles_rad.copy()
         gain = _FIT_M2 @ np.linalg.inv(_FIT_M2 + np.nan_to_num(R.T @ markers.cov_m2[self.on_hand] @ R))
         targets = places + (gain @ (targets - places)[..., None])[..., 0]
-        for one in self._fingers:
-            m, f = one.marker, one.finger
-            target = tuple(targets[m].tolist())
-            if not np.isfinite(target[0]):
-                continue
-            seen[f] = True
-            a, flexion, pip, dip = angles[f].tolist()
-            if f != 0:
-                a, flexion, pip, dip = one.closed_form.solve(target)[:4]
-            found = one.fabrik.solve(target, ((a, flexion), (pip,), (dip,)), one.closed_form.root)
-            reached[f], iterations[f], residual[f] = found.reached, found.iterations, found.residual_m
-            explained[f] = palm.surprise[m] < EXPLAINED
-            angles[f] = [angle for joint in found.angles for angle in joint]
+        for m, (f, finger) in self._fingers.items():
+            if np.isfinite(targets[m, 0]):
+                residual[f], iterations[f], reached[f] = finger.solve(targets[m], angles[f])
+                seen[f], explained[f] = True, palm.surprise[m] < EXPLAINED
         angles = self._model.clamp(angles)
         joints = self._model.joints(palm.T, self._model.chains(angles))
         off = joints.position_m - fitted.joints.position_m

@@ -22,7 +22,6 @@ from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.ik.arcs import Arcs
 from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
-from master.ik.fingers import FingerRefiner, surprise_of
 from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
@@ -33,6 +32,7 @@ from master.volume import inside
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
 _BAD_FIT_M = 8e-3
+_MODEL_M2 = 1e-3**2 * np.eye(3)  # bones and caps are known to about 1 mm
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
@@ -86,7 +86,6 @@ class HandTracker:
         self._solver = HandSolver(model, markers, priors)
         self.parameters = self._solver.parameters
         self._arcs = Arcs(model, self.parameters, markers)
-        self._refine = FingerRefiner(model, markers)
         self._elsewhere = MarkerCheck(model, markers)
         self._continuous = continuous
         mounts = [model.mount(name) for name in markers]
@@ -174,9 +173,6 @@ class HandTracker:
                     solution, last = fresh, None  # the leap was no motion
                     self._forget()
         if solution is not None:
-            solution = self._refine(
-                solution, points_m, cov_m2, frozenset() if others is None else others.fingers
-            )
             cov = self.doubt.push(solution, last, dt_s, hidden, cov_m2, seen, palm_seen=tells_palm)
             solution = replace(solution, cov_m2=cov)
             if last is not None:
@@ -255,7 +251,7 @@ class HandTracker:
         far = np.flatnonzero(np.vecdot(off, off) > _BAD_FIT_M**2)  # NaN is not: not seen
         if not len(far):
             return 0.0
-        surprise = surprise_of(off[far], cov_m2[far])
+        surprise = np.vecdot(off[far], np.linalg.solve(cov_m2[far] + _MODEL_M2, off[far][..., None])[..., 0])
         return float(np.sqrt(np.vecdot(off[far], off[far]).max(where=surprise > EXPLAINED, initial=0.0)))
 
     def _palm_rests(self, seen: Bool, orientation: Orientation | None) -> int:

@@ -18,7 +18,7 @@ from common.geometry import quaternion_to_matrix, rotation_vector_to_matrix
 from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
-from master.ik.vectors import Vector
+from master.fabrik.rotations import Vector
 
 MODEL = bench_model()
 needs_mink = pytest.mark.skipif(not peers_mink.installed(), reason=f"mink: {peers_mink.INSTALL}")

@@ -5,12 +5,12 @@ import pytest
 
 from common.arrays import Float
 from common.camera_model import CameraModel
-from master.ik.tracker import HandTracker
+from master.rig_pipeline import line_of
+from master.stages import StageTimes
 from master.stereo.place import Placement
 from master.stereo.rivals import Belief, Chosen, RivalChooser
 from master.stereo.whereabouts import HandBelief, Past
 from tests.hand_helpers import (
-    FACING,
     MARKERS,
     RIGHT,
     camera_models,
@@ -19,6 +19,7 @@ from tests.hand_helpers import (
     rig_file,
     small_cov,
 )
+from tests.synthetic_run import setup_of
 
 PAIR = tuple(camera_models(rig_file()).values())
 THREE = tuple(camera_models(rig_file(("left", "right", "top"))).values())

@@ -11,9 +11,19 @@ from hypothesis import strategies as st
 from common.hand_model import HandModel
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
-from master.ik.chain import finger_chain
-from master.ik.joints import Hinge, Joint, Rotor, clamp_direction, swing_and_flex
-from master.ik.vectors import IDENTITY, Matrix, Vector, between, length, product, rotate, rotation_about
+from master.fabrik.finger import finger_chain
+from master.fabrik.joints import Angles, Hinge, Joint, Rotor, swing_and_flex
+from master.fabrik.rotations import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    between,
+    length,
+    product,
+    rotate,
+    rotate_back,
+    rotation_about,
+)
 
 DEGREE = math.pi / 180
 FINGER = Hinge(0.0, 110 * DEGREE)
@@ -41,6 +51,14 @@ frames = st.tuples(directions, st.floats(-3.0, 3.0)).map(
 
 def _zero(joint: Joint) -> tuple[float, ...]:
     return ZERO[isinstance(joint, Hinge)]
+
+
+def clamp_direction(
+    joint: Joint, frame: Matrix, bone: Vector, direction: Vector, now: Angles
+) -> tuple[Vector, Angles]:
+    """The reachable bone direction nearest to a wanted one in the world, and its angles; frame: joint -> world."""
+    angles = joint.fit(bone, rotate_back(frame, direction), now)
+    return rotate(frame, rotate(joint.rotation(angles), bone)), angles
 
 
 def _inside(joint: Joint, angles: tuple[float, ...]) -> bool:

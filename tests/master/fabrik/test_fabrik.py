@@ -13,12 +13,20 @@ from hypothesis import strategies as st
 from common.hand_model import FINGERS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.ik.chain import Chain, Coupling, Link, finger_chain, nearest_reach
-from master.ik.chain_result import ChainResult, Reach
-from master.ik.fabrik import Fabrik, solve_chain, solve_finger
-from master.ik.finger import FingerSolver
-from master.ik.joints import Angles, Hinge, Rotor
-from master.ik.vectors import IDENTITY, Vector, length, product, rotate, rotate_back, rotation_about
+from master.fabrik.chain import Chain, Coupling, Link, nearest_reach
+from master.fabrik.fabrik import ChainResult, Fabrik, Reach
+from master.fabrik.finger import FingerSolver, finger_chain
+from master.fabrik.joints import Angles, Hinge, Rotor
+from master.fabrik.rotations import (
+    IDENTITY,
+    Vector,
+    as_vector,
+    length,
+    product,
+    rotate,
+    rotate_back,
+    rotation_about,
+)
 
 Preset = Literal["K", "D"]
 
@@ -41,6 +49,12 @@ def _narrowing(finger: int, left: float, coupled: bool) -> Fabrik:
     limits = msgspec.structs.replace(limits, **{FINGERS[finger]: of})
     model = HandModel.of(msgspec.structs.replace(generated_profile("made", "left"), limits_rad=limits))
     return Fabrik.of(finger_chain(model, finger, np.zeros(3), coupled=coupled))
+
+
+def _seeded(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> ChainResult:
+    """FABRIK from the closed form's pose; target in the palm frame [m]."""
+    a, f, pip, dip, _, _ = closed_form.solve(target)
+    return fabrik.solve(target, ((a, f), (pip,), (dip,)), closed_form.root)
 
 
 def _random_target(solver: FingerSolver, rng: np.random.Generator) -> Vector:
@@ -84,7 +98,7 @@ def test_ten_thousand_reachable_targets(side: str, preset: Preset) -> None:
     for k in range(10_000):
         fabrik, closed_form = _finger(side, preset, k % 5)
         target = _random_target(closed_form, rng)
-        result = solve_finger(fabrik, closed_form, target)
+        result = _seeded(fabrik, closed_form, target)
         miss = math.dist(result.positions[-1], target)
         missed += not miss < 1e-4
         undefined += not math.isfinite(sum(q for joint in result.angles for q in joint) + miss)
@@ -101,7 +115,7 @@ def test_without_a_seed_restarts_heal_the_deadlock() -> None:
         target = _random_target(closed_form, rng)
         result = fabrik.solve(target, None, closed_form.root)
         missed += result.residual_m > 1e-4
-        alone = Fabrik(fabrik.chain, fabrik.farthest_m, fabrik.nearest_m, 1e-5, 100, 0)
+        alone = Fabrik.of(fabrik.chain, restarts=0)
         plain += alone.solve(target, None, closed_form.root).residual_m > 1e-3
         assert not _violated(fabrik.chain, result.angles)
         assert _consistent(fabrik.chain, result, closed_form.root)
@@ -156,7 +170,7 @@ ARM = Chain(
 def test_iteration_itself_converges_from_a_nearby_pose(
     swing: tuple[float, float], elbow: float, wrist: float, off: tuple[float, float]
 ) -> None:
-    target = ARM.forward((swing, (elbow,), (wrist,)))[0][-1]
+    target = as_vector(ARM.forward((swing, (elbow,), (wrist,)))[0][-1])
     seed = ((swing[0] + off[0], swing[1] + off[1]), (elbow + off[0],), (wrist + off[1],))
     result = Fabrik.of(ARM, 1e-4, 200, restarts=0).solve(target, seed)
     assert math.dist(result.positions[-1], target) < 1e-4 + 1e-12
@@ -183,7 +197,7 @@ def test_rotor_in_the_middle_and_world_hinge_obey_their_limits() -> None:
                 (float(rng.uniform(-0.6, 0.6)),),
             )
         )
-        result = fabrik.solve(chain.forward(legal)[0][-1])
+        result = fabrik.solve(as_vector(chain.forward(legal)[0][-1]))
         reached += result.residual_m < 2e-3
         legal = chain.clamp(result.angles)
         assert np.concatenate(legal) == pytest.approx(np.concatenate(result.angles), abs=1e-9)
@@ -206,7 +220,7 @@ def test_a_narrowing_rotor_in_the_middle_and_a_world_rotor_obey_their_limits() -
     reached = 0
     for _ in range(60):
         legal = chain.clamp(tuple((float(a), float(f)) for a, f in rng.uniform(-1.0, 1.2, (3, 2))))
-        result = fabrik.solve(chain.forward(legal)[0][-1])
+        result = fabrik.solve(as_vector(chain.forward(legal)[0][-1]))
         reached += result.reached
         for (a, f), rotor in zip(result.angles[1:], (narrow, upright), strict=True):
             low, high = rotor.abduction_span(f)
@@ -223,7 +237,7 @@ def test_no_joint_twists(finger: int, local: Vector, side: str) -> None:
     x, y, z = (a + b for a, b in zip(local, closed_form.root, strict=True))
     for result in (
         fabrik.solve((x, y, z), None, closed_form.root),
-        solve_finger(fabrik, closed_form, (x, y, z)),
+        _seeded(fabrik, closed_form, (x, y, z)),
     ):
         parent = np.eye(3)
         for k, link in enumerate(fabrik.chain.links):
@@ -253,9 +267,9 @@ def test_root_and_frame_only_move_the_answer() -> None:
     target = (moved[0] + root[0], moved[1] + root[1], moved[2] + root[2])
     a, b = fabrik.solve(local), fabrik.solve(target, None, root, frame)
     assert np.array(b.angles[0]) == pytest.approx(np.array(a.angles[0]), abs=1e-6)
-    back = [rotate_back(frame, (p[0] - root[0], p[1] - root[1], p[2] - root[2])) for p in b.positions]
-    assert np.array(back) == pytest.approx(np.array(a.positions), abs=1e-7)
-    assert b.positions[0] == root
+    back = [rotate_back(frame, as_vector(p - root)) for p in b.positions]
+    assert np.array(back) == pytest.approx(a.positions, abs=1e-7)
+    assert as_vector(b.positions[0]) == root
 
 
 def test_too_far_is_stretched_and_flagged() -> None:
@@ -279,7 +293,7 @@ def test_too_near_is_flagged() -> None:
         Link(IDENTITY, Hinge(0.0, math.pi / 2), (0.0, 0.0, -0.02)),
     )
     assert nearest_reach(Chain(links)) == pytest.approx(math.sqrt(13) / 100, abs=1e-6)
-    result = solve_chain(Chain(links), (0.0, -0.01, -0.01))
+    result = Fabrik.of(Chain(links)).solve((0.0, -0.01, -0.01))
     assert result.reach is Reach.TOO_NEAR
     assert not result.reached
     assert math.isfinite(result.residual_m)
@@ -299,7 +313,7 @@ def test_no_finite_target_gives_nan_or_raises(finger: int, local: Vector) -> Non
     target = tuple(a + b for a, b in zip(local, closed_form.root, strict=True))
     for result in (
         fabrik.solve((target[0], target[1], target[2]), None, closed_form.root),
-        solve_finger(fabrik, closed_form, (target[0], target[1], target[2])),
+        _seeded(fabrik, closed_form, (target[0], target[1], target[2])),
     ):
         assert np.isfinite(result.positions).all()
         assert np.isfinite(result.orientations).all()
@@ -315,7 +329,7 @@ def test_not_seen_is_nan_and_says_so() -> None:
     fabrik, closed_form = _finger("right", "K", 0)
     for result in (
         fabrik.solve((math.nan, 0.0, 0.0)),
-        solve_finger(fabrik, closed_form, (0.0, math.inf, 0.0)),
+        _seeded(fabrik, closed_form, (0.0, math.inf, 0.0)),
     ):
         assert result.reach is Reach.NOT_SEEN
         assert not result.reached
@@ -330,8 +344,8 @@ def test_a_bone_without_length_is_flagged_and_solved_round() -> None:
         Link(IDENTITY, Hinge(0.0, 1.5), (0.0, 0.0, -0.02)),
     )
     chain = Chain(links)
-    target = chain.forward(((0.2, 0.3), (0.4,), (0.5,)))[0][-1]
-    result = solve_chain(chain, target)
+    target = as_vector(chain.forward(((0.2, 0.3), (0.4,), (0.5,)))[0][-1])
+    result = Fabrik.of(chain).solve(target)
     assert result.degenerate
     assert np.isfinite(result.positions).all()
     assert result.residual_m < 1e-3
@@ -345,6 +359,10 @@ def test_wrong_chains_and_settings_are_refused() -> None:
         Chain((link, link), Coupling(1, 0, 0.7))
     with pytest.raises(ValueError, match="positive"):
         Fabrik.of(Chain((link,)), 0.0)
+    with pytest.raises(ValueError, match="0 to 3"):
+        Fabrik.of(Chain((link,)), restarts=4)
+    with pytest.raises(ValueError, match="2 angles for a joint that has 1"):
+        Fabrik.of(Chain((link,))).solve((0.0, 0.0, -0.1), ((0.1, 0.2),))
 
 
 def test_uncoupled_finger_keeps_the_dip_free() -> None:

@@ -17,9 +17,7 @@ from common.calibration import Couplings, HandProfile, load
 from common.hand_model import FINGERS, TIPS, HandModel
 from common.hand_presets import preset_couplings, preset_limits
 from common.hand_profiles import generated_profile
-from master.ik.bounded import Four
-from master.ik.finger import NOT_SEEN, FingerSolver
-from master.ik.finger_table import FingerSolution
+from master.fabrik.finger import NOT_SEEN, Finger, FingerSolution, FingerSolver, Four
 
 Preset = Literal["K", "D"]
 DEGREE = math.pi / 180
@@ -151,13 +149,12 @@ def test_corners_of_the_limits_are_hit(finger: int, shares: tuple[float, ...], s
     assert _inside(model, finger, found)
 
 
-def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
+def test_reported_residual_is_true() -> None:
     rng = np.random.default_rng(4)
     for finger in range(5):
         model, solver = _model("right", "K"), _solver("right", "K", finger)
-        straight = solver.reachable(solver.forward((0.0, 0.0, 0.4, 0.4 * solver.ratio)))
-        assert straight is not None
-        assert straight.residual_m < 0.5e-6
+        straight = solver.solve(solver.forward((0.0, 0.0, 0.4, 0.4 * solver.ratio)))
+        assert straight.residual_m < 1e-12  # closed form, no search
         for _ in range(60):
             target = _target(np.array(solver.root) + rng.normal(0.0, 0.06, 3))
             found = solver.solve(target)
@@ -169,7 +166,7 @@ def test_reported_residual_is_true_and_the_tables_are_fine() -> None:
 
 @pytest.mark.parametrize("finger", [1, 4])
 def test_a_finger_out_of_plane_near_the_pole_is_hit(datasets: Path, finger: int) -> None:
-    # at the abduction's pole an error of the tables would grow without bound
+    # at the abduction's pole an error of the PIP would grow without bound
     model = HandModel.of(load(datasets / "hands" / "webxr-right.json", HandProfile))
     solver, rng = _prepared(model, finger), np.random.default_rng(11)
     near_pole = 0
@@ -336,3 +333,76 @@ def test_free_pairs_are_found_where_the_coupling_is_off() -> None:
             found = solver.solve(target)
             assert math.dist(solver.forward(found[:4]), target) * 1e3 < 1e-3
             assert _inside(model, finger, found)
+
+
+@cache
+def _fabrik(side: str, preset: Preset, finger: int) -> Finger:
+    model = _model(side, preset)
+    return Finger.of(model, finger, model.mounts[FINGERS[finger]].offset_m)
+
+
+@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize(("side", "preset"), [("right", "K"), ("left", "D")])
+def test_fabrik_in_place_hits_ten_thousand_reachable_targets(side: str, preset: Preset, known: bool) -> None:
+    model, rng = _model(side, preset), np.random.default_rng(12)
+    missed = violated = 0
+    for finger in range(5):
+        solver, fabrik = _solver(side, preset, finger), _fabrik(side, preset, finger)
+        truth = _legal(model, solver, finger, rng.random((2000, 4)))
+        points = _points(model, finger, truth, model.mounts[FINGERS[finger]].offset_m)
+        found = truth + rng.normal(0.0, 0.1, truth.shape) if known else np.full_like(truth, np.nan)
+        results = [fabrik.solve(point, row) for point, row in zip(points, found, strict=True)]
+        back = _points(model, finger, found, model.mounts[FINGERS[finger]].offset_m)
+        miss_m = np.linalg.norm(back - points, axis=1)
+        assert [r.residual_m for r in results] == pytest.approx(miss_m, abs=1e-12)
+        missed += int((miss_m > 1e-4).sum()) + sum(not r.reached for r in results)
+        hands = np.zeros((len(found), 5, 4))
+        hands[:, finger] = found
+        violated += int((~model.within_limits(hands, 0.0)[:, finger]).sum())
+    assert (missed, violated) == (0, 0)
+
+
+def test_a_free_thumb_stays_near_the_angles_it_had() -> None:
+    model, rng, fabrik = _model("right", "D"), np.random.default_rng(13), _fabrik("right", "D", 0)
+    truth = _legal(model, fabrik.closed_form, 0, rng.uniform(0.2, 0.8, (200, 4)))
+    truth[:, 3] = rng.uniform(*model.limits_rad[0, 3], 200)  # in no ratio to the MCP
+    steps: list[float] = []
+    for angles in truth:
+        point = np.array(fabrik.closed_form.forward(_four(angles)))
+        out = angles + rng.normal(0.0, 0.02, 4)
+        assert fabrik.solve(point, out).reached
+        steps.append(float(np.abs(out - angles).max()))
+    assert np.quantile(steps, 0.9) < 0.1
+    closed = [fabrik.closed_form.solve(fabrik.closed_form.forward(_four(q))).dip_rad for q in truth]
+    assert np.median(np.abs(closed - truth[:, 3])) > 0.2  # by its ratio it would be far from there
+
+
+@pytest.mark.parametrize("finger", range(5))
+def test_fabrik_in_place_is_no_worse_than_its_seed_out_of_reach(finger: int) -> None:
+    fabrik, rng = _fabrik("right", "K", finger), np.random.default_rng(finger)
+    unreached = 0
+    for _ in range(40):
+        target, angles = np.array(fabrik.closed_form.root) + rng.normal(0.0, 0.15, 3), np.full(4, np.nan)
+        result, seed = fabrik.solve(target, angles), fabrik.closed_form.solve(_target(target))
+        unreached += not result.reached
+        assert result.residual_m <= seed.residual_m + 1e-12
+        assert math.dist(fabrik.closed_form.forward(_four(angles)), target) == pytest.approx(
+            result.residual_m
+        )
+        assert _inside(_model("right", "K"), finger, FingerSolution(*angles.tolist(), 0.0, False))
+    assert unreached > 20
+
+
+def test_fabrik_in_place_leaves_the_angles_of_a_finger_that_is_not_seen() -> None:
+    angles = np.array([0.1, 0.2, 0.3, 0.2])
+    for nowhere in (math.nan, math.inf):
+        result = _fabrik("right", "K", 1).solve(np.array([0.0, nowhere, 0.1]), angles)
+        assert math.isnan(result.residual_m)
+        assert (result.iterations, result.reached) == (0, False)
+        assert angles.tolist() == [0.1, 0.2, 0.3, 0.2]
+
+
+def test_a_finger_refuses_settings_that_find_nothing() -> None:
+    for wrong in ({"tolerance_m": 0.0}, {"max_iterations": 0}):
+        with pytest.raises(ValueError, match="positive"):
+            Finger.of(_model("right", "K"), 1, np.zeros(3), **wrong)

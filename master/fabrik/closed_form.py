@@ -1,0 +1,284 @@
+"""Finger angles from one point on the finger, in closed form; and the nearest legal pose where there is none.
+
+A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
+point lies at w(PIP), which neither flexion nor abduction can stretch:
+
+    |target - root| = |w(PIP)|       monotone but for a few degrees round the straight finger -> PIP
+    R_y(a) rest R_x(-f) w = target   y gives the flexion, x and z the abduction: two atan2
+
+This holds for bones out of plane too. The range of the PIP is cut where |w| turns, and where the DIP meets its own
+limit, into branches on which |w| is monotone; each is inverted by Newton's method inside a bracket.
+
+Where no such pose is legal, least squares go on from the nearest of them inside the limits. There a free DIP finds
+its own angle, and a target out of reach the nearest pose.
+
+Kernels of a finger's chain: a rotor (box) and two flexion hinges, coupled or not. Angles are (4,): abduction, flexion,
+PIP, DIP (thumb: CMC abduction, CMC flexion, MCP, IP) [rad].
+"""
+
+from math import cos, inf, isfinite, pi, sin, sqrt
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inner, kernel
+from master.fabrik.chain import (
+    BONE,
+    REST,
+    ROOT,
+    SIGN,
+    TURN,
+    ChainArrays,
+    clamp_angles,
+    end_of,
+    matrix_at,
+    vector_at,
+)
+from master.fabrik.joints import hinge_fit, swing_and_flex
+from master.fabrik.least_squares import least_squares
+from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, rotate_back
+
+REACHED_M = 1e-6
+_ENOUGH_M = 0.05 * REACHED_M
+_SLACK_RAD = 1e-6
+"""A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
+PIP, DIP = np.int64(1), np.int64(2)  # links
+_EDGE_M2 = 1e-14
+"""Rounding of a squared distance at the end of a branch."""
+_PER_BRANCH = 2.0 * pi
+"""How much rather the more bent branch is taken: more than any abduction, by which the poses of one are ranked."""
+_ROOT_STEPS = 60
+_ROUNDING = 1e-15
+_SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
+"""PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
+_STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
+_FIRST_STEPS, _MOST_STEPS = np.int64(8), np.int64(60)
+"""Of least squares: from each start of a free DIP, and to the end."""
+
+
+@kernel
+def closed_form(
+    chain: ChainArrays, edges: Float, ratio: float, goal: Vector, near: Float, angles: Float, seeds: Float
+) -> float:
+    """The legal pose that hits the target.
+
+    Args:
+        chain: Of the finger.
+        edges: (B + 1,) ends of the branches of the PIP, rising [rad].
+        ratio: DIP per PIP.
+        goal: Target [m], root frame, finite.
+        near: (4,) angles of a moment ago [rad]: where several legal poses hit the target (straight finger, pole of
+            the abduction) the nearest is taken; NaN: the more bent one, then the less abducted.
+        angles: (4,) [rad]; out, where there is such a pose.
+        seeds: (3, 4) [rad]; out, legal poses from which to search on where there is none.
+
+    Returns:
+        Distance of the point to the target [m]; infinite: no such pose is legal.
+    """
+    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    distance2, branches = dot(local, local), len(edges) - 1
+    penalties, trial = np.full(2, inf), np.empty(4)
+    best, residual = inf, inf
+    for b in range(branches - 1, -1, -1):
+        pip, off = _invert(chain, ratio, edges[b], edges[b + 1], distance2)
+        dip = min(max(ratio * pip, chain.spans[3, 0]), chain.spans[3, 1])
+        for side in range(2):
+            cut = _swing(chain, pip, dip, local, side, trial)
+            if cut <= _SLACK_RAD and off <= _EDGE_M2:
+                # bones out of plane cannot point exactly at the pole: legal angles may still miss
+                miss = length(minus(end_of(chain, trial), goal))
+                rank = _rank(trial, near, branches - 1 - b)
+                if miss < REACHED_M and rank < best:
+                    best, residual = rank, miss
+                    _copy(trial, angles)
+            _keep(seeds, penalties, trial, cut + 1e2 * sqrt(max(off, 0.0)))
+    if residual == inf:
+        _in_plane(chain, edges, ratio, local, seeds)
+    return residual
+
+
+@kernel
+def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, float]:
+    """Squared distance |w|^2 [m^2] at a PIP [rad], the DIP in its ratio, and its derivative [m^2/rad]."""
+    led = ratio * pip
+    dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
+    slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
+    tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
+    turning = rotate(turn, (0.0, slope * tip[2], -slope * tip[1]))
+    inner = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
+    inner, turning, turn = _flexed(pip, inner), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
+    w = plus(rotate(turn, inner), vector_at(chain.links, ROOT, BONE))
+    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, inner[2], -inner[1]))))
+
+
+@inner
+def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
+    """The point w [m] in the root joint's frame at PIP and DIP [rad]."""
+    tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
+    inner = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
+    return plus(
+        rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, inner)), vector_at(chain.links, ROOT, BONE)
+    )
+
+
+@inner
+def _flexed(angle: float, v: Vector) -> Vector:
+    """Vector v turned by R_x(-angle)."""
+    c, s = cos(angle), sin(angle)
+    return v[0], c * v[1] + s * v[2], c * v[2] - s * v[1]
+
+
+@inner
+def _invert(
+    chain: ChainArrays, ratio: float, low: float, high: float, distance2: float
+) -> tuple[float, float]:
+    """PIP [rad] of a squared distance on the branch [low, high], and how far beyond the branch that is [m^2].
+
+    It starts with PIP linear in sqrt(|w|_far^2 - |w|^2), which it nearly is, also at the straight finger.
+    """
+    d_low, d_high = distance2_of(chain, ratio, low)[0], distance2_of(chain, ratio, high)[0]
+    far, bent = (low, high) if d_low >= d_high else (high, low)
+    far2, near2 = max(d_low, d_high), min(d_low, d_high)
+    off = max(distance2 - far2, near2 - distance2)
+    if off >= 0.0:
+        return far if distance2 >= far2 else bent, off
+    pip = far + sqrt((far2 - distance2) / (far2 - near2)) * (bent - far)
+    for _ in range(_ROOT_STEPS):
+        value, slope = distance2_of(chain, ratio, pip)
+        if value > distance2:
+            far = pip
+        else:
+            bent = pip
+        new = pip + (distance2 - value) / slope if slope != 0.0 else inf
+        if not min(far, bent) <= new <= max(far, bent):
+            new = 0.5 * (far + bent)
+        if new == pip or abs(value - distance2) <= _ROUNDING * far2:
+            break
+        pip = new
+    return pip, off
+
+
+@inner
+def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int, angles: Float) -> float:
+    """Write one of the two poses (4,) that point w at the target, legalised; by how much it was cut [rad]."""
+    rest, w = matrix_at(chain.links, ROOT, REST), _point(chain, pip, dip)
+    a, f = swing_and_flex(w, local, rest, chain.links[ROOT, SIGN])[side]
+    angles[0], angles[1], angles[2], angles[3] = a, f, pip, dip
+    clamp_angles(chain, angles)
+    return max(abs(angles[0] - a), abs(angles[1] - f))
+
+
+@inner
+def _rank(angles: Float, near: Float, branch: int) -> float:
+    """How much rather another pose is taken: the change of angles [rad], or branch and abduction."""
+    if not isfinite(near[0]):
+        return branch * _PER_BRANCH + abs(angles[0])
+    rank = 0.0
+    for i in range(4):
+        rank += abs(angles[i] - near[i])
+    return rank
+
+
+@inner
+def _copy(source: Float, out: Float) -> None:
+    """Write angles (4,)."""
+    for i in range(4):
+        out[i] = source[i]
+
+
+@inner
+def _copy_row(rows: Float, row: int, out: Float) -> None:
+    """Write angles (4,) from a row of (S, 4)."""
+    for i in range(4):
+        out[i] = rows[row, i]
+
+
+@inner
+def _keep(seeds: Float, penalties: Float, angles: Float, penalty: float) -> None:
+    """Keep a pose among the two (rows 1 and 2) that are least beyond what is legal."""
+    row = 1
+    if penalty < penalties[0]:
+        penalties[1] = penalties[0]
+        for i in range(4):
+            seeds[2, i] = seeds[1, i]
+    elif penalty < penalties[1]:
+        row = 2
+    else:
+        return
+    penalties[row - 1] = penalty
+    for i in range(4):
+        seeds[row, i] = angles[i]
+
+
+@inner
+def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, seeds: Float) -> None:
+    """Write row 0: the abduction is row 1's (cut at its limit), the rest is the point of its plane nearest by."""
+    a = seeds[1, 0]
+    c, s = cos(chain.links[ROOT, SIGN] * a), sin(chain.links[ROOT, SIGN] * a)
+    x, y, z = local
+    x, y, z = rotate_back(matrix_at(chain.links, ROOT, REST), (c * x - s * z, y, s * x + c * z))
+    last, in_plane2 = len(edges) - 1, y * y + z * z
+    pip, beside = 0.0, 0.0
+    for _ in range(2):
+        pip, _off = _invert(chain, ratio, edges[last - 1], edges[last], in_plane2 + beside * beside)
+        beside = _point(chain, pip, ratio * pip)[0]
+    w = _point(chain, pip, ratio * pip)
+    f = hinge_fit(chain.spans[1, 0], chain.spans[1, 1], (-1.0, 0.0, 0.0), w, (x, y, z), 0.0)
+    seeds[0, 0], seeds[0, 1], seeds[0, 2], seeds[0, 3] = a, f, pip, ratio * pip
+
+
+@kernel
+def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, angles: Float) -> float:
+    """The legal pose that comes nearest to the target, where the closed form has none that hits it.
+
+    Args:
+        chain, goal, near: As of `closed_form`.
+        seeds: (3, 4) [rad], of `closed_form`.
+        angles: (4,) [rad], out.
+
+    Returns:
+        Distance of the point to the target [m].
+    """
+    best, trial = inf, np.empty(4)
+    if chain.follower >= 0:
+        # a coupled finger that misses in closed form is out of reach: the best start is enough
+        for row in range(len(seeds)):
+            _copy_row(seeds, row, trial)
+            clamp_angles(chain, trial)
+            miss = length(minus(end_of(chain, trial), goal))
+            if miss < best:
+                best = miss
+                _copy(trial, angles)
+        return least_squares(chain, goal, _ENOUGH_M, _MOST_STEPS, angles)
+    local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
+    for start in range(_STARTS + 1):
+        steps = _FIRST_STEPS
+        if start < _STARTS:
+            _start(chain, local, near, seeds, start, trial)
+        else:
+            steps = _MOST_STEPS
+            _copy(angles, trial)
+        left = least_squares(chain, goal, _ENOUGH_M, steps, trial)
+        if left < best:
+            best = left
+            _copy(trial, angles)
+        if best < REACHED_M:
+            break
+    return best
+
+
+@inner
+def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
+    """Write the start (4,) of that number for a free DIP: seeds, the pose of a moment ago, pairs of PIP and DIP."""
+    pair = start - len(seeds) - 1
+    if start < len(seeds):
+        _copy_row(seeds, start, angles)
+    elif pair < 0:
+        _copy_row(seeds, 0, angles)
+        if isfinite(near[0]):
+            _copy(near, angles)
+    else:
+        pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]
+        pip = chain.spans[2, 0] + pip_share * (chain.spans[2, 1] - chain.spans[2, 0])
+        dip = chain.spans[3, 0] + dip_share * (chain.spans[3, 1] - chain.spans[3, 0])
+        _swing(chain, pip, dip, local, pair % 2, angles)

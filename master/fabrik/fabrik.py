@@ -1,0 +1,401 @@
+"""General solver for limited chains: FABRIK with the joint limits in both passes.
+
+Aristidou & Lasenby, "FABRIK: a fast, iterative solver for the inverse kinematics problem", 2011. One iteration:
+
+    aim        turn the first joint so that the end lies towards the target
+    backward   put the end on the target and walk to the root: each bone keeps its length and points as it did,
+               as far as the joint between it and the bone behind it allows
+    forward    put the root back and walk to the end: each bone points to its place of the backward pass, as far
+               as its own joint allows
+
+Aiming is ours: hinges hold the bones in one plane, and a backward pass that starts from a plane beside the
+target tilts it the wrong way. The forward pass ends legal, so every pose that leaves this file obeys the limits;
+joints keep full orientations, so bones need not be straight or planar. A coupled hinge follows its leader in the
+forward pass.
+
+FABRIK as published deadlocks on reachable targets: a limit flattens a finger and a straight limited chain cannot
+leave its line. Hence the seed (from the closed form, `master.fabrik.finger`, it starts on the target), and, when
+an attempt stalls, restarts from bent poses turned to the target. The best pose found is returned with its
+residual; nothing is claimed that is not so, and no finite target raises or gives NaN.
+"""
+
+from dataclasses import dataclass
+from enum import Enum
+from math import isfinite
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inner, kernel
+from master.fabrik.chain import (
+    BONE,
+    KIND,
+    ROOT,
+    START,
+    TURN,
+    WORLD,
+    Chain,
+    ChainArrays,
+    Pose,
+    angles_of,
+    clamp_angles,
+    end_of,
+    follow,
+    forward,
+    limits_of,
+    matrix_at,
+    nearest_reach,
+    put_angles,
+    put_matrix,
+    put_vector,
+    rest_frame,
+    vector_at,
+)
+from master.fabrik.joints import HINGE, clamp, fit, hinge_fit, rotation
+from master.fabrik.rotations import (
+    IDENTITY,
+    Matrix,
+    Vector,
+    between,
+    length,
+    minus,
+    product,
+    rotate,
+    rotate_back,
+    rotation_about,
+    transposed,
+)
+
+_RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
+"""How a restart shares out its bend between the front and the back of the chain."""
+_RESTART_HALVINGS = 14
+_STALL = 0.995
+_STALL_ITERATIONS = 6
+_SHORTEST_M = 1e-9
+
+
+class Reach(Enum):
+    """Where the target lies, by distance from the root alone."""
+
+    WITHIN = "within"
+    TOO_FAR = "farther than the sum of the bones"
+    TOO_NEAR = "nearer than the joint limits allow"
+    NOT_SEEN = "not finite"
+
+
+class ChainResult(NamedTuple):
+    """One solved pose of N links; NaN where the target is not finite.
+
+    Attributes:
+        positions: Joints, root first, and the end (N + 1, 3) [m].
+        orientations: Link frames (N, 3, 3) in the frame of the target.
+        angles: Of every joint [rad], legal.
+        residual_m: Distance of the end to the target.
+        iterations: Of all attempts.
+        reached: Residual within the tolerance.
+        reach: Verdict of the distance bounds.
+        degenerate: A bone has no length, or the target is at the root and says no direction.
+    """
+
+    positions: Float
+    orientations: Float
+    angles: Pose
+    residual_m: float
+    iterations: int
+    reached: bool
+    reach: Reach
+    degenerate: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Fabrik:
+    """A chain prepared for many targets.
+
+    Attributes:
+        chain: Links, limits, coupling.
+        farthest_m: Sum of the bones.
+        nearest_m: Least distance of the end to the root that the limits allow (found by search).
+        tolerance_m: Residual that counts as reached.
+        max_iterations: Per attempt.
+        restarts: Attempts after a stall, at most 3; 0: FABRIK as published, with limits.
+    """
+
+    chain: Chain
+    farthest_m: float
+    nearest_m: float
+    tolerance_m: float
+    max_iterations: int
+    restarts: int
+
+    @classmethod
+    def of(
+        cls, chain: Chain, tolerance_m: float = 1e-5, max_iterations: int = 100, restarts: int = 3
+    ) -> "Fabrik":
+        """Prepare a chain.
+
+        Raises:
+            ValueError: Tolerance or iterations are not positive, or there are not 0 to 3 restarts.
+        """
+        if not tolerance_m > 0.0 or max_iterations < 1:
+            raise ValueError(
+                f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
+            )
+        if not 0 <= restarts <= len(_RESTART_BENDS):
+            raise ValueError(f"{restarts} restarts: there are 0 to {len(_RESTART_BENDS)}")
+        return cls(chain, sum(chain.lengths), nearest_reach(chain), tolerance_m, max_iterations, restarts)
+
+    def solve(
+        self,
+        target: Vector,
+        seed: Pose | None = None,
+        root: Vector = (0.0, 0.0, 0.0),
+        frame: Matrix = IDENTITY,
+    ) -> ChainResult:
+        """Bring the chain's end to the target.
+
+        Args:
+            target: [m], in the frame the result shall be in. NaN: not seen.
+            seed: Angles to start from; None: the rest pose. Clamped to the limits.
+            root: Place of the first joint [m].
+            frame: Orientation of the chain's root frame.
+
+        Returns:
+            The best legal pose found; NaN poses for a target that is not finite.
+        """
+        goal = rotate_back(frame, minus(target, root))
+        reach = self._reach(goal)
+        chain = self.chain
+        angles = np.zeros(len(chain.arrays.spans)) if seed is None else chain.flat(seed)
+        if reach is Reach.NOT_SEEN:
+            return self._not_seen(chain.pose(np.full_like(angles, np.nan)))
+        restarts = self.restarts if reach is Reach.WITHIN else 0
+        residual, iterations = solve_chain(
+            chain.arrays, goal, self.tolerance_m, self.max_iterations, restarts, angles
+        )
+        positions, orientations = chain.forward_flat(angles)
+        turn = np.array(frame)
+        return ChainResult(
+            positions=positions @ turn.T + np.array(root),
+            orientations=turn @ orientations,
+            angles=chain.pose(angles),
+            residual_m=residual,
+            iterations=iterations,
+            reached=residual <= self.tolerance_m,
+            reach=reach,
+            degenerate=min(chain.lengths) < _SHORTEST_M or length(goal) < _SHORTEST_M,
+        )
+
+    def _reach(self, goal: Vector) -> Reach:
+        distance = length(goal)
+        if not isfinite(distance):
+            return Reach.NOT_SEEN
+        if distance > self.farthest_m + self.tolerance_m:
+            return Reach.TOO_FAR
+        return Reach.TOO_NEAR if distance < self.nearest_m - self.tolerance_m else Reach.WITHIN
+
+    def _not_seen(self, nowhere: Pose) -> ChainResult:
+        count = len(self.chain.links)
+        positions, orientations = np.full((count + 1, 3), np.nan), np.full((count, 3, 3), np.nan)
+        return ChainResult(positions, orientations, nowhere, float("nan"), 0, False, Reach.NOT_SEEN, False)
+
+
+@kernel
+def solve_chain(
+    chain: ChainArrays, goal: Vector, tolerance_m: float, max_iterations: int, restarts: int, angles: Float
+) -> tuple[float, int]:
+    """Bring the chain's end to `goal` [m], root frame, finite.
+
+    Args:
+        chain, goal, tolerance_m, max_iterations: As of `Fabrik`.
+        restarts: Attempts from bent poses as long as the target is not reached.
+        angles: (n,) [rad]; in: seed; out: the best legal pose found.
+
+    Returns:
+        Distance of the end to the goal [m]; iterations of all attempts.
+    """
+    clamp_angles(chain, angles)
+    residual, iterations = _attempt(chain, goal, tolerance_m, max_iterations, angles)
+    trial = np.empty_like(angles)
+    for front, back in _RESTART_BENDS:
+        if residual <= tolerance_m or restarts <= 0:
+            break
+        restarts -= 1
+        _bend_to(chain, length(goal), front, back, trial)
+        _aim(chain, end_of(chain, trial), goal, trial)
+        clamp_angles(chain, trial)
+        found, more = _attempt(chain, goal, tolerance_m, max_iterations, trial)
+        iterations += more
+        if found < residual:
+            residual = found
+            for i in range(len(angles)):
+                angles[i] = trial[i]
+    return residual, iterations
+
+
+@inner
+def _bend_to(chain: ChainArrays, distance: float, front: float, back: float, angles: Float) -> None:
+    """Write the bent pose whose end is as far from the root as the target: never on one line with it."""
+    low, high = 0.0, 1.0
+    for _ in range(_RESTART_HALVINGS):
+        share = 0.5 * (low + high)
+        _bend(chain, share, front, back, angles)
+        if length(end_of(chain, angles)) > distance:
+            low = share
+        else:
+            high = share
+    _bend(chain, 0.5 * (low + high), front, back, angles)
+
+
+@inner
+def _bend(chain: ChainArrays, share: float, front: float, back: float, angles: Float) -> None:
+    """Bend every hinge by its share of the longer way from rest; weight from `front` to `back`."""
+    last = max(len(chain.joints) - 1, 1)
+    for k in range(len(chain.joints)):
+        limits = limits_of(chain, k)
+        rest = clamp(limits, (0.0, 0.0))
+        if limits.kind == HINGE:
+            end = limits.high if limits.high - rest[0] >= rest[0] - limits.low else limits.low
+            weight = front + (back - front) * k / last
+            rest = (rest[0] + min(share * weight, 1.0) * (end - rest[0]), 0.0)
+        put_angles(chain, angles, k, rest)
+    clamp_angles(chain, angles)
+
+
+@inner
+def _aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
+    """Turn the first joint so that the end lies towards the goal."""
+    limits, turn, now = (
+        limits_of(chain, ROOT),
+        matrix_at(chain.links, ROOT, TURN),
+        angles_of(chain, angles, ROOT),
+    )
+    arm = rotate_back(rotation(limits, now), rotate_back(turn, end))
+    put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(turn, goal), now))
+
+
+@inner
+def _attempt(
+    chain: ChainArrays, goal: Vector, tolerance_m: float, max_iterations: int, angles: Float
+) -> tuple[float, int]:
+    """FABRIK from one legal start until it arrives, stalls or tires; `angles` become the best on the way."""
+    best = length(minus(end_of(chain, angles), goal))
+    if best <= tolerance_m:
+        return best, 0
+    count = len(chain.joints)
+    positions, orientations = np.empty((count + 1, 3)), np.empty((count, 9))
+    places, now = np.empty((count + 1, 3)), angles.copy()
+    forward(chain, now, positions, orientations)
+    slow, last = 0, best
+    for iteration in range(1, max_iterations + 1):
+        # hinges keep the chain in a plane, and only the first joint can turn that to the goal
+        _aim(chain, vector_at(positions, count, START), goal, now)
+        forward(chain, now, positions, orientations)
+        _backward_pass(chain, positions, orientations, now, goal, places)
+        _forward_pass(chain, places, now, positions, orientations)
+        residual = length(minus(vector_at(positions, count, START), goal))
+        slow = slow + 1 if residual > _STALL * last else 0
+        last = residual
+        if residual < best:
+            best = residual
+            for i in range(len(angles)):
+                angles[i] = now[i]
+        if best <= tolerance_m or slow >= _STALL_ITERATIONS:
+            return best, iteration
+    return best, max_iterations
+
+
+@inner
+def _backward_pass(
+    chain: ChainArrays, positions: Float, orientations: Float, angles: Float, goal: Vector, places: Float
+) -> None:
+    """Write places (N + 1, 3) [m] of the joints when the end is on the target, limits between neighbours kept."""
+    last = len(chain.joints) - 1
+    place = goal
+    put_vector(places, last + 1, place)
+    wanted = minus(place, vector_at(positions, last, START))
+    behind = _pointed(chain, last, matrix_at(orientations, last, START), angles, wanted)
+    place = minus(place, rotate(behind, vector_at(chain.links, last, BONE)))
+    put_vector(places, last, place)
+    for k in range(last - 1, -1, -1):
+        wanted, now, bone = (
+            minus(place, vector_at(positions, k, START)),
+            matrix_at(orientations, k, START),
+            vector_at(chain.links, k, BONE),
+        )
+        if chain.joints[k, WORLD] or chain.joints[k + 1, WORLD]:
+            here = _pointed(chain, k, now, angles, wanted)
+        elif chain.joints[k + 1, KIND] == HINGE:
+            here = _before_hinge(chain, k, behind, angles, wanted)
+        else:
+            here = _before_rotor(chain, k, behind, angles, _turned(now, bone, wanted))
+        place = minus(place, rotate(here, bone))
+        put_vector(places, k, place)
+        behind = here
+
+
+@inner
+def _turned(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
+    """Orientation turned the shortest way so that its bone points as wanted."""
+    return product(between(rotate(orientation, bone), wanted), orientation)
+
+
+@inner
+def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vector) -> Matrix:
+    """Orientation of link k whose bone points as wanted, as far as a joint with axes of the world allows."""
+    bone = vector_at(chain.links, k, BONE)
+    if not chain.joints[k, WORLD]:
+        return _turned(now, bone, wanted)
+    limits, turn = limits_of(chain, k), matrix_at(chain.links, k, TURN)
+    fitted = fit(limits, bone, rotate_back(turn, wanted), angles_of(chain, angles, k))
+    return product(turn, rotation(limits, fitted))
+
+
+@inner
+def _before_hinge(chain: ChainArrays, k: int, behind: Matrix, angles: Float, wanted: Vector) -> Matrix:
+    """Orientation of link k, whose bone points as wanted as far as the hinge between it and `behind` allows.
+
+    Seen from the bone behind, this bone turns the other way about the same axis.
+    """
+    limits, turn = limits_of(chain, k + 1), matrix_at(chain.links, k + 1, TURN)
+    seen = rotate_back(turn, vector_at(chain.links, k, BONE))
+    now = angles_of(chain, angles, k + 1)
+    angle = hinge_fit(-limits.high, -limits.low, limits.axis, seen, rotate_back(behind, wanted), -now[0])
+    return product(behind, product(rotation_about(limits.axis, angle), transposed(turn)))
+
+
+@inner
+def _before_rotor(chain: ChainArrays, k: int, behind: Matrix, angles: Float, here: Matrix) -> Matrix:
+    """Orientation `here` of link k, turned so that the bone `behind` lies in a direction the rotor allows."""
+    limits, bone = limits_of(chain, k + 1), vector_at(chain.links, k + 1, BONE)
+    frame = product(here, matrix_at(chain.links, k + 1, TURN))
+    actual = rotate(behind, bone)
+    fitted = fit(limits, bone, rotate_back(frame, actual), angles_of(chain, angles, k + 1))
+    allowed = rotate(frame, rotate(rotation(limits, fitted), bone))
+    return product(between(allowed, actual), here)
+
+
+@inner
+def _forward_pass(
+    chain: ChainArrays, places: Float, angles: Float, positions: Float, orientations: Float
+) -> None:
+    """Write the legal pose whose bones point to the places of the backward pass; `angles`: in, out [rad]."""
+    x, y, z = 0.0, 0.0, 0.0
+    put_vector(positions, ROOT, (x, y, z))
+    parent = matrix_at(chain.links, ROOT, TURN)
+    for k in range(len(chain.joints)):
+        limits, bone, frame = (
+            limits_of(chain, k),
+            vector_at(chain.links, k, BONE),
+            rest_frame(chain, k, parent),
+        )
+        if k == chain.follower:
+            follow(chain, angles)
+        else:
+            wanted = rotate_back(frame, minus(vector_at(places, k + 1, START), (x, y, z)))
+            put_angles(chain, angles, k, fit(limits, bone, wanted, angles_of(chain, angles, k)))
+        parent = product(frame, rotation(limits, angles_of(chain, angles, k)))
+        step = rotate(parent, bone)
+        x, y, z = x + step[0], y + step[1], z + step[2]
+        put_vector(positions, k + 1, (x, y, z))
+        put_matrix(orientations, k, parent)

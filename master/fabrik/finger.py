@@ -1,0 +1,272 @@
+"""A finger of a hand: its chain, its angles in closed form, and FABRIK that starts from these."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+from math import inf, isfinite
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+from common.hand_model import CHAINS, HandModel
+from master.fabrik.chain import Chain, Coupling, Link, end_of
+from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, nearest_pose
+from master.fabrik.fabrik import solve_chain
+from master.fabrik.joints import Hinge, Pair, Rotor
+from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector
+
+THUMB = 0
+Four = tuple[float, float, float, float]
+
+_GRID = 2001
+_THIRDS = 52
+_NAN = float("nan")
+_UNKNOWN = (_NAN,) * 4
+
+
+class FingerSolution(NamedTuple):
+    """Angles of one finger [rad] (thumb: CMC abduction, CMC flexion, MCP, IP) and how well they fit.
+
+    Attributes:
+        residual_m: Distance of the point to the target.
+        reached: Whether legal angles hit the target within 1 um.
+    """
+
+    abduction_rad: float
+    flexion_rad: float
+    pip_rad: float
+    dip_rad: float
+    residual_m: float
+    reached: bool
+
+
+class FingerResult(NamedTuple):
+    """How FABRIK ended on one finger.
+
+    Attributes:
+        residual_m: Distance of the point to the target; NaN: not seen.
+        iterations: 0: the seed was on the target.
+        reached: Residual within the tolerance.
+    """
+
+    residual_m: float
+    iterations: int
+    reached: bool
+
+
+NOT_SEEN = FingerSolution(_NAN, _NAN, _NAN, _NAN, _NAN, False)
+_NOT_SEEN = FingerResult(_NAN, 0, False)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FingerSolver:
+    """Closed form of one finger of one hand, prepared; build once with `of`.
+
+    Attributes:
+        chain: The finger's links and limits, root frame (the palm's axes, origin at the root joint).
+        root: MCP (thumb: CMC) in the palm frame [m].
+        ratio: DIP per PIP that makes the closed form exact.
+        edges: (B + 1,) ends of the branches of the PIP, rising [rad].
+    """
+
+    chain: Chain
+    root: Vector
+    ratio: float
+    edges: Float
+
+    @classmethod
+    def of(
+        cls, model: HandModel, finger: int, offset_m: Float, free_ratio: float | None = None
+    ) -> "FingerSolver":
+        """Prepare one finger.
+
+        Args:
+            model: The hand.
+            finger: 0 thumb ... 4 little.
+            offset_m: The observed point (3,) in the tip joint's frame [m]; zero: the tip joint.
+            free_ratio: DIP (thumb: IP) per PIP (MCP) to prefer where the model leaves it free; None: the
+                ratio it tends to, else that of their highest angles, with which every distance is reached.
+        """
+        chain = finger_chain(model, finger, offset_m)
+        (_, pip_high), (_, dip_high) = chain.spans[2:]
+        if chain.coupling is not None:
+            ratio = chain.coupling.ratio
+        elif free_ratio is not None:
+            ratio = free_ratio
+        elif finger != THUMB and model.dip_per_pip is not None:
+            ratio = model.dip_per_pip
+        else:
+            ratio = dip_high / pip_high if pip_high > 0.0 else 1.0
+        return cls(chain, finger_root(model, finger), float(ratio), _branches(chain, float(ratio)))
+
+    @property
+    def limits(self) -> tuple[Pair, ...]:
+        """Low and high of the four angles [rad]; the abduction's where flexion does not narrow it."""
+        return self.chain.spans
+
+    def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
+        """Angles that bring the point to `target`, or as near to it as the limits allow.
+
+        Args:
+            target: (x, y, z) of the point in the palm frame [m]. NaN: not seen.
+            near: Angles of a moment ago; where several legal poses hit the target (straight finger, pole of
+                the abduction) the nearest is taken, else the more bent one.
+
+        Returns:
+            Angles inside the limits; NaN where the target is not finite.
+        """
+        goal = _from_root(target, self.root)
+        if not isfinite(goal[0] + goal[1] + goal[2]):
+            return NOT_SEEN
+        before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
+        left = self.seed(goal, before, angles)
+        a, f, pip, dip = angles.tolist()
+        return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
+
+    def seed(self, goal: Vector, near: Float, angles: Float) -> float:
+        """As `solve`, on arrays: `goal` from the root [m], finite; near (4,) [rad] or NaN; angles (4,): out [rad].
+
+        Returns:
+            Distance of the point to the target [m].
+        """
+        arrays, seeds = self.chain.arrays, np.empty((3, 4))
+        left = closed_form(arrays, self.edges, self.ratio, goal, near, angles, seeds)
+        return left if left < inf else nearest_pose(arrays, goal, near, seeds, angles)
+
+    def forward(self, angles: Four) -> Vector:
+        """The point [m] in the palm frame at given angles [rad]."""
+        x, y, z = end_of(self.chain.arrays, np.array(angles, np.float64))
+        return x + self.root[0], y + self.root[1], z + self.root[2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finger:
+    """FABRIK for one finger of one hand, prepared; build once with `of`. Holds no state between calls.
+
+    Attributes:
+        closed_form: The same finger.
+        tolerance_m: Residual that counts as reached.
+        max_iterations: Of FABRIK; the seed is the answer, and what it cannot reach iterations improve little.
+    """
+
+    closed_form: FingerSolver
+    tolerance_m: float
+    max_iterations: int
+
+    @classmethod
+    def of(
+        cls,
+        model: HandModel,
+        finger: int,
+        offset_m: Float,
+        tolerance_m: float = 1e-5,
+        max_iterations: int = 10,
+    ) -> "Finger":
+        """Prepare one finger; arguments as of `FingerSolver.of`.
+
+        Raises:
+            ValueError: Tolerance or iterations are not positive.
+        """
+        if not tolerance_m > 0.0 or max_iterations < 1:
+            raise ValueError(
+                f"tolerance {tolerance_m} m and {max_iterations} iterations: both must be positive"
+            )
+        return cls(FingerSolver.of(model, finger, offset_m), tolerance_m, max_iterations)
+
+    def solve(self, target_m: Float, angles_rad: Float) -> FingerResult:
+        """Bring the finger's point to a target: FABRIK from the closed form.
+
+        Where the DIP is free (always the thumb's) the point does not tell all angles, and FABRIK starts from the given
+        ones; from the closed form only where they are NaN or do not lead to the target.
+
+        Args:
+            target_m: (3,) in the palm frame. NaN: not seen.
+            angles_rad: (4,) in place, contiguous; in: the angles of a moment ago, NaN: not known; out: the best legal
+                angles found, or as given where the target is not finite.
+        """
+        solver = self.closed_form
+        x, y, z = target_m.tolist()
+        goal = _from_root((x, y, z), solver.root)
+        if not isfinite(goal[0] + goal[1] + goal[2]):
+            return _NOT_SEEN
+        arrays, tolerance_m, most = solver.chain.arrays, self.tolerance_m, self.max_iterations
+        near, before = angles_rad.copy(), 0
+        if solver.chain.coupling is None and isfinite(near.sum()):
+            residual, before = solve_chain(arrays, goal, tolerance_m, most, 0, angles_rad)
+            if residual <= tolerance_m:
+                return FingerResult(residual, before, True)
+        solver.seed(goal, near, angles_rad)
+        residual, iterations = solve_chain(arrays, goal, tolerance_m, most, 0, angles_rad)
+        return FingerResult(residual, before + iterations, residual <= tolerance_m)
+
+
+def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: bool = True) -> Chain:
+    """The chain of one finger in the palm frame's axes, from MCP (thumb: CMC) to a point fixed to the tip joint.
+
+    Args:
+        model: The hand.
+        finger: 0 thumb ... 4 little.
+        offset_m: End effector (3,) in the tip joint's frame [m]; zero: the tip joint itself.
+        coupled: Whether the DIP follows the PIP where the model keeps their ratio exactly (never for the thumb).
+    """
+    limits = [(float(low), float(high)) for low, high in model.limits_rad[finger]]
+    rest = as_matrix(model.rest_rotation[CHAINS[finger, 0]])
+    turn, bone = model.turn[finger], model.bone_m[finger]
+    thumb = finger == THUMB
+    root = Rotor(
+        limits[0],
+        limits[1],
+        spread_at_full_flexion=float(model.spread_at_full_flexion[finger]),
+        sign=model.side_sign,
+        rest=IDENTITY if thumb else rest,
+    )
+    last = bone[2] + turn[2] @ np.asarray(offset_m, dtype=np.float64)
+    links = (
+        Link(rest if thumb else IDENTITY, root, as_vector(bone[0])),
+        Link(as_matrix(turn[0]), Hinge(*limits[2]), as_vector(bone[1])),
+        Link(as_matrix(turn[1]), Hinge(*limits[3]), as_vector(last)),
+    )
+    ratio = model.dip_per_pip
+    if not coupled or thumb or ratio is None or model.dip_spread_rad > 0.0:
+        return Chain(links)
+    return Chain(links, Coupling(1, 2, ratio))
+
+
+def finger_root(model: HandModel, finger: int) -> Vector:
+    """The MCP (thumb: CMC) in the palm frame [m]."""
+    return as_vector(model.rest_position_m[CHAINS[finger, 0]])
+
+
+def _from_root(target: Vector, root: Vector) -> Vector:
+    return target[0] - root[0], target[1] - root[1], target[2] - root[2]
+
+
+def _branches(chain: Chain, ratio: float) -> Float:
+    """Ends of the stretches of the PIP on which |w| is monotone, rising [rad]."""
+
+    def distance2(pip: float) -> float:
+        return distance2_of(chain.arrays, ratio, pip)[0]
+
+    (low, high), dip_span = chain.spans[2:]
+    grid = np.linspace(low, high, _GRID).tolist()
+    rising = [b > a for a, b in pairwise([distance2(pip) for pip in grid])]
+    cuts = {low, high}
+    for i, (before, after) in enumerate(pairwise(rising)):
+        if before != after:
+            cuts.add(_extremum(distance2, grid[i], grid[i + 2], maximum=before))
+    if ratio > 0.0:
+        cuts |= {bound / ratio for bound in dip_span if low < bound / ratio < high}
+    edges = sorted(cuts)
+    return np.array(edges if len(edges) > 1 else edges * 2, np.float64)
+
+
+def _extremum(function: Callable[[float], float], low: float, high: float, *, maximum: bool) -> float:
+    """By thirds: the curve is smooth and has one extremum inside."""
+    for _ in range(_THIRDS):
+        third = (high - low) / 3.0
+        if (function(low + third) < function(high - third)) == maximum:
+            low += third
+        else:
+            high -= third
+    return 0.5 * (low + high)
