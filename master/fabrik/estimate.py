@@ -6,6 +6,7 @@ import numpy as np
 
 from common.arrays import Bool, Code, Float, Int
 from common.hand_model import HandJoints
+from common.messages import Source
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +77,24 @@ class HandEstimate:
     residual_m: Float
     iterations: Int
     reached: Bool
+
+    @classmethod
+    def unseen(cls, t_ns: int, markers: MarkerPositions, smooth_m: Float, facing: Float) -> "HandEstimate":
+        """One of which nothing is known yet."""
+        return cls(
+            t_ns=t_ns,
+            markers=markers,
+            smooth_m=smooth_m,
+            facing=facing,
+            solution=None,
+            valid=np.zeros(26, np.bool_),
+            tracked=np.zeros(26, np.bool_),
+            source=np.full(26, Source.HELD, np.uint8),
+            seen=np.zeros(5, np.bool_),
+            residual_m=np.full(5, np.nan),
+            iterations=np.zeros(5, np.int64),
+            reached=np.zeros(5, np.bool_),
+        )
 
     @property
     def solved(self) -> bool:

@@ -6,9 +6,11 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.geometry import fit_rigid
-from common.hand_model import HandModel
-from master.fabrik.hand_tables import HandTables, Mounts, covariances
-from master.fabrik.palm_kernel import PalmPrior, fit
+from common.hand_model import HandJoints, HandModel
+from master.fabrik.hand_tables import HandTables, Mounts
+from master.fabrik.kinematics import covariances, pose
+from master.fabrik.palm_kernel import PalmPrior, fit, informations
+from master.fabrik.small_matrices import inverse
 from master.ik.attached import Attached
 from master.ik.hand import EXPLAINED, determined
 from master.ik.hidden import HiddenFingers
@@ -54,7 +56,7 @@ class PalmFitter:
         self.parameters = HandParameters.of(model)
         self.tables = HandTables.of(model, self.parameters)
         self.attached = Attached.markers(model, self.parameters, markers)
-        self._mounts = Mounts.of(self.attached)
+        self.mounts = Mounts.of(self.attached)
         self._on_finger = self.attached.on_finger[:, 0]
         habits = AnglePrior.of(model, self.parameters, self.priors)
         self._normal, self._pull = (
@@ -65,7 +67,7 @@ class PalmFitter:
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (0.6, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
         self._shapes_m = self.attached.place(model.chains(self.parameters.angles(self._postures)))
-        self._model_m2 = self.priors.model_m**2 * np.eye(3)
+        self._model_m2 = self.priors.model_m**2
         self._finger_of_free = self.parameters.free // 4
 
     def __call__(
@@ -90,11 +92,9 @@ class PalmFitter:
         Returns:
             The palm; None where there is no last one and too few markers, or none at all.
         """
-        seen = np.isfinite(points_m[:, 0])
-        if not seen.any():
+        seen, information = np.empty(len(points_m), np.bool_), np.empty((len(points_m), 3, 3))
+        if not informations(points_m, cov_m2, self._model_m2, seen, information):
             return None
-        information = np.zeros((len(points_m), 3, 3))
-        information[seen] = np.linalg.inv(cov_m2[seen] + self._model_m2)
         best = None
         if last is not None:
             prior = self._expected(last, age_s, seen, facing, hidden)
@@ -117,7 +117,7 @@ class PalmFitter:
         size = 6 + len(x)
         normal, surprise = np.empty((size, size)), np.zeros(len(points))
         cost, _ = fit(
-            self.tables, self._mounts, prior, points, information, seen, T, x, normal, surprise, _ENOUGH
+            self.tables, self.mounts, prior, points, information, seen, T, x, normal, surprise, _ENOUGH
         )
         alone = normal.reshape(-1)[:: size + 1]
         alone[:6] -= prior.palm_weight**2
@@ -125,7 +125,9 @@ class PalmFitter:
         alone[6:][walked] -= prior.weight[walked] ** 2
         alone += self.parameters.anywhere
         scale = max(1.0, float(surprise.sum()) / (3.0 * int(seen.sum())))
-        return Palm(T, x, scale * np.linalg.inv(normal), cost, surprise)
+        cov = np.empty((size, size))
+        inverse(normal, scale, cov)
+        return Palm(T, x, cov, cost, surprise)
 
     def _shown(self, seen: Bool) -> Bool:
         """(5,) which fingers have a marker that is seen."""
@@ -183,3 +185,10 @@ class PalmFitter:
         cov, tilt = np.empty((26, 3, 3)), np.empty((5, 3, 3))
         covariances(self.tables, palm.T, palm.x, palm.cov, cov, tilt)
         return cov, tilt
+
+    def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
+        """The joints of a palm (4, 4) and angles (5, 4) [rad], and the markers (M, 3) [m] in the palm frame."""
+        position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
+        places = np.empty((len(self.attached.offset_m), 3))
+        pose(self.tables, self.mounts, T, angles_rad.ravel(), position, rotation, places)
+        return HandJoints(position, rotation, T), places

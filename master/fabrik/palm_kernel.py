@@ -15,7 +15,9 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
-from master.fabrik.hand_tables import HandTables, Mounts, angles_of, chains, place, point_slopes, rig_slopes
+from master.fabrik.hand_tables import HandTables, Mounts
+from master.fabrik.kinematics import angles_of, chains, place, point_slopes, rig_slopes
+from master.fabrik.small_matrices import factor, inverse_3, substitute
 
 MAX_ITERATIONS = 30
 
@@ -145,35 +147,6 @@ def linearise(
 
 
 @kernel
-def solve(A: Float, b: Float, held: Bool, L: Float, out: Float) -> bool:
-    """Write the solution (n,) of A out = b by Cholesky, `held` unknowns 0; False where A is not positive definite."""
-    n = b.shape[0]
-    for j in range(n):
-        total = 1.0 if held[j] else A[j, j]
-        for k in range(j):
-            total -= L[j, k] * L[j, k]
-        if not total > 0.0:
-            return False
-        L[j, j] = sqrt(total)
-        for i in range(j + 1, n):
-            total = 0.0 if held[i] or held[j] else A[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            L[i, j] = total / L[j, j]
-    for i in range(n):
-        total = 0.0 if held[i] else b[i]
-        for k in range(i):
-            total -= L[i, k] * out[k]
-        out[i] = total / L[i, i]
-    for i in range(n - 1, -1, -1):
-        total = out[i]
-        for k in range(i + 1, n):
-            total -= L[k, i] * out[k]
-        out[i] = total / L[i, i]
-    return True
-
-
-@kernel
 def rotate_by(step: Float, T: Float, out: Float) -> None:
     """Write T (4, 4) turned by a rotation vector step[:3] [rad] in front, and shifted by step[3:6] [m]."""
     x, y, z = step[0], step[1], step[2]
@@ -238,9 +211,10 @@ def fit(
                 held[i] = (x[c] <= tables.low[c] and downhill[i] < 0.0) or (
                     x[c] >= tables.high[c] and downhill[i] > 0.0
                 )
-        if not solve(damped, downhill, held, L, step):
+        if not factor(damped, held, L):
             damping, growth = damping * growth, 2.0 * growth
             continue
+        substitute(L, downhill, held, step)
         hoped = 0.0
         for i in range(size):
             if not held[i]:
@@ -280,3 +254,85 @@ def fit(
             if damping > 1e6:
                 break
     return cost, iterations
+
+
+@kernel
+def informations(points: Float, cov: Float, model_m2: float, seen: Bool, out: Float) -> int:
+    """Write which markers are seen (M,) and the inverses (M, 3, 3) of cov + model_m2 I; return how many they are."""
+    count = 0
+    for m in range(points.shape[0]):
+        total = points[m, 0] + points[m, 1] + points[m, 2]
+        for i in range(3):
+            total += cov[m, i, 0] + cov[m, i, 1] + cov[m, i, 2]
+        seen[m] = np.isfinite(total)
+        if seen[m]:
+            inverse_3(cov[m], model_m2, out[m])
+            count += 1
+    return count
+
+
+@kernel
+def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
+    """Write the unit vector (3,) from a hand to the cameras that see its back; False where no marker is placed.
+
+    A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by
+    what each sees, add up to where it faces, as far as they tell.
+
+    Args:
+        points: (M, 3) [m] its markers, rig frame; NaN: not placed.
+        area_px2: (C, K) of those on its back as each camera sees them; NaN: not seen.
+        centres, focal_px: (C, 3) [m] and (C,) of the cameras.
+        out: Written.
+    """
+    count = 0
+    middle, back = np.zeros(3), np.empty(3)
+    for m in range(points.shape[0]):
+        if np.isfinite(points[m, 0]):
+            count += 1
+            for i in range(3):
+                middle[i] += points[m, i]
+    if count == 0:
+        return False
+    sum_px2, shown_px2 = 0.0, np.zeros(centres.shape[0])
+    for c in range(centres.shape[0]):
+        for k in range(area_px2.shape[1]):
+            if np.isfinite(area_px2[c, k]):
+                shown_px2[c] += area_px2[c, k]
+        sum_px2 += shown_px2[c]
+    for i in range(3):
+        out[i] = 0.0
+    for c in range(centres.shape[0]):
+        squared = 0.0
+        for i in range(3):
+            back[i] = centres[c, i] - middle[i] / count
+            squared += back[i] * back[i]
+        weight = 1.0 if sum_px2 == 0.0 else shown_px2[c] * squared / (focal_px[c] * focal_px[c])
+        for i in range(3):
+            out[i] += weight * back[i] / sqrt(squared)
+    length = sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    for i in range(3):
+        out[i] = out[i] / length if length > 0.0 else back[i] / sqrt(squared)
+    return True
+
+
+@kernel
+def targets_of(points: Float, cov: Float, T: Float, places: Float, fit_m2: float, out: Float) -> None:
+    """Write where fingers are to bring their markers (M, 3) [m], palm frame: measured, as far as that is surer.
+
+    Args:
+        points, cov: (M, 3) [m] and (M, 3, 3) [m^2] measured, rig frame; NaN: not seen.
+        T: (4, 4) palm.
+        places: (M, 3) [m] where the palm's fit has them, palm frame.
+        fit_m2: Variance of these.
+        out: Written; NaN where not seen.
+    """
+    gain, off, moved = np.empty((3, 3)), np.empty(3), np.empty(3)
+    for m in range(points.shape[0]):
+        inverse_3(cov[m], fit_m2, gain)
+        for i in range(3):
+            here = T[i, 0] * places[m, 0] + T[i, 1] * places[m, 1] + T[i, 2] * places[m, 2]
+            off[i] = points[m, i] - here - T[i, 3]
+        for i in range(3):
+            moved[i] = fit_m2 * (gain[i, 0] * off[0] + gain[i, 1] * off[1] + gain[i, 2] * off[2])
+        for i in range(3):
+            out[m, i] = places[m, i] + T[0, i] * moved[0] + T[1, i] * moved[1] + T[2, i] * moved[2]

@@ -5,16 +5,19 @@ Push machine without clock, socket or thread. It holds what joins the cameras in
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from math import isfinite
 
 import numpy as np
 
-from common.arrays import Float
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
-from master.fabrik.estimate import HandEstimate, MarkerPositions, SolvedHand
+from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
 from master.fabrik.palm import Palm, PalmFitter
+from master.fabrik.palm_kernel import facing_of, targets_of
 from master.fabrik.triangulate import Triangulate
 from master.filters import PointFilter
 from master.ik.hand import EXPLAINED
@@ -24,11 +27,12 @@ from master.stereo.pairing import Instant, Pairing
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
 _ON_TARGET_M = 1e-4
-_FIT_M2 = (3e-3) ** 2 * np.eye(3)  # of a finger's marker as the palm's fit has it
+_FIT_M2 = (3e-3) ** 2  # of a finger's marker as the palm's fit has it
 _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
 _NATURAL = 1.0  # the line knows no hand without habits
+_NO_WALK = np.zeros((5, 3, 3))
 _ANYWHERE = HiddenFingers(np.zeros((5, 4)), np.full(5, np.inf), np.zeros(5), np.ones(5))
 
 
@@ -69,6 +73,7 @@ class FabrikSolver:
         self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
         mounts = [model.mount(name) for name in hand_markers]
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
+        self._back = self.on_hand[self._on_palm]
         self._fingers = {
             m: (mount.finger, Finger.of(model, mount.finger, mount.offset_m, _ON_TARGET_M))
             for m, mount in enumerate(mounts)
@@ -98,16 +103,20 @@ class FabrikSolver:
         seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
         with self._stage("triangulate"):
             markers = self._triangulate(*pixels, seen_as, age_s)
-            if seen_as is None and (first := self._fit(markers.points_m, markers.cov_m2, instant, None, 0.0)):
+            if seen_as is None:
                 self._memory = FingerMemory(self._model)
-                markers = self._triangulate(*pixels, self._hand_of(first), 0.0)
+                first = self.peek(markers.points_m, markers.cov_m2, instant.area)
+                if first is not None:
+                    markers = self._triangulate(*pixels, first, 0.0)
         with self._stage("filter"):
             smooth = markers.points_m
             if self._one_euro is not None:
                 smooth = self._one_euro.push(instant.t_ns, smooth, markers.noise_m2)
         with self._stage("fabrik"):
-            palm = self._fit(smooth, markers.cov_m2, instant, last, age_s)
-            return self._estimate(instant, markers, smooth, palm)
+            points, cov = smooth[self.on_hand], markers.cov_m2[self.on_hand]
+            out = HandEstimate.unseen(instant.t_ns, markers, smooth, self.towards(points, instant.area))
+            palm = self._fit(instant.t_ns, points, cov, out.facing, last, age_s)
+            return self._estimate(out, points, cov, palm)
 
     def peek(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
         """The hand by points alone, and nothing remembered; a finger that is not seen may be anywhere natural.
@@ -120,7 +129,8 @@ class FabrikSolver:
             The hand; None: the points are too few.
         """
         points, cov = points[self.on_hand], cov[self.on_hand]
-        palm = self._palm(points, cov, self._facing_of(points, area_px2), hidden=_ANYWHERE)
+        facing = self.towards(points, area_px2) if self._shows_back(points) else None
+        palm = self._palm(points, cov, facing, hidden=_ANYWHERE)
         return None if palm is None else self._hand_of(palm)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
@@ -131,126 +141,73 @@ class FabrikSolver:
         return self._last, age_s
 
     def _fit(
-        self, points: Float, cov: Float, instant: Instant, last: SolvedHand | None, age_s: float
+        self, t_ns: int, points: Float, cov: Float, towards: Float, last: SolvedHand | None, age_s: float
     ) -> Palm | None:
-        """The palm of an instant; `last` as of `_recent`."""
-        points, cov = points[self.on_hand], cov[self.on_hand]
-        seen = np.isfinite(points[:, 0])
-        facing = self._facing_of(points, instant.area)
+        """The palm of an instant from the hand's points (H, 3) [m]; `last` as of `_recent`."""
+        facing = towards if self._shows_back(points) else None
         if last is None:
             return self._palm(points, cov, facing)
-        shown = frozenset(f for m, (f, _) in self._fingers.items() if seen[m])
-        hidden = self._memory.belief(instant.t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
+        shown = frozenset(f for m, (f, _) in self._fingers.items() if isfinite(points[m, 0]))
+        hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
         return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
 
-    def _facing_of(self, points: Float, area_px2: Float) -> Float | None:
-        """As `facing`; None: nothing of the back is seen."""
-        return self.facing(points, area_px2) if np.isfinite(points[self._on_palm, 0]).any() else None
+    def _shows_back(self, points: Float) -> bool:
+        """Whether a marker on the back is placed."""
+        return bool(np.isfinite(points[self._on_palm, 0]).any())
 
-    def facing(self, points: Float, area_px2: Float) -> Float:
-        """Unit vector (3,) from what is seen of the hand to the cameras that see the back of it.
-
-        A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras,
-        weighed by what each sees, add up to where it faces, as far as they tell.
-
-        Args:
-            points: (H, 3) [m] markers of the hand; NaN: not placed.
-            area_px2: (C, M) of all markers.
-        """
-        found = points[np.isfinite(points[:, 0])]
-        if not len(found):
-            return self._ahead
-        back = self._centres - found.mean(axis=0)
-        distance = np.linalg.norm(back, axis=1)
-        shown = np.nansum(area_px2[:, self.on_hand[self._on_palm]], axis=1) * (distance / self._focal_px) ** 2
-        towards = (shown if shown.any() else np.ones(len(shown))) @ (back / distance[:, None])
-        length = float(np.linalg.norm(towards))
-        return towards / length if length > 0.0 else back[0] / distance[0]
+    def towards(self, points: Float, area_px2: Float) -> Float:
+        """Unit vector (3,) from the hand's points (H, 3) [m] to the cameras that see most of its back (C, M) [px^2]."""
+        out = self._ahead.copy()
+        facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
+        return out
 
     def _hand_of(self, palm: Palm) -> SolvedHand:
         """The hand as the palm's fit has it."""
         angles = self._model.clamp(self._palm.parameters.angles(palm.x))
-        joints = self._model.joints(palm.T, self._model.chains(angles))
-        cov, tilt = self._palm.covariances(palm)
-        return SolvedHand(palm.T, angles, joints, cov, tilt, np.zeros((5, 3, 3)))
+        joints, _ = self._palm.pose(palm.T, angles)
+        return SolvedHand(palm.T, angles, joints, *self._palm.covariances(palm), _NO_WALK)
 
-    def _estimate(
-        self, instant: Instant, markers: MarkerPositions, smooth: Float, palm: Palm | None
-    ) -> HandEstimate:
+    def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Palm | None) -> HandEstimate:
         """Bring the fingers of a palm onto their markers; without a palm the last hand is held."""
-        points = smooth[self.on_hand]
-        seen, reached = np.zeros(5, np.bool_), np.zeros(5, np.bool_)
-        residual, iterations = np.full(5, np.nan), np.zeros(5, np.int64)
-        explained = np.zeros(5, np.bool_)
-        facing = self.facing(points, instant.area)
-        valid, tracked = np.zeros(26, np.bool_), np.zeros(26, np.bool_)
-        source = np.full(26, Source.HELD, np.uint8)
+        last, age_s = self._recent(out.t_ns)
         if palm is None:
-            hand = self._held(instant.t_ns)
-            valid[:] = hand is not None
-            return HandEstimate(
-                instant.t_ns,
-                markers,
-                smooth,
-                facing,
-                hand,
-                valid,
-                tracked,
-                source,
-                seen,
-                residual,
-                iterations,
-                reached,
-            )
-        fitted = self._hand_of(palm)
-        R, origin = palm.T[:3, :3], palm.T[:3, 3]
-        targets = (points - origin) @ R
-        places = self._palm.attached.place(self._model.chains(fitted.angles_rad))
-        angles = fitted.angles_rad.copy()
-        gain = _FIT_M2 @ np.linalg.inv(_FIT_M2 + np.nan_to_num(R.T @ markers.cov_m2[self.on_hand] @ R))
-        targets = places + (gain @ (targets - places)[..., None])[..., 0]
+            out.valid[:] = last is not None
+            return out if last is None else replace(out, solution=_drifted(last, age_s))
+        fitted = self._palm.parameters.angles(palm.x)
+        before, places = self._palm.pose(palm.T, fitted)
+        targets, angles = np.empty_like(places), fitted.copy()
+        targets_of(points, cov, palm.T, places, _FIT_M2, targets)
+        explained = np.zeros(5, np.bool_)
         for m, (f, finger) in self._fingers.items():
-            if np.isfinite(targets[m, 0]):
-                residual[f], iterations[f], reached[f] = finger.solve(targets[m], angles[f])
-                seen[f], explained[f] = True, palm.surprise[m] < EXPLAINED
+            if isfinite(targets[m, 0]):
+                out.residual_m[f], out.iterations[f], out.reached[f] = finger.solve(targets[m], angles[f])
+                out.seen[f], explained[f] = True, palm.surprise[m] < EXPLAINED
         angles = self._model.clamp(angles)
-        joints = self._model.joints(palm.T, self._model.chains(angles))
-        off = joints.position_m - fitted.joints.position_m
-        cov = fitted.cov_m2 + off[:, :, None] * off[:, None, :]
-        hand = SolvedHand(palm.T, angles, joints, cov, fitted.tilt_cov_rad2, fitted.tilt_walk_rad2_s2)
-        count = int(np.isfinite(points[:, 0]).sum())
-        placed = count >= _PALM_MARKERS or (count == 2 and np.isfinite(points[self._on_palm, 0]).any())
-        valid[:] = True
-        tracked[(CHAINS if placed else TIPS)[explained]] = True
-        source[CHAINS[seen]] = Source.SOLVED
-        source[TIPS[seen]] = Source.MEASURED
-        if placed:
-            tracked[_PALM_JOINTS], source[_PALM_JOINTS] = True, Source.SOLVED
-        last, age_s = self._recent(instant.t_ns)
+        joints, _ = self._palm.pose(palm.T, angles)
+        joint_cov, tilt = self._palm.covariances(palm)
+        off = joints.position_m - before.position_m
+        joint_cov += off[:, :, None] * off[:, None, :]
+        hand = SolvedHand(palm.T, angles, joints, joint_cov, tilt, _NO_WALK)
+        placed = np.isfinite(points[:, 0])
+        self._judge(out, explained, int(placed.sum()), self._shows_back(points))
         if last is not None:
             self._memory.moved(last.angles_rad, angles, age_s)
-        self._last, self._last_palm, self._last_ns = hand, palm, instant.t_ns
-        return HandEstimate(
-            instant.t_ns,
-            markers,
-            smooth,
-            facing,
-            hand,
-            valid,
-            tracked,
-            source,
-            seen,
-            residual,
-            iterations,
-            reached,
-        )
+        self._last, self._last_palm, self._last_ns = hand, palm, out.t_ns
+        return replace(out, solution=hand)
 
-    def _held(self, t_ns: int) -> SolvedHand | None:
-        """The last hand while it says anything, as much less sure as it may have moved."""
-        last, age_s = self._recent(t_ns)
-        if last is None:
-            return None
-        cov = last.cov_m2 + (_DRIFT_M_S * age_s) ** 2 * np.eye(3)
-        return SolvedHand(
-            last.T_rig_palm, last.angles_rad, last.joints, cov, last.tilt_cov_rad2, last.tilt_walk_rad2_s2
-        )
+    @staticmethod
+    def _judge(out: HandEstimate, explained: Bool, placed: int, back: bool) -> None:
+        """Write the bits of a solved hand: what is seen and explained is tracked, the rest is held."""
+        out.valid[:] = True
+        out.source[CHAINS[out.seen]] = Source.SOLVED
+        out.source[TIPS[out.seen]] = Source.MEASURED
+        if placed >= _PALM_MARKERS or (placed == _PALM_MARKERS - 1 and back):
+            out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
+            out.tracked[CHAINS[explained]] = True
+        else:
+            out.tracked[TIPS[explained]] = True
+
+
+def _drifted(hand: SolvedHand, age_s: float) -> SolvedHand:
+    """A hand that was solved a time ago, as much less sure as it may have moved."""
+    return replace(hand, cov_m2=hand.cov_m2 + (_DRIFT_M_S * age_s) ** 2 * np.eye(3))
