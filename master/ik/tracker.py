@@ -31,7 +31,7 @@ from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
-_BAD_FIT_M = 8e-3
+_MISLED = 2.0 * EXPLAINED  # chi square by which another hand explains the markers better than one led here by the last
 _MODEL_M2 = 1e-3**2 * np.eye(3)  # bones and caps are known to about 1 mm
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
@@ -166,10 +166,10 @@ class HandTracker:
 
         solution = solve(before)
         if solution is not None and last is not None and start is not None:
-            worst_m = self._unexplained_m(solution, points_m, cov_m2)
-            if worst_m > 2.0 * self._unexplained_m(start, points_m, cov_m2):
+            wrong = self._surprise(solution, points_m, cov_m2)
+            if wrong > _MISLED + self._surprise(start, points_m, cov_m2):
                 fresh = solve(None)
-                if fresh is not None and worst_m > 2.0 * self._unexplained_m(fresh, points_m, cov_m2):
+                if fresh is not None and wrong > _MISLED + self._surprise(fresh, points_m, cov_m2):
                     solution, last = fresh, None  # the leap was no motion
                     self._forget()
         if solution is not None:
@@ -245,14 +245,10 @@ class HandTracker:
         self._told_ns = np.where(told, t_ns, self._told_ns)
         return ages
 
-    def _unexplained_m(self, hand: SolvedHand, points_m: Float, cov_m2: Float) -> float:
-        """The largest distance [m] of a marker from its place on the hand that its noise does not explain."""
+    def _surprise(self, hand: SolvedHand, points_m: Float, cov_m2: Float) -> float:
+        """Chi square of the markers (M, 3) [m] on a hand; NaN: not seen."""
         off = points_m - self._attached.on(hand.joints)
-        far = np.flatnonzero(np.vecdot(off, off) > _BAD_FIT_M**2)  # NaN is not: not seen
-        if not len(far):
-            return 0.0
-        surprise = np.vecdot(off[far], np.linalg.solve(cov_m2[far] + _MODEL_M2, off[far][..., None])[..., 0])
-        return float(np.sqrt(np.vecdot(off[far], off[far]).max(where=surprise > EXPLAINED, initial=0.0)))
+        return float(np.nansum(np.vecdot(off, np.linalg.solve(cov_m2 + _MODEL_M2, off[..., None])[..., 0])))
 
     def _palm_rests(self, seen: Bool, orientation: Orientation | None) -> int:
         """What tells at this instant where the palm is and how it is turned; 0: nothing does."""
