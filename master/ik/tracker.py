@@ -142,6 +142,8 @@ class HandTracker:
         palm_rests = self._palm_rests(seen, orientation)
         tells_palm = palm_rests > 0
         last, dt_s = self.recent(t_ns)
+        if last is not None and start is not None and self._leapt(last, dt_s, start, points_m, cov_m2):
+            last = None
         if last is None:
             self._forget()
         before = None if last is None else self._turned(last, orientation)
@@ -244,6 +246,13 @@ class HandTracker:
         ages = np.where(told, (t_ns - self._told_ns) * 1e-9, dt_s)
         self._told_ns = np.where(told, t_ns, self._told_ns)
         return ages
+
+    def _leapt(
+        self, last: HandSolution, dt_s: float, start: SolvedHand, points_m: Float, cov_m2: Float
+    ) -> bool:
+        """Whether no motion from the last hand explains the markers, but another hand does."""
+        walked = cov_m2 + (self._solver.priors.palm_walk_m_s * dt_s) ** 2 * np.eye(3)
+        return self._surprise(last, points_m, walked) > _MISLED + self._surprise(start, points_m, cov_m2)
 
     def _surprise(self, hand: SolvedHand, points_m: Float, cov_m2: Float) -> float:
         """Chi square of the markers (M, 3) [m] on a hand; NaN: not seen."""

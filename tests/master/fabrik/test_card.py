@@ -1,0 +1,145 @@
+"""The card's line in the path of every pose: the shipped rig, spied on; and what it is worth to the estimator."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from master.fabrik.one_euro import OneEuro
+
+from common.arrays import Float
+from common.geometry import axis_rotation
+from common.messages import HandPose, MarkerDetections
+from master.fabrik.finger import Finger
+from master.fabrik.triangulate import DepthTriangulator
+from master.ik.tracker import HandTracker
+from master.rig import RigSetup, build_pipeline, load_setup
+from master.stages import StageTimes
+from master.stereo.caps import CapModel
+from tests.hand_helpers import detections, natural_angles, palm
+from tests.synthetic_run import SyntheticRun, synthetic_run
+
+FRAMES = 30
+
+
+def shipped(root: Path, rig: str) -> tuple[RigSetup, list[MarkerDetections]]:
+    """The shipped rig, and what its two cameras see of a hand that moves; both at once."""
+    setup = load_setup(root / "calib_json", rig)
+    model, caps = setup.hand, CapModel(setup.hand, setup.rig.markers)
+    cameras, angles = tuple(setup.models.values()), natural_angles(np.random.default_rng(1))
+    messages: list[MarkerDetections] = []
+    for k in range(FRAMES):
+        at = np.array([0.04 + 0.03 * np.sin(0.1 * k), 0.08, 0.6])
+        joints = model.forward(palm(at_m=at), model.clamp(angles + 0.1 * np.sin(0.1 * k)))
+        points = model.marker_points(joints, setup.rig.markers)
+        bias = caps.bias_px(joints, points, cameras)
+        for c, (name, camera) in enumerate(setup.models.items()):
+            uv = camera.project(points) + bias[c]
+            if k % 5 == 4:
+                uv[k % 6] = np.nan  # one that is hidden
+            messages.append(detections(name, k, 1_000_000_000 + k * 16_666_667, uv))
+    return setup, messages
+
+
+@pytest.mark.parametrize("rig", ["desk", "desk-fabrik"])
+def test_every_pose_of_the_shipped_rig_goes_through_law_filter_and_fabrik(
+    root: Path, monkeypatch: pytest.MonkeyPatch, rig: str
+) -> None:
+    calls, seen = Counter[str](), list[int]()
+
+    def spy(owner: type, name: str, what: str) -> None:
+        real: Callable[..., Any] = getattr(owner, name)
+
+        def spied(*told: Any, **named: Any) -> Any:
+            calls[what] += 1
+            return real(*told, **named)
+
+        monkeypatch.setattr(owner, name, spied)
+
+    setup, messages = shipped(root, rig)
+    pipeline = build_pipeline(setup, StageTimes())
+    spy(DepthTriangulator, "__call__", "depth")
+    spy(OneEuro, "push", "one_euro")
+    spy(Finger, "solve", "fabrik")
+    poses: list[HandPose] = []
+    for message in messages:
+        before = calls.copy()
+        for solved in pipeline.push(message):
+            poses.append(solved.pose)
+            fingers = int(np.isfinite(solved.pose.markers_m[:5, 0]).sum())
+            seen.append(fingers)
+            made = calls - before
+            assert made["depth"] == (
+                2 if len(poses) == 1 else 1
+            )  # of the first it looks twice: which side of the caps?
+            assert made["one_euro"] >= 1
+            assert made["fabrik"] == fingers
+    assert len(poses) == FRAMES
+    assert min(seen) == 4
+    assert all(pose.valid.all() for pose in poses)
+
+
+@pytest.fixture(scope="module")
+def run() -> SyntheticRun:
+    return synthetic_run(40)
+
+
+def errors_after(run: SyntheticRun, T: Callable[[Float], Float], *, start: bool) -> list[float]:
+    """Mean error of the joints [mm] in the frames after the tracked state was set wrong; without the line's start."""
+    pipeline, errors, count = build_pipeline(run.setup, StageTimes()), list[float](), 0
+    tracker = pipeline._tracker  # pyright: ignore[reportPrivateUsage]
+    assert isinstance(tracker, HandTracker)
+    if not start:
+        push = tracker.push
+        tracker.push = lambda *told: push(*told[:-1], None)  # type: ignore[method-assign]
+    for message in run.messages:
+        for solved in pipeline.push(message):
+            count += 1
+            truth = run.truth(solved.pose.t_ns).position_m
+            if count > 25:
+                errors.append(float(1e3 * np.linalg.norm(solved.pose.position_m - truth, axis=1)[1:].mean()))
+        if count == 25 and not errors:
+            last = tracker.last
+            assert last is not None
+            wrong = T(last.T_rig_palm)
+            tracker.last = replace(
+                last, T_rig_palm=wrong, joints=run.setup.hand.forward(wrong, last.angles_rad)
+            )
+    return errors
+
+
+@pytest.mark.parametrize("shift_m", [(0.0, 0.0, 0.0), (-0.2, 0.1, 0.25)])
+@pytest.mark.parametrize("axis", [1, 2])
+def test_a_state_that_is_wrong_is_left_within_two_frames_because_of_the_line(
+    run: SyntheticRun, axis: int, shift_m: tuple[float, float, float]
+) -> None:
+    def wrong(T: Float) -> Float:
+        out = T.copy()
+        out[:3, :3] = T[:3, :3] @ axis_rotation(axis, np.radians(120.0))
+        out[:3, 3] += shift_m
+        return out
+
+    usual = errors_after(run, lambda T: T, start=True)
+    left = errors_after(run, wrong, start=True)
+    misled = errors_after(run, wrong, start=False)
+    assert left[1] < max(usual) + 3.0 < 5.0
+    assert min(misled[:6]) > 2.0 * left[1]
+
+
+def test_without_a_planted_jump_nothing_begins_anew(
+    run: SyntheticRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forgot = Counter[str]()
+    real = HandTracker._forget  # pyright: ignore[reportPrivateUsage]
+    pipeline = build_pipeline(run.setup, StageTimes())
+
+    def spied(tracker: HandTracker) -> None:
+        forgot["hands"] += 1
+        real(tracker)
+
+    monkeypatch.setattr(HandTracker, "_forget", spied)
+    assert len([solved for message in run.messages for solved in pipeline.push(message)]) > 30
+    assert forgot["hands"] == 1  # the first frame
