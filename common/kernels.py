@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -27,3 +28,8 @@ def inner(function: F) -> F:
     """As `kernel`, for a function that only kernels call: it compiles in half the time, and Python cannot call it."""
     alone = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return cast(F, cast(Any, numba).njit(**_OPTIONS, **alone)(function))
+
+
+def constant(number: int) -> int:
+    """A whole number that kernels pass on: numba's type of it is not "literally this", for which it compiles anew."""
+    return cast(int, np.int64(number))

@@ -15,21 +15,18 @@ from typing import NamedTuple
 import numpy as np
 
 from common.arrays import Float, Int
-from common.kernels import inner, kernel
+from common.kernels import constant, inner, kernel
 from master.fabrik.joints import HINGE, Angles, Hinge, Joint, Limits, Pair, clamp, rotation
 from master.fabrik.rotations import Matrix, Vector, length, product, rotate
 
 Pose = tuple[Angles, ...]
 """Angles of every joint [rad]: one of a hinge, abduction and flexion of a rotor."""
 
-# Numpy's integers, because numba compiles what is called anew for every other literal of Python.
-ROOT = START = np.int64(
+ROOT = START = constant(
     0
 )  # the first link; where the numbers of a row begin that is all one vector or matrix
-KIND, WORLD, FIRST = np.int64(0), np.int64(1), np.int64(2)  # columns of `ChainArrays.joints`
-TURN, REST, BONE, AXIS, SPREAD, SIGN = (
-    np.int64(i) for i in (0, 9, 18, 21, 24, 25)
-)  # and of `ChainArrays.links`
+KIND, WORLD, FIRST = map(constant, range(3))  # columns of `ChainArrays.joints`
+TURN, REST, BONE, AXIS, SPREAD, SIGN = map(constant, (0, 9, 18, 21, 24, 25))  # and of `ChainArrays.links`
 
 _SEARCH_STARTS = (1.0, 0.5, 0.0)
 _FIRST_STEP, _LEAST_STEP = 0.25, 1e-4
@@ -240,7 +237,7 @@ def put_matrix(rows: Float, k: int, m: Matrix) -> None:
 @inner
 def limits_of(chain: ChainArrays, k: int) -> Limits:
     """What joint k allows."""
-    i = chain.joints[k, FIRST]
+    i = int(chain.joints[k, FIRST])
     j = i if chain.joints[k, KIND] == HINGE else i + 1
     return Limits(
         chain.joints[k, KIND],
@@ -258,14 +255,14 @@ def limits_of(chain: ChainArrays, k: int) -> Limits:
 @inner
 def angles_of(chain: ChainArrays, angles: Float, k: int) -> Pair:
     """Angles of joint k [rad]; a hinge's second is 0."""
-    i = chain.joints[k, FIRST]
+    i = int(chain.joints[k, FIRST])
     return angles[i], 0.0 if chain.joints[k, KIND] == HINGE else angles[i + 1]
 
 
 @inner
 def put_angles(chain: ChainArrays, angles: Float, k: int, pair: Pair) -> None:
     """Write the angles of joint k [rad]."""
-    i = chain.joints[k, FIRST]
+    i = int(chain.joints[k, FIRST])
     angles[i] = pair[0]
     if chain.joints[k, KIND] != HINGE:
         angles[i + 1] = pair[1]
@@ -284,7 +281,7 @@ def clamp_angles(chain: ChainArrays, angles: Float) -> None:
 def follow(chain: ChainArrays, angles: Float) -> None:
     """Set the coupled hinge's angle by its leader's, within its own limits."""
     k = chain.follower
-    led = chain.ratio * angles[chain.joints[chain.leader, FIRST]]
+    led = chain.ratio * float(angles[int(chain.joints[chain.leader, FIRST])])
     put_angles(chain, angles, k, clamp(limits_of(chain, k), (led, 0.0)))
 
 

@@ -21,7 +21,7 @@ from math import cos, inf, isfinite, pi, sin, sqrt
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inner, kernel
+from common.kernels import constant, inner, kernel
 from master.fabrik.chain import (
     BONE,
     REST,
@@ -42,7 +42,7 @@ REACHED_M = 1e-6
 _ENOUGH_M = 0.05 * REACHED_M
 _SLACK_RAD = 1e-6
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
-PIP, DIP = np.int64(1), np.int64(2)  # links
+PIP, DIP = constant(1), constant(2)  # links
 _EDGE_M2 = 1e-14
 """Rounding of a squared distance at the end of a branch."""
 _PER_BRANCH = 2.0 * pi
@@ -52,7 +52,7 @@ _ROUNDING = 1e-15
 _SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
 """PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
 _STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
-_FIRST_STEPS, _MOST_STEPS = np.int64(8), np.int64(60)
+_FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
 """Of least squares: from each start of a free DIP, and to the end."""
 
 

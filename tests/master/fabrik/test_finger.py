@@ -365,7 +365,8 @@ def test_fabrik_in_place_hits_ten_thousand_reachable_targets(side: str, preset: 
 def test_a_free_thumb_stays_near_the_angles_it_had() -> None:
     model, rng, fabrik = _model("right", "D"), np.random.default_rng(13), _fabrik("right", "D", 0)
     truth = _legal(model, fabrik.closed_form, 0, rng.uniform(0.2, 0.8, (200, 4)))
-    truth[:, 3] = rng.uniform(*model.limits_rad[0, 3], 200)  # in no ratio to the MCP
+    low, high = model.limits_rad[0, 3].tolist()
+    truth[:, 3] = rng.uniform(low, high, 200)  # in no ratio to the MCP
     steps: list[float] = []
     for angles in truth:
         point = np.array(fabrik.closed_form.forward(_four(angles)))
@@ -389,7 +390,7 @@ def test_fabrik_in_place_is_no_worse_than_its_seed_out_of_reach(finger: int) -> 
         assert math.dist(fabrik.closed_form.forward(_four(angles)), target) == pytest.approx(
             result.residual_m
         )
-        assert _inside(_model("right", "K"), finger, FingerSolution(*angles.tolist(), 0.0, False))
+        assert _inside(_model("right", "K"), finger, FingerSolution(*_four(angles), 0.0, False))
     assert unreached > 20
 
 
@@ -403,6 +404,6 @@ def test_fabrik_in_place_leaves_the_angles_of_a_finger_that_is_not_seen() -> Non
 
 
 def test_a_finger_refuses_settings_that_find_nothing() -> None:
-    for wrong in ({"tolerance_m": 0.0}, {"max_iterations": 0}):
+    for tolerance_m, iterations in ((0.0, 10), (1e-5, 0)):
         with pytest.raises(ValueError, match="positive"):
-            Finger.of(_model("right", "K"), 1, np.zeros(3), **wrong)
+            Finger.of(_model("right", "K"), 1, np.zeros(3), tolerance_m, iterations)
