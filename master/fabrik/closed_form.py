@@ -53,7 +53,7 @@ _SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5),
 """PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
 _STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
 _FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
-"""Of least squares: from each start of a free DIP, and to the end."""
+"""Of least squares: from each start, and from the best of their ends."""
 
 
 @kernel
@@ -240,20 +240,11 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
         Distance of the point to the target [m].
     """
     best, trial = inf, np.empty(4)
-    if chain.follower >= 0:
-        # a coupled finger that misses in closed form is out of reach: the best start is enough
-        for row in range(len(seeds)):
-            _copy_row(seeds, row, trial)
-            clamp_angles(chain, trial)
-            miss = length(minus(end_of(chain, trial), goal))
-            if miss < best:
-                best = miss
-                _copy(trial, angles)
-        return least_squares(chain, goal, _ENOUGH_M, _MOST_STEPS, angles)
     local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
-    for start in range(_STARTS + 1):
+    starts = len(seeds) if chain.follower >= 0 else _STARTS
+    for start in range(starts + 1):
         steps = _FIRST_STEPS
-        if start < _STARTS:
+        if start < starts:
             _start(chain, local, near, seeds, start, trial)
         else:
             steps = _MOST_STEPS
@@ -269,7 +260,7 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
 
 @inner
 def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
-    """Write the start (4,) of that number for a free DIP: seeds, the pose of a moment ago, pairs of PIP and DIP."""
+    """Write the start (4,) of that number: the seeds; for a free DIP also the pose of a moment ago, and pairs."""
     pair = start - len(seeds) - 1
     if start < len(seeds):
         _copy_row(seeds, start, angles)
