@@ -1,1 +1,1 @@
-"""The card's line from centroids to fingers: FABRIK with hinges and rotors, each finger seeded in closed form."""
+"""FABRIK with joint limits, each finger seeded in closed form."""

@@ -1,4 +1,4 @@
-"""Finger angles from one point on the finger, in closed form; and the nearest legal pose where there is none.
+"""Finger angles from one point on the finger, in closed form.
 
 A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
 point lies at w(PIP), which neither flexion nor abduction can stretch:
@@ -22,7 +22,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import constant, inner, kernel
-from master.fabrik.chain import (
+from master.fabrik.chain_arrays import (
     BONE,
     REST,
     ROOT,
@@ -34,8 +34,8 @@ from master.fabrik.chain import (
     matrix_at,
     vector_at,
 )
-from master.fabrik.joints import hinge_fit, swing_and_flex
 from master.fabrik.least_squares import least_squares
+from master.fabrik.limits import hinge_fit, swing_and_flex
 from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, rotate_back
 
 REACHED_M = 1e-6
@@ -99,7 +99,7 @@ def closed_form(
 
 @kernel
 def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, float]:
-    """Squared distance |w|^2 [m^2] at a PIP [rad], the DIP in its ratio, and its derivative [m^2/rad]."""
+    """Squared distance |w|^2 [m^2] at a PIP [rad], and its derivative [m^2/rad]."""
     led = ratio * pip
     dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
     slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
@@ -132,7 +132,7 @@ def _flexed(angle: float, v: Vector) -> Vector:
 def _invert(
     chain: ChainArrays, ratio: float, low: float, high: float, distance2: float
 ) -> tuple[float, float]:
-    """PIP [rad] of a squared distance on the branch [low, high], and how far beyond the branch that is [m^2].
+    """PIP [rad] of |w|^2 on the branch [low, high], and how far that is beyond it.
 
     It starts with PIP linear in sqrt(|w|_far^2 - |w|^2), which it nearly is, also at the straight finger.
     """
@@ -160,7 +160,7 @@ def _invert(
 
 @inner
 def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int, angles: Float) -> float:
-    """Write one of the two poses (4,) that point w at the target, legalised; by how much it was cut [rad]."""
+    """Write one of both poses that point w at the target, clamped by so much [rad]."""
     rest, w = matrix_at(chain.links, ROOT, REST), _point(chain, pip, dip)
     a, f = swing_and_flex(w, local, rest, chain.links[ROOT, SIGN])[side]
     angles[0], angles[1], angles[2], angles[3] = a, f, pip, dip
@@ -170,7 +170,7 @@ def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int,
 
 @inner
 def _rank(angles: Float, near: Float, branch: int) -> float:
-    """How much rather another pose is taken: the change of angles [rad], or branch and abduction."""
+    """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
     if not isfinite(near[0]):
         return branch * _PER_BRANCH + abs(angles[0])
     rank = 0.0
@@ -212,7 +212,7 @@ def _keep(seeds: Float, penalties: Float, angles: Float, penalty: float) -> None
 
 @inner
 def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, seeds: Float) -> None:
-    """Write row 0: the abduction is row 1's (cut at its limit), the rest is the point of its plane nearest by."""
+    """Write row 0: with row 1's abduction, its plane's nearest point to the target."""
     a = seeds[1, 0]
     c, s = cos(chain.links[ROOT, SIGN] * a), sin(chain.links[ROOT, SIGN] * a)
     x, y, z = local
@@ -229,7 +229,7 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
 
 @kernel
 def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, angles: Float) -> float:
-    """The legal pose that comes nearest to the target, where the closed form has none that hits it.
+    """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:
         chain, goal, near: As of `closed_form`.
@@ -260,7 +260,7 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
 
 @inner
 def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
-    """Write the start (4,) of that number: the seeds; for a free DIP also the pose of a moment ago, and pairs."""
+    """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
     pair = start - len(seeds) - 1
     if start < len(seeds):
         _copy_row(seeds, start, angles)

@@ -1,4 +1,4 @@
-"""A finger of a hand: its chain, its angles in closed form, and FABRIK that starts from these."""
+"""A finger of a hand: its chain, its closed form, and FABRIK from there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,10 +10,12 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, HandModel
-from master.fabrik.chain import Chain, Coupling, Link, end_of
+from master.fabrik.chain import Chain, Coupling, Link
+from master.fabrik.chain_arrays import end_of
 from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, nearest_pose
 from master.fabrik.fabrik import solve_chain
-from master.fabrik.joints import Hinge, Pair, Rotor
+from master.fabrik.joints import Hinge, Rotor
+from master.fabrik.limits import Pair
 from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector
 
 THUMB = 0
@@ -26,7 +28,9 @@ _UNKNOWN = (_NAN,) * 4
 
 
 class FingerSolution(NamedTuple):
-    """Angles of one finger [rad] (thumb: CMC abduction, CMC flexion, MCP, IP) and how well they fit.
+    """Angles of one finger [rad] and how well they fit.
+
+    The thumb's are CMC abduction, CMC flexion, MCP and IP.
 
     Attributes:
         residual_m: Distance of the point to the target.
@@ -102,7 +106,7 @@ class FingerSolver:
 
     @property
     def limits(self) -> tuple[Pair, ...]:
-        """Low and high of the four angles [rad]; the abduction's where flexion does not narrow it."""
+        """Low and high of the four angles [rad]; as of `Chain.spans`."""
         return self.chain.spans
 
     def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
@@ -125,7 +129,12 @@ class FingerSolver:
         return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
 
     def seed(self, goal: Vector, near: Float, angles: Float) -> float:
-        """As `solve`, on arrays: `goal` from the root [m], finite; near (4,) [rad] or NaN; angles (4,): out [rad].
+        """As `solve`, on arrays.
+
+        Args:
+            goal: Target from the root [m], finite.
+            near: (4,) [rad]; NaN: not known.
+            angles: (4,) [rad], out.
 
         Returns:
             Distance of the point to the target [m].
@@ -142,7 +151,7 @@ class FingerSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finger:
-    """FABRIK for one finger of one hand, prepared; build once with `of`. Holds no state between calls.
+    """FABRIK for one finger of one hand, prepared. Holds no state between calls.
 
     Attributes:
         closed_form: The same finger.
@@ -204,7 +213,7 @@ class Finger:
 
 
 def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: bool = True) -> Chain:
-    """The chain of one finger in the palm frame's axes, from MCP (thumb: CMC) to a point fixed to the tip joint.
+    """The chain from a finger's MCP (thumb: CMC) to a point fixed to its tip joint.
 
     Args:
         model: The hand.

@@ -1,4 +1,4 @@
-"""Closed-form finger: angles out equal angles in, for real and generated hands; limits and unreachable targets."""
+"""A finger: angles out equal angles in; limits; targets out of reach; in place."""
 
 import math
 from functools import cache
@@ -38,7 +38,7 @@ def _solver(side: str, preset: Preset, finger: int) -> FingerSolver:
 
 @cache
 def _narrowed(share: float, soft: bool) -> HandModel:
-    """A left hand whose fingers, and thumb, keep a share of their abduction; its DIPs fixed or free to stray."""
+    """A left hand whose fingers keep a share of their abduction; DIPs fixed or loose."""
     limits = preset_limits("D")
     fingers = {
         name: msgspec.structs.replace(getattr(limits, name), spread_at_full_flexion=share) for name in FINGERS
@@ -57,7 +57,7 @@ def _prepared(model: HandModel, finger: int) -> FingerSolver:
 
 
 def _legal(model: HandModel, solver: FingerSolver, finger: int, shares: Float) -> Float:
-    """Angles (N, 4) inside the limits that obey the coupling, from shares (N, 4) of the ranges."""
+    """Legal, coupled angles (N, 4) from shares (N, 4) of the ranges."""
     low, high = model.limits_rad[finger, :, 0], model.limits_rad[finger, :, 1]
     angles = low + shares * (high - low)
     spread = model.abduction_limits_rad(np.repeat(angles[:, 1:2], 5, axis=1))
