@@ -105,20 +105,19 @@ def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, f
     slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
     turning = rotate(turn, (0.0, slope * tip[2], -slope * tip[1]))
-    inner = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
-    inner, turning, turn = _flexed(pip, inner), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
-    w = plus(rotate(turn, inner), vector_at(chain.links, ROOT, BONE))
-    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, inner[2], -inner[1]))))
+    end = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
+    end, turning, turn = _flexed(pip, end), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
+    w = plus(rotate(turn, end), vector_at(chain.links, ROOT, BONE))
+    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, end[2], -end[1]))))
 
 
 @inner
 def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
     """The point w [m] in the root joint's frame at PIP and DIP [rad]."""
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    inner = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
-    return plus(
-        rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, inner)), vector_at(chain.links, ROOT, BONE)
-    )
+    end = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
+    end = rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, end))
+    return plus(end, vector_at(chain.links, ROOT, BONE))
 
 
 @inner
@@ -169,9 +168,15 @@ def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int,
 
 
 @inner
+def _known(angles: Float) -> bool:
+    """Whether all of a finger's angles (4,) are known."""
+    return isfinite(angles[0] + angles[1] + angles[2] + angles[3])
+
+
+@inner
 def _rank(angles: Float, near: Float, branch: int) -> float:
     """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
-    if not isfinite(near[0]):
+    if not _known(near):
         return branch * _PER_BRANCH + abs(angles[0])
     rank = 0.0
     for i in range(4):
@@ -250,7 +255,7 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
             steps = _MOST_STEPS
             _copy(angles, trial)
         left = least_squares(chain, goal, _ENOUGH_M, steps, trial)
-        if left < best:
+        if start == 0 or left < best:
             best = left
             _copy(trial, angles)
         if best < REACHED_M:
@@ -266,7 +271,7 @@ def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: 
         _copy_row(seeds, start, angles)
     elif pair < 0:
         _copy_row(seeds, 0, angles)
-        if isfinite(near[0]):
+        if _known(near):
             _copy(near, angles)
     else:
         pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]

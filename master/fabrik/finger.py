@@ -16,7 +16,7 @@ from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, near
 from master.fabrik.fabrik import solve_chain
 from master.fabrik.joints import Hinge, Rotor
 from master.fabrik.limits import Pair
-from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector
+from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector, length, minus
 
 THUMB = 0
 Four = tuple[float, float, float, float]
@@ -120,8 +120,8 @@ class FingerSolver:
         Returns:
             Angles inside the limits; NaN where the target is not finite.
         """
-        goal = _from_root(target, self.root)
-        if not isfinite(goal[0] + goal[1] + goal[2]):
+        goal = minus(target, self.root)
+        if not isfinite(length(goal)):
             return NOT_SEEN
         before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
         left = self.seed(goal, before, angles)
@@ -196,8 +196,8 @@ class Finger:
         """
         solver = self.closed_form
         x, y, z = target_m.tolist()
-        goal = _from_root((x, y, z), solver.root)
-        if not isfinite(goal[0] + goal[1] + goal[2]):
+        goal = minus((x, y, z), solver.root)
+        if not isfinite(length(goal)):
             return _NOT_SEEN
         arrays, near, residual, iterations = solver.chain.arrays, angles_rad.copy(), inf, 0
         if solver.chain.coupling is None and isfinite(near.sum()):
@@ -247,10 +247,6 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
 def finger_root(model: HandModel, finger: int) -> Vector:
     """The MCP (thumb: CMC) in the palm frame [m]."""
     return as_vector(model.rest_position_m[CHAINS[finger, 0]])
-
-
-def _from_root(target: Vector, root: Vector) -> Vector:
-    return target[0] - root[0], target[1] - root[1], target[2] - root[2]
 
 
 def _branches(chain: Chain, ratio: float) -> Float:

@@ -403,6 +403,25 @@ def test_fabrik_in_place_leaves_the_angles_of_a_finger_that_is_not_seen() -> Non
         assert angles.tolist() == [0.1, 0.2, 0.3, 0.2]
 
 
+def test_angles_that_are_known_in_part_are_not_known() -> None:
+    for finger in range(5):
+        fabrik, whole = _fabrik("right", "K", finger), np.full(4, np.nan)
+        target = np.array(fabrik.closed_form.forward((0.0, 0.6, 0.5, 0.5 * fabrik.closed_form.ratio)))
+        assert fabrik.solve(target, whole).reached
+        for k in range(4):
+            angles = np.array([0.1, 0.2, 0.3, 0.2])
+            angles[k] = math.nan
+            assert fabrik.solve(target, angles).reached
+            assert angles.tolist() == whole.tolist()
+
+
+def test_a_target_beyond_all_numbers_is_not_seen() -> None:
+    solver = _solver("right", "K", 1)
+    assert solver.solve((1e200, 0.0, 0.0)) is NOT_SEEN
+    assert not solver.solve((1e150, 0.0, 0.0)).reached
+    assert _inside(_model("right", "K"), 1, solver.solve((1e150, 0.0, 0.0)))
+
+
 def test_a_finger_refuses_settings_that_find_nothing() -> None:
     for tolerance_m, iterations in ((0.0, 10), (1e-5, 0)):
         with pytest.raises(ValueError, match="positive"):
