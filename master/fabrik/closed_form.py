@@ -1,4 +1,4 @@
-"""Finger angles from one point on the finger, in closed form; and the nearest legal pose where there is none.
+"""Finger angles from one point on the finger, in closed form.
 
 A point leaves one angle free; with DIP = ratio * PIP the finger is exactly determined. In the root joint's frame the
 point lies at w(PIP), which neither flexion nor abduction can stretch:
@@ -21,8 +21,8 @@ from math import cos, inf, isfinite, pi, sin, sqrt
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inner, kernel
-from master.fabrik.chain import (
+from common.kernels import constant, inner, kernel
+from master.fabrik.chain_arrays import (
     BONE,
     REST,
     ROOT,
@@ -34,15 +34,15 @@ from master.fabrik.chain import (
     matrix_at,
     vector_at,
 )
-from master.fabrik.joints import hinge_fit, swing_and_flex
 from master.fabrik.least_squares import least_squares
+from master.fabrik.limits import hinge_fit, swing_and_flex
 from master.fabrik.rotations import Vector, dot, length, minus, plus, rotate, rotate_back
 
 REACHED_M = 1e-6
 _ENOUGH_M = 0.05 * REACHED_M
 _SLACK_RAD = 1e-6
 """A limit passed by less is rounding: the angle is clamped, which moves the point < 0.2 um."""
-PIP, DIP = np.int64(1), np.int64(2)  # links
+PIP, DIP = constant(1), constant(2)  # links
 _EDGE_M2 = 1e-14
 """Rounding of a squared distance at the end of a branch."""
 _PER_BRANCH = 2.0 * pi
@@ -52,8 +52,8 @@ _ROUNDING = 1e-15
 _SPREAD_OF_STARTS = ((0.1, 0.9), (0.9, 0.1), (0.5, 0.0), (0.5, 1.0), (0.0, 0.5), (1.0, 0.5))
 """PIP and DIP, as shares of their ranges, from which a free pair is sought when the coupled one fails."""
 _STARTS = 4 + 2 * len(_SPREAD_OF_STARTS)
-_FIRST_STEPS, _MOST_STEPS = np.int64(8), np.int64(60)
-"""Of least squares: from each start of a free DIP, and to the end."""
+_FIRST_STEPS, _MOST_STEPS = constant(8), constant(60)
+"""Of least squares: from each start, and from the best of their ends."""
 
 
 @kernel
@@ -99,26 +99,25 @@ def closed_form(
 
 @kernel
 def distance2_of(chain: ChainArrays, ratio: float, pip: float) -> tuple[float, float]:
-    """Squared distance |w|^2 [m^2] at a PIP [rad], the DIP in its ratio, and its derivative [m^2/rad]."""
+    """Squared distance |w|^2 [m^2] at a PIP [rad], and its derivative [m^2/rad]."""
     led = ratio * pip
     dip = min(max(led, chain.spans[3, 0]), chain.spans[3, 1])
     slope, turn = ratio if dip == led else 0.0, matrix_at(chain.links, DIP, TURN)
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
     turning = rotate(turn, (0.0, slope * tip[2], -slope * tip[1]))
-    inner = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
-    inner, turning, turn = _flexed(pip, inner), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
-    w = plus(rotate(turn, inner), vector_at(chain.links, ROOT, BONE))
-    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, inner[2], -inner[1]))))
+    end = plus(rotate(turn, tip), vector_at(chain.links, PIP, BONE))
+    end, turning, turn = _flexed(pip, end), _flexed(pip, turning), matrix_at(chain.links, PIP, TURN)
+    w = plus(rotate(turn, end), vector_at(chain.links, ROOT, BONE))
+    return dot(w, w), 2.0 * dot(w, rotate(turn, plus(turning, (0.0, end[2], -end[1]))))
 
 
 @inner
 def _point(chain: ChainArrays, pip: float, dip: float) -> Vector:
     """The point w [m] in the root joint's frame at PIP and DIP [rad]."""
     tip = _flexed(dip, vector_at(chain.links, DIP, BONE))
-    inner = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
-    return plus(
-        rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, inner)), vector_at(chain.links, ROOT, BONE)
-    )
+    end = plus(rotate(matrix_at(chain.links, DIP, TURN), tip), vector_at(chain.links, PIP, BONE))
+    end = rotate(matrix_at(chain.links, PIP, TURN), _flexed(pip, end))
+    return plus(end, vector_at(chain.links, ROOT, BONE))
 
 
 @inner
@@ -132,7 +131,7 @@ def _flexed(angle: float, v: Vector) -> Vector:
 def _invert(
     chain: ChainArrays, ratio: float, low: float, high: float, distance2: float
 ) -> tuple[float, float]:
-    """PIP [rad] of a squared distance on the branch [low, high], and how far beyond the branch that is [m^2].
+    """PIP [rad] of |w|^2 on the branch [low, high], and how far that is beyond it.
 
     It starts with PIP linear in sqrt(|w|_far^2 - |w|^2), which it nearly is, also at the straight finger.
     """
@@ -160,7 +159,7 @@ def _invert(
 
 @inner
 def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int, angles: Float) -> float:
-    """Write one of the two poses (4,) that point w at the target, legalised; by how much it was cut [rad]."""
+    """Write one of both poses that point w at the target, clamped by so much [rad]."""
     rest, w = matrix_at(chain.links, ROOT, REST), _point(chain, pip, dip)
     a, f = swing_and_flex(w, local, rest, chain.links[ROOT, SIGN])[side]
     angles[0], angles[1], angles[2], angles[3] = a, f, pip, dip
@@ -169,9 +168,15 @@ def _swing(chain: ChainArrays, pip: float, dip: float, local: Vector, side: int,
 
 
 @inner
+def _known(angles: Float) -> bool:
+    """Whether all of a finger's angles (4,) are known."""
+    return isfinite(angles[0] + angles[1] + angles[2] + angles[3])
+
+
+@inner
 def _rank(angles: Float, near: Float, branch: int) -> float:
-    """How much rather another pose is taken: the change of angles [rad], or branch and abduction."""
-    if not isfinite(near[0]):
+    """Rank of a pose that hits, least first: change [rad], or branch and abduction."""
+    if not _known(near):
         return branch * _PER_BRANCH + abs(angles[0])
     rank = 0.0
     for i in range(4):
@@ -212,7 +217,7 @@ def _keep(seeds: Float, penalties: Float, angles: Float, penalty: float) -> None
 
 @inner
 def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, seeds: Float) -> None:
-    """Write row 0: the abduction is row 1's (cut at its limit), the rest is the point of its plane nearest by."""
+    """Write row 0: with row 1's abduction, its plane's nearest point to the target."""
     a = seeds[1, 0]
     c, s = cos(chain.links[ROOT, SIGN] * a), sin(chain.links[ROOT, SIGN] * a)
     x, y, z = local
@@ -229,7 +234,7 @@ def _in_plane(chain: ChainArrays, edges: Float, ratio: float, local: Vector, see
 
 @kernel
 def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, angles: Float) -> float:
-    """The legal pose that comes nearest to the target, where the closed form has none that hits it.
+    """The legal pose nearest to the target, where none hits it in closed form.
 
     Args:
         chain, goal, near: As of `closed_form`.
@@ -240,26 +245,17 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
         Distance of the point to the target [m].
     """
     best, trial = inf, np.empty(4)
-    if chain.follower >= 0:
-        # a coupled finger that misses in closed form is out of reach: the best start is enough
-        for row in range(len(seeds)):
-            _copy_row(seeds, row, trial)
-            clamp_angles(chain, trial)
-            miss = length(minus(end_of(chain, trial), goal))
-            if miss < best:
-                best = miss
-                _copy(trial, angles)
-        return least_squares(chain, goal, _ENOUGH_M, _MOST_STEPS, angles)
     local = rotate_back(matrix_at(chain.links, ROOT, TURN), goal)
-    for start in range(_STARTS + 1):
+    starts = len(seeds) if chain.follower >= 0 else _STARTS
+    for start in range(starts + 1):
         steps = _FIRST_STEPS
-        if start < _STARTS:
+        if start < starts:
             _start(chain, local, near, seeds, start, trial)
         else:
             steps = _MOST_STEPS
             _copy(angles, trial)
         left = least_squares(chain, goal, _ENOUGH_M, steps, trial)
-        if left < best:
+        if start == 0 or left < best:
             best = left
             _copy(trial, angles)
         if best < REACHED_M:
@@ -269,13 +265,13 @@ def nearest_pose(chain: ChainArrays, goal: Vector, near: Float, seeds: Float, an
 
 @inner
 def _start(chain: ChainArrays, local: Vector, near: Float, seeds: Float, start: int, angles: Float) -> None:
-    """Write the start (4,) of that number for a free DIP: seeds, the pose of a moment ago, pairs of PIP and DIP."""
+    """Write start (4,): a seed; for a free DIP also the last pose, and pairs."""
     pair = start - len(seeds) - 1
     if start < len(seeds):
         _copy_row(seeds, start, angles)
     elif pair < 0:
         _copy_row(seeds, 0, angles)
-        if isfinite(near[0]):
+        if _known(near):
             _copy(near, angles)
     else:
         pip_share, dip_share = _SPREAD_OF_STARTS[pair // 2]

@@ -28,44 +28,20 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inner, kernel
-from master.fabrik.chain import (
-    BONE,
-    KIND,
-    ROOT,
+from master.fabrik.chain import Chain, Pose, nearest_reach
+from master.fabrik.chain_arrays import (
     START,
-    TURN,
-    WORLD,
-    Chain,
     ChainArrays,
-    Pose,
-    angles_of,
     clamp_angles,
     end_of,
-    follow,
     forward,
     limits_of,
-    matrix_at,
-    nearest_reach,
     put_angles,
-    put_matrix,
-    put_vector,
-    rest_frame,
     vector_at,
 )
-from master.fabrik.joints import HINGE, clamp, fit, hinge_fit, rotation
-from master.fabrik.rotations import (
-    IDENTITY,
-    Matrix,
-    Vector,
-    between,
-    length,
-    minus,
-    product,
-    rotate,
-    rotate_back,
-    rotation_about,
-    transposed,
-)
+from master.fabrik.limits import HINGE, clamp
+from master.fabrik.passes import aim, backward_pass, forward_pass
+from master.fabrik.rotations import IDENTITY, Matrix, Vector, length, minus, rotate_back
 
 _RESTART_BENDS = ((1.0, 1.0), (2.0, 0.5), (0.5, 2.0))
 """How a restart shares out its bend between the front and the back of the chain."""
@@ -222,7 +198,7 @@ def solve_chain(
             break
         restarts -= 1
         _bend_to(chain, length(goal), front, back, trial)
-        _aim(chain, end_of(chain, trial), goal, trial)
+        aim(chain, end_of(chain, trial), goal, trial)
         clamp_angles(chain, trial)
         found, more = _attempt(chain, goal, tolerance_m, max_iterations, trial)
         iterations += more
@@ -235,7 +211,7 @@ def solve_chain(
 
 @inner
 def _bend_to(chain: ChainArrays, distance: float, front: float, back: float, angles: Float) -> None:
-    """Write the bent pose whose end is as far from the root as the target: never on one line with it."""
+    """Write the bent pose whose end is as far from the root as the target."""
     low, high = 0.0, 1.0
     for _ in range(_RESTART_HALVINGS):
         share = 0.5 * (low + high)
@@ -249,7 +225,7 @@ def _bend_to(chain: ChainArrays, distance: float, front: float, back: float, ang
 
 @inner
 def _bend(chain: ChainArrays, share: float, front: float, back: float, angles: Float) -> None:
-    """Bend every hinge by its share of the longer way from rest; weight from `front` to `back`."""
+    """Bend every hinge by a share of its longer way from rest, weighted."""
     last = max(len(chain.joints) - 1, 1)
     for k in range(len(chain.joints)):
         limits = limits_of(chain, k)
@@ -263,22 +239,10 @@ def _bend(chain: ChainArrays, share: float, front: float, back: float, angles: F
 
 
 @inner
-def _aim(chain: ChainArrays, end: Vector, goal: Vector, angles: Float) -> None:
-    """Turn the first joint so that the end lies towards the goal."""
-    limits, turn, now = (
-        limits_of(chain, ROOT),
-        matrix_at(chain.links, ROOT, TURN),
-        angles_of(chain, angles, ROOT),
-    )
-    arm = rotate_back(rotation(limits, now), rotate_back(turn, end))
-    put_angles(chain, angles, ROOT, fit(limits, arm, rotate_back(turn, goal), now))
-
-
-@inner
 def _attempt(
     chain: ChainArrays, goal: Vector, tolerance_m: float, max_iterations: int, angles: Float
 ) -> tuple[float, int]:
-    """FABRIK from one legal start until it arrives, stalls or tires; `angles` become the best on the way."""
+    """FABRIK from legal angles, which become the best, until it arrives or stalls."""
     best = length(minus(end_of(chain, angles), goal))
     if best <= tolerance_m:
         return best, 0
@@ -289,10 +253,10 @@ def _attempt(
     slow, last = 0, best
     for iteration in range(1, max_iterations + 1):
         # hinges keep the chain in a plane, and only the first joint can turn that to the goal
-        _aim(chain, vector_at(positions, count, START), goal, now)
+        aim(chain, vector_at(positions, count, START), goal, now)
         forward(chain, now, positions, orientations)
-        _backward_pass(chain, positions, orientations, now, goal, places)
-        _forward_pass(chain, places, now, positions, orientations)
+        backward_pass(chain, positions, orientations, now, goal, places)
+        forward_pass(chain, places, now, positions, orientations)
         residual = length(minus(vector_at(positions, count, START), goal))
         slow = slow + 1 if residual > _STALL * last else 0
         last = residual
@@ -303,99 +267,3 @@ def _attempt(
         if best <= tolerance_m or slow >= _STALL_ITERATIONS:
             return best, iteration
     return best, max_iterations
-
-
-@inner
-def _backward_pass(
-    chain: ChainArrays, positions: Float, orientations: Float, angles: Float, goal: Vector, places: Float
-) -> None:
-    """Write places (N + 1, 3) [m] of the joints when the end is on the target, limits between neighbours kept."""
-    last = len(chain.joints) - 1
-    place = goal
-    put_vector(places, last + 1, place)
-    wanted = minus(place, vector_at(positions, last, START))
-    behind = _pointed(chain, last, matrix_at(orientations, last, START), angles, wanted)
-    place = minus(place, rotate(behind, vector_at(chain.links, last, BONE)))
-    put_vector(places, last, place)
-    for k in range(last - 1, -1, -1):
-        wanted, now, bone = (
-            minus(place, vector_at(positions, k, START)),
-            matrix_at(orientations, k, START),
-            vector_at(chain.links, k, BONE),
-        )
-        if chain.joints[k, WORLD] or chain.joints[k + 1, WORLD]:
-            here = _pointed(chain, k, now, angles, wanted)
-        elif chain.joints[k + 1, KIND] == HINGE:
-            here = _before_hinge(chain, k, behind, angles, wanted)
-        else:
-            here = _before_rotor(chain, k, behind, angles, _turned(now, bone, wanted))
-        place = minus(place, rotate(here, bone))
-        put_vector(places, k, place)
-        behind = here
-
-
-@inner
-def _turned(orientation: Matrix, bone: Vector, wanted: Vector) -> Matrix:
-    """Orientation turned the shortest way so that its bone points as wanted."""
-    return product(between(rotate(orientation, bone), wanted), orientation)
-
-
-@inner
-def _pointed(chain: ChainArrays, k: int, now: Matrix, angles: Float, wanted: Vector) -> Matrix:
-    """Orientation of link k whose bone points as wanted, as far as a joint with axes of the world allows."""
-    bone = vector_at(chain.links, k, BONE)
-    if not chain.joints[k, WORLD]:
-        return _turned(now, bone, wanted)
-    limits, turn = limits_of(chain, k), matrix_at(chain.links, k, TURN)
-    fitted = fit(limits, bone, rotate_back(turn, wanted), angles_of(chain, angles, k))
-    return product(turn, rotation(limits, fitted))
-
-
-@inner
-def _before_hinge(chain: ChainArrays, k: int, behind: Matrix, angles: Float, wanted: Vector) -> Matrix:
-    """Orientation of link k, whose bone points as wanted as far as the hinge between it and `behind` allows.
-
-    Seen from the bone behind, this bone turns the other way about the same axis.
-    """
-    limits, turn = limits_of(chain, k + 1), matrix_at(chain.links, k + 1, TURN)
-    seen = rotate_back(turn, vector_at(chain.links, k, BONE))
-    now = angles_of(chain, angles, k + 1)
-    angle = hinge_fit(-limits.high, -limits.low, limits.axis, seen, rotate_back(behind, wanted), -now[0])
-    return product(behind, product(rotation_about(limits.axis, angle), transposed(turn)))
-
-
-@inner
-def _before_rotor(chain: ChainArrays, k: int, behind: Matrix, angles: Float, here: Matrix) -> Matrix:
-    """Orientation `here` of link k, turned so that the bone `behind` lies in a direction the rotor allows."""
-    limits, bone = limits_of(chain, k + 1), vector_at(chain.links, k + 1, BONE)
-    frame = product(here, matrix_at(chain.links, k + 1, TURN))
-    actual = rotate(behind, bone)
-    fitted = fit(limits, bone, rotate_back(frame, actual), angles_of(chain, angles, k + 1))
-    allowed = rotate(frame, rotate(rotation(limits, fitted), bone))
-    return product(between(allowed, actual), here)
-
-
-@inner
-def _forward_pass(
-    chain: ChainArrays, places: Float, angles: Float, positions: Float, orientations: Float
-) -> None:
-    """Write the legal pose whose bones point to the places of the backward pass; `angles`: in, out [rad]."""
-    x, y, z = 0.0, 0.0, 0.0
-    put_vector(positions, ROOT, (x, y, z))
-    parent = matrix_at(chain.links, ROOT, TURN)
-    for k in range(len(chain.joints)):
-        limits, bone, frame = (
-            limits_of(chain, k),
-            vector_at(chain.links, k, BONE),
-            rest_frame(chain, k, parent),
-        )
-        if k == chain.follower:
-            follow(chain, angles)
-        else:
-            wanted = rotate_back(frame, minus(vector_at(places, k + 1, START), (x, y, z)))
-            put_angles(chain, angles, k, fit(limits, bone, wanted, angles_of(chain, angles, k)))
-        parent = product(frame, rotation(limits, angles_of(chain, angles, k)))
-        step = rotate(parent, bone)
-        x, y, z = x + step[0], y + step[1], z + step[2]
-        put_vector(positions, k + 1, (x, y, z))
-        put_matrix(orientations, k, parent)

@@ -1,4 +1,4 @@
-"""A finger of a hand: its chain, its angles in closed form, and FABRIK that starts from these."""
+"""A finger of a hand: its chain, its closed form, and FABRIK from there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,11 +10,13 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS, HandModel
-from master.fabrik.chain import Chain, Coupling, Link, end_of
+from master.fabrik.chain import Chain, Coupling, Link
+from master.fabrik.chain_arrays import end_of
 from master.fabrik.closed_form import REACHED_M, closed_form, distance2_of, nearest_pose
 from master.fabrik.fabrik import solve_chain
-from master.fabrik.joints import Hinge, Pair, Rotor
-from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector
+from master.fabrik.joints import Hinge, Rotor
+from master.fabrik.limits import Pair
+from master.fabrik.rotations import IDENTITY, Vector, as_matrix, as_vector, length, minus
 
 THUMB = 0
 Four = tuple[float, float, float, float]
@@ -26,7 +28,9 @@ _UNKNOWN = (_NAN,) * 4
 
 
 class FingerSolution(NamedTuple):
-    """Angles of one finger [rad] (thumb: CMC abduction, CMC flexion, MCP, IP) and how well they fit.
+    """Angles of one finger [rad] and how well they fit.
+
+    The thumb's are CMC abduction, CMC flexion, MCP and IP.
 
     Attributes:
         residual_m: Distance of the point to the target.
@@ -102,7 +106,7 @@ class FingerSolver:
 
     @property
     def limits(self) -> tuple[Pair, ...]:
-        """Low and high of the four angles [rad]; the abduction's where flexion does not narrow it."""
+        """Low and high of the four angles [rad]; as of `Chain.spans`."""
         return self.chain.spans
 
     def solve(self, target: Vector, near: Four | None = None) -> FingerSolution:
@@ -116,8 +120,8 @@ class FingerSolver:
         Returns:
             Angles inside the limits; NaN where the target is not finite.
         """
-        goal = _from_root(target, self.root)
-        if not isfinite(goal[0] + goal[1] + goal[2]):
+        goal = minus(target, self.root)
+        if not isfinite(length(goal)):
             return NOT_SEEN
         before, angles = np.array(_UNKNOWN if near is None else near), np.empty(4)
         left = self.seed(goal, before, angles)
@@ -125,7 +129,12 @@ class FingerSolver:
         return FingerSolution(a, f, pip, dip, left, left < REACHED_M)
 
     def seed(self, goal: Vector, near: Float, angles: Float) -> float:
-        """As `solve`, on arrays: `goal` from the root [m], finite; near (4,) [rad] or NaN; angles (4,): out [rad].
+        """As `solve`, on arrays.
+
+        Args:
+            goal: Target from the root [m], finite.
+            near: (4,) [rad]; NaN: not known.
+            angles: (4,) [rad], out.
 
         Returns:
             Distance of the point to the target [m].
@@ -142,7 +151,7 @@ class FingerSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finger:
-    """FABRIK for one finger of one hand, prepared; build once with `of`. Holds no state between calls.
+    """FABRIK for one finger of one hand, prepared. Holds no state between calls.
 
     Attributes:
         closed_form: The same finger.
@@ -187,8 +196,8 @@ class Finger:
         """
         solver = self.closed_form
         x, y, z = target_m.tolist()
-        goal = _from_root((x, y, z), solver.root)
-        if not isfinite(goal[0] + goal[1] + goal[2]):
+        goal = minus((x, y, z), solver.root)
+        if not isfinite(length(goal)):
             return _NOT_SEEN
         arrays, tolerance_m, most = solver.chain.arrays, self.tolerance_m, self.max_iterations
         near, before = angles_rad.copy(), 0
@@ -202,7 +211,7 @@ class Finger:
 
 
 def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: bool = True) -> Chain:
-    """The chain of one finger in the palm frame's axes, from MCP (thumb: CMC) to a point fixed to the tip joint.
+    """The chain from a finger's MCP (thumb: CMC) to a point fixed to its tip joint.
 
     Args:
         model: The hand.
@@ -236,10 +245,6 @@ def finger_chain(model: HandModel, finger: int, offset_m: Float, *, coupled: boo
 def finger_root(model: HandModel, finger: int) -> Vector:
     """The MCP (thumb: CMC) in the palm frame [m]."""
     return as_vector(model.rest_position_m[CHAINS[finger, 0]])
-
-
-def _from_root(target: Vector, root: Vector) -> Vector:
-    return target[0] - root[0], target[1] - root[1], target[2] - root[2]
 
 
 def _branches(chain: Chain, ratio: float) -> Float:

@@ -1,4 +1,4 @@
-"""The legal pose of a finger whose end is nearest to a target, from a start nearby.
+"""The legal pose of a finger whose end is nearest to a target.
 
 Damped least squares (Wampler 1986; Levenberg-Marquardt) on the four angles, with an active set: an angle at its limit
 that the gradient would push outside is left out of the step. Three equations, so the step is
@@ -13,7 +13,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.kernels import inner
-from master.fabrik.chain import (
+from master.fabrik.chain_arrays import (
     ROOT,
     START,
     TURN,
@@ -24,7 +24,7 @@ from master.fabrik.chain import (
     put_vector,
     vector_at,
 )
-from master.fabrik.joints import narrowing
+from master.fabrik.limits import narrowing
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 
 _FIRST_DAMPING_M2 = 1e-7
@@ -76,7 +76,7 @@ def least_squares(chain: ChainArrays, goal: Vector, enough_m: float, max_steps: 
 
 @inner
 def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, columns: Float) -> Vector:
-    """Write the angles of the unknowns, which are clamped, and the Jacobian's columns (4, 3) [m/rad]; what is left."""
+    """Clamp the unknowns, write angles and Jacobian's columns (4, 3); what is left."""
     limits = limits_of(chain, ROOT)
     unknowns[0] = min(max(unknowns[0], limits.low), limits.high)
     unknowns[1] = min(max(unknowns[1], limits.flexion_low), limits.flexion_high)
@@ -111,7 +111,7 @@ def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, 
 def _step(
     chain: ChainArrays, unknowns: Float, left: Vector, columns: Float, damping: float, new: Float
 ) -> bool:
-    """Write the next unknowns (4,), not yet clamped; False where every legal direction is uphill."""
+    """Write the next unknowns (4,), not yet clamped; False: all are uphill."""
     xx = yy = zz = damping
     xy = xz = yz = 0.0
     some = False

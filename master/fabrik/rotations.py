@@ -1,4 +1,4 @@
-"""Kernels on single vectors (x, y, z) and rotations (three rows), as tuples of floats.
+"""Kernels on single vectors (x, y, z) and rotations (three rows), as tuples.
 
 Tuples stay in registers where the code is compiled, and on one vector an array operation would cost ten times the
 arithmetic where it is not.
@@ -94,7 +94,7 @@ def rotation_about(axis: Vector, angle: float) -> Matrix:
 
 @kernel
 def between(a: Vector, b: Vector) -> Matrix:
-    """Shortest rotation from direction a to direction b; identity where either has none."""
+    """Shortest rotation from direction a to b; identity where either has none."""
     scale = length(a) * length(b)
     if not scale > _TINY:
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -113,7 +113,7 @@ def between(a: Vector, b: Vector) -> Matrix:
 
 @inner
 def _half_turn_across(a: Vector) -> Matrix:
-    """Half a turn about an axis perpendicular to a, and to the coordinate axis in which a is least."""
+    """Half a turn about an axis across a, and across the coordinate least in a."""
     across = (1.0, 0.0, 0.0)
     if abs(a[1]) < abs(a[0]) and abs(a[1]) <= abs(a[2]):
         across = (0.0, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Poses of every solver for the same targets, printed as JSON: to compare compiled kernels with plain Python."""
+"""Print poses of every solver as JSON, to compare kernels with plain Python."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""FABRIK: ten thousand reachable targets, limits, flags; and that it solves what it can without a seed."""
+"""FABRIK: reachable targets, limits, flags, restarts without a seed."""
 
 import math
 from functools import cache
@@ -58,7 +58,7 @@ def _seeded(fabrik: Fabrik, closed_form: FingerSolver, target: Vector) -> ChainR
 
 
 def _random_target(solver: FingerSolver, rng: np.random.Generator) -> Vector:
-    """Where the point is at random legal angles; every tenth lies in a corner of the limits."""
+    """Where the point is at random legal angles, every tenth in a corner."""
     shares = rng.random(4)
     if rng.random() < 0.1:
         shares = np.round(shares)

@@ -1,4 +1,4 @@
-"""Closed-form finger: angles out equal angles in, for real and generated hands; limits and unreachable targets."""
+"""A finger: angles out equal angles in; limits; targets out of reach; in place."""
 
 import math
 from functools import cache
@@ -38,7 +38,7 @@ def _solver(side: str, preset: Preset, finger: int) -> FingerSolver:
 
 @cache
 def _narrowed(share: float, soft: bool) -> HandModel:
-    """A left hand whose fingers, and thumb, keep a share of their abduction; its DIPs fixed or free to stray."""
+    """A left hand whose fingers keep a share of their abduction; DIPs fixed or loose."""
     limits = preset_limits("D")
     fingers = {
         name: msgspec.structs.replace(getattr(limits, name), spread_at_full_flexion=share) for name in FINGERS
@@ -57,7 +57,7 @@ def _prepared(model: HandModel, finger: int) -> FingerSolver:
 
 
 def _legal(model: HandModel, solver: FingerSolver, finger: int, shares: Float) -> Float:
-    """Angles (N, 4) inside the limits that obey the coupling, from shares (N, 4) of the ranges."""
+    """Legal, coupled angles (N, 4) from shares (N, 4) of the ranges."""
     low, high = model.limits_rad[finger, :, 0], model.limits_rad[finger, :, 1]
     angles = low + shares * (high - low)
     spread = model.abduction_limits_rad(np.repeat(angles[:, 1:2], 5, axis=1))
@@ -365,7 +365,8 @@ def test_fabrik_in_place_hits_ten_thousand_reachable_targets(side: str, preset: 
 def test_a_free_thumb_stays_near_the_angles_it_had() -> None:
     model, rng, fabrik = _model("right", "D"), np.random.default_rng(13), _fabrik("right", "D", 0)
     truth = _legal(model, fabrik.closed_form, 0, rng.uniform(0.2, 0.8, (200, 4)))
-    truth[:, 3] = rng.uniform(*model.limits_rad[0, 3], 200)  # in no ratio to the MCP
+    low, high = model.limits_rad[0, 3].tolist()
+    truth[:, 3] = rng.uniform(low, high, 200)  # in no ratio to the MCP
     steps: list[float] = []
     for angles in truth:
         point = np.array(fabrik.closed_form.forward(_four(angles)))
@@ -389,7 +390,7 @@ def test_fabrik_in_place_is_no_worse_than_its_seed_out_of_reach(finger: int) -> 
         assert math.dist(fabrik.closed_form.forward(_four(angles)), target) == pytest.approx(
             result.residual_m
         )
-        assert _inside(_model("right", "K"), finger, FingerSolution(*angles.tolist(), 0.0, False))
+        assert _inside(_model("right", "K"), finger, FingerSolution(*_four(angles), 0.0, False))
     assert unreached > 20
 
 
@@ -402,7 +403,26 @@ def test_fabrik_in_place_leaves_the_angles_of_a_finger_that_is_not_seen() -> Non
         assert angles.tolist() == [0.1, 0.2, 0.3, 0.2]
 
 
+def test_angles_that_are_known_in_part_are_not_known() -> None:
+    for finger in range(5):
+        fabrik, whole = _fabrik("right", "K", finger), np.full(4, np.nan)
+        target = np.array(fabrik.closed_form.forward((0.0, 0.6, 0.5, 0.5 * fabrik.closed_form.ratio)))
+        assert fabrik.solve(target, whole).reached
+        for k in range(4):
+            angles = np.array([0.1, 0.2, 0.3, 0.2])
+            angles[k] = math.nan
+            assert fabrik.solve(target, angles).reached
+            assert angles.tolist() == whole.tolist()
+
+
+def test_a_target_beyond_all_numbers_is_not_seen() -> None:
+    solver = _solver("right", "K", 1)
+    assert solver.solve((1e200, 0.0, 0.0)) is NOT_SEEN
+    assert not solver.solve((1e150, 0.0, 0.0)).reached
+    assert _inside(_model("right", "K"), 1, solver.solve((1e150, 0.0, 0.0)))
+
+
 def test_a_finger_refuses_settings_that_find_nothing() -> None:
-    for wrong in ({"tolerance_m": 0.0}, {"max_iterations": 0}):
+    for tolerance_m, iterations in ((0.0, 10), (1e-5, 0)):
         with pytest.raises(ValueError, match="positive"):
-            Finger.of(_model("right", "K"), 1, np.zeros(3), **wrong)
+            Finger.of(_model("right", "K"), 1, np.zeros(3), tolerance_m, iterations)

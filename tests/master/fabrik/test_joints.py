@@ -1,4 +1,4 @@
-"""Joint limits: what comes out is inside, the same when asked again, and nearest for a hinge."""
+"""Joint limits: what comes out is inside, idempotent, and nearest for a hinge."""
 
 import math
 
@@ -12,7 +12,8 @@ from common.hand_model import HandModel
 from common.hand_presets import preset_limits
 from common.hand_profiles import generated_profile
 from master.fabrik.finger import finger_chain
-from master.fabrik.joints import Angles, Hinge, Joint, Rotor, swing_and_flex
+from master.fabrik.joints import Angles, Hinge, Joint, Rotor
+from master.fabrik.limits import swing_and_flex
 from master.fabrik.rotations import (
     IDENTITY,
     Matrix,
@@ -56,7 +57,7 @@ def _zero(joint: Joint) -> tuple[float, ...]:
 def clamp_direction(
     joint: Joint, frame: Matrix, bone: Vector, direction: Vector, now: Angles
 ) -> tuple[Vector, Angles]:
-    """The reachable bone direction nearest to a wanted one in the world, and its angles; frame: joint -> world."""
+    """Legal bone direction nearest to a wanted one (world), and its angles."""
     angles = joint.fit(bone, rotate_back(frame, direction), now)
     return rotate(frame, rotate(joint.rotation(angles), bone)), angles
 

@@ -1,4 +1,4 @@
-"""One source: what is compiled and the same functions as plain Python find the same poses."""
+"""Compiled kernels and the same functions as plain Python find the same poses."""
 
 import json
 import os
