@@ -136,5 +136,6 @@ $(STAMP): pyproject.toml constraints.txt
 	  "$$found" -m venv .venv; pip="$(BIN)/python -m pip install --quiet --disable-pip-version-check"; \
 	fi; \
 	$$pip -c constraints.txt hatchling; \
-	$$pip -c constraints.txt --no-build-isolation -e '.[master,dev]'
+	$$pip -c constraints.txt --no-build-isolation -e '.[master,dev]'; \
+	$(BIN)/python -m master.fabrik
 	@touch $@

@@ -11,6 +11,7 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
+from master.fabrik.compile import told_if_slow
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
@@ -103,7 +104,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         )
         tables = disparity_tables(cameras, law, residual.law, float(row_px), float(limits(2)[2]))
         triangulate = DepthTriangulator(tables, caps)
-    return FabrikSolver(
+    line = FabrikSolver(
         setup.models,
         setup.hand,
         rig.markers,
@@ -114,6 +115,9 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         palm=PalmFitter(setup.hand, setup.hand_markers),
         stage=stage,
     )
+    with told_if_slow():
+        line.rehearse()
+    return line
 
 
 def build_pipeline(

@@ -34,7 +34,7 @@ Restart=on-failure
 RestartSec=100ms
 # The loop itself feeds the watchdog.
 WatchdogSec=10
-TimeoutStartSec=60
+TimeoutStartSec=180
 TimeoutStopSec=10
 TimeoutAbortSec=2
 

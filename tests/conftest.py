@@ -1,5 +1,6 @@
 """What all tests share: where the data are, and random tests that are the same on every run."""
 
+import hashlib
 import os
 from pathlib import Path
 
@@ -32,6 +33,25 @@ LIVE = (
     "tests/master/web/test_page.py",
     "tests/master/export/test_export_gltf.py",
 )
+
+_KERNELS = ("common/kernels.py", "master/fabrik/*.py")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Drop machine code of kernels where any of their files has changed: numba asks only for the one it is in."""
+    if hasattr(config, "workerinput"):
+        return
+    files = sorted(path for pattern in _KERNELS for path in ROOT.glob(pattern))
+    now = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+    known = ROOT / ".pytest_cache" / "kernels"
+    if known.is_file() and known.read_text() == now:
+        return
+    if known.is_file():
+        for code in (ROOT / "master" / "fabrik" / "__pycache__").glob("*.nb[ci]"):
+            code.unlink(missing_ok=True)
+    known.parent.mkdir(exist_ok=True)
+    known.write_text(now)
+
 
 BEHIND = 10  # niceness of the workers whose tests are not live
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
+from common.geometry import rigid
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.fabrik.estimate import HandEstimate, SolvedHand
@@ -32,6 +33,7 @@ _DRIFT_M_S = 0.3  # of a hand that is held
 _PALM_JOINTS = np.array([PALM, WRIST, *METACARPALS])
 _PALM_MARKERS = 3
 _NATURAL = 1.0  # the line knows no hand without habits
+_AWAY = rigid(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.6]))  # a hand before a camera at the origin
 _NO_WALK = np.zeros((5, 3, 3))
 _ANYWHERE = HiddenFingers(np.zeros((5, 4)), np.full(5, np.inf), np.zeros(5), np.ones(5))
 
@@ -73,6 +75,7 @@ class FabrikSolver:
         self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
         mounts = [model.mount(name) for name in hand_markers]
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
+        self._count = len(markers)
         self._back = self.on_hand[self._on_palm]
         self._fingers = {
             m: (mount.finger, Finger.of(model, mount.finger, mount.offset_m, _ON_TARGET_M))
@@ -132,6 +135,22 @@ class FabrikSolver:
         facing = self.towards(points, area_px2) if self._shows_back(points) else None
         palm = self._palm(points, cov, facing, hidden=_ANYWHERE)
         return None if palm is None else self._hand_of(palm)
+
+    def rehearse(self) -> None:
+        """Call every kernel once, so that none is compiled while a hand is tracked."""
+        bent = np.full((5, 4), 0.2)
+        _, places = self._palm.pose(_AWAY, self._model.clamp(bent))
+        points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
+        points[self.on_hand], cov[self.on_hand] = places @ _AWAY[:3, :3].T + _AWAY[:3, 3], 1e-6 * np.eye(3)
+        seen = np.ones((len(self._centres), self._count))
+        first = self.peek(points, cov, seen)
+        self._triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
+        if first is not None:
+            for m, (f, finger) in self._fingers.items():
+                for aside_m in (0.0, 0.1):  # with and without a search
+                    finger.solve(places[m] + aside_m, first.angles_rad[f])
+            out = np.empty_like(places)
+            targets_of(points[self.on_hand], cov[self.on_hand], _AWAY, places, _FIT_M2, out)
 
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """The last hand, if it still says anything, and how long ago it held [s]."""

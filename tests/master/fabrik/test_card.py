@@ -72,9 +72,7 @@ def test_every_pose_of_the_shipped_rig_goes_through_law_filter_and_fabrik(
             fingers = int(np.isfinite(solved.pose.markers_m[:5, 0]).sum())
             seen.append(fingers)
             made = calls - before
-            assert made["depth"] == (
-                2 if len(poses) == 1 else 1
-            )  # of the first it looks twice: which side of the caps?
+            assert made["depth"] == (2 if len(poses) == 1 else 1)  # the first looks twice
             assert made["one_euro"] >= 1
             assert made["fabrik"] == fingers
     assert len(poses) == FRAMES

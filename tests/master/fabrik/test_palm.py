@@ -99,19 +99,16 @@ def test_too_few_markers_and_none_are_no_palm_and_a_known_one_goes_on_by_one() -
     assert fitter(points, vague, FACING, known, 0.02) is None
 
 
-def test_a_leap_is_followed_where_the_last_palm_explains_nothing() -> None:
-    fitter, rng = PalmFitter(RIGHT, MARKERS), np.random.default_rng(4)
-    angles = natural_angles(rng)
+def test_a_leap_that_the_last_palm_does_not_explain_is_followed_from_afresh() -> None:
+    fitter, angles = PalmFitter(RIGHT, MARKERS), natural_angles(np.random.default_rng(4))
     last = fitter(RIGHT.marker_points(RIGHT.forward(palm(), angles), MARKERS), small_cov(), FACING)
-    there = palm(np.array([10.0, 25.0, -20.0]), np.array([0.1, 0.0, 0.65]))
+    there = palm(np.array([5.0, 5.0, 120.0]), np.array([0.1, 0.0, 0.65]))
     points = RIGHT.marker_points(RIGHT.forward(there, angles), MARKERS)
-    found = fitter(points, small_cov(), FACING, last, 1 / 60)
+    found, afresh = fitter(points, small_cov(), FACING, last, 1 / 60), fitter(points, small_cov(), FACING)
     assert found is not None
-    afresh = fitter(points, small_cov(), FACING)
     assert afresh is not None
-    assert np.linalg.norm(found.T[:3, 3] - afresh.T[:3, 3]) < 0.003
-    assert np.linalg.norm(found.T[:3, 3] - there[:3, 3]) < 0.03
     assert found.surprise.max() < 16.3
+    assert np.linalg.norm(found.T[:3, 3] - there[:3, 3]) < 0.02
 
 
 def test_the_covariance_of_joints_and_directions_is_that_of_numpy() -> None:

@@ -12,7 +12,7 @@ from master.fabrik.solver import FORGET_S, FabrikSolver
 from master.rig import build_pipeline
 from master.rig_pipeline import line_of
 from master.stages import StageTimes
-from tests.hand_helpers import RIGHT
+from tests.hand_helpers import RIGHT, detections
 from tests.synthetic_run import PERIOD_NS, SyntheticRun, synthetic_run
 
 PINHOLE = AffineDisparityCalibration(a_m_px=37.5, x0_px=0.0)
@@ -20,6 +20,7 @@ MODELS: list[dict[str, object]] = [
     {"depth_model": "affine_disparity", "affine_disparity": PINHOLE},
     {"depth_model": "stereo"},
 ]
+FAR_M = np.array([0.1, 0.0, 0.15])
 
 
 @pytest.fixture(scope="module", params=MODELS, ids=["law", "stereo"])
@@ -71,10 +72,7 @@ def test_the_covariance_holds_the_joints(run: SyntheticRun) -> None:
 def without(message: MarkerDetections, *markers: int) -> MarkerDetections:
     uv = message.uv.copy()
     uv[list(markers)] = np.nan
-    return MarkerDetections(
-        message.camera, message.session, message.seq, message.t_ns, message.ready_t_ns, uv, message.area,
-        message.quality, message.sigma_px, message.rival_uv,
-    )  # fmt: skip
+    return detections(message.camera, message.seq, message.t_ns, uv)
 
 
 def test_a_hidden_finger_is_held_and_said_to_be(run: SyntheticRun) -> None:
@@ -113,13 +111,12 @@ def test_one_camera_lost_the_line_says_so_holds_and_comes_back(run: SyntheticRun
 
 
 def test_a_target_out_of_reach_is_flagged_and_not_tracked(run: SyntheticRun) -> None:
-    """The index's marker 25 cm beside the hand, in both cameras alike."""
+    """The index's marker 18 cm beside the hand, in both cameras alike."""
     far = list[MarkerDetections]()
     for m in run.messages:
-        point = RIGHT.marker_points(run.truth(m.t_ns), ("index",)) + [0.2, 0.0, 0.15]
-        moved = without(m)
-        moved.uv[1] = run.setup.models[m.camera].project(point)[0]
-        far.append(moved if m.seq >= 20 else m)
+        uv, point = m.uv.copy(), RIGHT.marker_points(run.truth(m.t_ns), ("index",)) + FAR_M
+        uv[1] = run.setup.models[m.camera].project(point)[0]
+        far.append(detections(m.camera, m.seq, m.t_ns, uv) if m.seq >= 20 else m)
     hands = solve(line(run), far)[22:-2]
     assert all(hand.seen[1] for hand in hands)
     assert not any(hand.tracked[CHAINS[1]].any() for hand in hands)

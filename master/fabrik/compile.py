@@ -1,0 +1,23 @@
+"""Says that kernels are compiled, which takes about 15 s on the first start of a version."""
+
+import logging
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_SLOW_S = 1.5  # from the cache it takes half a second
+_LOG = logging.getLogger(__name__)
+
+
+@contextmanager
+def told_if_slow() -> Iterator[None]:
+    """Log that kernels are compiled, where that takes longer than loading them does."""
+    timer = threading.Timer(
+        _SLOW_S, _LOG.warning, ("compiling the solvers, once for each version: about 15 s ...",)
+    )
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
