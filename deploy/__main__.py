@@ -58,7 +58,13 @@ def _demo(options: argparse.Namespace) -> int:
 
 def _replay(options: argparse.Namespace) -> int:
     settings = ReplaySettings(
-        options.recording, options.out, options.calibration, options.hand, options.level, options.only
+        options.recording,
+        options.out,
+        options.calibration,
+        options.hand,
+        level=options.level,
+        solver=options.solver,
+        only=options.only,
     )
     _finish(run_replay(settings, _say), None)
     print(f"\nposes   {settings.out / 'poses.npz'}\nsummary {settings.out / 'summary.json'}")

@@ -135,6 +135,12 @@ def _add_replay(add_parser: AddParser) -> None:
         help="fingers before a wrist device from the laser alone (fk), from laser and fingertip (ik), or from what "
         "there is (auto); default: what its rig says",
     )
+    replay.add_argument(
+        "--solver",
+        choices=("estimator", "fabrik"),
+        help="of markers the hand of disparity, depth law, 1 € filter and FABRIK (fabrik), or the one that is fitted "
+        "to all pixels from there (estimator); default: what its rig says",
+    )
 
 
 def _positive(text: str) -> float:

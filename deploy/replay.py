@@ -27,6 +27,7 @@ class ReplaySettings:
         calibration: calib_json tree for marker colours and hands, or None.
         hand: Hand profile, or None for the rig's.
         level: What the fingers before a wrist device are solved from: fk, ik, auto; None: as its rig says.
+        solver: Whose hand a rig of markers publishes: estimator, fabrik; None: as it says.
         only: "markers" or "wrist": the rigs of that kind alone; None: all.
     """
 
@@ -35,6 +36,7 @@ class ReplaySettings:
     calibration: Path | None
     hand: Path | None
     level: str | None = None
+    solver: str | None = None
     only: str | None = None
 
 
@@ -47,6 +49,8 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     rigs = _rigs(settings.recording, settings.only)
     if settings.level is not None and all(rig.kind != "wrist" for rig in rigs):
         raise ReplayError(f"--level: {settings.recording} is of no wrist device, which alone has levels")
+    if settings.solver is not None and all(rig.kind != "markers" for rig in rigs):
+        raise ReplayError(f"--solver: {settings.recording} is of no rig of markers, which alone has solvers")
     if settings.hand is not None and not settings.hand.is_file():  # said now, not after all the detection
         raise ReplayError(f"{settings.hand}: no such hand profile")
     out = settings.out
@@ -65,6 +69,7 @@ def run_replay(settings: ReplaySettings, say: Callable[[str], None]) -> dict[str
     say("solving ...")
     which = [] if settings.only is None else ["--only", settings.only]
     which += [] if settings.level is None else ["--level", settings.level]
+    which += [] if settings.solver is None else ["--solver", settings.solver]
     results = ["--detections", str(out), "--out", str(out)]
     _step("master", "solve", recording, *calibration, *hand, *which, *results)
     return cast(dict[str, object], json.loads((out / "summary.json").read_text()))

@@ -51,6 +51,7 @@ def rigs_to_solve(
     names: Sequence[str],
     only: Literal["markers", "wrist"] | None = None,
     level: Literal["fk", "ik", "auto"] | None = None,
+    solver: Literal["estimator", "fabrik"] | None = None,
 ) -> list[RigCalibration]:
     """The rigs of a recording that are solved, those of markers first.
 
@@ -59,10 +60,11 @@ def rigs_to_solve(
         names: Rigs that are wanted; none: all.
         only: Of one kind alone.
         level: Of the wrist rigs in place of their own.
+        solver: Of the marker rigs in place of their own.
 
     Raises:
         RecordingError: It has no such rig.
-        CalibrationError: A level for rigs of which none is of a wrist device.
+        CalibrationError: A level for rigs of which none is of a wrist device, a solver for such as are of no markers.
     """
     wanted = [manifest.rig_named(name) for name in names] or list(manifest.all_rigs)
     rigs = [rig for rig in wanted if only in (None, rig.kind)]
@@ -71,6 +73,12 @@ def rigs_to_solve(
         raise RecordingError(
             f"{MANIFEST}: no rig to solve{f' of kind {only!r}' if only else ''}; it has {known}"
         )
+    if solver is not None:
+        if all(rig.kind != "markers" for rig in rigs):
+            raise CalibrationError(
+                f"--solver: rig {rigs[0].name!r} is of a wrist device; a rig of markers has solvers"
+            )
+        rigs = [msgspec.structs.replace(rig, solver=solver) if rig.kind == "markers" else rig for rig in rigs]
     if level is None:
         return rigs
     if all(rig.kind != "wrist" for rig in rigs):

@@ -12,6 +12,7 @@ from master.said import progress, say
 from master.solve import rigs_to_solve, solve_hands
 
 Level = Literal["fk", "ik", "auto"]
+Solver = Literal["estimator", "fabrik"]
 Kind = Literal["markers", "wrist"]
 
 
@@ -43,6 +44,13 @@ def solve(
             "there is (auto); default: what the rig says."
         ),
     ] = None,
+    solver: Annotated[
+        Solver | None,
+        typer.Option(
+            help="Of a rig of markers: the hand of disparity, depth law, 1 € filter and FABRIK (fabrik), or the one "
+            "that is fitted to all pixels from there (estimator); default: what the rig says."
+        ),
+    ] = None,
 ) -> None:
     """Solve recorded detections offline and deterministically: no clock, no network.
 
@@ -58,7 +66,7 @@ def solve(
       phalanx-master solve CURL --detections DIR --out DIR --hand HAND.json --level fk
     """
     opened = open_recording(recording)
-    rigs = rigs_to_solve(opened.manifest, rig_names or [], only, level)
+    rigs = rigs_to_solve(opened.manifest, rig_names or [], only, level, solver)
     setups = setups_with_hands(rigs, opened.manifest.cameras, calibration, hand, opened.manifest.objects)
     out.mkdir(parents=True, exist_ok=True)
     solve_hands(opened, setups, detections, out, lambda done, total: progress("solving", done, total))

@@ -136,6 +136,10 @@ def test_what_is_not_there_is_refused_by_name(recorded: Recorded) -> None:
     with pytest.raises(CalibrationError, match="--level: rig 'desk' is of markers"):
         rigs_to_solve(manifest, [], "markers", "fk")
     assert [rig.level for rig in rigs_to_solve(manifest, [], None, "fk")] == ["auto", "fk"]
+    with pytest.raises(CalibrationError, match=r"--solver: .* of a wrist device"):
+        rigs_to_solve(manifest, [], "wrist", None, "fabrik")
+    solvers = [rig.solver for rig in rigs_to_solve(manifest, [], None, None, "fabrik")]
+    assert solvers == ["fabrik", "estimator"]
 
 
 def test_a_second_hand_has_files_of_its_own_and_no_score_of_the_first(
