@@ -58,11 +58,7 @@ class PalmFitter:
         self.attached = Attached.markers(model, self.parameters, markers)
         self.mounts = Mounts.of(self.attached)
         self._on_finger = self.attached.on_finger[:, 0]
-        habits = AnglePrior.of(model, self.parameters, self.priors)
-        self._normal, self._pull = (
-            np.ascontiguousarray(habits.normal[0]),
-            np.ascontiguousarray(habits.pull[0]),
-        )
+        self._habits: dict[frozenset[int], tuple[Float, Float]] = {}
         bent = np.zeros((len(_BENDS_RAD), 5, 4))
         bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (0.6, 1.0))[:, None]
         self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
@@ -148,19 +144,32 @@ class PalmFitter:
         return self._prior(x, weight, last.T, self.priors.palm_weight(age_s), facing)
 
     def _unexpected(self, seen: Bool, facing: Float | None, hidden: HiddenFingers | None) -> PalmPrior:
-        """The prior where no last palm is known."""
-        fingers = frozenset(self.attached.finger[seen & self._on_finger].tolist())
+        """The prior where no last palm is known: a hidden finger is curled, but not one between two that show."""
+        shown = frozenset(self.attached.finger[seen & self._on_finger].tolist())
+        like = frozenset(f for f in (2, 3) if hidden is None and {f - 1, f + 1} <= shown) - shown
         known = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
-        weight, mean = hidden_belief(self.parameters, self.priors, fingers, known)
-        return self._prior(mean, weight, np.eye(4), np.zeros(6), facing)
+        weight, mean = hidden_belief(self.parameters, self.priors, shown | like, known)
+        unlike = frozenset(range(5)) - shown - like if hidden is None else frozenset[int]()
+        return self._prior(mean, weight, np.eye(4), np.zeros(6), facing, unlike)
 
     def _prior(
-        self, x: Float, weight: Float, T: Float, palm_weight: Float, facing: Float | None
+        self,
+        x: Float,
+        weight: Float,
+        T: Float,
+        palm_weight: Float,
+        facing: Float | None,
+        unlike: frozenset[int] = frozenset(),
     ) -> PalmPrior:
+        if unlike not in self._habits:  # each of the 32 sets is worked out once
+            habits = AnglePrior.of(self.model, self.parameters, self.priors, unlike)
+            self._habits[unlike] = (
+                np.ascontiguousarray(habits.normal[0]),
+                np.ascontiguousarray(habits.pull[0]),
+            )
         known = facing is not None
         return PalmPrior(
-            self._normal,
-            self._pull,
+            *self._habits[unlike],
             x,
             weight,
             T,
