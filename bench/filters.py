@@ -9,7 +9,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import FilterCalibration
-from master.filters import OneEuro, OneEuroParameters, PointFilter
+from master.fabrik.one_euro import OneEuro, OneEuroParameters, PointFilter
 
 _ROUNDS = 9
 _SAMPLES = 400

@@ -11,7 +11,7 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
-from master.filters import OneEuroParameters, PointFilter
+from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
 from master.ik.hand_filter import HandFilter

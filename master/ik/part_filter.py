@@ -1,6 +1,6 @@
 """Smooths signals that come in parts, such as the joints of one finger, by the noise that they themselves show.
 
-A first-order low pass, as the 1 € filter is (`master.filters`), whose gain follows motion. It differs in three things
+A first-order low pass, as the 1 € filter is (`master.fabrik.one_euro`), whose gain follows motion. It differs in three things
 that 26 signals of one hand need and the plain law does not give: told a cut-off at rest low enough for half a
 millimetre, it lags 20 mm at 1 m/s, or trembles.
 

@@ -18,7 +18,7 @@ from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
-from master.filters import PointFilter
+from master.fabrik.one_euro import PointFilter
 from master.ik.hand import HandSolution
 from master.ik.hand_filter import HandFilter
 from master.ik.orientation import OrientationTrack

@@ -21,7 +21,7 @@ from common.arrays import Bool, Float
 from common.hand_model import FINGERS
 from common.messages import Level, WristDetections
 from common.wrist_bend import STRAIGHT
-from master.filters import OneEuroParameters, PointFilter
+from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
 from master.wrist.bend_slope import BendSlope, SightWorth, near

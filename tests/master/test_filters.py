@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from common.arrays import Float
-from master.filters import OneEuro, OneEuroParameters, PointFilter
+from master.fabrik.one_euro import OneEuro, OneEuroParameters, PointFilter
 
 
 class _LowPass:

@@ -1,0 +1,1 @@
+"""The paper's line to a hand: filtered 3D markers, palm, FABRIK per finger."""
