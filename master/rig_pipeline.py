@@ -14,7 +14,7 @@ from common.messages import Detections
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
 from master.stereo.depth import depth_law
@@ -58,10 +58,10 @@ def _point_filter(setup: RigSetup) -> PointFilter:
     )
 
 
-def _hand_filter(setup: RigSetup) -> HandFilter:
+def _hand_filter(setup: RigSetup) -> HandOneEuro:
     """The filter of the solved hand, which leaves no more jitter than that of the points may."""
     lead_m_s = None if setup.wrist is None else _LEAD_M_S
-    return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
+    return HandOneEuro(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
 
 
 def build_pipeline(

@@ -20,7 +20,7 @@ from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
 from master.fabrik.one_euro import PointFilter
 from master.ik.hand import HandSolution
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.orientation import OrientationTrack
 from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
@@ -75,7 +75,7 @@ class MarkerPipeline:
         residual: CalibrationResidual = EXACT,
         smooth: PointFilter | None = None,
         tracker: HandTracker,
-        steady: HandFilter | None = None,
+        steady: HandOneEuro | None = None,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,

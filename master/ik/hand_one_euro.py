@@ -79,7 +79,7 @@ class _Shown:
         return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[PARTS]  # smooth at both ends
 
 
-class HandFilter:
+class HandOneEuro:
     """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
 
     def __init__(
