@@ -16,9 +16,7 @@ _SAMPLES = 400
 _PERIOD_NS = 16_666_667
 _SIGMA_M = np.array([2e-4, 2e-4, 1.6e-3])  # claimed at 0.6 m from the rig `desk`
 _NEW = 0.3  # of it is new in each frame, as on rendered hands at rest
-_SETTINGS = OneEuroParameters(
-    *(getattr(FilterCalibration(), n) for n in ("min_cutoff_hz", "beta", "d_cutoff_hz"))
-)
+_SETTINGS = OneEuroParameters.of(FilterCalibration())
 
 
 class _LowPass:
@@ -103,12 +101,12 @@ def _behaviour() -> list[tuple[str, float, str, str]]:
 
 
 def _plain(points: Float) -> Float:
-    machine = OneEuro.of(_SETTINGS)
+    machine = OneEuro(_SETTINGS)
     return np.array([machine.push(k * _PERIOD_NS, p) for k, p in enumerate(points)])
 
 
 def _limited(points: Float) -> Float:
-    machine = PointFilter(_SETTINGS, FilterCalibration().jitter_m, np.eye(3))
+    machine = PointFilter(_SETTINGS, np.eye(3))
     cov = np.diag(_SIGMA_M**2)[None]
     return np.array([machine.push(k * _PERIOD_NS, p[None], cov)[0] for k, p in enumerate(points)])
 
@@ -130,12 +128,12 @@ def rows() -> list[tuple[str, float, str, str]]:
             theirs.append(np.array(out).reshape(6, 3))
 
     def machine() -> None:
-        one_euro = OneEuro(1.0, 0.1, 1.0)
+        one_euro = OneEuro(OneEuroParameters(1.0, 0.1, 1.0))
         ours[:] = [one_euro.push(k * period, sample) for k, sample in enumerate(samples)]
 
     slow, fast = _median_us(reference, _SAMPLES), _median_us(machine, _SAMPLES)
     difference = float(np.abs(np.stack(ours) - np.stack(theirs)).max())
-    limited = PointFilter(_SETTINGS, FilterCalibration().jitter_m, np.eye(3))
+    limited = PointFilter(_SETTINGS, np.eye(3))
     cov = np.tile(np.diag(_SIGMA_M**2), (6, 1, 1))
     points = _median_us(lambda: _push_all(limited, samples, cov), _SAMPLES)
     return [

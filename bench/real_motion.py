@@ -31,6 +31,7 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.npz import read_npz
 from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
+from master.fabrik.one_euro import OneEuroParameters
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
@@ -190,7 +191,7 @@ def _track(
 ) -> tuple[list[HandSolution], list[HandSolution]]:
     """Solved and shown hands of caps (T, 6, 3) with 1 mm of noise."""
     tracker = HandTracker(model, MARKERS)
-    smooth = HandOneEuro(model, MARKERS, FilterCalibration().jitter_m)
+    smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
     solved: list[HandSolution] = []
     shown: list[HandSolution] = []
     for t, seen in zip(t_ns.tolist(), points, strict=True):

@@ -46,22 +46,20 @@ class Pipeline(Protocol):
 
 def _point_filter(setup: RigSetup) -> PointFilter:
     """The filter this rig's file describes, along the mean sight of its cameras and across it."""
-    settings = setup.rig.filter
     poses = np.array([model.T_rig_camera for model in setup.models.values()])
     ahead = poses[:, :3, 2].sum(axis=0)
     across = cross(poses[0, :3, 1], ahead)
     view = np.stack([across, cross(ahead, across), ahead])
     return PointFilter(
-        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
-        settings.jitter_m,
+        OneEuroParameters.of(setup.rig.filter),
         view / np.linalg.norm(view, axis=1, keepdims=True),
     )
 
 
 def _hand_filter(setup: RigSetup) -> HandOneEuro:
-    """The filter of the solved hand, which leaves no more jitter than that of the points may."""
+    """The filter of the solved hand, by the same settings."""
     lead_m_s = None if setup.wrist is None else _LEAD_M_S
-    return HandOneEuro(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
+    return HandOneEuro(setup.hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
 
 
 def build_pipeline(

@@ -5,8 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from common.arrays import Float
+from common.calibration import FilterCalibration
 from common.geometry import rigid
 from common.hand_model import CHAINS, TIPS
+from master.fabrik.one_euro import OneEuroParameters
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import LEAD_OVER_S, HandOneEuro
 from master.ik.tracker import HandTracker, TrackedHand
@@ -14,6 +16,7 @@ from tests.hand_helpers import FACING, MARKERS, RIGHT, palm, within
 
 DT_NS = 16_666_667
 SIGMA_M = 1e-3
+SETTINGS = OneEuroParameters.of(FilterCalibration())
 COV = np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1))
 
 
@@ -50,7 +53,7 @@ class Run:
         self.true_m = joints.position_m
         noise = np.random.default_rng(seed).normal(0.0, sigma_m, (len(poses), 6, 3))
         points = RIGHT.marker_points(joints, MARKERS) + noise
-        tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, 3e-4)
+        tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
         self.solved: list[TrackedHand] = []
         self.shown: list[TrackedHand] = []
         for k, seen in enumerate(points):
@@ -184,7 +187,7 @@ def test_a_whole_hand_that_moved_unseen_is_led_over() -> None:
 
 
 def test_frames_that_fail_to_come_are_as_good_as_a_hand_unseen() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, 3e-4)
+    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
     at = [(k * DT_NS, 0.0) for k in range(30)] + [
         (29 * DT_NS + 300_000_000 + k * DT_NS, 0.05) for k in range(20)
     ]
@@ -208,7 +211,7 @@ def test_a_hand_that_was_forgotten_begins_anew_where_it_is() -> None:
 
 
 def test_no_hand_and_a_time_that_stands_still_are_passed_on() -> None:
-    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, 3e-4)
+    tracker, smooth = HandTracker(RIGHT, MARKERS), HandOneEuro(RIGHT, MARKERS, SETTINGS)
     nothing = tracker.push(0, np.full((6, 3), np.nan), np.full((6, 3, 3), np.nan), FACING)
     assert smooth.push(0, nothing, np.full((6, 3, 3), np.nan)) is nothing
     points = RIGHT.marker_points(RIGHT.forward(palm(), RELAXED), MARKERS)
