@@ -246,7 +246,9 @@ class RigTuning:
 
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
-        if not self._watched.changed(self._files.paths(self._setups)):
+        with self._turn:
+            changed = self._watched.changed(self._files.paths(self._setups))
+        if not changed:
             return
         try:
             self.reload()
@@ -267,10 +269,13 @@ class RigTuning:
     def try_filter(self, body: str) -> None:
         """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).
 
+        What has changed in the files until now is used first: the next look does not take the trial back for that.
+
         Raises:
             CalibrationError: The body is none, or of a rig that does not run. Nothing has changed.
         """
         trial = parse(body.encode(), FilterTrial, "filter")
+        self.look()
         with self._turn:
             self._use(lambda: _with_filter(self._setups, trial))
 
