@@ -59,9 +59,9 @@ class FilterCalibration(Part, frozen=True):
     `jitter_m`: what may be left of the noise of each signal at rest; noisier ones are filtered more.
     """
 
-    min_cutoff_hz: Frequency = 6.0
-    beta: NonNegative = 2000.0
-    d_cutoff_hz: Frequency = 4.0
+    min_cutoff_hz: Frequency = 10.0
+    beta: NonNegative = 3000.0
+    d_cutoff_hz: Frequency = 2.5
     jitter_m: Length = 3e-4
 
 

@@ -26,7 +26,7 @@ _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ..
         True,
         "lower: calmer at rest, later to start",
     ),
-    ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 4000.0, 0, False, "higher: less lag in quick motion"),
+    ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 6000.0, 0, False, "higher: less lag in quick motion"),
     (
         "d_cutoff_hz",
         "Cut-off of the speed",

@@ -21,14 +21,16 @@ moves is not seen, and errors that cancel, as those of place and rotation of one
 taken with no more than the larger of
 
     at rest     a = 2 q / (1 + q),  q = (jitter / s)^2           which leaves `jitter` of the noise: s^2 a / (2 - a)
-    in motion   a = c / (1 + c),    c^3 = u^2 (2 + c)^2,  u^2 = max((v dt / s)^2, ((x - x^) / s)^2 - 9)
+    in motion   a = 2 / (1 + sqrt(1 + 4 / u^2)),  u^2 = max((v dt / s)^2, ((x - x^) / s)^2 - 9)
 
-the second of which makes the sum of squared lag (v dt / c)^2 and noise left s^2 a / (2 - a) smallest. Here v, also in
-the cut-off, is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s leaves
-s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by much,
-the innovation x - x^ those that begin or turn round. Of a group, what moves most counts. Where the noise is small this
-is the paper's filter; a sample far less sure than its neighbours is ridden over. Give variances with room: noise passes
-three standard deviations once in 370 samples, and what that lets in takes long to fade where s is many times `jitter`.
+the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960). Here v,
+also in the cut-off, is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s
+leaves s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by
+much, the innovation x - x^ those that begin or turn round. Of a group, what moves most counts.
+
+Where the noise is small this is the paper's filter; a sample far less sure than its neighbours is ridden over. Give
+variances with room: noise passes three standard deviations once in 370 samples, and what that lets in takes long to
+fade where s is many times `jitter`.
 
 `PointFilter` filters 3D points along the axes of the view, for a point from two cameras is several times less sure
 along the sight than across it: one cut-off for both either trembles in depth or lags sideways.
@@ -47,7 +49,7 @@ from common.kernels import kernel
 # Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
 # rest is light and shape, which stay.
 FRESH = 0.25
-_QUANTILE = 9.0  # chi-square, one degree of freedom: what passes three standard deviations is motion
+_QUANTILE = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
 _NEVER = -(2**63)
 
 
@@ -257,15 +259,5 @@ def _step(
 
 @kernel
 def _gain_in_motion(u2: float) -> float:
-    """The gain c / (1 + c) with c^3 = u^2 (2 + c)^2, of u squared."""
-    if u2 <= 0.0:
-        return 0.0
-    c = u2 + 2.0 * (4.0 * u2) ** (
-        1.0 / 3.0
-    )  # above the root, where the cubic is convex: Newton comes down to it
-    for _ in range(5):
-        step = (c * c * c - u2 * (2.0 + c) ** 2) / (3.0 * c * c - 2.0 * u2 * (2.0 + c))
-        c -= step
-        if step < 1e-6 * c:
-            break
-    return c / (1.0 + c)
+    """Gain of the steady Kalman filter of a random walk, of u squared: its step's variance by that of the noise."""
+    return 2.0 / (1.0 + (1.0 + 4.0 / u2) ** 0.5) if u2 > 0.0 else 0.0
