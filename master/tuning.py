@@ -31,7 +31,7 @@ from master.rig_objects import gestures_file
 from master.stereo.pipeline import SolvedPose, Stage
 from master.world import World
 
-_WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (10 Hz at rest) has settled after 0.1 s
+_WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
 
