@@ -20,7 +20,7 @@ SECTIONS = {
     "tags": "Fiducial tags on generated frames with exact corners; baseline: cv2.aruco and its ways to refine",
     "steadiness": "Ten thousand frames through one detector: worst sort of frame, memory",
     "light": "Light that changes, standard scene, both cameras; baseline: the same detector with fixed colours",
-    "filters": "1 euro filter, 18 signals; baseline: one object per signal",
+    "filters": "1 euro filter: points, the hand at three settings, speed; baseline: one object per signal",
     "uncertainty": "95 % regions of markers: how often they hold the truth; rendered hands, a profile off by a tenth",
     "ik": "Inverse kinematics of fingers, palm known; baseline: the papers' FABRIK with limits, scipy, mink",
     "hand_poses": "Hands of independent joints, palm turned by up to 45 degrees; baseline: the papers' fixed palm",

@@ -29,9 +29,10 @@ from common.gesture_settings import default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
 from common.sim.poses import StudyPoses
+from master.fabrik.one_euro import OneEuroParameters
 from master.gestures.features import features_of
 from master.gestures.poses import PoseRecogniser
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 from master.outputs.files import load_poses
 from master.study.one import TRIALS, Task, run_participant
@@ -67,7 +68,7 @@ def people(numbers: Sequence[int] | range, seconds: float = 15.0) -> Told:
         motion = StudyPoses(true, np.array([0.0, 0.0, 0.5]), _SEED + number)
         tracker, smooth = (
             HandTracker(known, MARKERS),
-            HandFilter(known, MARKERS, FilterCalibration().jitter_m),
+            HandOneEuro(known, MARKERS, OneEuroParameters.of(FilterCalibration())),
         )
         rng = np.random.default_rng([_SEED, number])
         poses: list[HandPose] = []

@@ -17,7 +17,8 @@ from common.hand_model import CHAINS, HandModel
 from common.messages import HandPose
 from common.npz import read_npz
 from common.sim.motion import POSES
-from master.ik.hand_filter import HandFilter
+from master.fabrik.one_euro import OneEuroParameters
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 
 _ROOT = Path(__file__).parent.parent
@@ -131,7 +132,8 @@ def _shown(recorded: Recorded, model: HandModel, seed: int) -> list[HandPose]:
 
 def _solved(model: HandModel, t_ns: list[int], points: Float, towards: Float, seed: int) -> list[HandPose]:
     """Poses of caps (T, 6, 3) [m] with noise added."""
-    tracker, smooth = HandTracker(model, MARKERS), HandFilter(model, MARKERS, FilterCalibration().jitter_m)
+    tracker = HandTracker(model, MARKERS)
+    smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
     noisy = points + np.random.default_rng([seed, 17]).normal(0.0, SIGMA_M, points.shape)
     out: list[HandPose] = []
     for t, seen in zip(t_ns, noisy, strict=True):

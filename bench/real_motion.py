@@ -31,8 +31,9 @@ from common.hand_model import CHAINS, FINGERS, HandModel
 from common.hand_profiles import generated_profile
 from common.npz import read_npz
 from common.sim.leap import KEYS, RIG_FROM_LEAP, palm_rotation
+from master.fabrik.one_euro import OneEuroParameters
 from master.ik.hand import HandSolution
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 
 MARKERS = ("thumb", "index", "middle", "ring", "little", "back")
@@ -43,8 +44,8 @@ _SHORTEST_S = 0.5
 _HIDDEN = np.cos(np.radians(75.0))
 _FIXED = 40  # frames per recording in which the profile is judged without noise
 _PERIOD_NS = 16_666_667
-_FACING = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])  # fingers up, back to the cameras
-_TOWARDS = np.array([0.0, 0.0, -1.0])
+FACING = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])  # fingers up, back to the cameras
+TOWARDS = np.array([0.0, 0.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -190,7 +191,7 @@ def _track(
 ) -> tuple[list[HandSolution], list[HandSolution]]:
     """Solved and shown hands of caps (T, 6, 3) with 1 mm of noise."""
     tracker = HandTracker(model, MARKERS)
-    smooth = HandFilter(model, MARKERS, FilterCalibration().jitter_m)
+    smooth = HandOneEuro(model, MARKERS, OneEuroParameters.of(FilterCalibration()))
     solved: list[HandSolution] = []
     shown: list[HandSolution] = []
     for t, seen in zip(t_ns.tolist(), points, strict=True):
@@ -272,7 +273,7 @@ def jitter(hands: list[HandSolution]) -> tuple[float, float, float]:
 
 def _held_rows(seeds: int = 5, frames: int = 300, settled: int = 60) -> Iterator[Row]:
     model = HandModel.of(generated_profile("held", "right"))
-    T = rigid(_FACING, np.array([0.03, 0.08, 0.5]))
+    T = rigid(FACING, np.array([0.03, 0.08, 0.5]))
     t_ns = _PERIOD_NS * np.arange(frames)
     for name, angles in held_poses(model).items():
         caps = model.marker_points(model.forward(T, angles), MARKERS)
@@ -280,7 +281,7 @@ def _held_rows(seeds: int = 5, frames: int = 300, settled: int = 60) -> Iterator
         after: list[tuple[float, float, float]] = []
         for seed in range(seeds):
             noise = np.random.default_rng(seed).normal(0.0, SIGMA_M, (frames, 6, 3))
-            solved, shown = _track(model, t_ns, caps + noise, _TOWARDS)
+            solved, shown = _track(model, t_ns, caps + noise, TOWARDS)
             before.append(jitter(solved[settled:]))
             after.append(jitter(shown[settled:]))
         raw, left, worst = np.mean(before, axis=0), np.mean(after, axis=0), np.max(after, axis=0)
@@ -321,14 +322,14 @@ def _pose_rows(path: Path, seeds: int = 10) -> Iterator[Row]:
 
 def _pose_error(model: HandModel, joints: Float, rng: np.random.Generator | None) -> Float:
     """PIP errors (4,) [deg] of a pose (25, 4, 4) in the frame of its wrist."""
-    T = rigid(_FACING, np.array([0.0, 0.08, 0.5]))
+    T = rigid(FACING, np.array([0.0, 0.08, 0.5]))
     places = (joints[:, :3, 3] @ np.diag([-1.0, 1.0, -1.0])) @ T[:3, :3].T + T[:3, 3]
     truth = places[CHAINS - 1].reshape(1, 20, 3)
     caps = np.vstack([truth[0, 3::4], T[:3, :3] @ model.mount("back").offset_m + T[:3, 3]])
     if rng is not None:
         caps = caps + rng.normal(0.0, SIGMA_M, caps.shape)
     hand = HandTracker(model, MARKERS, continuous=False).push(
-        0, caps, np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1)), _TOWARDS
+        0, caps, np.tile(SIGMA_M**2 * np.eye(3), (6, 1, 1)), TOWARDS
     )
     assert hand.solution is not None
     found = hand.solution.joints.position_m[CHAINS].reshape(1, 20, 3)

@@ -54,14 +54,14 @@ class AffineDisparityCalibration(Part, frozen=True):
 
 
 class FilterCalibration(Part, frozen=True):
-    """The 1 € filter of the 3D markers: cut-off at rest, its rise per speed [Hz per m/s], cut-off of the speed.
+    """The 1 € filter of the hand and its markers: cut-off at rest, its rise per speed [Hz per m/s], that of the speed.
 
-    `jitter_m`: what may be left of the noise of a marker at rest, per axis; noisier axes are filtered more.
+    `jitter_m`: what may be left of the noise of each signal at rest; noisier ones are filtered more.
     """
 
-    min_cutoff_hz: Frequency = 6.0
-    beta: NonNegative = 120.0
-    d_cutoff_hz: Frequency = 6.0
+    min_cutoff_hz: Frequency = 10.0
+    beta: NonNegative = 3000.0
+    d_cutoff_hz: Frequency = 2.5
     jitter_m: Length = 3e-4
 
 

@@ -12,13 +12,13 @@ from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
 from master.fabrik.compile import told_if_slow
+from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
-from master.filters import OneEuroParameters, PointFilter
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
 from master.stereo.caps import CapModel
@@ -55,22 +55,20 @@ class Pipeline(Protocol):
 
 def _point_filter(setup: RigSetup) -> PointFilter:
     """The filter this rig's file describes, along the mean sight of its cameras and across it."""
-    settings = setup.rig.filter
     poses = np.array([model.T_rig_camera for model in setup.models.values()])
     ahead = poses[:, :3, 2].sum(axis=0)
     across = cross(poses[0, :3, 1], ahead)
     view = np.stack([across, cross(ahead, across), ahead])
     return PointFilter(
-        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
-        settings.jitter_m,
+        OneEuroParameters.of(setup.rig.filter),
         view / np.linalg.norm(view, axis=1, keepdims=True),
     )
 
 
-def _hand_filter(setup: RigSetup) -> HandFilter:
-    """The filter of the solved hand, which leaves no more jitter than that of the points may."""
+def _hand_filter(setup: RigSetup) -> HandOneEuro:
+    """The filter of the solved hand, by the same settings."""
     lead_m_s = None if setup.wrist is None else _LEAD_M_S
-    return HandFilter(setup.hand, setup.hand_markers, setup.rig.filter.jitter_m, lead_m_s)
+    return HandOneEuro(setup.hand, setup.hand_markers, OneEuroParameters.of(setup.rig.filter), lead_m_s)
 
 
 def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> FabrikSolver:

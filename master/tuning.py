@@ -30,7 +30,7 @@ from master.rig_objects import gestures_file
 from master.stereo.pipeline import SolvedPose, Stage
 from master.world import World
 
-_WARM_FRAMES = 6  # of each camera: tracks need two, and the 1 € filter (6 Hz at rest) has settled after 0.1 s
+_WARM_FRAMES = 6  # of each camera: tracks need two, and the shipped 1 € filter has settled after 0.1 s
 _CLOSE_FRAMES = 2  # of each camera: what may be left for the loop to catch up with
 _ROUNDS = 20
 
@@ -239,7 +239,9 @@ class RigTuning:
 
     def look(self) -> None:
         """Use the files if they were changed; where that fails, say so once and go on as before."""
-        if not self._watched.changed(self._files.paths(self._setups)):
+        with self._turn:
+            changed = self._watched.changed(self._files.paths(self._setups))
+        if not changed:
             return
         try:
             self.reload()
@@ -260,10 +262,13 @@ class RigTuning:
     def try_filter(self, body: str) -> None:
         """Use another 1 € filter for one rig, until its files change or `reload` (body: `FilterTrial`).
 
+        What has changed in the files until now is used first: the next look does not take the trial back for that.
+
         Raises:
             CalibrationError: The body is none, or of a rig that does not run. Nothing has changed.
         """
         trial = parse(body.encode(), FilterTrial, "filter")
+        self.look()
         with self._turn:
             self._use(lambda: _with_filter(self._setups, trial))
 

@@ -26,7 +26,7 @@ _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ..
         True,
         "lower: calmer at rest, later to start",
     ),
-    ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 400.0, 0, False, "higher: less lag in quick motion"),
+    ("beta", "Rise with speed", "Hz per m/s", 1.0, 0.0, 6000.0, 0, False, "higher: less lag in quick motion"),
     (
         "d_cutoff_hz",
         "Cut-off of the speed",
@@ -47,7 +47,7 @@ _PARAMETERS: tuple[tuple[str, str, str, float, float, float, int, bool, str], ..
         3.0,
         2,
         True,
-        "noisier axes are filtered more, down to this",
+        "noisier signals are filtered more, down to this",
     ),
 )
 

@@ -17,10 +17,10 @@ from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import MarkerDetections, Source
 from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.fabrik.finger import Finger
+from master.fabrik.one_euro import PointFilter
 from master.fabrik.palm import Palm, PalmFitter
 from master.fabrik.palm_kernel import facing_of, targets_of
 from master.fabrik.triangulate import Triangulate
-from master.filters import PointFilter
 from master.ik.hand import EXPLAINED
 from master.ik.hidden import FingerMemory, HiddenFingers
 from master.stereo.pairing import Instant, Pairing

@@ -36,7 +36,7 @@ class Lead:
         self._points_m = np.full((len(on_palm), 3), np.nan)
 
     def push(self, gap_s: float, rests: Int, shown: Float, solved: Float, points_m: Float) -> Float:
-        """What is to be added to the solved signals (26,) [m] (`master.ik.hand_filter`).
+        """What is to be added to the solved signals (26,) [m] (`master.ik.hand_one_euro`).
 
         Args:
             gap_s: Time since the last; 0: there is none.

@@ -23,6 +23,7 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
+from master.fabrik.one_euro import OneEuroParameters
 from master.objects.chosen import Chosen, sighted_now
 from master.objects.course import Course, unheeded
 from master.objects.features import Features
@@ -82,7 +83,7 @@ class ObjectLine:
         self._triangulator = Triangulator.of(self._cameras) if len(models) > 1 else None
         self._hidden = Hidden(self._features, self._cameras)
         middle = self._features.points.mean(axis=0) if len(self._features.points) else np.zeros(3)
-        self._steady = Steady(middle, rig.filter.jitter_m)
+        self._steady = Steady(middle, OneEuroParameters.of(rig.filter))
         self._course = Course()
         self._lone = LoneTag(self._features, self._cameras, self._fit)
         self._lost_behind = False

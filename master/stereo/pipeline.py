@@ -21,7 +21,7 @@ from common.messages import HandPose, MarkerDetections, restamped
 from master.fabrik.estimate import HandEstimate
 from master.fabrik.solver import FabrikSolver
 from master.ik.hand import HandSolution
-from master.ik.hand_filter import HandFilter
+from master.ik.hand_one_euro import HandOneEuro
 from master.ik.orientation import OrientationTrack
 from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
@@ -73,7 +73,7 @@ class MarkerPipeline:
         line: FabrikSolver,
         residual: CalibrationResidual = EXACT,
         tracker: HandTracker | None,
-        steady: HandFilter | None = None,
+        steady: HandOneEuro | None = None,
         stamp_offset_us: Mapping[str, float] | None = None,
         volume: Volume | None = None,
         imu: ImuCalibration | None = None,

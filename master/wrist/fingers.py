@@ -21,7 +21,7 @@ from common.arrays import Bool, Float
 from common.hand_model import FINGERS
 from common.messages import Level, WristDetections
 from common.wrist_bend import STRAIGHT
-from master.filters import OneEuroParameters, PointFilter
+from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.stereo.pipeline import Stage
 from master.wrist.belief import AngleBelief, FingerAngles
 from master.wrist.bend_slope import BendSlope, SightWorth, near
@@ -222,9 +222,7 @@ def count(counts: Counter[str], event: str, fingers: Bool) -> None:
 
 def _point_filter(setup: WristSetup, axes: PlaneAxes) -> PointFilter:
     """The rig's 1 € filter, across, out of and along the plane."""
-    settings = setup.filter
     return PointFilter(
-        OneEuroParameters(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz),
-        settings.jitter_m,
+        OneEuroParameters.of(setup.filter),
         np.stack([axes.axes[0], setup.normal, axes.axes[1]]),
     )

@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from common.calibration import FilterCalibration, ImuCalibration, RigCalibration
 from common.clock import SystemClock
 from common.errors import BusError, CalibrationError
 from common.geometry import matrix_to_quaternion
+from common.hand_model import HandJoints
 from common.keys import new_key
 from common.messages import Command, HandPose, MarkerDetections
 from common.zenoh_bus import ZenohBus
@@ -171,6 +172,16 @@ def test_a_filter_is_tried_without_its_file_and_gone_with_a_reload(told: Told) -
     assert told.tuning.setups[0].rig.filter.beta != 30.0
 
 
+def test_the_first_look_does_not_take_a_trial_back_and_a_change_does(told: Told) -> None:
+    told.tuning.try_filter('{"rig": "bench", "filter": {"beta": 30.0}}')
+    told.tuning.look()
+    assert told.tuning.setups[0].rig.filter.beta == 30.0
+    content = msgspec.json.decode(told.rig_path.read_bytes())
+    told.rig_path.write_bytes(msgspec.json.encode(content | {"stamp_offset_us": {"right": 8000.0}}))
+    told.tuning.look()
+    assert told.tuning.setups[0].rig.filter.beta != 30.0
+
+
 def test_files_that_say_the_same_are_no_change(told: Told) -> None:
     told.tuning.look()
     told.tuning.reload()
@@ -260,9 +271,16 @@ def test_what_needs_a_restart_is_refused_with_the_reason(
 
 
 class Master:
-    """A live master on files of its own, two slaves that send a hand at rest, and somebody on the bus."""
+    """A live master on files of its own, two slaves that send a hand, and somebody on the bus.
+
+    Attributes:
+        hand: The true hand at a time [ns]; at rest at first.
+        sigma_px: Standard deviation of the noise of its centroids.
+    """
 
     def __init__(self, folder: Path, stop: threading.Event) -> None:
+        self.hand: Callable[[int], HandJoints] = lambda _t_ns: hand_at(0.0)
+        self.sigma_px = 0.0
         self.files = tree(folder / "calib")
         key, beacon, endpoint = bytes.fromhex(new_key()), free_udp_port(), free_endpoint()
         setup = load_setup(self.files.calibration, "bench")
@@ -289,14 +307,15 @@ class Master:
         self.sender.start()
 
     def _send(self, setup: RigSetup, stop: threading.Event) -> None:
-        joints = hand_at(0.0)
-        points = RIGHT.marker_points(joints, MARKERS)
-        bias = CapModel(RIGHT, MARKERS).bias_px(joints, points, tuple(setup.models.values()))
-        seq = 0
+        caps, rng, seq = CapModel(RIGHT, MARKERS), np.random.default_rng(1), 0
         while not stop.wait(0.015):
             t_ns = time.monotonic_ns()
+            joints = self.hand(t_ns)
+            points = RIGHT.marker_points(joints, MARKERS)
+            bias = caps.bias_px(joints, points, tuple(setup.models.values()))
             for c, (name, camera) in enumerate(setup.models.items()):
-                message: MarkerDetections = seen(name, seq, t_ns, camera.project(points) + bias[c])
+                uv = camera.project(points) + bias[c] + rng.normal(0.0, self.sigma_px, (len(MARKERS), 2))
+                message: MarkerDetections = seen(name, seq, t_ns, uv)
                 self.slaves[name].send(msgspec.structs.replace(message, session=self.slaves[name].session))
             seq += 1
 

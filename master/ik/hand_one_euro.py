@@ -1,11 +1,15 @@
-"""Smooths the solved hand as it arrives, and leads it over where it would leap.
+"""Smooths the solved hand as it arrives by the rig's 1 € filter, and blends over where it would leap.
 
-**Noise.** Place and turn of the palm and the angles go through a low pass that measures their noise and follows their
-motion (`master.ik.part_filter`), the palm and each finger as a part. All 26 signals are in metres, so that the jitter
-which the rig's file allows its points holds here too: an angle counts by how far it moves the end of its finger, the
-turn by how far it moves the ends of the fingers. The palm's place is that of its middle knuckle, about which its turn
-is unsure: at the wrist the noise of the turn would shake the place as well. A turn is filtered as the sum of the
-filter's own steps and the rotation vector from there to what was solved, so it is never near half a turn.
+**Signals.** Position and rotation of the palm and the angles go through one filter (`master.fabrik.one_euro`), the
+palm and each finger as a group. All 26 signals are in metres, so that the rig's settings mean for the hand what they
+mean for points: an angle counts by how far it moves the end of its finger, the rotation by how far it moves the ends of
+the fingers. The palm's position is that of its middle knuckle, about which its rotation is unsure: at the wrist the
+noise of the rotation would shake the position as well. A rotation is filtered as the sum of the filter's own steps and
+the rotation vector from there to what was solved, so it is never near half a turn.
+
+**Noise.** The variance of each signal is measured while it runs (`master.fabrik.noise`) and is at most that of the
+markers it rests on. A solved pose is steadier than its markers in one pose and less steady in another, as its priors
+hold it, and its covariance contains errors that stay; neither says what is new in each frame.
 
 The joints come from forward kinematics of what was filtered, so bones keep their lengths. Where the DIP follows the
 PIP, what goes through the filter is by how much it does not. A filtered angle lies between angles that were within
@@ -31,12 +35,14 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import matrix_to_rotation_vector, rigid, rotation_vector_to_matrix, unskew
 from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, HandJoints, HandModel
+from master.fabrik.noise import NoiseEstimator
+from master.fabrik.one_euro import OneEuro, OneEuroParameters
 from master.ik.hand import HandSolution
 from master.ik.lead import ANGLES, PARTS, PLACE, TURN, Lead
-from master.ik.part_filter import PartFilter
 from master.ik.tracker import TrackedHand
 
 LEAD_OVER_S = 0.1
+_GROUPS = (6, 4, 4, 4, 4, 4)  # the palm and each finger
 _ELSEWHERE_M = 5e-3
 _FORGET_S = 0.5  # after this long without a hand the next one begins anew
 
@@ -46,6 +52,7 @@ class _Shown:
     """What was shown last, and what is left of leaps; renewed when a hand begins anew.
 
     Attributes:
+        noise: Measures the noise of the signals.
         smooth: The filter of the 26 signals: place (3), turn (3), angles (5, 4), all [m].
         t_ns: When.
         rests: (6,) what the fingers, and the palm, rested on: `TrackedHand.rests`.
@@ -56,7 +63,8 @@ class _Shown:
         until_ns: When nothing is left of any.
     """
 
-    smooth: PartFilter
+    noise: NoiseEstimator
+    smooth: OneEuro
     t_ns: int
     rests: Int
     values: Float
@@ -79,24 +87,28 @@ class _Shown:
         return self.offset * (1.0 - x * x * (3.0 - 2.0 * x))[PARTS]  # smooth at both ends
 
 
-class HandFilter:
+class HandOneEuro:
     """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
 
     def __init__(
-        self, model: HandModel, markers: tuple[str, ...], jitter_m: float, lead_m_s: float | None = None
+        self,
+        model: HandModel,
+        markers: tuple[str, ...],
+        parameters: OneEuroParameters,
+        lead_m_s: float | None = None,
     ) -> None:
         """Set up.
 
         Args:
             model: The hand.
             markers: Names of its markers in the order of the covariances.
-            jitter_m: Standard deviation that may be left of a signal's noise at rest [m].
+            parameters: Of the 1 € filter [m, s].
             lead_m_s: How fast the palm, and a finger on it, may be led over [m/s]; None: within a tenth of a second.
 
         Raises:
             CalibrationError: The profile mounts no marker of one of the names.
         """
-        self._model, self._jitter_m = model, jitter_m
+        self._model, self._parameters = model, parameters
         rest = model.rest_position_m
         self._knuckle = rest[MIDDLE_PROXIMAL]
         fingers = [model.mount(name).finger for name in markers]
@@ -140,7 +152,8 @@ class HandFilter:
             left = shown.left(t_ns)
         if left is not None:
             signals = signals + left
-        signals = shown.smooth.push(gap_s, signals, self._noise(cov_m2, seen))
+        variance = shown.noise.push(t_ns, signals, self._noise(cov_m2, seen))
+        signals = shown.smooth.push(t_ns, signals, variance)
         rotation = rotation_vector_to_matrix((signals - shown.values)[TURN] / self._across_m) @ shown.rotation
         joints, angles = self._posed(signals, rotation)
         cov, tracked = solution.cov_m2, hand.tracked
@@ -169,10 +182,10 @@ class HandFilter:
             shown.leap(t_ns, again, solved)
 
     def _begin(self, t_ns: int, solution: HandSolution, rests: Int) -> _Shown:
-        smooth = PartFilter((6, 4, 4, 4, 4, 4), self._jitter_m)
         self._lead = None if self._lead_m_s is None else Lead(self._lead_m_s, self._on_palm)
         rotation, never = solution.T_rig_palm[:3, :3], np.zeros(6, np.int64)
-        return _Shown(smooth, t_ns, rests, np.zeros(26), rotation, np.zeros(26), never, t_ns)
+        noise, smooth = NoiseEstimator(), OneEuro(self._parameters, _GROUPS)
+        return _Shown(noise, smooth, t_ns, rests, np.zeros(26), rotation, np.zeros(26), never, t_ns)
 
     def _signals(self, solution: HandSolution, shown: _Shown) -> Float:
         """What is filtered (26,) [m]."""

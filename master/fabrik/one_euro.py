@@ -1,0 +1,263 @@
+"""Smooths what is measured as it arrives: the 1 € filter of many signals at once, of points and of the solved hand.
+
+Casiez, Roussel, Vogel, "1 € Filter", CHI 2012. A low pass whose cut-off rises with speed, so that a hand
+at rest does not tremble and a fast one does not lag. Per signal, with x^ the filtered value and dt the time
+since the signal was last seen:
+
+    dx   = (x - x^) / dt                                   against the previous *filtered* value
+    dx^ += a(d_cutoff) (dx - dx^)
+    x^  += a(min_cutoff + beta |dx^|) (x - x^)             a(f) = r / (r + 1),  r = 2 pi f dt
+
+Rules beside the paper's:
+- Not finite (NaN) = not observed: the output of that signal is NaN, its state is held, the others go on.
+- A signal that returns continues with the true dt since it was last seen, so that a stale state fades by
+  itself; after more than `restart_gap_s` it restarts from that value, as a new signal does.
+- A time that is not after the last one changes nothing: the last output is returned and `late` counts it.
+
+**Groups.** Signals of one group have one cut-off, that of the fastest of them. Noise in the others of a group that
+moves is not seen, and errors that cancel, as those of place and rotation of one body do, stay together.
+
+**Noise.** A sample may come with the variance s^2 of its noise. Where s is above the allowed `jitter`, the sample is
+taken with no more than the larger of
+
+    at rest     a = 2 q / (1 + q),  q = (jitter / s)^2           which leaves `jitter` of the noise: s^2 a / (2 - a)
+    in motion   a = 2 / (1 + sqrt(1 + 4 / u^2)),  u^2 = max((v dt / s)^2, ((x - x^) / s)^2 - 9)
+
+the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960). Here v,
+also in the cut-off, is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s
+leaves s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by
+much, the innovation x - x^ those that begin or turn round. Of a group, what moves most counts.
+
+Where the noise is small this is the paper's filter; a sample far less sure than its neighbours is ridden over. Give
+variances with room: noise passes three standard deviations once in 370 samples, and what that lets in takes long to
+fade where s is many times `jitter`.
+
+`PointFilter` filters 3D points along the axes of the view, for a point from two cameras is several times less sure
+along the sight than across it: one cut-off for both either trembles in depth or lags sideways.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf, isfinite, nan, pi
+
+import numpy as np
+
+from common.arrays import Float, Int
+from common.calibration import FilterCalibration
+from common.kernels import kernel
+
+# Part of the variance of a marker's noise that is new in each frame: about 0.1 on rendered hands, here with room. The
+# rest is light and shape, which stay.
+FRESH = 0.25
+_QUANTILE = 9.0  # chi-square, one degree of freedom, 99.7 %: what is beyond is motion
+_NEVER = -(2**63)
+
+
+@dataclass(frozen=True, slots=True)
+class OneEuroParameters:
+    """Settings of the filter, the same for all its signals.
+
+    Attributes:
+        min_cutoff_hz: Cut-off at rest; lower: less jitter.
+        beta: Cut-off per speed [Hz per (unit of the signal)/s]; higher: less lag.
+        d_cutoff_hz: Cut-off of the speed estimate.
+        restart_gap_s: A signal unseen for longer restarts from its next value.
+        jitter: Standard deviation that may be left of a signal's noise at rest [unit of the signal], where the noise
+            is known; infinite: however much is.
+    """
+
+    min_cutoff_hz: float = 1.0
+    beta: float = 0.1
+    d_cutoff_hz: float = 1.0
+    restart_gap_s: float = 0.5
+    jitter: float = inf
+
+    def __post_init__(self) -> None:
+        for name in ("min_cutoff_hz", "d_cutoff_hz", "restart_gap_s"):
+            value: float = getattr(self, name)
+            if not (isfinite(value) and value > 0.0):
+                raise ValueError(f"1 € filter: {name} must be positive and finite, not {value}")
+        if not (isfinite(self.beta) and self.beta >= 0.0):
+            raise ValueError(f"1 € filter: beta must be finite and not negative, not {self.beta}")
+        if not self.jitter > 0.0:
+            raise ValueError(f"1 € filter: jitter must be positive, not {self.jitter}")
+
+    @classmethod
+    def of(cls, settings: FilterCalibration) -> "OneEuroParameters":
+        """What a rig file says [Hz, m, s]."""
+        return cls(settings.min_cutoff_hz, settings.beta, settings.d_cutoff_hz, jitter=settings.jitter_m)
+
+
+class OneEuro:
+    """Push machine; holds each signal's filtered value, its speed and when it was last seen."""
+
+    def __init__(self, parameters: OneEuroParameters, groups: Sequence[int] | None = None) -> None:
+        """Set up.
+
+        Args:
+            parameters: Settings of all signals.
+            groups: Number of signals of each group; they come in this order. None: each signal is its own.
+        """
+        self.parameters = parameters
+        self.late = 0
+        self._groups = groups
+        self._t_ns: int | None = None
+        self._settings = np.array(
+            [
+                parameters.min_cutoff_hz,
+                parameters.beta,
+                parameters.d_cutoff_hz,
+                parameters.restart_gap_s,
+                parameters.jitter**2,
+            ]
+        )
+        self._shape: tuple[int, ...] = ()
+        self._unknown = self._x = self._speed = self._last = np.empty(0)
+        self._seen_ns: Int = np.empty(0, np.int64)
+        self._group: Int = np.empty(0, np.int64)
+        self._fastest = np.empty((0, 2))
+        self._step(0, self._x, self._x)  # compiles it here, so that no sample waits for that
+
+    def push(self, t_ns: int, values: Float, variance: Float | None = None) -> Float:
+        """Filter one sample of every signal.
+
+        Args:
+            t_ns: Time of the sample [ns]; 0 is a time like any other.
+            values: Any shape, the same at every push. NaN: not seen.
+            variance: Variances of their noise that is new in each sample, same shape; NaN or None: not known.
+
+        Returns:
+            Filtered values, same shape; NaN where the input is.
+
+        Raises:
+            ValueError: The shape differs from the first push, or is not that of the groups or variances.
+        """
+        if values.shape != self._shape or self._t_ns is None:
+            self._first(values)
+        elif t_ns <= self._t_ns:
+            self.late += 1
+            return self._last.reshape(self._shape).copy()
+        noise = self._unknown if variance is None else _flat(variance)
+        if len(noise) != len(self._x):
+            raise ValueError(f"1 € filter: {len(noise)} variances for {len(self._x)} signals")
+        self._t_ns, self._last = t_ns, self._step(t_ns, _flat(values), noise)
+        return self._last.reshape(self._shape).copy()
+
+    def _step(self, t_ns: int, values: Float, variance: Float) -> Float:
+        out = np.empty(len(values))
+        _step(
+            t_ns,
+            values,
+            variance,
+            self._settings,
+            self._group,
+            self._fastest,
+            self._x,
+            self._speed,
+            self._seen_ns,
+            out,
+        )
+        return out
+
+    def _first(self, values: Float) -> None:
+        if self._t_ns is not None:
+            raise ValueError(f"1 € filter: shape was {self._shape}, now {values.shape}: use a new filter")
+        n = values.size
+        sizes = np.ones(n, np.int64) if self._groups is None else np.asarray(self._groups, np.int64)
+        if sizes.sum() != n:
+            raise ValueError(f"1 € filter: groups of {sizes.tolist()} signals, but {n} came")
+        self._shape = values.shape
+        self._group = np.repeat(np.arange(len(sizes)), sizes)
+        self._fastest = np.zeros((len(sizes), 2))
+        self._x, self._speed, self._unknown = np.zeros(n), np.zeros(n), np.full(n, nan)
+        self._seen_ns = np.full(n, _NEVER)
+
+
+class PointFilter:
+    """Push machine for points in space; holds the filter of their coordinates along the axes of the view."""
+
+    def __init__(self, parameters: OneEuroParameters, R_view_rig: Float) -> None:
+        """Set up.
+
+        Args:
+            parameters: Of the 1 € filter [m, s]; `jitter` is per axis.
+            R_view_rig: (3, 3) rows are the axes of the view in the rig frame, the last along the sight.
+        """
+        self._filter = OneEuro(parameters)
+        self._R = R_view_rig
+
+    def push(self, t_ns: int, points: Float, cov: Float) -> Float:
+        """Filter points (M, 3) [m], rig frame, with covariances (M, 3, 3) [m^2] of their noise; NaN: not seen.
+
+        Times as in `OneEuro.push`.
+        """
+        variance = np.vecdot(self._R @ cov, self._R)  # of each coordinate: the diagonal of R cov R'
+        return self._filter.push(t_ns, points @ self._R.T, FRESH * variance) @ self._R
+
+
+def _flat(values: Float) -> Float:
+    """A writable copy (n,), the one type that the kernel is compiled for."""
+    return np.array(values, np.float64, order="C").reshape(-1)
+
+
+@kernel
+def _step(
+    t_ns: int,
+    values: Float,
+    variance: Float,
+    settings: Float,
+    group: Int,
+    fastest: Float,
+    x: Float,
+    speed: Float,
+    seen_ns: Int,
+    out: Float,
+) -> None:
+    """Filter one sample of N signals into `out`.
+
+    Args:
+        t_ns: Later than that of the last sample.
+        values, variance: (N,) as of `OneEuro.push`.
+        settings: (5,) min_cutoff_hz, beta, d_cutoff_hz, restart_gap_s, jitter squared.
+        group: (N,) number of each signal's group.
+        fastest: (G, 2) scratch: speed of each group, and the largest u squared.
+        x, speed, seen_ns: (N,) state, changed.
+        out: (N,)
+    """
+    min_cutoff, beta, d_cutoff, restart_gap, jitter_2 = settings
+    fastest[:] = 0.0
+    for i in range(len(values)):
+        out[i] = nan
+        if not isfinite(values[i]):
+            continue
+        dt = 1e-9 * (t_ns - seen_ns[i]) if seen_ns[i] != _NEVER else inf
+        if dt > restart_gap:
+            x[i], speed[i], seen_ns[i] = values[i], 0.0, t_ns
+            out[i] = values[i]
+            continue
+        r = 2.0 * pi * d_cutoff * dt
+        speed[i] += r / (r + 1.0) * ((values[i] - x[i]) / dt - speed[i])
+        square = speed[i] * speed[i]
+        if variance[i] > jitter_2:
+            square = max(0.0, square - _QUANTILE * r / (2.0 + r) * variance[i] / (dt * dt))
+            off = values[i] - x[i]
+            u2 = max(square * dt * dt, off * off - _QUANTILE * variance[i]) / variance[i]
+            fastest[group[i], 1] = max(fastest[group[i], 1], u2)
+        fastest[group[i], 0] = max(fastest[group[i], 0], square**0.5)
+    for i in range(len(values)):
+        if seen_ns[i] == t_ns or not isfinite(values[i]):
+            continue
+        r = 2.0 * pi * 1e-9 * (t_ns - seen_ns[i]) * (min_cutoff + beta * fastest[group[i], 0])
+        gain = r / (r + 1.0)
+        if variance[i] > jitter_2:
+            q = jitter_2 / variance[i]
+            gain = min(gain, max(2.0 * q / (1.0 + q), _gain_in_motion(fastest[group[i], 1])))
+        x[i] += gain * (values[i] - x[i])
+        seen_ns[i] = t_ns
+        out[i] = x[i]
+
+
+@kernel
+def _gain_in_motion(u2: float) -> float:
+    """Gain of the steady Kalman filter of a random walk, of u squared: its step's variance by that of the noise."""
+    return 2.0 / (1.0 + (1.0 + 4.0 / u2) ** 0.5) if u2 > 0.0 else 0.0
