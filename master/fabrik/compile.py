@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 _SLOW_S = 1.5  # from the cache it takes half a second
@@ -10,7 +10,7 @@ _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
-def told_if_slow() -> Iterator[None]:
+def told_if_slow() -> Generator[None]:
     """Log that kernels are compiled, where that takes longer than loading them does."""
     timer = threading.Timer(
         _SLOW_S, _LOG.warning, ("compiling the solvers, once for each version: about 15 s ...",)

@@ -310,8 +310,12 @@ def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, o
         for i in range(3):
             out[i] += weight * back[i] / sqrt(squared)
     length = sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
-    for i in range(3):
-        out[i] = out[i] / length if length > 0.0 else back[i] / sqrt(squared)
+    if length > 0.0:
+        for i in range(3):
+            out[i] /= length
+    else:  # cameras on both sides
+        for i in range(3):
+            out[i] = 1.0 if i == 2 else 0.0
     return True
 
 

@@ -29,7 +29,7 @@ from common.kernels import kernel
 from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.stereo.caps import CapModel
-from master.stereo.depth import DepthLaw, PowerLaw
+from master.stereo.depth import AffineDisparity, PowerLaw
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
@@ -73,7 +73,11 @@ class DisparityTables(NamedTuple):
 
 
 def disparity_tables(
-    cameras: tuple[CameraModel, ...], law: DepthLaw, law_error: float, row_sigma_px: float, row_limit: float
+    cameras: tuple[CameraModel, ...],
+    law: PowerLaw | AffineDisparity,
+    law_error: float,
+    row_sigma_px: float,
+    row_limit: float,
 ) -> DisparityTables:
     """Tabulate the geometry of the first two cameras over the left image; arguments as of `DisparityTables`."""
     left, right = cameras[:2]
@@ -93,11 +97,11 @@ def disparity_tables(
         rows[k] = uv[:, 1] - seen[:, 1]
     solve = np.linalg.pinv(design)
     table[:, :2], table[:, 2:4], table[:, 4:] = (solve @ disparity).T, (solve @ rows).T, xy
-    first, second = (law.k_m, law.z) if isinstance(law, PowerLaw) else (law.a_m_px, law.x0_px)
+    power = isinstance(law, PowerLaw)
     return DisparityTables(
-        isinstance(law, PowerLaw),
-        first,
-        second,
+        power,
+        law.k_m if power else law.a_m_px,
+        law.z if power else law.x0_px,
         law_error,
         row_sigma_px,
         row_limit,
@@ -310,7 +314,7 @@ def triangulate(
                 points[m, a] = point[a]
                 for b in range(3):
                     cov[m, a, b] = spread2 if a == b else 0.0
-        radius = caps.radius_m[row] if row >= 0 else 0.0
+        radius = float(caps.radius_m[row]) if row >= 0 else 0.0
         hidden_part(area_px2[:, m], z / tables.focal_px, whole, radius, variance)
         rows2 = tables.row_sigma_px * tables.row_sigma_px + sigma_px[0, m] ** 2 + sigma_px[1, m] ** 2
         if rows * rows > tables.row_limit * (rows2 + variance[0] + variance[1]):

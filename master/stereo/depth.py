@@ -117,7 +117,7 @@ def ideal_law(baseline_m: float, fov_rad: float, width_px: int) -> AffineDispari
     return AffineDisparity(baseline_m * width_px / (2.0 * tan(fov_rad / 2.0)), 0.0)
 
 
-def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> DepthLaw | None:
+def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw | AffineDisparity | None:
     """The law the rig file asks for; None when it asks for full stereo triangulation.
 
     Args:
@@ -134,7 +134,7 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> DepthLaw |
         raise CalibrationError(
             f"rig {rig.name!r}: depth_model {model!r} needs two cameras, cameras has {len(rig.cameras)}: use 'stereo'"
         )
-    law: DepthLaw | None = None
+    law: PowerLaw | AffineDisparity | None = None
     if model == "power_law" and rig.power_law is not None:
         law = PowerLaw.of(rig.power_law)
     if model == "affine_disparity" and rig.affine_disparity is not None:

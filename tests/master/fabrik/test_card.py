@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from master.fabrik.one_euro import OneEuro
 
 from common.arrays import Float
 from common.geometry import axis_rotation
 from common.messages import HandPose, MarkerDetections
 from master.fabrik.finger import Finger
+from master.fabrik.one_euro import OneEuro
 from master.fabrik.triangulate import DepthTriangulator
 from master.ik.tracker import HandTracker
 from master.rig import RigSetup, build_pipeline, load_setup
@@ -88,7 +88,7 @@ def run() -> SyntheticRun:
 def errors_after(run: SyntheticRun, T: Callable[[Float], Float], *, start: bool) -> list[float]:
     """Mean error of the joints [mm] in the frames after the tracked state was set wrong; without the line's start."""
     pipeline, errors, count = build_pipeline(run.setup, StageTimes()), list[float](), 0
-    tracker = pipeline._tracker  # pyright: ignore[reportPrivateUsage]
+    tracker = pipeline._tracker
     assert isinstance(tracker, HandTracker)
     if not start:
         push = tracker.push
@@ -131,7 +131,7 @@ def test_without_a_planted_jump_nothing_begins_anew(
     run: SyntheticRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forgot = Counter[str]()
-    real = HandTracker._forget  # pyright: ignore[reportPrivateUsage]
+    real = HandTracker._forget
     pipeline = build_pipeline(run.setup, StageTimes())
 
     def spied(tracker: HandTracker) -> None:

@@ -11,7 +11,7 @@ from master.fabrik.cap_views import CapTables, hidden_part
 from master.fabrik.estimate import SolvedHand
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables, place_centroids
 from master.stereo.caps import CapModel
-from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw
+from master.stereo.depth import AffineDisparity, PowerLaw
 from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, natural_angles, palm
 
 DISTORTED = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])
@@ -39,7 +39,10 @@ CAPS = CapModel(RIGHT, MARKERS)
 
 
 def triangulator(
-    cameras: tuple[CameraModel, ...], law: DepthLaw = PINHOLE, caps: CapModel = FLAT, law_error: float = 0.0
+    cameras: tuple[CameraModel, ...],
+    law: PowerLaw | AffineDisparity = PINHOLE,
+    caps: CapModel = FLAT,
+    law_error: float = 0.0,
 ) -> DepthTriangulator:
     return DepthTriangulator(disparity_tables(cameras, law, law_error, ROWS_PX, LIMIT), caps)
 
@@ -65,7 +68,7 @@ def axis_law(cameras: tuple[CameraModel, ...]) -> AffineDisparity:
 
 
 @pytest.mark.parametrize("law", [PINHOLE, PowerLaw(37.5, -1.0)])
-def test_a_parallel_pair_gives_its_points_back_by_either_law(law: DepthLaw) -> None:
+def test_a_parallel_pair_gives_its_points_back_by_either_law(law: PowerLaw | AffineDisparity) -> None:
     points = np.random.default_rng(1).uniform([-0.15, -0.12, 0.45], [0.2, 0.12, 0.85], (6, 3))
     found = triangulator(EXACT, law)(seen(EXACT, points), SIGMA, np.full((2, 6), np.nan), None, 0.0)
     np.testing.assert_allclose(found.points_m, points, atol=1e-6)
