@@ -1,8 +1,8 @@
 """Say where a tracked marker is expected, and whether a blob there may be it.
 
 The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
-(Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the
-marker; the scan has looked at the whole frame anyway, so a marker outside its window costs nothing.
+(Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the marker, and
+where the frame is scanned at all when only windows are (`scan`).
 """
 
 import math
@@ -21,6 +21,33 @@ SUDDEN = 2.5  # an area that changes by more between two frames is looked at clo
 COVERED = 0.06  # share of the usual area that is missing while something is in front
 COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
 TURNING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
+
+
+class Window(NamedTuple):
+    """Where one marker is expected in one frame; both the gate for blobs and what is scanned.
+
+    Attributes:
+        u, v: Expected centroid [px].
+        x, y: How far from there the centroid may be [px]: the margin and the marker's own side.
+        margin: How much wider than the marker the window is, to each side [px].
+        area: Last area of the scan's blob [px^2].
+        largest: Area [px^2] beyond which a blob is something else.
+    """
+
+    u: float
+    v: float
+    x: float
+    y: float
+    margin: float
+    area: float
+    largest: float
+
+    def cost(self, blob: Blob) -> float:
+        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible."""
+        x, y = abs(blob.u - self.u), abs(blob.v - self.v)
+        if x > self.x or y > self.y or blob.area > self.largest:
+            return math.inf
+        return math.hypot(x, y) / self.margin + 0.5 * abs(math.log(blob.area / self.area))
 
 
 class Track(NamedTuple):
@@ -64,18 +91,20 @@ class Track(NamedTuple):
         dt_s = min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9
         return self.u + self.du * dt_s, self.v + self.dv * dt_s
 
-    def cost(self, blob: Blob, t_ns: int, image_width: int, roi_margin: float) -> float:
-        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible.
+    def window(self, t_ns: int, image_width: int, roi_margin: float) -> "Window":
+        """Where the marker may be at `t_ns`.
 
         `roi_margin`: how much wider than the marker the window is, share of the image width.
         """
         u, v = self.predicted(t_ns)
         growth = max(0.0, (t_ns - self.t_ns - VELOCITY_NS) * 1e-9) * GROWTH_PER_S
         margin = image_width * (roi_margin + growth)
-        x, y = abs(blob.u - u), abs(blob.v - v)
-        if x > margin + self.width or y > margin + self.height or blob.area > LARGEST * self.whole + 40.0:
-            return math.inf
-        return math.hypot(x, y) / margin + 0.5 * abs(math.log(blob.area / self.area))
+        x, y = margin + self.width, margin + self.height
+        return Window(u, v, x, y, margin, self.area, LARGEST * self.whole + 40.0)
+
+    def growing(self, t_ns: int) -> bool:
+        """Whether the marker has not been seen for so long that its window grows."""
+        return t_ns - self.t_ns > VELOCITY_NS
 
     def sudden(self, blob: Blob) -> bool:
         """Whether the area of `blob` jumped against the last frame, by more than the grid of the scan explains."""
