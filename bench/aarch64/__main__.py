@@ -1,7 +1,7 @@
 """`make instructions`: aarch64 instructions of the slave per frame, held against the recorded baseline.
 
     python -m bench.aarch64 count                 every case
-    python -m bench.aarch64 count six lost        some of: step six twelve lost seed
+    python -m bench.aarch64 count six lost        some of: step six twelve lost windows search seed
     python -m bench.aarch64 count six --parts     and the parts of the detector, six markers
     python -m bench.aarch64 count --record        every case, and what was counted is the new baseline
 
@@ -25,11 +25,15 @@ CASES = {
     "six": "detection, six markers",
     "twelve": "detection, twelve markers",
     "lost": "detection, six markers, all sought anew in every frame",
+    "windows": "detection in windows alone, six markers",
+    "search": "the same, one of them lost: a strip is searched in every frame",
     "seed": "published pipeline rebuilt, six markers",
 }
 LONGEST = 30  # parts shown
 RATIOS = (
     ("seed", "six", "published / ours"),
+    ("six", "windows", "whole frame / windows"),
+    ("search", "six", "windows and one marker lost / whole frame"),
     ("twelve", "six", "12 markers / 6 markers"),
     ("lost", "six", "every marker sought anew / tracked"),
 )

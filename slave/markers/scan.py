@@ -24,7 +24,7 @@ from slave.markers.roi import Window
 FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
 OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
 STRIPS = 8  # of a frame: so many frames until a lost marker that lies still is found
-ROUNDS = 3  # of widening: what reaches beyond that is larger than a marker
+ROUNDS = 3  # of widening, before the whole frame is scanned: what reaches so far is no marker
 
 
 class Part(NamedTuple):
@@ -34,24 +34,6 @@ class Part(NamedTuple):
     top: int
     right: int
     bottom: int
-
-    def meets(self, other: "Part") -> bool:
-        """Whether the two overlap or touch."""
-        return (
-            self.left <= other.right
-            and other.left <= self.right
-            and self.top <= other.bottom
-            and other.top <= self.bottom
-        )
-
-    def joined(self, other: "Part") -> "Part":
-        """The smallest part that holds both."""
-        return Part(
-            min(self.left, other.left),
-            min(self.top, other.top),
-            max(self.right, other.right),
-            max(self.bottom, other.bottom),
-        )
 
 
 class Scanned(NamedTuple):
@@ -119,25 +101,26 @@ class Scanner:
             windows: Of each marker; None: nothing is expected anywhere.
             lost: Rows of those markers that are sought.
         """
-        expected = {m: [self._of_window(w)] for m, w in enumerate(windows) if w is not None}
+        wanted = {m for m, window in enumerate(windows) if window is not None}
+        asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for w in windows if w is not None]
         proposed = self._search(image, table, lost) if lost else {}
-        parts = merged(part for some in (expected, proposed) for more in some.values() for part in more)
+        asked += [self._of(blob) for blobs in proposed.values() for blob in blobs]
+        parts = merged(asked)
         scanned = [self._part(image, table, part) for part in parts]
         for _ in range(ROUNDS):
-            wider = merged(self._widened(part, blobs) for part, _, blobs in scanned)
-            if wider == parts:
+            clipped = [blob for part, _, blobs in scanned for blob in self._clipped(part, blobs)]
+            if not clipped:
                 break
-            parts = wider
+            parts = merged([*parts, *(self._of(blob) for blob in clipped)])
             scanned = [self._part(image, table, part) for part in parts]
         else:
-            for part, _, blobs in scanned:
-                for m, options in enumerate(blobs):
-                    blobs[m] = [blob for blob in options if self._of(blob, 1.0).joined(part) == part]
+            return self.whole(image, table)
         found = _gathered([blobs for _, _, blobs in scanned], len(windows))
-        for m in (expected.keys() | proposed.keys()) if parts else ():
+        for m in wanted | proposed.keys():
             if not found[m]:
-                grid = FINER if m in proposed else OTHERS[self._frames % len(OTHERS)]
-                (found[m],) = _gathered([self._finer(image, table, m, part, grid) for part in parts], 1)
+                step, dx, dy = FINER if m in proposed else OTHERS[self._frames % len(OTHERS)]
+                seen = [self._on_grid(image, table, [table.bits[m]], part, step, dx, dy)[1] for part in parts]
+                found[m] = _gathered(seen, 1)[0]
         self._frames += 1
         return Scanned([(part, codes) for part, codes, _ in scanned], found)
 
@@ -146,69 +129,86 @@ class Scanner:
         rows, k = self._all.bottom, self._strip
         self._strip = (k + 1) % STRIPS
         strip = Part(0, rows * k // STRIPS, self._all.right, rows * (k + 1) // STRIPS)
-        found = self._on_grid(image, table, [table.bits[m] for m in lost], strip, FINER)[1]
-        return {m: [self._of(blob) for blob in blobs] for m, blobs in zip(lost, found, strict=True) if blobs}
+        found = self._on_grid(image, table, [table.bits[m] for m in lost], strip, *FINER)[1]
+        return {m: blobs for m, blobs in zip(lost, found, strict=True) if blobs}
 
     def _part(self, image: Image, table: ColourTable, part: Part) -> tuple[Part, Codes, list[list[Blob]]]:
-        codes, blobs = self._on_grid(image, table, table.bits, part, (SCALE, 0, 0))
+        codes, blobs = self._on_grid(image, table, table.bits, part, SCALE, 0, 0)
         return part, codes.copy(), blobs
 
-    def _finer(
-        self, image: Image, table: ColourTable, m: int, part: Part, grid: tuple[int, int, int]
-    ) -> list[list[Blob]]:
-        return self._on_grid(image, table, [table.bits[m]], part, grid)[1]
-
     def _on_grid(
-        self,
-        image: Image,
-        table: ColourTable,
-        bits: Sequence[int],
-        part: Part,
-        grid: tuple[int, int, int],
+        self, image: Image, table: ColourTable, bits: Sequence[int], part: Part, step: int, dx: int, dy: int
     ) -> tuple[Codes, list[list[Blob]]]:
-        step, dx, dy = grid
+        left, top, right, bottom = part
         times = SCALE // step
-        size = times * (part.bottom - part.top), times * (part.right - part.left)
-        return self._scan(image, table, bits, step, SCALE * part.left + dx, SCALE * part.top + dy, size)
+        size = times * (bottom - top), times * (right - left)
+        return self._scan(image, table, bits, step, SCALE * left + dx, SCALE * top + dy, size)
 
-    def _of_window(self, window: Window) -> Part:
-        return self._within(
-            window.u - window.x, window.v - window.y, window.u + window.x, window.v + window.y
+    def _around(self, left: float, top: float, right: float, bottom: float) -> Part:
+        """The part of the frame that holds this box [px]."""
+        columns, rows = self._all.right, self._all.bottom
+        x0, y0, x1, y1 = (
+            int(left) // SCALE,
+            int(top) // SCALE,
+            int(right) // SCALE + 1,
+            int(bottom) // SCALE + 1,
         )
-
-    def _of(self, blob: Blob, reach: float | None = None) -> Part:
-        """The part that holds a blob, and around it what may be a fragment of it, or so many pixels."""
-        more = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE if reach is None else reach
-        return self._within(blob.left - more, blob.top - more, blob.right + more, blob.bottom + more)
-
-    def _within(self, left: float, top: float, right: float, bottom: float) -> Part:
-        """From pixels to points of the grid in the image."""
         return Part(
-            max(int(left) // SCALE, 0),
-            max(int(top) // SCALE, 0),
-            min(int(right) // SCALE + 1, self._all.right),
-            min(int(bottom) // SCALE + 1, self._all.bottom),
+            x0 if x0 > 0 else 0,
+            y0 if y0 > 0 else 0,
+            x1 if x1 < columns else columns,
+            y1 if y1 < rows else rows,
         )
 
-    def _widened(self, part: Part, blobs: list[list[Blob]]) -> Part:
+    def _of(self, blob: Blob) -> Part:
+        """The part that holds a blob, and around it whatever may be a fragment of it."""
+        reach = _reach(blob)
+        return self._around(blob.left - reach, blob.top - reach, blob.right + reach, blob.bottom + reach)
+
+    def _clipped(self, part: Part, blobs: list[list[Blob]]) -> list[Blob]:
+        """Blobs that the part may not hold whole, or not with all their fragments."""
+        # Where the part ends at the border of the image, nothing is cut off.
+        left = SCALE * part.left if part.left > 0 else -math.inf
+        top = SCALE * part.top if part.top > 0 else -math.inf
+        right = SCALE * part.right if part.right < self._all.right else math.inf
+        bottom = SCALE * part.bottom if part.bottom < self._all.bottom else math.inf
+        clipped: list[Blob] = []
         for options in blobs:
             for blob in options:
-                part = part.joined(self._of(blob))
-        return part
+                reach = _reach(blob)
+                if (
+                    blob.left - reach < left
+                    or blob.right + reach > right
+                    or blob.top - reach < top
+                    or blob.bottom + reach > bottom
+                ):
+                    clipped.append(blob)
+        return clipped
+
+
+def _reach(blob: Blob) -> float:
+    """How far from a blob fragments of it may begin [px]."""
+    return FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
 
 
 def merged(parts: Iterable[Part]) -> list[Part]:
     """Parts of which no two meet, so that no blob lies in two, and that hold all of these; empty ones are left out."""
     apart: list[Part] = []
     for part in parts:
-        if part.left >= part.right or part.top >= part.bottom:
+        left, top, right, bottom = part
+        if left >= right or top >= bottom:
             continue
-        rest = apart
-        while met := [other for other in rest if part.meets(other)]:
-            rest = [other for other in rest if other not in met]
-            for other in met:
-                part = part.joined(other)
-        apart = [*rest, part]
+        k = 0
+        while k < len(apart):
+            other = apart[k]
+            if left <= other[2] and other[0] <= right and top <= other[3] and other[1] <= bottom:
+                left, right = min(left, other[0]), max(right, other[2])
+                top, bottom = min(top, other[1]), max(bottom, other[3])
+                del apart[k]
+                k = 0  # it may meet now what it did not before
+            else:
+                k += 1
+        apart.append(Part(left, top, right, bottom))
     return apart
 
 
