@@ -43,6 +43,7 @@ CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that 
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
+NOT_SEEN = (math.nan,) * 10  # what is reported of a marker
 RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
 
@@ -170,11 +171,12 @@ class MarkerDetector:
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
-        result = np.full((10, len(self._names)), np.nan)
+        reports = [NOT_SEEN] * len(self._names)
         for m, seen in zip(rows, measured, strict=False):
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                result[:, m] = self._report(m, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
-        np.round(result, DIGITS, out=result)
+                before = self._tracks[m] if windows[m] is not None else None
+                reports[m] = self._report(m, before, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
+        result = np.array(reports).round(DIGITS).T
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
     @property
@@ -211,12 +213,16 @@ class MarkerDetector:
         self._table = table
 
     def _report(
-        self, m: int, seen: Measured, blob: Blob, rival: Blob | None, t_ns: int, doubt: float
+        self,
+        m: int,
+        before: Track | None,
+        seen: Measured,
+        blob: Blob,
+        rival: Blob | None,
+        t_ns: int,
+        doubt: float,
     ) -> tuple[float, ...]:
-        """One marker's column of the result; its track goes on."""
-        before = self._tracks[m]
-        if before is not None and not before.alive(t_ns):
-            before = None
+        """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
         self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
         quality = _quality(seen, track)
         sigma = sigma_of(seen, before, track, self._exposure_s)
@@ -318,8 +324,12 @@ class MarkerDetector:
 
 def _quality(seen: Measured, track: Track) -> float:
     """0..1: how far the centroid can be trusted to be the centroid of the whole cap's visible side."""
-    quality = math.sqrt(min(1.0, seen.area / track.whole)) * min(1.0, seen.contrast / CLEAR_CONTRAST)
-    quality *= math.sqrt(min(1.0, seen.area / SMALL))
+    area, contrast = seen.area, seen.contrast
+    quality = math.sqrt(area / track.whole) if area < track.whole else 1.0
+    if contrast < CLEAR_CONTRAST:
+        quality *= contrast / CLEAR_CONTRAST
+    if area < SMALL:
+        quality *= math.sqrt(area / SMALL)
     if seen.cut:
         quality *= 0.5
     if seen.thin:

@@ -86,19 +86,17 @@ class Track(NamedTuple):
         """Whether the track still says where the marker is."""
         return 0 <= t_ns - self.t_ns <= HOLD_NS
 
-    def predicted(self, t_ns: int) -> tuple[float, float]:
-        """Expected centroid (u, v) [px] at `t_ns`, constant velocity for a short time, then at rest."""
-        dt_s = min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9
-        return self.u + self.du * dt_s, self.v + self.dv * dt_s
-
     def window(self, t_ns: int, image_width: int, roi_margin: float) -> "Window":
-        """Where the marker may be at `t_ns`.
+        """Where the marker may be at `t_ns`: at constant velocity for a short time, then anywhere about that place.
 
         `roi_margin`: how much wider than the marker the window is, share of the image width.
         """
-        u, v = self.predicted(t_ns)
-        growth = max(0.0, (t_ns - self.t_ns - VELOCITY_NS) * 1e-9) * GROWTH_PER_S
-        margin = image_width * (roi_margin + growth)
+        away_ns = t_ns - self.t_ns
+        if away_ns > VELOCITY_NS:
+            roi_margin += (away_ns - VELOCITY_NS) * 1e-9 * GROWTH_PER_S
+            away_ns = VELOCITY_NS
+        u, v = self.u + self.du * away_ns * 1e-9, self.v + self.dv * away_ns * 1e-9
+        margin = image_width * roi_margin
         x, y = margin + self.width, margin + self.height
         return Window(u, v, x, y, margin, self.area, LARGEST * self.whole + 40.0)
 
@@ -125,26 +123,25 @@ class Track(NamedTuple):
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
     """The track after one more sighting; a track that was lost starts anew, without velocity."""
-    u, v, area = seen.u, seen.v, max(seen.area, 1.0)
+    u, v, area, xx, xy, yy = seen.u, seen.v, seen.area, seen.xx, seen.xy, seen.yy
+    if area < 1.0:
+        area = 1.0
     width, height = float(blob.right - blob.left), float(blob.bottom - blob.top)
     if track is None or not 0 < t_ns - track.t_ns <= HOLD_NS:
         whole = area if track is None else max(area, 0.5 * track.whole)
-        shape = seen.xx, seen.xy, seen.yy
-        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, *shape, width, height, t_ns)
+        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, xx, xy, yy, width, height, t_ns)
     dt_s = (t_ns - track.t_ns) * 1e-9
-    whole = max(area, area + (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S))
-    du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
-    if dt_s > VELOCITY_NS * 1e-9:
-        du = dv = 0.0
+    whole = area
+    if area < track.whole:
+        whole += (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S)
+    du = dv = 0.0
+    if dt_s <= VELOCITY_NS * 1e-9:
+        du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
     keep = math.exp(-dt_s / USUAL_LIFE_S)
     usual = area + (track.usual - area) * keep
     covered = track.covers(area, t_ns)
     if covered:
-        shape = track.xx, track.xy, track.yy
+        xx, xy, yy = track.xx, track.xy, track.yy
     else:
-        shape = (
-            seen.xx + (track.xx - seen.xx) * keep,
-            seen.xy + (track.xy - seen.xy) * keep,
-            seen.yy + (track.yy - seen.yy) * keep,
-        )
-    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, *shape, width, height, t_ns)
+        xx, xy, yy = xx + (track.xx - xx) * keep, xy + (track.xy - xy) * keep, yy + (track.yy - yy) * keep
+    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, xx, xy, yy, width, height, t_ns)

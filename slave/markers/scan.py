@@ -12,7 +12,7 @@ all around it that may be a fragment of it.
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from common.arrays import Image
 from slave.markers.blobs import FRAGMENT_GAP, MAX_CANDIDATES, SCALE, Blob
@@ -27,13 +27,8 @@ STRIPS = 8  # of a frame: so many frames until a lost marker that lies still is 
 ROUNDS = 3  # of widening, before the whole frame is scanned: what reaches so far is no marker
 
 
-class Part(NamedTuple):
-    """A part of the frame in columns and rows of the scan's grid; right and bottom exclusive."""
-
-    left: int
-    top: int
-    right: int
-    bottom: int
+# A part of the frame in columns and rows of the scan's grid: left, top, right, bottom; the last two exclusive.
+Part: TypeAlias = tuple[int, int, int, int]
 
 
 class Scanned(NamedTuple):
@@ -50,9 +45,9 @@ class Scanned(NamedTuple):
     def skin_share(self, skin: int, blob: Blob) -> float:
         """Share of the points around one of the blobs that are skin, 0..1; `skin`: its bit."""
         x, y = blob.u / SCALE, blob.v / SCALE
-        for part, codes in self.parts:
-            if part.left <= x <= part.right and part.top <= y <= part.bottom:
-                dx, dy = SCALE * part.left, SCALE * part.top
+        for (x0, y0, x1, y1), codes in self.parts:
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                dx, dy = SCALE * x0, SCALE * y0
                 left, top, right, bottom = blob.left - dx, blob.top - dy, blob.right - dx, blob.bottom - dy
                 return skin_share(codes, skin, blob._replace(left=left, top=top, right=right, bottom=bottom))
         raise ValueError(f"{blob} is not of this scan")
@@ -63,7 +58,7 @@ class Scanner:
 
     def __init__(self, width: int, height: int, engine: Engine) -> None:
         """Scan frames of this size [px] by `engine`."""
-        self._all = Part(0, 0, width // SCALE, height // SCALE)
+        self._columns, self._rows = width // SCALE, height // SCALE
         self._scan = engine.scan_blobs
         self._frames = 0
         self._strip = 0
@@ -88,7 +83,7 @@ class Scanner:
             for m, options in zip(missing, finer, strict=True):
                 blobs[m] = options
         self._frames += 1
-        return Scanned([(self._all, codes)], blobs)
+        return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
 
     def around(
         self, image: Image, table: ColourTable, windows: Sequence[Window | None], lost: Sequence[int]
@@ -126,9 +121,9 @@ class Scanner:
 
     def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Part]]:
         """Where the next strip shows the colours of lost markers: row of the marker -> parts of the frame."""
-        rows, k = self._all.bottom, self._strip
+        rows, k = self._rows, self._strip
         self._strip = (k + 1) % STRIPS
-        strip = Part(0, rows * k // STRIPS, self._all.right, rows * (k + 1) // STRIPS)
+        strip = 0, rows * k // STRIPS, self._columns, rows * (k + 1) // STRIPS
         found = self._on_grid(image, table, [table.bits[m] for m in lost], strip, *FINER)[1]
         return {m: blobs for m, blobs in zip(lost, found, strict=True) if blobs}
 
@@ -146,14 +141,14 @@ class Scanner:
 
     def _around(self, left: float, top: float, right: float, bottom: float) -> Part:
         """The part of the frame that holds this box [px]."""
-        columns, rows = self._all.right, self._all.bottom
+        columns, rows = self._columns, self._rows
         x0, y0, x1, y1 = (
             int(left) // SCALE,
             int(top) // SCALE,
             int(right) // SCALE + 1,
             int(bottom) // SCALE + 1,
         )
-        return Part(
+        return (
             x0 if x0 > 0 else 0,
             y0 if y0 > 0 else 0,
             x1 if x1 < columns else columns,
@@ -168,10 +163,10 @@ class Scanner:
     def _clipped(self, part: Part, blobs: list[list[Blob]]) -> list[Blob]:
         """Blobs that the part may not hold whole, or not with all their fragments."""
         # Where the part ends at the border of the image, nothing is cut off.
-        left = SCALE * part.left if part.left > 0 else -math.inf
-        top = SCALE * part.top if part.top > 0 else -math.inf
-        right = SCALE * part.right if part.right < self._all.right else math.inf
-        bottom = SCALE * part.bottom if part.bottom < self._all.bottom else math.inf
+        x0, y0, x1, y1 = part
+        left, top = SCALE * x0 if x0 > 0 else -math.inf, SCALE * y0 if y0 > 0 else -math.inf
+        right = SCALE * x1 if x1 < self._columns else math.inf
+        bottom = SCALE * y1 if y1 < self._rows else math.inf
         clipped: list[Blob] = []
         for options in blobs:
             for blob in options:
@@ -200,15 +195,15 @@ def merged(parts: Iterable[Part]) -> list[Part]:
             continue
         k = 0
         while k < len(apart):
-            other = apart[k]
-            if left <= other[2] and other[0] <= right and top <= other[3] and other[1] <= bottom:
-                left, right = min(left, other[0]), max(right, other[2])
-                top, bottom = min(top, other[1]), max(bottom, other[3])
+            x0, y0, x1, y1 = apart[k]
+            if left <= x1 and x0 <= right and top <= y1 and y0 <= bottom:
+                left, top = x0 if x0 < left else left, y0 if y0 < top else top
+                right, bottom = x1 if x1 > right else right, y1 if y1 > bottom else bottom
                 del apart[k]
                 k = 0  # it may meet now what it did not before
             else:
                 k += 1
-        apart.append(Part(left, top, right, bottom))
+        apart.append((left, top, right, bottom))
     return apart
 
 
