@@ -141,12 +141,12 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
             step(k)
         mark(LAST)
 
-    engine = engine_named("numba" if case.startswith("numba") else "numpy")
+    engine = engine_named("numba" if "numba" in case else "numpy")
     detector = MarkerDetector(frames.camera, frames.names, engine=engine)
     found: list[Detections] = []
-    detector.windows_only = case in ("windows", "search", "numba-windows")
-    if case in ("six", "twelve", "parts", "windows", "search", "numba", "numba-windows"):
-        with counted_parts(marks, case == "parts"):
+    detector.windows_only = case in ("windows", "search", "numba-windows", "parts-numba")
+    if case in ("six", "twelve", "parts", "windows", "search", "numba", "numba-windows", "parts-numba"):
+        with counted_parts(marks, case.startswith("parts")):
             each(lambda k: found.append(detector.push(frames.image(k), k * FRAME_NS)))
     elif case == "lost":
         each(lambda k: found.append(detector.fresh().push(frames.image(k), 0)))

@@ -258,12 +258,13 @@ class MarkerDetector:
         last_ns, self._last_ns = self._last_ns, t_ns
         if not self.windows_only or not self._scanner.began:
             return self._scanner.whole(image, self._table)
-        lost: list[int] = []
-        for m, track in enumerate(self._tracks):
-            if track is None or track.t_ns != last_ns:
-                lost.append(m)
-                if track is not None and track.growing(t_ns):
-                    windows = [None if n == m else window for n, window in enumerate(windows)]
+        lost = [m for m, track in enumerate(self._tracks) if track is None or track.t_ns != last_ns]
+        if lost:
+            windows = list(windows)
+        for m in lost:
+            track = self._tracks[m]
+            if track is not None and track.growing(t_ns):
+                windows[m] = None  # the strips are less to look at
         return self._scanner.around(image, self._table, windows, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:
