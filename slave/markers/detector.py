@@ -258,14 +258,19 @@ class MarkerDetector:
         last_ns, self._last_ns = self._last_ns, t_ns
         if not self.windows_only or not self._scanner.began:
             return self._scanner.whole(image, self._table)
-        lost = [m for m, track in enumerate(self._tracks) if track is None or track.t_ns != last_ns]
-        if lost:
-            windows = list(windows)
-        for m in lost:
-            track = self._tracks[m]
-            if track is not None and track.growing(t_ns):
-                windows[m] = None  # the strips are less to look at
-        return self._scanner.around(image, self._table, windows, lost)
+        lost: list[int] = []
+        places: list[tuple[Window, ...]] = []
+        for m, (track, window) in enumerate(zip(self._tracks, windows, strict=True)):
+            seen = track is not None and track.t_ns == last_ns
+            if not seen:
+                lost.append(m)
+            if track is None or window is None or (track.growing(t_ns) and not seen):
+                places.append(())  # what has grown is more to look at than strips
+            elif abs(window.u - track.u) > window.margin or abs(window.v - track.v) > window.margin:
+                places.append((window, window._replace(u=track.u, v=track.v)))  # it may have come to rest
+            else:
+                places.append((window,))
+        return self._scanner.around(image, self._table, places, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:
         """Largest side [px] and area [px^2] of the whole marker as far as its track knows, else inf and nan."""

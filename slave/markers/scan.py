@@ -86,18 +86,18 @@ class Scanner:
         return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
 
     def around(
-        self, image: Image, table: ColourTable, windows: Sequence[Window | None], lost: Sequence[int]
+        self, image: Image, table: ColourTable, windows: Sequence[Sequence[Window]], lost: Sequence[int]
     ) -> Scanned:
         """Scan where markers are expected, and for lost ones the next strip of the frame.
 
         Args:
             image: (H, W, 3) BGR.
             table: Colour table of the camera.
-            windows: Of each marker; None: nothing is expected anywhere.
+            windows: Of each marker where it may be; none: it is not expected anywhere.
             lost: Rows of those markers that are sought.
         """
-        wanted = {m for m, window in enumerate(windows) if window is not None}
-        asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for w in windows if w is not None]
+        wanted = {m for m, some in enumerate(windows) if some}
+        asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for some in windows for w in some]
         proposed = self._search(image, table, lost) if lost else {}
         asked += [self._of(blob) for blobs in proposed.values() for blob in blobs]
         parts = merged(asked)
