@@ -31,6 +31,9 @@ from slave.markers.engine import engine_named
 from slave.tally import Tally
 
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
+MACHINE_CODE = ("numba", "numba-windows")  # cases
+WINDOWS = ("windows", "search", "numba-windows")
+PUSHED = ("six", "twelve", "parts", "numba", *WINDOWS)
 KEY = bytes(range(32))
 MASTER, SLAVE = ("10.0.0.1", 47801), ("10.0.0.2", 5)
 
@@ -141,12 +144,12 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
             step(k)
         mark(LAST)
 
-    engine = engine_named("numba" if "numba" in case else "numpy")
+    engine = engine_named("numba" if case in MACHINE_CODE else "numpy")
     detector = MarkerDetector(frames.camera, frames.names, engine=engine)
+    detector.windows_only = case in WINDOWS
     found: list[Detections] = []
-    detector.windows_only = case in ("windows", "search", "numba-windows", "parts-numba")
-    if case in ("six", "twelve", "parts", "windows", "search", "numba", "numba-windows", "parts-numba"):
-        with counted_parts(marks, case.startswith("parts")):
+    if case in PUSHED:
+        with counted_parts(marks, case == "parts"):
             each(lambda k: found.append(detector.push(frames.image(k), k * FRAME_NS)))
     elif case == "lost":
         each(lambda k: found.append(detector.fresh().push(frames.image(k), 0)))

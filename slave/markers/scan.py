@@ -54,19 +54,19 @@ class Scanned(NamedTuple):
 
 
 class Scanner:
-    """Scans the frames of one camera. Holds how many there were, and which strip is searched next."""
+    """Scans the frames of one camera. Holds which further grid and which strip are next."""
 
     def __init__(self, width: int, height: int, engine: Engine) -> None:
         """Scan frames of this size [px] by `engine`."""
         self._columns, self._rows = width // SCALE, height // SCALE
         self._scan = engine.scan_blobs
-        self._frames = 0
+        self._turn = -1  # negative before the first frame
         self._strip = 0
 
     @property
     def began(self) -> bool:
         """Whether there was a frame."""
-        return self._frames > 0
+        return self._turn >= 0
 
     def whole(self, image: Image, table: ColourTable) -> Scanned:
         """Scan the whole frame (H, W, 3).
@@ -78,11 +78,13 @@ class Scanner:
         missing = [m for m, options in enumerate(blobs) if not options]
         if missing:
             codes = codes.copy()  # the next scan reuses it
-            step, dx, dy = OTHERS[self._frames % len(OTHERS)] if self.began else FINER
+            step, dx, dy = OTHERS[self._turn] if self.began else FINER
+            self._turn = (self._turn + 1) % len(OTHERS)
             _, finer = self._scan(image, table, [table.bits[m] for m in missing], step, dx, dy, None)
             for m, options in zip(missing, finer, strict=True):
                 blobs[m] = options
-        self._frames += 1
+        elif not self.began:
+            self._turn = 0
         return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
 
     def around(
@@ -111,16 +113,18 @@ class Scanner:
         else:
             return self.whole(image, table)
         found = _gathered([blobs for _, _, blobs in scanned], len(windows))
-        for m in wanted | proposed.keys():
-            if not found[m]:
-                step, dx, dy = FINER if m in proposed else OTHERS[self._frames % len(OTHERS)]
+        missing = [m for m, options in enumerate(found) if not options]
+        for m in missing:
+            if m in wanted or m in proposed:
+                step, dx, dy = FINER if m in proposed else OTHERS[self._turn]
                 seen = [self._on_grid(image, table, [table.bits[m]], part, step, dx, dy)[1] for part in parts]
                 found[m] = _gathered(seen, 1)[0]
-        self._frames += 1
+        if missing:
+            self._turn = (self._turn + 1) % len(OTHERS)
         return Scanned([(part, codes) for part, codes, _ in scanned], found)
 
-    def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Part]]:
-        """Where the next strip shows the colours of lost markers: row of the marker -> parts of the frame."""
+    def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Blob]]:
+        """What the next strip shows of the colours of lost markers: row of the marker -> blobs."""
         rows, k = self._rows, self._strip
         self._strip = (k + 1) % STRIPS
         strip = 0, rows * k // STRIPS, self._columns, rows * (k + 1) // STRIPS
