@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from common.calibration import HandProfile, load
 from common.clock import Clock, SystemClock
-from common.errors import RecordingError
+from common.errors import CalibrationError, RecordingError
 from slave.commands.camera import add_camera, open_lit
 from slave.commands.options import (
     add_link,
@@ -151,6 +151,8 @@ def _files(options: argparse.Namespace) -> "CameraFiles":
     from slave.tuning import CameraFiles
 
     rig, camera = camera_of(options)
+    if rig.kind == "wrist" and options.scan == "windows":
+        raise CalibrationError(f"--scan windows: camera {options.name!r} of a wrist device sees no markers")
     objects = tuple(objects_of(options, rig).values())
     files = CameraFiles(camera_path(options, options.name), rig_path(options), camera, rig, objects=objects)
     if rig.kind != "wrist" or options.colours == "none":  # with none, fingers need not be known

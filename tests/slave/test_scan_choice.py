@@ -2,6 +2,7 @@
 
 import logging
 import threading
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from slave.markers.changing import ChangingDetector
 from slave.markers.detector import MarkerDetector
 from slave.markers.known import KnownDetector
 from slave.markers.scan_choice import JUDGED, PROBE_EVERY, PROBES, Scan, ScanChoice
+from slave.offline import calibrate_colours
 from slave.tally import Tally
 from tests.slave.painted import NAMES, RANGES, camera, hand, render
 from tests.slave.test_app import Source, Wire, frame
@@ -98,6 +100,7 @@ def test_a_name_that_is_none_is_refused(capsys: pytest.CaptureFixture[str]) -> N
         with pytest.raises(SystemExit):
             main(command)
         assert "argument --scan: invalid choice" in capsys.readouterr().err
+    assert parser().parse_args(["run", "--name", "left", "--camera", "synthetic"]).scan == "auto"
     assert parser().parse_args(["detect", "r", "--camera", "left", "-o", "f"]).scan == "full"
 
 
@@ -179,3 +182,18 @@ def test_a_marker_whose_colour_comes_later_is_found_and_without_any_colour_nothi
     detector.replace(MarkerDetector(camera(), NAMES))
     assert np.isfinite(detector.push(HAND, 2 * STEP_NS).uv[:, 0]).all()
     assert choice.frames == 2
+
+
+def test_a_recording_gives_the_same_bytes_in_windows(datasets: Path, tmp_path: Path) -> None:
+    (tmp_path / "cameras").mkdir()
+    calibrate_colours(datasets / "stereo/calib_colors", "left", tmp_path / "cameras/left.json")
+    command = ["detect", str(datasets / "stereo/static"), "--camera", "left", "--calibration", str(tmp_path)]
+    for scan in ("full", "windows"):
+        assert main([*command, "-o", str(tmp_path / f"{scan}.npz"), "--scan", scan]) == 0
+    assert (tmp_path / "full.npz").read_bytes() == (tmp_path / "windows.npz").read_bytes()
+
+
+def test_a_wrist_device_has_no_windows_of_markers(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["run", "--name", "wrist", "--rig", "wrist", "--camera", "synthetic", "--scan", "windows"]
+    assert main([*command, "--calibration", str(root / "calib_json")]) == 1
+    assert "--scan windows: camera 'wrist' of a wrist device sees no markers" in capsys.readouterr().err
