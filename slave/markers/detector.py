@@ -171,12 +171,15 @@ class MarkerDetector:
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
-        reports = [NOT_SEEN] * len(self._names)
+        reports: dict[int, tuple[float, ...]] = {}
         for m, seen in zip(rows, measured, strict=False):
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
                 before = self._tracks[m] if windows[m] is not None else None
                 reports[m] = self._report(m, before, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
-        result = np.array(reports).round(DIGITS).T
+        values: list[float] = []
+        for m in range(len(self._names)):
+            values += reports.get(m, NOT_SEEN)
+        result = np.array(values).round(DIGITS).reshape(-1, len(NOT_SEEN)).T
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
     @property
@@ -266,10 +269,13 @@ class MarkerDetector:
                 lost.append(m)
             if track is None or window is None or (track.growing(t_ns) and not seen):
                 places.append(())  # what has grown is more to look at than strips
-            elif abs(window.u - track.u) > window.margin or abs(window.v - track.v) > window.margin:
-                places.append((window, window._replace(u=track.u, v=track.v)))  # it may have come to rest
-            else:
+            elif (
+                -window.margin <= window.u - track.u <= window.margin
+                and -window.margin <= window.v - track.v <= window.margin
+            ):
                 places.append((window,))
+            else:
+                places.append((window, window._replace(u=track.u, v=track.v)))  # it may have come to rest
         return self._scanner.around(image, self._table, places, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:

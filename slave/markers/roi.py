@@ -111,7 +111,7 @@ class Track(NamedTuple):
 
     def covers(self, area: float, t_ns: int) -> bool:
         """Whether something has come in front of the marker, or still is."""
-        if self.hidden(area) <= COVERED:
+        if 1.0 - area / self.usual <= COVERED:
             return False
         lost = 1.0 - area / self.seen
         return self.covered or lost > max(COVERING, TURNING_PER_S * (t_ns - self.t_ns) * 1e-9)

@@ -24,7 +24,7 @@ from slave.markers.roi import Window
 FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
 OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
 STRIPS = 8  # of a frame: so many frames until a lost marker that lies still is found
-ROUNDS = 3  # of widening, before the whole frame is scanned: what reaches so far is no marker
+ROUNDS = 3  # of scans, each wider, before that of the whole frame: what reaches so far is no marker
 
 
 # A part of the frame in columns and rows of the scan's grid: left, top, right, bottom; the last two exclusive.
@@ -102,14 +102,13 @@ class Scanner:
         asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for some in windows for w in some]
         proposed = self._search(image, table, lost) if lost else {}
         asked += [self._of(blob) for blobs in proposed.values() for blob in blobs]
-        parts = merged(asked)
-        scanned = [self._part(image, table, part) for part in parts]
         for _ in range(ROUNDS):
+            parts = merged(asked)
+            scanned = [self._part(image, table, part) for part in parts]
             clipped = [blob for part, _, blobs in scanned for blob in self._clipped(part, blobs)]
             if not clipped:
                 break
-            parts = merged([*parts, *(self._of(blob) for blob in clipped)])
-            scanned = [self._part(image, table, part) for part in parts]
+            asked = [*parts, *(self._of(blob) for blob in clipped)]
         else:
             return self.whole(image, table)
         found = _gathered([blobs for _, _, blobs in scanned], len(windows))
@@ -161,7 +160,7 @@ class Scanner:
 
     def _of(self, blob: Blob) -> Part:
         """The part that holds a blob, and around it whatever may be a fragment of it."""
-        reach = _reach(blob)
+        reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE  # as far as a fragment may begin [px]
         return self._around(blob.left - reach, blob.top - reach, blob.right + reach, blob.bottom + reach)
 
     def _clipped(self, part: Part, blobs: list[list[Blob]]) -> list[Blob]:
@@ -174,7 +173,7 @@ class Scanner:
         clipped: list[Blob] = []
         for options in blobs:
             for blob in options:
-                reach = _reach(blob)
+                reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
                 if (
                     blob.left - reach < left
                     or blob.right + reach > right
@@ -183,11 +182,6 @@ class Scanner:
                 ):
                     clipped.append(blob)
         return clipped
-
-
-def _reach(blob: Blob) -> float:
-    """How far from a blob fragments of it may begin [px]."""
-    return FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
 
 
 def merged(parts: Iterable[Part]) -> list[Part]:
