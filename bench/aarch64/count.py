@@ -40,8 +40,8 @@ def counted(
 ) -> Counted:
     """Run `cases` under emulation, each in a process of its own: what ran before moves a count by some 1e-3.
 
-    `fast`: Folder of the wheels that cases of machine code need. One runs before they are counted, some minutes the first
-    time: what was compiled in the same process is not the code that every later start loads.
+    `fast`: Folder of the wheels that cases of machine code need. One runs before they are counted, some minutes
+    the first time: what was compiled in the same process is not the code that every later start loads.
 
     Raises:
         NotPossibleError: The emulated program failed.
