@@ -47,12 +47,17 @@ def rows() -> list[Row]:
 def _generated() -> list[Row]:
     six, twelve, many = (Timed(KINDS[name]) for name in ("finger_end", "twelve", "twentyfour"))
     small, large = Timed(KINDS["320x240"]), Timed(KINDS["1456x1088"], scenes=1, frames=4)
-    numba = {"numba": six.ours(6, engine_named("numba"))} if NUMBA else {}
+    numba: dict[str, Step] = {}
+    if NUMBA:
+        engine = engine_named("numba")
+        numba = {"numba": six.ours(6, engine), "numba windows": six.ours(6, engine, windows_only=True)}
     took = interleaved(
         numba
         | {
             "published": six.published(),
             "ours": six.ours(6),
+            "windows": six.ours(6, windows_only=True),
+            "large windows": large.ours(6, windows_only=True),
             "anew": six.anew(),
             "6 of 12": twelve.ours(6),
             "12": twelve.ours(12),
@@ -69,7 +74,9 @@ def _generated() -> list[Row]:
         _time("published pipeline, 6 markers", took["published"], "baseline"),
         _time("our detector, 6 markers, whole frame, refined", took["ours"], ""),
         _ratio("published / ours", took["published"], took["ours"], "goal >= 9"),
-        *[_ratio("published / ours with numba", took["published"], took[n], "goal >= 20") for n in numba],
+        *[_ratio(f"published / ours with {n}", took["published"], took[n], "goal >= 20") for n in numba],
+        _ratio("whole frame / windows", took["ours"], took["windows"], ""),
+        _ratio("whole frame / windows, 1456x1088", took["large"], took["large windows"], ""),
         _ratio("every marker sought anew / tracked", took["anew"], took["ours"], "goal <= 1.3"),
         _ratio("12 markers / 6 of them", took["12"], took["6 of 12"], "goal <= 1.5"),
         _ratio("24 markers / 6 of them", took["24"], took["6 of 24"], ""),
@@ -96,10 +103,11 @@ class Timed:
         ranges = [(self._camera.markers or {})[name] for name in self.kind.names]
         return self._each(lambda scene, image, t_ns: detect(image, ranges))
 
-    def ours(self, count: int, engine: Engine = NUMPY) -> Step:
+    def ours(self, count: int, engine: Engine = NUMPY, *, windows_only: bool = False) -> Step:
         """Our detector, looking for the first `count` markers, each pointed out in the first frame."""
         names = self.kind.names[:count]
         first = MarkerDetector(self._camera, names, engine=engine)
+        first.windows_only = windows_only
         detectors = [first.fresh(clicks(self.kind, scene[0])) for scene in self.scenes]
         return self._each(lambda scene, image, t_ns: detectors[scene].push(image, t_ns))
 

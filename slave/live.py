@@ -23,6 +23,7 @@ from slave.markers.detector import MarkerDetector
 from slave.markers.engine import Engine
 from slave.markers.following import can_follow, detector_for
 from slave.markers.known import KnownDetector
+from slave.markers.scan_choice import Scan, ScanChoice
 from slave.overlay import MarkerOverlay, WristOverlay
 from slave.picker import LivePicker
 from slave.preview import Previews
@@ -57,6 +58,7 @@ def run_live(
     uplink: Uplink,
     clock: Clock,
     colours: Colours,
+    scan: Scan,
     engine: Engine | WristEngine,
     stop: threading.Event,
     say: Callable[[str], None],
@@ -73,6 +75,7 @@ def run_live(
         uplink: Where detections go.
         clock: The slave's clock.
         colours: Whether those of markers follow the light, stay fixed, or nothing is detected at all.
+        scan: Whether whole frames are scanned for markers, or windows (`scan_choice`).
         engine: What scans and measures for markers, or what does the inner loops before a wrist device.
         stop: Set by a signal handler, or by the command "stop" on the bus.
         say: Told one line when it is ready, and one at the end.
@@ -90,7 +93,7 @@ def run_live(
     if isinstance(engine, WristEngine):
         line = _wrist_line(name, files, read, uplink, clock, colours, engine, stop, service)
     else:
-        line = _marker_line(name, files, read, uplink, clock, colours, engine, stop, workers, service)
+        line = _marker_line(name, files, read, uplink, clock, colours, scan, engine, stop, workers, service)
     tuning = CameraTuning(
         files, source, line.prepare, lambda: line.numbers.counts()["frames"] > 0, line.picker
     )
@@ -149,6 +152,7 @@ def _marker_line(
     uplink: Uplink,
     clock: Clock,
     colours: Colours,
+    scan: Scan,
     engine: Engine,
     stop: threading.Event,
     workers: ThreadPoolExecutor,
@@ -166,10 +170,16 @@ def _marker_line(
             None,
         )
     make = _maker(files, colours, engine, workers)
-    detector = ChangingDetector(make(files.camera, rig))
+    choice = ScanChoice(scan, files.camera)
+    detector = ChangingDetector(make(files.camera, rig), choice)
     tally = Tally(
         rig.markers,
-        lambda: tags.counts() | _uncalibrated(detector.missing) | told_frames(detector.plain),
+        lambda: (
+            tags.counts()
+            | _uncalibrated(detector.missing)
+            | {"windows": choice.frames}
+            | told_frames(detector.plain)
+        ),
         lambda: told_places(detector.plain),
     )
     previews = Previews(name, clock, MarkerOverlay(detector, rig.markers))

@@ -17,6 +17,7 @@ from slave.cameras.replay import read_png
 from slave.markers.autocolour import calibrate_moving, frames_for
 from slave.markers.autocolour_names import by_clicks, by_hand, by_hues, checked
 from slave.markers.autocolour_surroundings import spread
+from slave.markers.changing import plain_of
 from slave.markers.colours import ColourRow, calibrate
 from slave.markers.following import detector_for
 from slave.markers.workers import Inline
@@ -79,6 +80,8 @@ def detect_recording(
     calibration: Path | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     tags: "TagCollector | None" = None,
+    *,
+    windows_only: bool = False,
 ) -> RecordedDetections:
     """Detect the markers in every frame of one camera, with colours that follow the light where it has references.
 
@@ -88,6 +91,7 @@ def detect_recording(
         calibration: calib_json tree whose cameras/<camera>.json holds the marker colours.
         progress: Called with frames done and frames in all.
         tags: Is given every frame, too.
+        windows_only: Scan windows where markers are expected, as `MarkerDetector`.
 
     Raises:
         RecordingError: The recording is broken or has no such camera or no frame of it.
@@ -102,6 +106,8 @@ def detect_recording(
     rig = recording.manifest.marker_rig()
     names, clicks = rig.markers, recording.manifest.clicks.get(camera)
     detector = detector_for(model, names, Inline(), clicks, free=rig.free_markers)
+    if (plain := plain_of(detector)) is not None:
+        plain.windows_only = windows_only
     shape = (len(rows), len(names))
     uv, rival_uv = np.full((*shape, 2), np.nan), np.full((*shape, 2), np.nan)
     area, quality, sigma_px = np.full(shape, np.nan), np.full(shape, np.nan), np.full(shape, np.nan)

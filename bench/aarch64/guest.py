@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from bench import seed_markers
-from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, MarkedFrames, read
+from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, MarkedFrames, read, without
 from bench.aarch64.parts import counted_parts
 from common.messages import Message
 from master.link import MasterLink
@@ -27,9 +27,13 @@ from slave.app import run
 from slave.cameras.source import Frame
 from slave.link import SlaveLink
 from slave.markers.detector import Detections, MarkerDetector
+from slave.markers.engine import engine_named
 from slave.tally import Tally
 
 FIRST, LAST = 20, 60  # the slope is taken between these counts of frames
+MACHINE_CODE = ("numba", "numba-windows")  # cases
+WINDOWS = ("windows", "search", "numba-windows")
+PUSHED = ("six", "twelve", "parts", "numba", *WINDOWS)
 KEY = bytes(range(32))
 MASTER, SLAVE = ("10.0.0.1", 47801), ("10.0.0.2", 5)
 
@@ -126,6 +130,8 @@ class _Source:
 def run_case(case: str, folder: Path, marks: Marks) -> str:
     """Run `case` over all frames with marks at FIRST and LAST; return the hash of what it found."""
     frames = read(folder / (TWELVE if case == "twelve" else SIX))
+    if case == "search":
+        frames = without(frames, frames.names[0])
     digest = Digest()
 
     def mark(k: int) -> None:
@@ -138,9 +144,11 @@ def run_case(case: str, folder: Path, marks: Marks) -> str:
             step(k)
         mark(LAST)
 
-    detector = MarkerDetector(frames.camera, frames.names)
+    engine = engine_named("numba" if case in MACHINE_CODE else "numpy")
+    detector = MarkerDetector(frames.camera, frames.names, engine=engine)
+    detector.windows_only = case in WINDOWS
     found: list[Detections] = []
-    if case in ("six", "twelve", "parts"):
+    if case in PUSHED:
         with counted_parts(marks, case == "parts"):
             each(lambda k: found.append(detector.push(frames.image(k), k * FRAME_NS)))
     elif case == "lost":

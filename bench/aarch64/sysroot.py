@@ -35,6 +35,7 @@ WHEELS = (
     "smbus2",
 )
 WHEELS_OF_WHEELS = ("cffi", "pycparser")
+FAST = ("llvmlite", "numba")  # those of the extra `fast`, beside the others and only where a case needs them
 UNREACHABLE = ("resolve", "connect", "unreachable", "NewConnectionError", "timed out")
 KEYRING = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 TOOLS = {"mmdebstrap": "mmdebstrap", "gcc": "gcc libc6-dev", "tar": "tar"}
@@ -93,7 +94,8 @@ def _prepared(say: Callable[[str], None]) -> Sysroot:
     architecture, loader = HOSTS[platform.machine()]
     root = _debian("arm64", PACKAGES, say)
     tools = _debian(architecture, ("qemu-user",), say)
-    wheels = _made("wheels", f"{PYTHON} {WHEELS} {_pins()}", _download_wheels, say)
+    names = [*WHEELS, *WHEELS_OF_WHEELS]
+    wheels = _made("wheels", f"{PYTHON} {WHEELS} {_pins(names)}", lambda place: _download(place, WHEELS), say)
     plugin = _made("plugin", PLUGIN.read_text(), _compile_plugin, say)
     triplet = f"{platform.machine()}-linux-gnu"
     # The loader by its real path: the usual one is a link to / and would be the machine's own, of another libc.
@@ -135,14 +137,35 @@ def _debian(architecture: str, packages: tuple[str, ...], say: Callable[[str], N
     return _made(f"{SUITE}-{architecture}-{packages[0]}", f"{packages} {MIRROR}", unpack, say)
 
 
-def _pins() -> list[str]:
+def fast_wheels(say: Callable[[str], None]) -> Path:
+    """The folder of the extra `fast`, 200 MB, made if it is not there; beside what `prepare` made.
+
+    Raises:
+        NoNetworkError: The registry of wheels cannot be reached.
+        NotPossibleError: A tool fails.
+    """
+    with (CACHE / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return _made(
+            "fast", f"{PYTHON} {_pins(FAST)}", lambda place: _download(place, FAST, "--no-deps"), say
+        )
+
+
+def _pins(names: Sequence[str]) -> list[str]:
     """The lines of constraints.txt that say which wheels."""
-    names = "|".join([*WHEELS, *WHEELS_OF_WHEELS])
-    return re.findall(rf"^(?:{names})==.*$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    return re.findall(rf"^(?:{'|'.join(names)})==.*$", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
 
 
-def _download_wheels(folder: Path) -> None:
-    pins = ["-c", str(ROOT / "constraints.txt"), "--target", str(folder), "--only-binary=:all:", *WHEELS]
+def _download(folder: Path, wheels: Sequence[str], *more: str) -> None:
+    pins = [
+        "-c",
+        str(ROOT / "constraints.txt"),
+        "--target",
+        str(folder),
+        "--only-binary=:all:",
+        *more,
+        *wheels,
+    ]
     if importlib.util.find_spec("pip") is not None:
         platforms = [f"--platform=manylinux_2_{glibc}_aarch64" for glibc in (28, 27, 26, 17)]
         abis = [f"--abi=cp{PYTHON.replace('.', '')}", "--abi=abi3", "--abi=none"]

@@ -29,6 +29,13 @@ def add_options(command: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="its cameras/NAME.json gives the colours; for a wrist device its hands/ the hand",
     )
+    command.add_argument(
+        "--scan",
+        choices=("full", "windows"),
+        default="full",
+        help="where markers are looked for: in the full frame, or in windows about where they are expected, as a live "
+        "slave does where full frames do not fit (default: %(default)s; docs/cameras.md)",
+    )
     command.add_argument("--hand", type=Path, metavar="FILE", help="hand profile, for a wrist device")
     command.add_argument(
         "-o", "--output", type=Path, required=True, metavar="FILE", help="detections_NAME.npz"
@@ -49,6 +56,8 @@ def run(options: argparse.Namespace, aside: Callable[[str], None]) -> int:
             aside(f"{options.camera}: {done} of {total} frames")
 
     if is_grey(load_manifest(options.recording), options.camera):
+        if options.scan != "full":
+            raise CalibrationError(f"--scan: camera {options.camera!r} sees no markers")
         _detect_fingers(options, progress, aside)
         return 0
     if options.hand is not None:
@@ -63,7 +72,10 @@ def _detect_markers(options: argparse.Namespace, progress: Callable[[int, int], 
     from slave.offline import detect_recording, save_detections, tag_collector
 
     tags = tag_collector(options.recording, options.camera, options.calibration)
-    found = detect_recording(options.recording, options.camera, options.calibration, progress, tags)
+    windows = options.scan == "windows"
+    found = detect_recording(
+        options.recording, options.camera, options.calibration, progress, tags, windows_only=windows
+    )
     save_detections(options.output, found)
     if tags is not None:
         save_detections(options.output.parent / f"tags_{options.camera}.npz", tags.all())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from common.calibration import HandProfile, load
 from common.clock import Clock, SystemClock
-from common.errors import RecordingError
+from common.errors import CalibrationError, RecordingError
 from slave.commands.camera import add_camera, open_lit
 from slave.commands.options import (
     add_link,
@@ -22,6 +22,7 @@ from slave.commands.options import (
     secrets_of,
     skew_of,
 )
+from slave.markers.scan_choice import SCANS
 from slave.service import COMPILE_S, Service
 from slave.stopping import stop_on_signals
 
@@ -45,6 +46,8 @@ EXAMPLES = """\
         before there are colours: for `phalanx-master calibrate capture`
   phalanx-slave run --name left --rig desk --camera v4l2:/dev/v4l/by-id/CAM --control gain=32 --key-file rig.key
         with a USB camera; docs/cameras.md says which settings are fixed and checked
+  phalanx-slave run --name left --rig desk --camera picamera2 --scan windows --key-file rig.key
+        only windows about the markers are scanned: for a board or a rate at which whole frames do not fit
   phalanx-slave run --name left --rig desk --camera picamera2 --raw-folder recordings --key-file rig.key
         keeps raw frames while it tracks whenever `phalanx-master record FILE --raw` asks; docs/recording.md
 """
@@ -73,6 +76,14 @@ def add_options(command: argparse.ArgumentParser) -> None:
         default="numpy",
         help="what detects markers, or fingers before a wrist device: numba is several times faster, needs the extra "
         "`fast` (default: %(default)s)",
+    )
+    command.add_argument(
+        "--scan",
+        choices=SCANS,
+        default="auto",
+        help="where markers are looked for: in the full frame; in windows about where they are expected, and strip by "
+        "strip where one is lost, which takes a lost marker a few frames more; auto: in the full frame as long as that "
+        "fits the time of a frame (default: %(default)s; docs/cameras.md)",
     )
     command.add_argument(
         "--raw-folder",
@@ -118,7 +129,19 @@ def run(options: argparse.Namespace, say: Callable[[str], None]) -> int:
         say(f"{options.name}: {line}")
 
     run_live(
-        options.name, files, source, uplink, clock, options.colours, engine, stop, tell, service, access, raw
+        options.name,
+        files,
+        source,
+        uplink,
+        clock,
+        options.colours,
+        options.scan,
+        engine,
+        stop,
+        tell,
+        service,
+        access,
+        raw,
     )
     return 0
 
@@ -128,6 +151,8 @@ def _files(options: argparse.Namespace) -> "CameraFiles":
     from slave.tuning import CameraFiles
 
     rig, camera = camera_of(options)
+    if rig.kind == "wrist" and options.scan == "windows":
+        raise CalibrationError(f"--scan windows: camera {options.name!r} of a wrist device sees no markers")
     objects = tuple(objects_of(options, rig).values())
     files = CameraFiles(camera_path(options, options.name), rig_path(options), camera, rig, objects=objects)
     if rig.kind != "wrist" or options.colours == "none":  # with none, fingers need not be known

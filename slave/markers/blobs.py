@@ -64,7 +64,7 @@ def find_blobs(
     found: list[list[Blob]] = [[] for _ in bits]
     mine = np.array(bits, codes.dtype)
     flat = codes.reshape(-1)
-    index = _nonzero(flat, int(np.bitwise_or.reduce(mine)))
+    index = np.flatnonzero((flat & np.bitwise_or.reduce(mine)) != 0)
     if index.size == 0:
         return found
     marker, place = ((flat[index] & mine[:, None]) != 0).nonzero()
@@ -148,18 +148,6 @@ def with_fragments(blob: Blob, options: Sequence[Blob], extent: float, whole: fl
             area, u, v = area + piece.area, u + piece.u * piece.area, v + piece.v * piece.area
     doubt = 0.0 if known and area <= whole else math.hypot(u / area - blob.u, v / area - blob.v)
     return blob._replace(left=left, top=top, right=right, bottom=bottom), doubt
-
-
-def _nonzero(flat: Codes, wanted: int) -> npt.NDArray[np.int64]:
-    """Indices of the codes with a wanted bit; 8-byte words are tested first, since nearly all have none."""
-    per_word = 8 // flat.itemsize
-    whole = flat.size - flat.size % per_word
-    pattern = np.full(per_word, wanted, flat.dtype)
-    words = np.flatnonzero(flat[:whole].view(np.uint64) & pattern.view(np.uint64)[0])
-    index = (words[:, None] * per_word + np.arange(per_word)).reshape(-1)
-    if whole < flat.size:
-        index = np.concatenate([index, np.arange(whole, flat.size)])
-    return index[(flat[index] & pattern[0]) != 0]
 
 
 def _label(

@@ -5,6 +5,7 @@ follows the light it must know the light before it is of use: it looks at some f
 too, and takes over as soon as it may tell markers by their colours.
 """
 
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import TypeAlias
@@ -19,6 +20,7 @@ from slave.markers.colour_watch import ColourWarning
 from slave.markers.detector import Detections, MarkerDetector
 from slave.markers.following import FollowingDetector
 from slave.markers.known import KnownDetector
+from slave.markers.scan_choice import ScanChoice
 from slave.tuning import CameraFiles, Prepare
 
 LOOKS = 60  # a first light takes some tens of frames to be proven, or is not there to be proven
@@ -29,11 +31,17 @@ Changeable: TypeAlias = MarkerDetector | FollowingDetector | KnownDetector
 
 class ChangingDetector:
     """Holds the detector in use, the one that takes over with the next frame, that frame's predecessor, and what was
-    found of late."""
+    found of late. Attribute `choice`: whether whole frames are scanned; None: they are."""
 
-    def __init__(self, detector: Changeable) -> None:
-        """Begin with `detector`."""
+    def __init__(
+        self,
+        detector: Changeable,
+        choice: ScanChoice | None = None,
+        processor_ns: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        """Begin with `detector`; `processor_ns` says what time [ns] this thread has had of the processor."""
         self._detector = detector
+        self.choice, self._processor_ns = choice, processor_ns
         self._next: deque[Changeable] = deque(maxlen=1)  # one thread fills it, another empties it
         self._frames = Passing[tuple[Image, int]]()
         self._found: deque[tuple[int, Float]] = deque(maxlen=RECENT)
@@ -45,13 +53,25 @@ class ChangingDetector:
             _hand_over(self._detector, coming)
             self._detector = coming
         self._frames.put((image, t_ns))
-        found = self._detector.push(image, t_ns)
+        found = self._detect(image, t_ns)
         self._found.append((t_ns, found.uv))
         return found
 
+    def _detect(self, image: Image, t_ns: int) -> Detections:
+        plain, choice = self.plain, self.choice
+        if plain is None or choice is None:
+            return self._detector.push(image, t_ns)
+        plain.windows_only = choice.windows
+        began_ns = self._processor_ns()
+        found = self._detector.push(image, t_ns)
+        choice.push(self._processor_ns() - began_ns)
+        return found
+
     def tune(self, camera: CameraCalibration) -> None:
-        """The camera has another exposure or margin. From any thread."""
+        """The camera has another exposure, rate or margin. From any thread."""
         self._detector.tune(camera)
+        if self.choice is not None:
+            self.choice.tune(camera)
 
     def replace(self, detector: Changeable) -> None:
         """Let `detector`, of the same markers, take over. Not from the loop's thread: it may take a second."""
@@ -77,7 +97,7 @@ class ChangingDetector:
     @property
     def plain(self) -> MarkerDetector | None:
         """What detects at present, with its colour table; None: no colour is known. From any thread."""
-        return _plain(self._detector)
+        return plain_of(self._detector)
 
     @property
     def missing(self) -> tuple[str, ...]:
@@ -123,7 +143,10 @@ def marker_changes(
         if looks[0] != looks[1]:
             made = make(new.camera, new.rig)
             _refuse_blinding(detector, made)
-        tuned = [(files.camera.exposure_us, files.camera.roi_margin) for files in (old, new)]
+        tuned = [
+            (files.camera.exposure_us, files.camera.roi_margin, files.camera.frame_rate_hz)
+            for files in (old, new)
+        ]
         if made is None and tuned[0] == tuned[1]:
             return None
 
@@ -145,7 +168,8 @@ def _refuse_blinding(old: ChangingDetector, made: Changeable) -> None:
         )
 
 
-def _plain(detector: Changeable) -> MarkerDetector | None:
+def plain_of(detector: Changeable) -> MarkerDetector | None:
+    """What detects; None: nothing does."""
     return detector if isinstance(detector, MarkerDetector) else detector.plain
 
 
@@ -153,6 +177,6 @@ def _hand_over(old: Changeable, new: Changeable) -> None:
     if isinstance(old, FollowingDetector) and isinstance(new, FollowingDetector):
         new.adopt(old)
         return
-    before, after = _plain(old), _plain(new)
+    before, after = plain_of(old), plain_of(new)
     if before is not None and after is not None:
         after.adopt(before)

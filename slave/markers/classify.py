@@ -106,7 +106,9 @@ class ColourTable:
             return self._table.take(cv2.LUT(pixels, mapped).view(np.uint32).reshape(packed.shape))
         return self._table.take(packed & 0xFFFFFF)
 
-    def scan(self, image: Image, step: int, dx: int = 0, dy: int = 0) -> Codes:
+    def scan(
+        self, image: Image, step: int, dx: int = 0, dy: int = 0, size: tuple[int, int] | None = None
+    ) -> Codes:
         """Class codes on a grid: every `step`-th pixel of every `step`-th row.
 
         Decimated, not averaged: an averaged pixel on the rim of a marker has a hue that no paint has.
@@ -114,16 +116,18 @@ class ColourTable:
         Args:
             image: (H, W, 3) BGR, C-contiguous.
             step: Distance of the grid's lines [px], at least 2.
-            dx, dy: Where the grid begins [px], less than `step`.
+            dx, dy: Where the grid begins [px]; less than `step` for the whole image.
+            size: Rows and columns of the grid; None: those of the whole image.
 
         Returns:
-            (H // step, W // step) codes of the pixels (dy + step v, dx + step u). Reused by the next call.
+            Codes of that size, (H // step, W // step) of the whole image, of the pixels (dy + step v, dx + step u).
+            Reused by the next call.
         """
-        height, width = image.shape[0] // step, image.shape[1] // step
+        height, width = (image.shape[0] // step, image.shape[1] // step) if size is None else size
         row = image.shape[1] * 3
         # A pixel is read as four bytes, of which the last belongs to its neighbour. Read from one byte before it
         # instead, the first belongs to its other neighbour; so one of the two never leaves the image.
-        late = dx == step - 1
+        late = dx % step == step - 1
         words = np.ndarray(
             (height, width),
             "<u4",

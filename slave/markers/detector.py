@@ -1,9 +1,9 @@
-"""Frame in, marker centroids out: scan everything, decide which blob is which marker, measure it.
+"""Frame in, marker centroids out: scan, decide which blob is which marker, measure it.
 
 A push machine. It holds one track per marker, and counts what is beside them; a new recording gets a new
 detector (`fresh`).
 
-    scan     one table look-up on every second pixel, all colours at once         classify
+    scan     one table look-up, all colours at once; the whole frame or windows   scan, classify
     blobs    connected blobs per colour                                          blobs
     decide   by prediction where a track answers; else by what belongs together  roi, group
     measure  sub-pixel centroid of the visible paint, full resolution            centroid
@@ -18,9 +18,9 @@ import numpy as np
 from common.arrays import Float, Image
 from common.calibration import CameraCalibration, HsvRange
 from slave.markers.beside import Beside
-from slave.markers.blobs import SCALE, Blob, with_fragments
+from slave.markers.blobs import Blob, with_fragments
 from slave.markers.centroid import PAD, Measured
-from slave.markers.classify import Codes, ColourTable, table_of
+from slave.markers.classify import ColourTable, table_of
 from slave.markers.edge import Ellipse, centre_of, explained
 from slave.markers.engine import NUMPY, Engine
 from slave.markers.group import (
@@ -31,13 +31,11 @@ from slave.markers.group import (
     choose,
     connected,
     on_fringe,
-    skin_share,
 )
-from slave.markers.roi import Track, advance
+from slave.markers.roi import Track, Window, advance
+from slave.markers.scan import Scanned, Scanner
 from slave.markers.sigma import COVERED_PX, sigma_of
 
-FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
-OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
 CLICK_REACH = 6  # px between a click and the scanned box of its marker
 FRINGE = 0.2  # share of foreign neighbours from which a thin sliver counts as a colour fringe
 SLIVER = 14.0  # px^2; a thinner sliver cannot be told from a fringe
@@ -45,6 +43,7 @@ CLEAR_CONTRAST = 6.0  # standard deviations between paint and surroundings that 
 SMALL = 40.0  # px^2 below which the centroid of a cap is uncertain
 SMEARED = 2.0  # px of way during the exposure from which an edge is no edge
 DIGITS = 6  # of what is reported: what comes after them differs between processors
+NOT_SEEN = (math.nan,) * 10  # what is reported of a marker
 RIVALS = 2  # that are measured in one frame
 RIVAL = 0.3  # of the marker's area: a smaller blob is no rival, nor one as much larger
 
@@ -78,7 +77,13 @@ class Detections:
 
 
 class MarkerDetector:
-    """Finds the markers of one camera, frame by frame. Holds one track per marker."""
+    """Finds the markers of one camera, frame by frame. Holds one track per marker.
+
+    Attributes:
+        windows_only: Only windows of tracked markers are scanned, and strips for lost ones; the first frame is scanned
+            whole. May change between two frames.
+        beside: Things of a marker's colour that are none, as far as scans saw them.
+    """
 
     def __init__(
         self,
@@ -112,13 +117,17 @@ class MarkerDetector:
         engine.prepare(self._table)
         self._seeds = {markers.index(name): uv for name, uv in (seeds or {}).items() if name in markers}
         self._tracks: list[Track | None] = [None] * len(markers)
-        self.beside = Beside(markers)  # things of a marker's colour that are none
-        self._turn = -1  # which further grid is next; negative before the first frame
+        self._scanner = Scanner(camera.width_px, camera.height_px, engine)
+        self._last_ns: int | None = None  # time of the last frame
+        self.windows_only = False
+        self.beside = Beside(markers)
 
     def fresh(self, seeds: Mapping[str, tuple[float, float]] | None = None) -> "MarkerDetector":
         """A detector of the same camera that has seen nothing yet; shares the colour table."""
         free = [self._names[m] for m in self._free]
-        return MarkerDetector(self._camera, self._names, seeds, self._table, self._engine, free)
+        other = MarkerDetector(self._camera, self._names, seeds, self._table, self._engine, free)
+        other.windows_only = self.windows_only
+        return other
 
     def push(self, image: Image, t_ns: int) -> Detections:
         """Detect in one frame.
@@ -134,8 +143,14 @@ class MarkerDetector:
         if image.shape != size or image.dtype != np.uint8:
             raise ValueError(f"image {image.shape} {image.dtype}, the camera file says {size} uint8")
         image = np.ascontiguousarray(image)
-        codes, blobs = self._scan(image)
-        chosen = self._decide(codes, blobs, t_ns)
+        width = self._camera.width_px
+        windows = [
+            track.window(t_ns, width, self._margin) if track is not None and track.alive(t_ns) else None
+            for track in self._tracks
+        ]
+        scanned = self._look(image, t_ns, windows)
+        blobs = scanned.blobs
+        chosen = self._decide(scanned, windows)
         self.beside.push(blobs, chosen)
         self._seeds = {}
         rows = list(chosen)
@@ -144,23 +159,27 @@ class MarkerDetector:
         for m in rows:
             if len(blobs[m]) > 1:
                 chosen[m], doubt[m] = with_fragments(chosen[m], blobs[m], *self._known(m, t_ns))
-                rival = self._rival(m, chosen[m], blobs, t_ns)
+                rival = self._rival(m, chosen[m], blobs, windows[m])
                 if rival is not None:
                     rivals[m] = rival
         # A rival costs as much as a marker, so a frame full of them is not measured through.
         closely = sorted(rivals, key=lambda m: -rivals[m].area)[:RIVALS]
-        windows = [(m, chosen[m]) for m in rows] + [(m, rivals[m]) for m in closely]
-        alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in windows]
-        bits = [self._table.bits[m] for m, _ in windows]
-        measured = self._engine.measure(image, self._table, bits, [blob for _, blob in windows], alone)
+        asked = [(m, chosen[m]) for m in rows] + [(m, rivals[m]) for m in closely]
+        alone = [len(blobs[m]) == 1 or _alone(blob, blobs[m]) for m, blob in asked]
+        bits = [self._table.bits[m] for m, _ in asked]
+        measured = self._engine.measure(image, self._table, bits, [blob for _, blob in asked], alone)
         for m, seen in zip(closely, measured[len(rows) :], strict=True):
             if seen is not None:
                 rivals[m] = rivals[m]._replace(u=seen.u, v=seen.v)
-        result = np.full((10, len(self._names)), np.nan)
+        reports: dict[int, tuple[float, ...]] = {}
         for m, seen in zip(rows, measured, strict=False):
             if seen is not None and not (seen.thin and (seen.foreign > FRINGE or seen.area < SLIVER)):
-                result[:, m] = self._report(m, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
-        np.round(result, DIGITS, out=result)
+                before = self._tracks[m] if windows[m] is not None else None
+                reports[m] = self._report(m, before, seen, chosen[m], rivals.get(m), t_ns, doubt.get(m, 0.0))
+        values: list[float] = []
+        for m in range(len(self._names)):
+            values += reports.get(m, NOT_SEEN)
+        result = np.array(values).round(DIGITS).reshape(-1, len(NOT_SEEN)).T
         return Detections(result[:2].T, result[2], result[3], result[4], result[5:7].T, result[7:].T)
 
     @property
@@ -182,7 +201,8 @@ class MarkerDetector:
         """Go on with the tracks of another detector, of the markers that both seek."""
         self._seeds = {}
         if other._names == self._names:
-            self._tracks, self._turn, self.beside = other._tracks, other._turn, other.beside
+            self._tracks, self._scanner, self.beside = other._tracks, other._scanner, other.beside
+            self._last_ns = other._last_ns
             return
         tracks = dict(zip(other._names, other._tracks, strict=True))
         self._tracks = [tracks.get(name) for name in self._names]
@@ -196,12 +216,16 @@ class MarkerDetector:
         self._table = table
 
     def _report(
-        self, m: int, seen: Measured, blob: Blob, rival: Blob | None, t_ns: int, doubt: float
+        self,
+        m: int,
+        before: Track | None,
+        seen: Measured,
+        blob: Blob,
+        rival: Blob | None,
+        t_ns: int,
+        doubt: float,
     ) -> tuple[float, ...]:
-        """One marker's column of the result; its track goes on."""
-        before = self._tracks[m]
-        if before is not None and not before.alive(t_ns):
-            before = None
+        """What is reported of one marker, whose track was `before` if it was alive; it goes on."""
         self._tracks[m] = track = advance(self._tracks[m], seen, blob, t_ns)
         quality = _quality(seen, track)
         sigma = sigma_of(seen, before, track, self._exposure_s)
@@ -222,37 +246,37 @@ class MarkerDetector:
         blue, green, red = seen.colour
         return u, v, area, max(0.01, quality), sigma, *other, blue, green, red
 
-    def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], t_ns: int) -> Blob | None:
+    def _rival(self, m: int, blob: Blob, blobs: list[list[Blob]], window: Window | None) -> Blob | None:
         """The largest other blob of the colour that may be the marker as far as size and motion tell; no rim is."""
-        track = self._tracks[m]
         least, most = RIVAL * blob.area, blob.area / RIVAL
         others = [b for b in blobs[m] if least < b.area < most and not _within(b, blob)]
-        if track is not None and track.alive(t_ns):
-            width = self._camera.width_px
-            others = [b for b in others if math.isfinite(track.cost(b, t_ns, width, self._margin))]
+        if window is not None:
+            others = [b for b in others if math.isfinite(window.cost(b))]
         foreign = [b for n, rest in enumerate(blobs) if n != m for b in rest[:1]]
         others = [b for b in others if not on_fringe(b, foreign)]
         return max(others, key=lambda b: b.area) if others else None
 
-    def _scan(self, image: Image) -> tuple[Codes, list[list[Blob]]]:
-        """Codes of the scan, and blobs of every colour.
-
-        A colour that the grid shows nowhere is sought on further grids: in the first frame on all of them, later on
-        one more each time, in turn.
-        """
-        table, scan = self._table, self._engine.scan_blobs
-        codes, blobs = scan(image, table, table.bits, SCALE, 0, 0)
-        missing = [m for m, options in enumerate(blobs) if not options]
-        if missing:
-            codes = codes.copy()  # the next scan reuses it
-            step, dx, dy = FINER if self._turn < 0 else OTHERS[self._turn]
-            self._turn = (self._turn + 1) % len(OTHERS)
-            _, finer = scan(image, table, [table.bits[m] for m in missing], step, dx, dy)
-            for m, options in zip(missing, finer, strict=True):
-                blobs[m] = options
-        elif self._turn < 0:
-            self._turn = 0
-        return codes, blobs
+    def _look(self, image: Image, t_ns: int, windows: list[Window | None]) -> Scanned:
+        """Scan the frame as far as it has to be."""
+        last_ns, self._last_ns = self._last_ns, t_ns
+        if not self.windows_only or not self._scanner.began:
+            return self._scanner.whole(image, self._table)
+        lost: list[int] = []
+        places: list[tuple[Window, ...]] = []
+        for m, (track, window) in enumerate(zip(self._tracks, windows, strict=True)):
+            seen = track is not None and track.t_ns == last_ns
+            if not seen:
+                lost.append(m)
+            if track is None or window is None or (track.growing(t_ns) and not seen):
+                places.append(())  # what has grown is more to look at than strips
+            elif (
+                -window.margin <= window.u - track.u <= window.margin
+                and -window.margin <= window.v - track.v <= window.margin
+            ):
+                places.append((window,))
+            else:
+                places.append((window, window._replace(u=track.u, v=track.v)))  # it may have come to rest
+        return self._scanner.around(image, self._table, places, lost)
 
     def _known(self, m: int, t_ns: int) -> tuple[float, float]:
         """Largest side [px] and area [px^2] of the whole marker as far as its track knows, else inf and nan."""
@@ -261,19 +285,19 @@ class MarkerDetector:
             return math.inf, math.nan
         return 1.3 * max(track.width, track.height) + 2.0, track.whole
 
-    def _decide(self, codes: Codes, blobs: list[list[Blob]], t_ns: int) -> dict[int, Blob]:
-        """Marker row -> its blob, by prediction alone where that answers for every colour in the image."""
-        width = self._camera.width_px
+    def _decide(self, scanned: Scanned, windows: list[Window | None]) -> dict[int, Blob]:
+        """Marker row -> its blob, by prediction alone where that answers for every colour that was seen."""
+        blobs = scanned.blobs
         tracked: dict[int, Blob] = {}
         certain = not self._seeds
         for m, options in enumerate(blobs):
-            track = self._tracks[m]
+            track, window = self._tracks[m], windows[m]
             if not options:
                 continue
-            if track is None or not track.alive(t_ns):
+            if track is None or window is None:
                 certain = False
                 continue
-            costs = [track.cost(blob, t_ns, width, self._margin) for blob in options]
+            costs = [window.cost(blob) for blob in options]
             cost = min(costs)
             if math.isfinite(cost):
                 tracked[m] = options[costs.index(cost)]
@@ -287,7 +311,7 @@ class MarkerDetector:
             others = [blob for n, rest in enumerate(blobs) if n != m for blob in rest[:1]]
             for blob in options:
                 bonus = self._bonus(m, blob, tracked.get(m))
-                skin = skin_share(codes, self._table.skin, blob)
+                skin = scanned.skin_share(self._table.skin, blob)
                 candidates.append(candidate(m, blob, skin, on_fringe(blob, others), bonus))
         clicked = {c.marker for c in candidates if c.bonus >= CLICKED}
         candidates = [c for c in candidates if c.bonus >= CLICKED or c.marker not in clicked]
@@ -312,8 +336,12 @@ class MarkerDetector:
 
 def _quality(seen: Measured, track: Track) -> float:
     """0..1: how far the centroid can be trusted to be the centroid of the whole cap's visible side."""
-    quality = math.sqrt(min(1.0, seen.area / track.whole)) * min(1.0, seen.contrast / CLEAR_CONTRAST)
-    quality *= math.sqrt(min(1.0, seen.area / SMALL))
+    area, contrast = seen.area, seen.contrast
+    quality = math.sqrt(area / track.whole) if area < track.whole else 1.0
+    if contrast < CLEAR_CONTRAST:
+        quality *= contrast / CLEAR_CONTRAST
+    if area < SMALL:
+        quality *= math.sqrt(area / SMALL)
     if seen.cut:
         quality *= 0.5
     if seen.thin:

@@ -11,7 +11,8 @@ from slave.markers.centroid import Measured, measure
 from slave.markers.classify import Codes, ColourTable
 
 ScanBlobs: TypeAlias = Callable[
-    [Image, ColourTable, Sequence[int], int, int, int], tuple[Codes, list[list[Blob]]]
+    [Image, ColourTable, Sequence[int], int, int, int, tuple[int, int] | None],
+    tuple[Codes, list[list[Blob]]],
 ]
 Measure: TypeAlias = Callable[
     [Image, ColourTable, Sequence[int], Sequence[Blob], Sequence[bool]], list[Measured | None]
@@ -23,8 +24,8 @@ class Engine:
     """The two steps of a detector that look at pixels.
 
     Attributes:
-        scan_blobs: Image, table, bits, step, dx, dy -> codes of the scan (may be reused by the next call), and the
-            blobs of each colour (`blobs.find_blobs`).
+        scan_blobs: Image, table, bits, step, dx, dy, size of the grid as of `ColourTable.scan` -> codes of the scan
+            (may be reused by the next call), and the blobs of each colour (`blobs.find_blobs`).
         measure: As `centroid.measure`.
         prepare: Makes ready for a table what would else be made in the first frame: machine code, brief tables.
     """
@@ -35,10 +36,16 @@ class Engine:
 
 
 def scan_blobs(
-    image: Image, table: ColourTable, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
+    image: Image,
+    table: ColourTable,
+    bits: Sequence[int],
+    step: int = SCALE,
+    dx: int = 0,
+    dy: int = 0,
+    size: tuple[int, int] | None = None,
 ) -> tuple[Codes, list[list[Blob]]]:
     """Codes of the scan, which the next call reuses, and blobs of each colour."""
-    codes = table.scan(image, step, dx, dy)
+    codes = table.scan(image, step, dx, dy, size)
     return codes, find_blobs(codes, bits, step, dx, dy)
 
 

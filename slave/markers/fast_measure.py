@@ -15,7 +15,7 @@ from slave.markers.blobs import SCALE, Blob
 from slave.markers.centroid import Measured
 from slave.markers.classify import ColourTable
 from slave.markers.fast_cells import cells_of
-from slave.markers.fast_window import ANSWERED, ASKED, Rules, measure_windows
+from slave.markers.fast_window import ANSWERED, Rules, measure_windows
 
 Float32 = npt.NDArray[np.float32]
 
@@ -44,56 +44,52 @@ def measure(
     if not blobs:
         return []
     pad = centroid.PAD
-    asked: list[int] = []
-    places: list[tuple[int, int, int, int]] = []
-    start = 0
-    for b, bit, lonely in zip(blobs, bits, alone, strict=True):
-        end = start + (b.bottom - b.top + 2 * pad) * (b.right - b.left + 2 * pad)
-        asked += (b.left, b.top, b.right, b.bottom, bit, lonely, start)
-        places.append((start, end, b.bottom - b.top + 2 * pad, b.right - b.left + 2 * pad))
-        start = end
+    asked: list[tuple[int, ...]] = []
+    size = 0
+    for (_, _, _, left, top, right, bottom), bit, lonely in zip(blobs, bits, alone, strict=True):
+        asked.append((left, top, right, bottom, bit, lonely, size))
+        size += (bottom - top + 2 * pad) * (right - left + 2 * pad)
     answers = np.zeros((len(blobs), ANSWERED))
-    windows = np.zeros(start, np.float32)
+    windows = np.zeros(size, np.float32)
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
-    requests = np.array(asked, np.int64).reshape(-1, ASKED)
     _, cells, skin = cells_of(table)
     measure_windows(
-        pixels, table.entries, table.places, cells, skin, shares.LIGHT, requests, RULES, answers, windows
+        pixels,
+        table.entries,
+        table.places,
+        cells,
+        skin,
+        shares.LIGHT,
+        np.array(asked, np.int64),
+        RULES,
+        answers,
+        windows,
     )
-    return [
-        Measured(
-            u,
-            v,
-            area,
-            contrast,
-            [blue, green, red],
-            cut != 0.0,
-            thin != 0.0,
-            foreign,
-            xx,
-            xy,
-            yy,
-            windows[first:end].reshape(height, width),
-            b.left - pad,
-            b.top - pad,
+    found: list[Measured | None] = []
+    for (left, top, right, bottom, _, _, start), answer in zip(asked, answers.tolist(), strict=True):
+        there, u, v, area, contrast, blue, green, red, cut, thin, foreign, xx, xy, yy = answer
+        if not there:
+            found.append(None)
+            continue
+        height, width = bottom - top + 2 * pad, right - left + 2 * pad
+        window = windows[start : start + height * width].reshape(height, width)
+        found.append(
+            Measured(
+                u,
+                v,
+                area,
+                contrast,
+                [blue, green, red],
+                cut != 0.0,
+                thin != 0.0,
+                foreign,
+                xx,
+                xy,
+                yy,
+                window,
+                left - pad,
+                top - pad,
+            )
         )
-        if found
-        else None
-        for b, (first, end, height, width), (
-            found,
-            u,
-            v,
-            area,
-            contrast,
-            blue,
-            green,
-            red,
-            cut,
-            thin,
-            foreign,
-            xx,
-            xy,
-            yy,
-        ) in zip(blobs, places, answers.tolist(), strict=True)
-    ]
+    return found

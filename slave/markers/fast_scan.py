@@ -37,7 +37,13 @@ class Grid(NamedTuple):
 
 
 def scan_blobs(
-    image: Image, table: ColourTable, bits: Sequence[int], step: int = SCALE, dx: int = 0, dy: int = 0
+    image: Image,
+    table: ColourTable,
+    bits: Sequence[int],
+    step: int = SCALE,
+    dx: int = 0,
+    dy: int = 0,
+    size: tuple[int, int] | None = None,
 ) -> tuple[Codes, list[list[Blob]]]:
     """Codes of the scan, and the blobs of each colour, largest first.
 
@@ -45,15 +51,16 @@ def scan_blobs(
         image: (H, W, 3) BGR.
         table: Colour table of the camera.
         bits: Bit mask of each marker that is sought.
-        step, dx, dy: The grid, as for `ColourTable.scan`.
+        step, dx, dy, size: The grid, as for `ColourTable.scan`.
 
     Returns:
-        (H // step, W // step) codes, and one list per marker, empty where its colour is not in the image.
+        Codes of that size, and one list per marker, empty where its colour is not in the image.
     """
     pixels = np.ascontiguousarray(image).view()
     pixels.flags.writeable = False  # one type for all images: a second one would be compiled in the loop
     cells = cells_of(table).first
-    codes = np.empty((image.shape[0] // step, image.shape[1] // step), cells.dtype)
+    rows, columns = (image.shape[0] // step, image.shape[1] // step) if size is None else size
+    codes = np.empty((rows, columns), cells.dtype)
     grid = Grid(step, dx, dy, step - 1, blobs.MAX_CANDIDATES, blobs.FULL)
     places, boxes = np.empty((len(bits) * grid.most, 3)), np.empty((len(bits) * grid.most, 5), np.int64)
     number = _scan_blobs(pixels, cells, np.array(bits, np.int64), grid, codes, places, boxes)
@@ -129,9 +136,9 @@ def _read(image: Image, cells: Codes, wanted: int, grid: Grid, codes: Codes, hit
     line = 64 // 3  # pixels in a line of the processor's cache
     ahead = 0
     for v in range(height):
-        row = image[grid.dy + grid.step * v, grid.dx :]
+        row = image[grid.dy + grid.step * v, grid.dx : grid.dx + grid.step * width]
         # The next row is asked from memory while this one is worked on.
-        later = image[min(grid.dy + grid.step * (v + 1), image.shape[0] - 1)]
+        later = image[min(grid.dy + grid.step * (v + 1), image.shape[0] - 1), grid.dx :][: len(row)]
         for x in range(0, len(later), line):
             ahead |= later[x, 0]
         into = codes[v]

@@ -101,15 +101,13 @@ def on_fringe(blob: Blob, others: Iterable[Blob]) -> bool:
 def connected(blobs: Sequence[Blob]) -> bool:
     """Whether every blob is linked to another one; skin around both is taken as given, since the past vouches."""
     reach = (REACH * (1.0 + SKIN_REACH)) ** 2
-    rest = list(blobs)
-    if len(rest) < 2:
-        return True
-    for a in rest:
-        limit = reach * math.sqrt(a.area)
-        if not any(
-            (a.u - b.u) ** 2 + (a.v - b.v) ** 2 <= limit * math.sqrt(b.area) for b in rest if b is not a
-        ):
-            return False
+    places = [(blob.u, blob.v, math.sqrt(blob.area)) for blob in blobs]
+    for i, (u, v, size) in enumerate(places):
+        for j, (other_u, other_v, other_size) in enumerate(places):
+            if (u - other_u) ** 2 + (v - other_v) ** 2 <= reach * size * other_size and i != j:
+                break
+        else:
+            return len(places) < 2
     return True
 
 

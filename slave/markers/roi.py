@@ -1,8 +1,8 @@
 """Say where a tracked marker is expected, and whether a blob there may be it.
 
 The region of interest is the marker's last box, moved by its velocity and widened by `roi_margin` of the camera file
-(Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the
-marker; the scan has looked at the whole frame anyway, so a marker outside its window costs nothing.
+(Kalbfleisch: "40 px at 640x480 was best"), more the longer it was not seen. It decides *which* blob is the marker, and
+where the frame is scanned at all when only windows are (`scan`).
 """
 
 import math
@@ -21,6 +21,33 @@ SUDDEN = 2.5  # an area that changes by more between two frames is looked at clo
 COVERED = 0.06  # share of the usual area that is missing while something is in front
 COVERING = 0.08  # share of the area that must go from one frame to the next for that to begin, and
 TURNING_PER_S = 5.0  # what a finger that turns away loses: a radian in a fifth of a second
+
+
+class Window(NamedTuple):
+    """Where one marker is expected in one frame; both the gate for blobs and what is scanned.
+
+    Attributes:
+        u, v: Expected centroid [px].
+        x, y: How far from there the centroid may be [px]: the margin and the marker's own side.
+        margin: How much wider than the marker the window is, to each side [px].
+        area: Last area of the scan's blob [px^2].
+        largest: Area [px^2] beyond which a blob is something else.
+    """
+
+    u: float
+    v: float
+    x: float
+    y: float
+    margin: float
+    area: float
+    largest: float
+
+    def cost(self, blob: Blob) -> float:
+        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible."""
+        x, y = abs(blob.u - self.u), abs(blob.v - self.v)
+        if x > self.x or y > self.y or blob.area > self.largest:
+            return math.inf
+        return math.hypot(x, y) / self.margin + 0.5 * abs(math.log(blob.area / self.area))
 
 
 class Track(NamedTuple):
@@ -59,23 +86,23 @@ class Track(NamedTuple):
         """Whether the track still says where the marker is."""
         return 0 <= t_ns - self.t_ns <= HOLD_NS
 
-    def predicted(self, t_ns: int) -> tuple[float, float]:
-        """Expected centroid (u, v) [px] at `t_ns`, constant velocity for a short time, then at rest."""
-        dt_s = min(t_ns - self.t_ns, VELOCITY_NS) * 1e-9
-        return self.u + self.du * dt_s, self.v + self.dv * dt_s
-
-    def cost(self, blob: Blob, t_ns: int, image_width: int, roi_margin: float) -> float:
-        """How badly `blob` fits: 0 is perfect, about 1 is the rim of the window, inf is impossible.
+    def window(self, t_ns: int, image_width: int, roi_margin: float) -> "Window":
+        """Where the marker may be at `t_ns`: at constant velocity for a short time, then anywhere about that place.
 
         `roi_margin`: how much wider than the marker the window is, share of the image width.
         """
-        u, v = self.predicted(t_ns)
-        growth = max(0.0, (t_ns - self.t_ns - VELOCITY_NS) * 1e-9) * GROWTH_PER_S
-        margin = image_width * (roi_margin + growth)
-        x, y = abs(blob.u - u), abs(blob.v - v)
-        if x > margin + self.width or y > margin + self.height or blob.area > LARGEST * self.whole + 40.0:
-            return math.inf
-        return math.hypot(x, y) / margin + 0.5 * abs(math.log(blob.area / self.area))
+        away_ns = t_ns - self.t_ns
+        if away_ns > VELOCITY_NS:
+            roi_margin += (away_ns - VELOCITY_NS) * 1e-9 * GROWTH_PER_S
+            away_ns = VELOCITY_NS
+        u, v = self.u + self.du * away_ns * 1e-9, self.v + self.dv * away_ns * 1e-9
+        margin = image_width * roi_margin
+        x, y = margin + self.width, margin + self.height
+        return Window(u, v, x, y, margin, self.area, LARGEST * self.whole + 40.0)
+
+    def growing(self, t_ns: int) -> bool:
+        """Whether the marker has not been seen for so long that its window grows."""
+        return t_ns - self.t_ns > VELOCITY_NS
 
     def sudden(self, blob: Blob) -> bool:
         """Whether the area of `blob` jumped against the last frame, by more than the grid of the scan explains."""
@@ -84,7 +111,7 @@ class Track(NamedTuple):
 
     def covers(self, area: float, t_ns: int) -> bool:
         """Whether something has come in front of the marker, or still is."""
-        if self.hidden(area) <= COVERED:
+        if 1.0 - area / self.usual <= COVERED:
             return False
         lost = 1.0 - area / self.seen
         return self.covered or lost > max(COVERING, TURNING_PER_S * (t_ns - self.t_ns) * 1e-9)
@@ -96,26 +123,25 @@ class Track(NamedTuple):
 
 def advance(track: Track | None, seen: Measured, blob: Blob, t_ns: int) -> Track:
     """The track after one more sighting; a track that was lost starts anew, without velocity."""
-    u, v, area = seen.u, seen.v, max(seen.area, 1.0)
+    u, v, area, xx, xy, yy = seen.u, seen.v, seen.area, seen.xx, seen.xy, seen.yy
+    if area < 1.0:
+        area = 1.0
     width, height = float(blob.right - blob.left), float(blob.bottom - blob.top)
     if track is None or not 0 < t_ns - track.t_ns <= HOLD_NS:
         whole = area if track is None else max(area, 0.5 * track.whole)
-        shape = seen.xx, seen.xy, seen.yy
-        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, *shape, width, height, t_ns)
+        return Track(u, v, 0.0, 0.0, blob.area, area, whole, area, False, xx, xy, yy, width, height, t_ns)
     dt_s = (t_ns - track.t_ns) * 1e-9
-    whole = max(area, area + (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S))
-    du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
-    if dt_s > VELOCITY_NS * 1e-9:
-        du = dv = 0.0
+    whole = area
+    if area < track.whole:
+        whole += (track.whole - area) * math.exp(-dt_s / WHOLE_LIFE_S)
+    du = dv = 0.0
+    if dt_s <= VELOCITY_NS * 1e-9:
+        du, dv = (u - track.u) / dt_s, (v - track.v) / dt_s
     keep = math.exp(-dt_s / USUAL_LIFE_S)
     usual = area + (track.usual - area) * keep
     covered = track.covers(area, t_ns)
     if covered:
-        shape = track.xx, track.xy, track.yy
+        xx, xy, yy = track.xx, track.xy, track.yy
     else:
-        shape = (
-            seen.xx + (track.xx - seen.xx) * keep,
-            seen.xy + (track.xy - seen.xy) * keep,
-            seen.yy + (track.yy - seen.yy) * keep,
-        )
-    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, *shape, width, height, t_ns)
+        xx, xy, yy = xx + (track.xx - xx) * keep, xy + (track.xy - xy) * keep, yy + (track.yy - yy) * keep
+    return Track(u, v, du, dv, blob.area, area, whole, usual, covered, xx, xy, yy, width, height, t_ns)

@@ -35,13 +35,15 @@ def sigma_of(seen: Measured, before: Track | None, track: Track, exposure_s: flo
         track: The track after it.
         exposure_s: Exposure time.
     """
-    radius = math.sqrt(max(seen.area, 1.0) / math.pi)
-    edge = math.hypot(EDGE_PX2 / radius, LEAST_PX) * max(1.0, CLEAR / max(seen.contrast, 1.0))
+    radius = math.sqrt((seen.area if seen.area > 1.0 else 1.0) / math.pi)
+    edge = math.hypot(EDGE_PX2 / radius, LEAST_PX)
+    if seen.contrast < CLEAR:
+        edge *= CLEAR / max(seen.contrast, 1.0)
     blur = BLUR * math.hypot(track.du, track.dv) * exposure_s
-    hidden = LASTING * max(0.0, 1.0 - seen.area / track.whole)
+    hidden = LASTING * (1.0 - seen.area / track.whole) if seen.area < track.whole else 0.0
     if before is not None and track.covered:
         hidden = max(hidden, before.hidden(seen.area))
-    cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8))
+    cover = COVER * hidden * radius / (1.0 - min(hidden, 0.8)) if hidden > 0.0 else 0.0
     cut = CUT * radius if seen.cut else 0.0
     sigma = math.sqrt(edge * edge + blur * blur + cover * cover + cut * cut)
     return THIN * sigma if seen.thin else sigma

@@ -17,7 +17,7 @@ from bench.aarch64 import baseline, scene, sysroot
 from bench.aarch64.__main__ import CASES, main
 from bench.aarch64.baseline import Baseline, BaselineError
 from bench.aarch64.count import FIRST, LAST, Counted, counted, native, slope, spans
-from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, write
+from bench.aarch64.frames import FRAME_NS, SIX, TWELVE, forth_and_back, read, without, write
 from bench.aarch64.guest import Digest, Marks, run_case
 from bench.aarch64.parts import counted_parts
 from bench.aarch64.sysroot import NotPossibleError, Sysroot
@@ -165,6 +165,13 @@ def test_a_case_marks_twice_and_repeats_bit_by_bit(folder: Path) -> None:
     assert marks.labels == [f"step {FIRST}", f"step {LAST}"]
 
 
+def test_windows_find_what_whole_frames_do_and_a_lost_marker_is_one(folder: Path) -> None:
+    assert run_case("windows", folder, Marks()) == run_case("six", folder, Marks())
+    frames = without(read(folder / SIX), "thumb")
+    found = detector.MarkerDetector(frames.camera, frames.names).push(frames.image(0), 0)
+    assert np.isfinite(found.uv[:, 0]).tolist() == [name != "thumb" for name in frames.names]
+
+
 def test_counting_parts_changes_no_result_and_is_undone(folder: Path) -> None:
     before = vars(detector) | vars(detector.MarkerDetector)
     marks = Marks()
@@ -228,7 +235,8 @@ def test_wrong_arguments_are_refused(arguments: list[str]) -> None:
 
 
 def test_every_wheel_is_pinned() -> None:
-    assert len(sysroot._pins()) == len(sysroot.WHEELS) + len(sysroot.WHEELS_OF_WHEELS)
+    names = [*sysroot.WHEELS, *sysroot.WHEELS_OF_WHEELS, *sysroot.FAST]
+    assert len(sysroot._pins(names)) == len(names)
 
 
 def test_what_is_cached_is_made_once_and_anew_for_other_inputs(

@@ -49,7 +49,7 @@ def recorded_run(folder: Path, file: Path) -> str:
                     str(folder / "live.json"),
                 ],
                 [*slave, "--name", "left", "--scene-epoch-ns", epoch_ns],
-                [*slave, "--name", "right", "--scene-epoch-ns", epoch_ns],
+                [*slave, "--name", "right", "--scene-epoch-ns", epoch_ns, "--scan", "windows"],
             ):
                 python = [sys.executable, "-m", *command]
                 running.append(subprocess.Popen(python, cwd=ROOT, stdout=out, stderr=subprocess.STDOUT))

@@ -24,6 +24,7 @@ from slave.cameras.source import Frame
 from slave.cameras.synthetic import SyntheticCamera
 from slave.markers.changing import ChangingDetector, marker_changes
 from slave.markers.following import detector_for
+from slave.markers.scan_choice import Scan, ScanChoice
 from slave.markers.workers import Inline
 from slave.report import Reporter
 from slave.tally import Tally
@@ -250,7 +251,7 @@ class Wire:
 class Slave:
     """What `phalanx-slave run` joins, with a simulated camera, on a bus inside this process."""
 
-    def __init__(self, files: CameraFiles, stop: threading.Event) -> None:
+    def __init__(self, files: CameraFiles, stop: threading.Event, scan: Scan) -> None:
         self.bus, self.wire, self.files = LoopbackBus(), Wire(), files
         clock = SystemClock()
         self.source = SyntheticCamera(SCENE, "left", clock.now_ns(), clock, 0, clock)
@@ -258,7 +259,7 @@ class Slave:
         def make(camera: CameraCalibration, rig: RigCalibration) -> Any:
             return detector_for(camera, rig.markers, Inline(), free=rig.free_markers)
 
-        self.detector = ChangingDetector(make(FILE, RIG))
+        self.detector = ChangingDetector(make(FILE, RIG), ScanChoice(scan, FILE))
         tally = Tally(RIG.markers)
         changes = marker_changes(self.detector, make)
         self.tuning = CameraTuning(files, self.source, changes, lambda: tally.counts()["frames"] > 0)
@@ -282,9 +283,9 @@ class Slave:
 
 
 @contextmanager
-def slave(files: CameraFiles) -> Generator[Slave, None, None]:
+def slave(files: CameraFiles, scan: Scan = "full") -> Generator[Slave, None, None]:
     stop = threading.Event()
-    started = Slave(files, stop)
+    started = Slave(files, stop, scan)
     try:
         assert until(
             lambda: bool(started.seen() == 6 and started.light.all() and "left" in started.bus.alive()), 30.0
@@ -314,7 +315,10 @@ def test_exposure_changed_over_the_bus_changes_the_picture_and_the_markers_stay(
             left.ask("dance")
 
 
-def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file(files: CameraFiles) -> None:
+@pytest.mark.parametrize("scan", ["full", "windows"])
+def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file(
+    files: CameraFiles, scan: Scan
+) -> None:
     """Calibration mode writes a new file: validated, atomic, equal after the round trip, in use at once."""
     assert FILE.markers is not None
     narrower = {
@@ -326,7 +330,7 @@ def test_a_new_calibration_goes_over_the_bus_into_the_running_slave_and_its_file
         for name, colour in FILE.markers.items()
     }
     new = changed(exposure_us=4500.0, analogue_gain=1.5, markers=narrower)
-    with slave(files) as left:
+    with slave(files, scan) as left:
         tables = left.detector
         used = tables._detector
         track = used._detector._tracks  # pyright: ignore[reportAttributeAccessIssue]

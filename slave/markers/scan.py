@@ -1,0 +1,213 @@
+"""Look for blobs of the markers' colours: in the whole frame, or only where markers are expected.
+
+    whole    one table look-up on every fourth pixel of every fourth row, and on a further grid where a colour shows on
+             none of these points
+    windows  the same points in the windows of tracked markers alone (`roi`). While a marker is lost, one strip of the
+             frame is searched for its colour in every frame, all of it in `STRIPS` frames, and what is found there is
+             looked at like a window
+
+A blob has the same points, and so the same centroid and box, in both: a window is widened until it holds the blob and
+all around it that may be a fragment of it.
+"""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeAlias
+
+from common.arrays import Image
+from slave.markers.blobs import FRAGMENT_GAP, MAX_CANDIDATES, SCALE, Blob
+from slave.markers.classify import Codes, ColourTable
+from slave.markers.engine import Engine
+from slave.markers.group import skin_share
+from slave.markers.roi import Window
+
+FINER = (SCALE // 2, 0, 0)  # grids: step, dx, dy
+OTHERS = ((SCALE, SCALE // 2, SCALE // 2), (SCALE, SCALE // 2, 0), (SCALE, 0, SCALE // 2))
+STRIPS = 8  # of a frame: so many frames until a lost marker that lies still is found
+ROUNDS = 3  # of scans, each wider, before that of the whole frame: what reaches so far is no marker
+
+
+# A part of the frame in columns and rows of the scan's grid: left, top, right, bottom; the last two exclusive.
+Part: TypeAlias = tuple[int, int, int, int]
+
+
+class Scanned(NamedTuple):
+    """What a scan saw.
+
+    Attributes:
+        parts: What was scanned, and the codes (H, W) of its points.
+        blobs: Of each marker's colour, the largest first.
+    """
+
+    parts: list[tuple[Part, Codes]]
+    blobs: list[list[Blob]]
+
+    def skin_share(self, skin: int, blob: Blob) -> float:
+        """Share of the points around one of the blobs that are skin, 0..1; `skin`: its bit."""
+        x, y = blob.u / SCALE, blob.v / SCALE
+        for (x0, y0, x1, y1), codes in self.parts:
+            if x0 <= x <= x1 and y0 <= y <= y1:
+                dx, dy = SCALE * x0, SCALE * y0
+                left, top, right, bottom = blob.left - dx, blob.top - dy, blob.right - dx, blob.bottom - dy
+                return skin_share(codes, skin, blob._replace(left=left, top=top, right=right, bottom=bottom))
+        raise ValueError(f"{blob} is not of this scan")
+
+
+class Scanner:
+    """Scans the frames of one camera. Holds which further grid and which strip are next."""
+
+    def __init__(self, width: int, height: int, engine: Engine) -> None:
+        """Scan frames of this size [px] by `engine`."""
+        self._columns, self._rows = width // SCALE, height // SCALE
+        self._scan = engine.scan_blobs
+        self._turn = -1  # negative before the first frame
+        self._strip = 0
+
+    @property
+    def began(self) -> bool:
+        """Whether there was a frame."""
+        return self._turn >= 0
+
+    def whole(self, image: Image, table: ColourTable) -> Scanned:
+        """Scan the whole frame (H, W, 3).
+
+        A colour that the grid shows nowhere is sought on further grids: in the first frame on all of them, later on
+        one more each time, in turn.
+        """
+        codes, blobs = self._scan(image, table, table.bits, SCALE, 0, 0, None)
+        missing = [m for m, options in enumerate(blobs) if not options]
+        if missing:
+            codes = codes.copy()  # the next scan reuses it
+            step, dx, dy = OTHERS[self._turn] if self.began else FINER
+            self._turn = (self._turn + 1) % len(OTHERS)
+            _, finer = self._scan(image, table, [table.bits[m] for m in missing], step, dx, dy, None)
+            for m, options in zip(missing, finer, strict=True):
+                blobs[m] = options
+        elif not self.began:
+            self._turn = 0
+        return Scanned([((0, 0, self._columns, self._rows), codes)], blobs)
+
+    def around(
+        self, image: Image, table: ColourTable, windows: Sequence[Sequence[Window]], lost: Sequence[int]
+    ) -> Scanned:
+        """Scan where markers are expected, and for lost ones the next strip of the frame.
+
+        Args:
+            image: (H, W, 3) BGR.
+            table: Colour table of the camera.
+            windows: Of each marker where it may be; none: it is not expected anywhere.
+            lost: Rows of those markers that are sought.
+        """
+        wanted = {m for m, some in enumerate(windows) if some}
+        asked = [self._around(w.u - w.x, w.v - w.y, w.u + w.x, w.v + w.y) for some in windows for w in some]
+        proposed = self._search(image, table, lost) if lost else {}
+        asked += [self._of(blob) for blobs in proposed.values() for blob in blobs]
+        for _ in range(ROUNDS):
+            parts = merged(asked)
+            scanned = [self._part(image, table, part) for part in parts]
+            clipped = [blob for part, _, blobs in scanned for blob in self._clipped(part, blobs)]
+            if not clipped:
+                break
+            asked = [*parts, *(self._of(blob) for blob in clipped)]
+        else:
+            return self.whole(image, table)
+        found = _gathered([blobs for _, _, blobs in scanned], len(windows))
+        missing = [m for m, options in enumerate(found) if not options]
+        for m in missing:
+            if m in wanted or m in proposed:
+                step, dx, dy = FINER if m in proposed else OTHERS[self._turn]
+                seen = [self._on_grid(image, table, [table.bits[m]], part, step, dx, dy)[1] for part in parts]
+                found[m] = _gathered(seen, 1)[0]
+        if missing:
+            self._turn = (self._turn + 1) % len(OTHERS)
+        return Scanned([(part, codes) for part, codes, _ in scanned], found)
+
+    def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Blob]]:
+        """What the next strip shows of the colours of lost markers: row of the marker -> blobs."""
+        rows, k = self._rows, self._strip
+        self._strip = (k + 1) % STRIPS
+        strip = 0, rows * k // STRIPS, self._columns, rows * (k + 1) // STRIPS
+        found = self._on_grid(image, table, [table.bits[m] for m in lost], strip, *FINER)[1]
+        return {m: blobs for m, blobs in zip(lost, found, strict=True) if blobs}
+
+    def _part(self, image: Image, table: ColourTable, part: Part) -> tuple[Part, Codes, list[list[Blob]]]:
+        codes, blobs = self._on_grid(image, table, table.bits, part, SCALE, 0, 0)
+        return part, codes.copy(), blobs
+
+    def _on_grid(
+        self, image: Image, table: ColourTable, bits: Sequence[int], part: Part, step: int, dx: int, dy: int
+    ) -> tuple[Codes, list[list[Blob]]]:
+        left, top, right, bottom = part
+        times = SCALE // step
+        size = times * (bottom - top), times * (right - left)
+        return self._scan(image, table, bits, step, SCALE * left + dx, SCALE * top + dy, size)
+
+    def _around(self, left: float, top: float, right: float, bottom: float) -> Part:
+        """The part of the frame that holds this box [px]."""
+        columns, rows = self._columns, self._rows
+        x0, y0, x1, y1 = (
+            int(left) // SCALE,
+            int(top) // SCALE,
+            int(right) // SCALE + 1,
+            int(bottom) // SCALE + 1,
+        )
+        return (
+            x0 if x0 > 0 else 0,
+            y0 if y0 > 0 else 0,
+            x1 if x1 < columns else columns,
+            y1 if y1 < rows else rows,
+        )
+
+    def _of(self, blob: Blob) -> Part:
+        """The part that holds a blob, and around it whatever may be a fragment of it."""
+        reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE  # as far as a fragment may begin [px]
+        return self._around(blob.left - reach, blob.top - reach, blob.right + reach, blob.bottom + reach)
+
+    def _clipped(self, part: Part, blobs: list[list[Blob]]) -> list[Blob]:
+        """Blobs that the part may not hold whole, or not with all their fragments."""
+        # Where the part ends at the border of the image, nothing is cut off.
+        x0, y0, x1, y1 = part
+        left, top = SCALE * x0 if x0 > 0 else -math.inf, SCALE * y0 if y0 > 0 else -math.inf
+        right = SCALE * x1 if x1 < self._columns else math.inf
+        bottom = SCALE * y1 if y1 < self._rows else math.inf
+        clipped: list[Blob] = []
+        for options in blobs:
+            for blob in options:
+                reach = FRAGMENT_GAP * math.sqrt(blob.area) + SCALE
+                if (
+                    blob.left - reach < left
+                    or blob.right + reach > right
+                    or blob.top - reach < top
+                    or blob.bottom + reach > bottom
+                ):
+                    clipped.append(blob)
+        return clipped
+
+
+def merged(parts: Iterable[Part]) -> list[Part]:
+    """Parts of which no two meet, so that no blob lies in two, and that hold all of these; empty ones are left out."""
+    apart: list[Part] = []
+    for part in parts:
+        left, top, right, bottom = part
+        if left >= right or top >= bottom:
+            continue
+        k = 0
+        while k < len(apart):
+            x0, y0, x1, y1 = apart[k]
+            if left <= x1 and x0 <= right and top <= y1 and y0 <= bottom:
+                left, top = x0 if x0 < left else left, y0 if y0 < top else top
+                right, bottom = x1 if x1 > right else right, y1 if y1 > bottom else bottom
+                del apart[k]
+                k = 0  # it may meet now what it did not before
+            else:
+                k += 1
+        apart.append((left, top, right, bottom))
+    return apart
+
+
+def _gathered(found: Sequence[list[list[Blob]]], count: int) -> list[list[Blob]]:
+    """Blobs of `count` colours from several parts, the largest first."""
+    if len(found) == 1:
+        return found[0]
+    every = [[blob for part in found for blob in part[m]] for m in range(count)]
+    return [sorted(options, key=lambda blob: -blob.area)[:MAX_CANDIDATES] for options in every]
