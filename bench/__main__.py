@@ -23,6 +23,7 @@ SECTIONS = {
     "filters": "1 euro filter: points, the hand at three settings, speed; baseline: one object per signal",
     "uncertainty": "95 % regions of markers: how often they hold the truth; rendered hands, a profile off by a tenth",
     "ik": "Inverse kinematics of fingers, palm known; baseline: the papers' FABRIK with limits, scipy, mink",
+    "fabrik": "The card's line against the estimator, what each part costs, and its time; exact truth",
     "hand_poses": "Hands of independent joints, palm turned by up to 45 degrees; baseline: the papers' fixed palm",
     "hand": "A moving hand with its palm pose; baseline: the papers' fixed palm, scipy, mink",
     "real_motion": "Recorded and held hands through solver and filter; truth: the recording (PHALANX_DATASETS)",

@@ -67,7 +67,7 @@ class FabrikSolver:
             palm: Fits the palm from the hand's markers.
             stage: Opens a timer by stage name.
         """
-        self._model, self.sync, self._triangulate = model, sync, triangulate
+        self._model, self.sync, self.triangulate = model, sync, triangulate
         self._one_euro, self._palm, self._stage = one_euro, palm, stage
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
@@ -105,12 +105,12 @@ class FabrikSolver:
         last, age_s = self._recent(instant.t_ns)
         seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
         with self._stage("triangulate"):
-            markers = self._triangulate(*pixels, seen_as, age_s)
+            markers = self.triangulate(*pixels, seen_as, age_s)
             if seen_as is None:
                 self._memory = FingerMemory(self._model)
                 first = self.peek(markers.points_m, markers.cov_m2, instant.area)
                 if first is not None:
-                    markers = self._triangulate(*pixels, first, 0.0)
+                    markers = self.triangulate(*pixels, first, 0.0)
         with self._stage("filter"):
             smooth = markers.points_m
             if self._one_euro is not None:
@@ -144,7 +144,7 @@ class FabrikSolver:
         points[self.on_hand], cov[self.on_hand] = places @ _AWAY[:3, :3].T + _AWAY[:3, 3], 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
         first = self.peek(points, cov, seen)
-        self._triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
+        self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         if first is not None:
             for m, (f, finger) in self._fingers.items():
                 for aside_m in (0.0, 0.1):  # with and without a search
