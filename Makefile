@@ -4,6 +4,7 @@
 .DELETE_ON_ERROR:
 
 PYTHON ?=
+RIG ?= desk
 DEMO_SECONDS ?= 30
 DEMO_ARGS ?=
 TEST_ARGS ?=
@@ -21,20 +22,24 @@ unexport PYTHONDONTWRITEBYTECODE
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+# The default rig of a scene is not named, so that DEMO_ARGS may name a scene or a rig of its own.
+DEMO_RIG := $(filter-out desk,$(RIG))
+DEMO_OUT := out/demo$(addprefix -,$(DEMO_RIG))
 # Fits: 3.11-3.13, and able to make a virtual environment (Debian splits ensurepip off into python3-venv).
 FITS := import sys, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | while IFS="$$(printf '\t')" read -r target text; do printf '  make %-12s %s\n' "$$target" "$$text"; done
-	@echo "  variables: PYTHON=python3.12  DEMO_SECONDS=30  DEMO_ARGS='--headless'  TEST_ARGS='-k geometry'  BENCH_ARGS=..."
+	@echo "  variables: PYTHON=python3.12  RIG=desk-fabrik  DEMO_SECONDS=30  DEMO_ARGS='--headless'  TEST_ARGS='-k geometry'  BENCH_ARGS=..."
 
 install: $(STAMP) ## make .venv with everything in it, in the locked versions
 	@echo "ready: $(BIN)/phalanx --help"
 
-demo: $(STAMP) ## two simulated cameras and the master as live processes on this machine
-	@mkdir -p out/demo
+demo: $(STAMP) ## two simulated cameras and the master as live processes on this machine; RIG=desk-fabrik for the other solver
+	@mkdir -p $(DEMO_OUT)
 	@headless=; [ -n "$${DISPLAY-}$${WAYLAND_DISPLAY-}" ] || headless=--headless; \
-	  exec $(BIN)/phalanx demo $$headless --seconds $(DEMO_SECONDS) --out out/demo --json out/demo/summary.json $(DEMO_ARGS)
+	  exec $(BIN)/phalanx demo $$headless $(addprefix --rig ,$(DEMO_RIG)) --seconds $(DEMO_SECONDS) \
+	    --out $(DEMO_OUT) --json $(DEMO_OUT)/summary.json $(DEMO_ARGS)
 
 browser: ## a Chromium for the tests of the console's pages; without root it says what to install
 	@command -v chromium >/dev/null || command -v chromium-browser >/dev/null || command -v google-chrome >/dev/null || { \

@@ -212,7 +212,8 @@ def check_rig(rig: RigCalibration, where: str) -> None:
     check_places(rig, where)
     if rig.depth_model != "stereo" and getattr(rig, rig.depth_model) is None:
         raise CalibrationError(
-            f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing"
+            f"{where}: depth_model is {rig.depth_model!r} but the key {rig.depth_model!r} is missing: set depth_model"
+            f" to 'stereo' until `phalanx-master calibrate depth --use {rig.depth_model}` has fitted it"
         )
 
 

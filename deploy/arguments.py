@@ -84,8 +84,9 @@ def _add_scene(demo: argparse.ArgumentParser) -> None:
         action="append",
         metavar="NAME",
         help="once for each that runs; default: desk, for scenes of both kinds desk-back3 (three markers on the back "
-        "tell how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4; desk-cube "
-        "and desk-tracker track objects, too; --rig desk --rig wrist has one hand",
+        "tell how the palm lies) and wrist-back3 of the same hand, for object desk-wand, for gestures desk4; "
+        "desk-fabrik is desk with the card's line alone; desk-cube and desk-tracker track objects, too; "
+        "--rig desk --rig wrist has one hand",
     )
     rig.add_argument(
         "--wrist", dest="rigs", action="store_const", const=["wrist"], help="the wrist device: --rig wrist"

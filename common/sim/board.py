@@ -34,6 +34,24 @@ INTO_VIEW = 0.92  # share of the half view that corners may reach
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Print:
+    """What is on a flat thing and behind it, as shares of the way from one colour to another.
+
+    Attributes:
+        texture: (rows, columns) shares, TEXELS_PER_M; above 0 on the thing.
+        origin: Texel (2,), column first, at the origin of the thing's frame.
+        wall: Share of what lies behind.
+        none_bgr, all_bgr: (3,) linear light of the shares 0 and 1, blue first, of a thing that faces the camera.
+    """
+
+    texture: Float32
+    origin: Float
+    wall: float
+    none_bgr: Float
+    all_bgr: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BoardScene:
     """A checkerboard of 9 x 6 inner corners, squares of 25 mm, moved through the view of a rig's cameras.
 
@@ -54,7 +72,19 @@ class BoardScene:
         for name in self.rig.cameras:
             if name not in self.cameras:
                 raise CalibrationError(f"rig {self.rig.name!r}: cameras: no camera file for {name!r}")
-        object.__setattr__(self, "poses", _poses([self.optics(name) for name in self.rig.cameras], self.seed))
+        object.__setattr__(self, "poses", self.find_poses())
+
+    def find_poses(self) -> Float:
+        """Where it is held (K, 4, 4) [m], one place after the other.
+
+        Raises:
+            CalibrationError: There is no such place.
+        """
+        return _poses([self.optics(name) for name in self.rig.cameras], self.seed)
+
+    def printed(self) -> Print:
+        """Return what is seen of it."""
+        return _printed()
 
     def optics(self, camera: str) -> CameraModel:
         """One camera as geometry.
@@ -84,7 +114,10 @@ def board_corners() -> Float:
 
 
 class BoardRenderer:
-    """Images of a board scene by one camera. It holds rays, texture and noise; a frame is a pure function of t."""
+    """Images of a board scene by one camera; a frame is a pure function of t.
+
+    It holds rays, print and noise, and the last picture without noise: most of the time the board is held.
+    """
 
     def __init__(self, scene: BoardScene, camera: str) -> None:
         """Prepare the ray of every fine pixel.
@@ -99,52 +132,68 @@ class BoardRenderer:
         v = (np.arange(height)[:, None] + fine).ravel()
         uv = np.stack(np.meshgrid(u, v), axis=-1)
         self._xy = self._optics.undistort(uv).astype(np.float32)
-        self._texture, self._origin = _texture()
+        self._print = scene.printed()
         self._noise = NoiseTiles.make(height, width, scene.seed * 64 + scene.rig.cameras.index(camera))
         self._encode = SrgbTables.make()
         self._gains_bgr = np.ones(3, dtype=np.float32)
+        self._drawn: tuple[Float, Image] | None = None
 
     def exposed(self, exposure_us: float, gains_bgr: Float) -> "BoardRenderer":
         """The same before a camera of other brightness (3,), blue first; nothing here is smeared by `exposure_us`."""
         del exposure_us
         other = copy(self)
         other._gains_bgr = np.array(gains_bgr, dtype=np.float32)
+        other._drawn = None
         return other
 
     def render(self, t_s: float) -> Image:
         """Image (H, W, 3) BGR of scene time `t_s` [s]."""
-        T = invert(self._optics.T_rig_camera) @ self._scene.T_rig_board(t_s)
+        T_rig_board = self._scene.T_rig_board(t_s)
+        if self._drawn is None or not np.array_equal(T_rig_board, self._drawn[0]):
+            self._drawn = T_rig_board, self._draw(invert(self._optics.T_rig_camera) @ T_rig_board)
+        image = self._drawn[1].copy()
+        self._noise.add_to(image, round(t_s * 1e6))
+        return image
+
+    def _draw(self, T: Float) -> Image:
+        """Image (H, W, 3) BGR without noise of a board at T (4, 4) [m], camera frame."""
         # board (x, y, 1) -> ray: the columns of rotation and translation of a plane (Hartley & Zisserman, 8.1.1)
         to_board = np.linalg.inv(T[:3, [0, 1, 3]])
         texels = np.diag([TEXELS_PER_M, TEXELS_PER_M, 1.0]) @ to_board
-        texels[:2] += self._origin[:, None] * texels[2]
+        texels[:2] += self._print.origin[:, None] * texels[2]
         u, v = cv2.split(cv2.perspectiveTransform(self._xy, texels))
         shade = 0.55 + 0.45 * abs(float(T[2, 2]))
         board: Float32 = np.asarray(
             cv2.remap(
-                self._texture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=(0.0,)
+                self._print.texture,
+                u,
+                v,
+                cv2.INTER_LINEAR,
+                borderMode=cv2.BORDER_CONSTANT,
+                borderValue=(0.0,),
             ),
             np.float32,
         )
-        fine = np.where(board > 0.0, board * np.float32(shade), np.float32(WALL))
+        fine = np.where(board > 0.0, board * np.float32(shade), np.float32(self._print.wall))
         size = (self._optics.width_px, self._optics.height_px)
         light = cv2.GaussianBlur(
             cv2.resize(fine, size, interpolation=cv2.INTER_AREA), (5, 5), 1.5 * LENS_SIGMA_PX
         )
-        image = self._encode.encode(np.asarray(light[..., None] * self._gains_bgr, np.float32))
-        self._noise.add_to(image, round(t_s * 1e6))
-        return image
+        none = np.float32(self._print.none_bgr)
+        colour = none + light[..., None] * (np.float32(self._print.all_bgr) - none)
+        return self._encode.encode(np.asarray(colour * self._gains_bgr, np.float32))
 
 
-def _texture() -> tuple[Float32, Float]:
-    """The board in linear light (rows, columns) float32, and the texel (2,) of its first inner corner."""
+def _printed() -> Print:
+    """The board, a share of 1 being all light; its origin is the first inner corner."""
     step = round(SQUARE_M * TEXELS_PER_M)
     margin = round(MARGIN_M * TEXELS_PER_M)
     y, x = np.indices(((ROWS + 1) * step, (COLUMNS + 1) * step)) // step
     squares = np.where((x + y) % 2 == 0, BLACK, WHITE).astype(np.float32)
     texture = cv2.copyMakeBorder(squares, margin, margin, margin, margin, cv2.BORDER_CONSTANT, value=(WHITE,))
     # Texel k covers k - 0.5 .. k + 0.5: the edge between two squares lies half a texel before the second.
-    return np.asarray(texture, np.float32), np.array([margin + step - 0.5, margin + step - 0.5])
+    corner = np.full(2, margin + step - 0.5)
+    return Print(np.asarray(texture, np.float32), corner, WALL, np.zeros(3), np.ones(3))
 
 
 def _poses(optics: list[CameraModel], seed: int) -> Float:

@@ -10,6 +10,7 @@ from common.errors import PhalanxError
 from common.hand_model import HandModel
 from common.object_profile import ObjectProfile
 from common.sim.board import BoardRenderer, BoardScene
+from common.sim.card import CardScene
 from common.sim.illuminant import ROOM
 from common.sim.leap import load_leap
 from common.sim.poses import StudyPoses
@@ -22,7 +23,7 @@ from common.sim.wrist.render import LIVE_BEND_RAD, LIVE_STEP, WristRenderer
 from common.sim.wrist.scene import WRIST_NAMES, WristScene
 
 NAMES = f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {' | '.join(TOGETHER)}"
-VIEWS = f"{NAMES} | board"
+VIEWS = f"{NAMES} | board | card"
 _LEAP = "leap:"
 
 
@@ -66,7 +67,7 @@ def scene_by_name(
     together = together_motion(name, HandModel.of(hand), view_centre(rig), seed)
     if together is not None:
         return Scene.of_motion(rig, cameras, hand, together, seed, objects)
-    raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board for cameras only)")
+    raise PhalanxError(f"scene {name!r}: there are {VIEWS} (board and card for cameras only)")
 
 
 def view_by_name(
@@ -77,14 +78,16 @@ def view_by_name(
     seed: int,
     objects: Mapping[str, ObjectProfile] | None = None,
 ) -> Scene | BoardScene | WristScene:
-    """What a simulated camera may look at: a scene with a hand, that of a wrist rig where the rig is one, or `board`,
-    a checkerboard to calibrate cameras with.
+    """What a simulated camera may look at: a scene with a hand, that of a wrist rig where the rig is one, `board`, a
+    checkerboard to calibrate cameras with, or `card`, a painted card to calibrate the depth of a pair with.
 
     Raises:
         PhalanxError: As `scene_by_name`; the scene is none of this kind of rig.
     """
     if name == "board":
         return BoardScene(rig, cameras, seed)
+    if name == "card" and rig.kind == "markers":
+        return CardScene(rig, cameras, seed)
     if rig.kind == "wrist":
         return WristScene.by_name(name, rig, cameras, hand, seed)
     return scene_by_name(name, rig, cameras, hand, seed, objects)

@@ -63,7 +63,7 @@ def add_simulated(add: Callable[..., argparse.Action]) -> None:
         "--scene",
         default="standard",
         metavar="NAME",
-        help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | board; before a "
+        help=f"standard | lights | poses | hand-routine | object | leap:FILE.npz | {BOTH} | board | card; before a "
         f"wrist device standard | curl | wearer | poses | spread | {BOTH}, each with @dark | @indoor | @bright | @sun, "
         "or board",
     )

@@ -25,6 +25,9 @@ STILL_FRAMES = 5
 STILL_SIGMAS = 6.0  # distance of a frame's centroid from the mean of its stretch
 AROUND_S = 0.25  # frames before and after a time that `--distances FILE` names
 _NOISE_PX = 0.1  # of a centroid whose sigma is not stated
+_UNSURE_PX = (
+    0.2  # of a target at rest; more is stated of what moves suddenly, and must not excuse that it moves
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,8 +169,8 @@ def by_file(pairs: Pairs, path: Path) -> Sweep:
 def still_runs(pairs: Pairs) -> list[Int]:
     """The stretches, as indices of pairs, in which the target stands in both images.
 
-    A pair joins the stretch before it while its centroids lie within six standard deviations of the stretch's mean. A
-    tenth is cut off each end, where the target may still be settling, or be touched again.
+    A pair joins the stretch before it while its centroids lie within six standard deviations, 1.2 px at most, of the
+    stretch's mean. A tenth is cut off each end, where the target may still be settling, or be touched again.
     """
     runs: list[Int] = []
     start = 0
@@ -184,7 +187,7 @@ def still_runs(pairs: Pairs) -> list[Int]:
 def _near(pairs: Pairs, run: Int, new: int | Int) -> bool:
     """Whether all of the pairs `new` lie at the mean of the pairs `run`; false where one is not seen."""
     off = np.abs(pairs.uv[:, new] - pairs.uv[:, run].mean(axis=1).reshape(2, *([1] * np.ndim(new)), 2))
-    sigma = np.fmax(pairs.sigma_px[:, new], _NOISE_PX)[..., None]
+    sigma = np.minimum(np.fmax(pairs.sigma_px[:, new], _NOISE_PX), _UNSURE_PX)[..., None]
     return bool((off <= STILL_SIGMAS * sigma).all())
 
 

@@ -143,6 +143,15 @@ def test_stretches_at_rest_are_found_and_averaged(tmp_path: Path) -> None:
     assert sweep.place[0] == "frames 3-28"
 
 
+def test_a_target_that_moves_does_not_stand_however_unsure_its_centroids_are(tmp_path: Path) -> None:
+    pairs = pairs_of(tmp_path, [1.0, 0.8], 30, 12)
+    between = np.arange(72) // 30 == 1  # the way, and the first frames after it
+    unsure = replace(pairs, sigma_px=np.where(between, 5.0, pairs.sigma_px))
+    runs = still_runs(unsure)
+    assert [int(run[0]) // 42 for run in runs] == [0, 1]
+    assert all(run[-1] % 42 < 30 for run in runs)  # nothing of the way between
+
+
 def test_a_target_that_never_rests_has_no_stretch(tmp_path: Path) -> None:
     assert still_runs(pairs_of(tmp_path, [1.0, 0.2], 1, 100)) == []
 
