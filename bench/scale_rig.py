@@ -41,7 +41,7 @@ def room(folder: Path, cameras: int, rate_hz: float) -> Path:
     for name in names:
         _write_camera(tree, "left", name, rate_hz)
     rig = json.loads((tree / "rigs" / f"{DESK}.json").read_text())
-    rig |= {"name": ROOM, "cameras": names}
+    rig |= {"name": ROOM, "cameras": names, "depth_model": "stereo"}
     rig["T_rig_camera"] = {name: pose.tolist() for name, pose in zip(names, dome(cameras), strict=True)}
     (tree / "rigs" / f"{ROOM}.json").write_text(json.dumps(rig, indent=1) + "\n")
     return tree

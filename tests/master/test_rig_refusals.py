@@ -59,6 +59,14 @@ def farther(rig: dict[str, Any]) -> None:
     rig["power_law"]["k_m"] *= 1.05
 
 
+def with_imu(rig: dict[str, Any]) -> None:
+    rig |= {"solver": "fabrik", "imu": {"q_palm_imu": [1, 0, 0, 0], "q_rig_world": [1, 0, 0, 0]}}
+
+
+def strange_solver(rig: dict[str, Any]) -> None:
+    rig["solver"] = "ik"
+
+
 @pytest.mark.parametrize(
     ("change", "says"),
     [
@@ -85,18 +93,13 @@ def farther(rig: dict[str, Any]) -> None:
             ),
         ),
         (
-            lambda rig: rig.update(
-                solver="fabrik", imu={"q_palm_imu": [1, 0, 0, 0], "q_rig_world": [1, 0, 0, 0]}
-            ),
+            with_imu,
             (
                 "rig 'desk': solver 'fabrik' knows markers alone, but an IMU watches this hand too",
                 "set solver to 'estimator'",
             ),
         ),
-        (
-            lambda rig: rig.update(solver="ik"),
-            ("desk.json: ", "solver"),
-        ),
+        (strange_solver, ("desk.json: ", "solver")),
     ],
     ids=["no numbers", "turned cameras", "law against places", "IMU", "no such solver"],
 )
