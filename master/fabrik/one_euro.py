@@ -23,9 +23,9 @@ taken with no more than the larger of
     at rest     a = 2 q / (1 + q),  q = (jitter / s)^2           which leaves `jitter` of the noise: s^2 a / (2 - a)
     in motion   a = 2 / (1 + sqrt(1 + 4 / u^2)),  u^2 = max((v dt / s)^2, ((x - x^) / s)^2 - 9)
 
-the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960). Here v,
-also in the cut-off, is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s
-leaves s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by
+the second of which is the gain of the steady Kalman filter of a random walk with steps of u s (Kalman 1960). Here v
+is the speed beyond what noise alone makes of it, at three standard deviations: white noise of s leaves
+s^2 / dt^2 a / (2 - a) in dx^ squared, with a = a(d_cutoff). The speed finds slow motions before they are off by
 much, the innovation x - x^ those that begin or turn round. Of a group, what moves most counts.
 
 Where the noise is small this is the paper's filter; a sample far less sure than its neighbours is ridden over. Give
@@ -237,13 +237,12 @@ def _step(
             continue
         r = 2.0 * pi * d_cutoff * dt
         speed[i] += r / (r + 1.0) * ((values[i] - x[i]) / dt - speed[i])
-        square = speed[i] * speed[i]
+        fastest[group[i], 0] = max(fastest[group[i], 0], abs(speed[i]))
         if variance[i] > jitter_2:
-            square = max(0.0, square - _QUANTILE * r / (2.0 + r) * variance[i] / (dt * dt))
+            moved_2 = speed[i] * speed[i] * dt * dt - _QUANTILE * r / (2.0 + r) * variance[i]
             off = values[i] - x[i]
-            u2 = max(square * dt * dt, off * off - _QUANTILE * variance[i]) / variance[i]
+            u2 = max(moved_2, off * off - _QUANTILE * variance[i]) / variance[i]
             fastest[group[i], 1] = max(fastest[group[i], 1], u2)
-        fastest[group[i], 0] = max(fastest[group[i], 0], square**0.5)
     for i in range(len(values)):
         if seen_ns[i] == t_ns or not isfinite(values[i]):
             continue
