@@ -18,19 +18,20 @@ from common.geometry import matrix_to_quaternion, quaternion_to_matrix, transfor
 from common.hand_model import HandModel
 from common.rig_calibration import check_places
 
-_ALIKE = ("markers", "free_markers", "pairing", "filter")
+_ALIKE = ("markers", "free_markers", "pairing", "filter", "solver")
 _UNTURNED = 1e-9  # of a rotation matrix that turns nothing
 
 
 def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
     """One marker rig with the cameras of all of them, in their order and in the frame that they share.
 
-    Its residual is that of the rig that was measured worst. It states the first volume that a rig states, where that
-    is a box along the axes of the shared frame, and the first place of a tracking system and file of gestures.
+    It triangulates by all of them, whatever law of two cameras each has (`depth_model` "stereo"). Its residual is that
+    of the rig that was measured worst. It states the first volume that a rig states, where that is a box along the axes
+    of the shared frame, and the first place of a tracking system and file of gestures.
 
     Raises:
-        CalibrationError: One depth model is not "stereo", they share a camera, two cameras stand in
-            one place, or markers, filter or pairing differ.
+        CalibrationError: They share a camera, two cameras stand in
+            one place, or markers, filter, pairing or solver differ.
     """
     placed = [in_world(rig) for rig in rigs]
     if len(placed) == 1:
@@ -38,11 +39,6 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
     refuse_shared_senders(rigs)
     first = placed[0]
     for rig in placed:
-        if rig.depth_model != "stereo":
-            raise CalibrationError(
-                f"rig {rig.name!r}: depth_model {rig.depth_model!r} is a law of two cameras: rigs of one hand need"
-                " 'stereo'"
-            )
         for key in _ALIKE:
             if getattr(rig, key) != getattr(first, key):
                 raise CalibrationError(
@@ -52,6 +48,7 @@ def merged_rig(rigs: Sequence[RigCalibration]) -> RigCalibration:
         first,
         name="_and_".join(rig.name for rig in placed),
         cameras=tuple(name for rig in placed for name in rig.cameras),
+        depth_model="stereo",
         T_rig_camera={name: pose for rig in placed for name, pose in rig.T_rig_camera.items()},
         stamp_offset_us={name: us for rig in placed for name, us in rig.stamp_offset_us.items()},
         volume=next((rig.volume for rig in placed if rig.volume is not None), None),

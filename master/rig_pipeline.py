@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from math import nan, sqrt
+from math import hypot, nan, sqrt
 from typing import Protocol, cast
 
 import numpy as np
@@ -22,7 +22,7 @@ from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
 from master.stereo.caps import CapModel
-from master.stereo.depth import depth_law, law_misfit
+from master.stereo.depth import LAW_MISFIT, depth_law, law_contradicts, law_misfit
 from master.stereo.locate import CapLocator
 from master.stereo.misfit import RIG_PX, limits
 from master.stereo.pairing import Pairing
@@ -30,7 +30,6 @@ from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Sta
 from master.stereo.place import CalibrationResidual, Placement
 from master.wrist.pipeline import WristPipeline
 
-_LAW_MISFIT = 0.02  # most by which a law of depth and the cameras' places may differ where both are used
 _MOUNTED_RAD = np.radians(0.5)  # standard deviation of the pitch of cameras mounted by eye
 _LEAD_M_S = 0.12  # of a palm, and of a finger on it, when another sensor takes over: 4 mm a frame at 60 Hz
 
@@ -90,17 +89,15 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
     if law is None:
         triangulate = CapLocator(cameras, caps, Placement(cameras, residual))
     else:
-        off, depth_m = law_misfit(law, cameras, rig.volume)
-        if off > _LAW_MISFIT and rig.solver == "estimator":
+        if contradiction := law_contradicts(rig, cameras):
             raise CalibrationError(
-                f"rig {rig.name!r}: depth_model {rig.depth_model!r} is {1e2 * off:.1f} % off the cameras' places at"
-                f" {depth_m:.2f} m, and solver 'estimator' needs both to agree within {1e2 * _LAW_MISFIT:.0f} %:"
-                " calibrate the cameras and the depth again, or set solver to 'fabrik', which takes the depth alone"
+                f"rig {rig.name!r}: {contradiction}: calibrate the cameras and the depth again, or set solver to"
+                " 'fabrik', which takes the depth alone"
             )
-        row_px = np.hypot(
-            sqrt(2.0) * RIG_PX, 0.0 if off <= _LAW_MISFIT else cameras[0].matrix[1, 1] * _MOUNTED_RAD
-        )
-        tables = disparity_tables(cameras, law, residual.law, float(row_px), float(limits(2)[2]))
+        off, _ = law_misfit(law, cameras, rig.volume)
+        tilt_px = 0.0 if off <= LAW_MISFIT else float(cameras[0].matrix[1, 1]) * _MOUNTED_RAD
+        row_px = hypot(sqrt(2.0) * RIG_PX, tilt_px)
+        tables = disparity_tables(cameras, law, residual.law, row_px, float(limits(2)[2]))
         triangulate = DepthTriangulator(tables, caps)
     line = FabrikSolver(
         setup.models,

@@ -21,7 +21,7 @@ WIDTH_M, HEIGHT_M = 0.075, 0.050
 ROLL_RAD = np.radians(
     4.0
 )  # no hand holds it along the rows, where rays in thirds of a pixel would draw it 0.1 px off
-DISTANCES_M = tuple(round(0.90 - 0.07 * k, 2) for k in range(9))
+DISTANCES_M = (*(round(0.88 - 0.03 * k, 2) for k in range(15)), 0.40, 0.35)  # closest where the hand is
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,9 +1,9 @@
 """Points from the centroids of two cameras by the depth model of the rig: disparity, D = k x^z, X, Y, Z, covariance.
 
 Kalbfleisch measures x = u_left - u_right on the images as they are, not rectified, and fits D = k x^z with a target on
-the axis (section VI). There the law contains how the cameras are misaligned. Away from the axis lens, roll and yaw
-change the disparity of the same depth: of the shipped desk rig, whose right camera is rolled by 0.3 degrees, by 0.8 px
-at the edge of the volume, which is 8 mm. By the rig's own geometry that change is
+the axis, before the middle between the lenses (section VI). There the law contains how the cameras are misaligned.
+Away from the axis lens, roll and yaw change the disparity of the same depth: of the shipped desk rig, whose right
+camera is rolled by 0.3 degrees, by 0.8 px at the edge of the volume, or 8 mm. By the rig's own geometry that change is
 
     x(u, v, D) - x(axis, D) = a(u, v) + b(u, v) / D
 
@@ -29,7 +29,7 @@ from common.kernels import kernel
 from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.stereo.caps import CapModel
-from master.stereo.depth import AffineDisparity, PowerLaw
+from master.stereo.depth import AffineDisparity, PowerLaw, disparity_on_axis
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
@@ -85,15 +85,13 @@ def disparity_tables(
     v = np.linspace(0.0, left.height_px, GRID + 1)
     uv = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
     xy = left.undistort(uv)
-    axis_px = float(left.matrix[0, 2])
     design = np.stack([np.ones_like(_DEPTHS_M), 1.0 / _DEPTHS_M], axis=1)
     table = np.empty((len(uv), 6))
     disparity, rows = np.empty((len(_DEPTHS_M), len(uv))), np.empty((len(_DEPTHS_M), len(uv)))
     rays = np.concatenate([xy, np.ones((len(xy), 1))], axis=1)
     for k, depth_m in enumerate(_DEPTHS_M):
         seen = right.project(_rig(left, rays * depth_m))
-        on_axis_px = float(right.project(_rig(left, np.array([[0.0, 0.0, depth_m]])))[0, 0])
-        disparity[k] = (uv[:, 0] - seen[:, 0]) - (axis_px - on_axis_px)
+        disparity[k] = (uv[:, 0] - seen[:, 0]) - disparity_on_axis(cameras, np.array([depth_m]))
         rows[k] = uv[:, 1] - seen[:, 1]
     solve = np.linalg.pinv(design)
     table[:, :2], table[:, 2:4], table[:, 4:] = (solve @ disparity).T, (solve @ rows).T, xy

@@ -27,6 +27,8 @@ PARALLEL_RAD = np.radians(3.0)
 """Most by which two cameras may be turned against each other where depth is a law of raw disparity."""
 ALIKE = 0.05
 """Most by which their focal lengths may differ, and the slope of their baseline against the image rows."""
+LAW_MISFIT = 0.02
+"""Most by which a law of depth and the cameras' places may differ where both are used."""
 _DEPTHS_M = (0.35, 1.0)
 
 
@@ -152,6 +154,24 @@ def depth_law(rig: RigCalibration, cameras: Sequence[CameraModel]) -> PowerLaw |
     return law
 
 
+def law_contradicts(rig: RigCalibration, cameras: Sequence[CameraModel]) -> str:
+    """How the rig's law contradicts the places of its cameras, where both are used; empty: not at all.
+
+    Raises:
+        CalibrationError: As `depth_law`.
+    """
+    law = depth_law(rig, cameras)
+    if law is None or rig.solver == "fabrik":
+        return ""
+    off, depth_m = law_misfit(law, cameras, rig.volume)
+    if off <= LAW_MISFIT:
+        return ""
+    return (
+        f"depth_model {rig.depth_model!r} is {1e2 * off:.1f} % off the cameras' places at {depth_m:.2f} m, and solver"
+        f" 'estimator' needs both to agree within {1e2 * LAW_MISFIT:.0f} %"
+    )
+
+
 def _crooked(left: CameraModel, right: CameraModel) -> str:
     """What keeps raw disparity from being a measure of depth; empty: nothing.
 
@@ -181,6 +201,16 @@ def _crooked(left: CameraModel, right: CameraModel) -> str:
     return ""
 
 
+def disparity_on_axis(cameras: Sequence[CameraModel], depth_m: Float) -> Float:
+    """Disparity (N,) [px] of depths (N,) [m] where a law is fitted: before the middle between the first two cameras."""
+    left, right = cameras[:2]
+    axis = left.T_rig_camera[:3, 2]
+    middle = 0.5 * (right.centre - left.centre)
+    foot = left.centre + middle - (middle @ axis) * axis
+    points = foot + depth_m[:, None] * axis
+    return (left.project(points) - right.project(points))[:, 0]
+
+
 def law_misfit(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | None) -> tuple[float, float]:
     """Largest relative difference of the law from the cameras' own geometry on the axis, and its depth [m].
 
@@ -189,15 +219,14 @@ def law_misfit(law: DepthLaw, cameras: Sequence[CameraModel], volume: Volume | N
         cameras: In the rig's order.
         volume: Whose depths are asked; None: usual ones.
     """
-    left, right = cameras[:2]
+    left = cameras[0]
     low_m, high_m = _DEPTHS_M
     if volume is not None:
         corners = np.array(list(product(*zip(volume.low_m, volume.high_m, strict=True))))
         ahead = (corners - left.centre) @ left.T_rig_camera[:3, 2]
         low_m, high_m = max(float(ahead.min()), 0.1 * float(ahead.max())), float(ahead.max())
     depth = np.linspace(low_m, high_m, 9)
-    on_axis = depth[:, None] * left.T_rig_camera[:3, 2] + left.centre
-    off = np.abs(law.depth((left.project(on_axis) - right.project(on_axis))[:, 0]) / depth - 1.0)
+    off = np.abs(law.depth(disparity_on_axis(cameras, depth)) / depth - 1.0)
     worst = int(np.nan_to_num(off, nan=np.inf).argmax())
     return float(np.nan_to_num(off[worst], nan=np.inf)), float(depth[worst])
 

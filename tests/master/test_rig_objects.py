@@ -104,8 +104,7 @@ def test_rigs_of_two_hands_do_not_both_have_an_object(tree: Path) -> None:
 
 
 def test_merged_rigs_have_the_objects_of_all_in_the_shared_frame(tree: Path) -> None:
-    # A law of depth is of two cameras: rigs that are run together take the rays.
-    rig = msgspec.structs.replace(load(tree / "rigs/desk-cube.json", RigCalibration), depth_model="stereo")
+    rig = load(tree / "rigs/desk-cube.json", RigCalibration)
     beside = msgspec.structs.replace(
         rig,
         name="side",

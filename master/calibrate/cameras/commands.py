@@ -19,6 +19,7 @@ from master.calibrate.cameras.files import (
     lens_provenance,
     places_provenance,
     rig_with_places,
+    without_wrong_law,
     write_files,
 )
 from master.calibrate.cameras.fit import CamerasFit, fit_cameras
@@ -150,12 +151,16 @@ def stereo(
         if name not in held
     }
     how = places_provenance(found, "calibrate stereo", data)
-    new = rig_with_places(rig_known, rig, dict(found.T_rig_camera), how)
+    new, dropped = without_wrong_law(
+        rig_with_places(rig_known, rig, dict(found.T_rig_camera), how), {**known, **files}
+    )
     if json_file is not None:
         write_summary(json_file, report_json(found) | {"rig": rig})
     written = [] if out is None else write_files(out, files, {rig: new})
     if rig_known is None and written:
         typer.echo(f"rig {rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
+    if dropped:
+        typer.echo(dropped)
     _written(written, known)
 
 

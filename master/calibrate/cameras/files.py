@@ -8,11 +8,13 @@ import numpy as np
 
 from common.arrays import Float
 from common.calibration import CameraCalibration, Intrinsics, Matrix4, Provenance, RigCalibration, check, load
+from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.result import CamerasResult
 from master.calibrate.tree_files import provenance, write_camera, write_rig
+from master.stereo.depth import law_contradicts
 
 NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not measured"
 
@@ -106,6 +108,31 @@ def rig_with_places(
         cameras=known.cameras + tuple(camera for camera in places if camera not in known.cameras),
         T_rig_camera=known.T_rig_camera | new,
         provenance=known.provenance | {"T_rig_camera": how},
+    )
+
+
+def without_wrong_law(
+    rig: RigCalibration, cameras: Mapping[str, CameraCalibration | None]
+) -> tuple[RigCalibration, str]:
+    """The rig with `depth_model` "stereo" where its law does not fit its places, and what to say of that.
+
+    Args:
+        rig: With new places.
+        cameras: Camera files by name; None: not known.
+    """
+    files = [cameras.get(name) for name in rig.cameras]
+    if rig.depth_model == "stereo" or any(file is None or file.intrinsics is None for file in files):
+        return rig, ""
+    models = [CameraModel.of(file, rig.camera_pose(file.name)) for file in files if file is not None]
+    try:
+        wrong = law_contradicts(rig, models)
+    except CalibrationError as error:
+        wrong = str(error)
+    if not wrong:
+        return rig, ""
+    return (
+        msgspec.structs.replace(rig, depth_model="stereo"),
+        f"{wrong}: depth_model is 'stereo' now; `phalanx-master calibrate depth --use {rig.depth_model}` fits it anew",
     )
 
 

@@ -11,7 +11,7 @@ from master.fabrik.cap_views import CapTables, hidden_part
 from master.fabrik.estimate import SolvedHand
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables, place_centroids
 from master.stereo.caps import CapModel
-from master.stereo.depth import AffineDisparity, PowerLaw
+from master.stereo.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, natural_angles, palm
 
 DISTORTED = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])
@@ -59,10 +59,9 @@ def hand(angles_rad: Float | None = None, tilt_rad: float = 0.0) -> SolvedHand:
 
 
 def axis_law(cameras: tuple[CameraModel, ...]) -> AffineDisparity:
-    """The law that target and ruler on the axis of the first camera give."""
+    """The law that target and ruler before the middle of the pair give."""
     depth = np.linspace(0.4, 1.0, 13)
-    on_axis = depth[:, None] * cameras[0].T_rig_camera[:3, 2] + cameras[0].centre
-    x = np.subtract(*(one.project(on_axis)[:, 0] for one in cameras))
+    x = disparity_on_axis(cameras, depth)
     a, x0 = np.polyfit(1.0 / depth, x, 1)
     return AffineDisparity(float(a), float(x0))
 
