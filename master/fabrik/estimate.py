@@ -60,7 +60,7 @@ class HandEstimate:
         solution: The hand; None: none is known.
         valid, tracked, source: (26,) as of `HandPose`.
         seen: (5,) fingers whose marker was placed now.
-        residual_m: (5,) distance of the finger's marker from its place on the hand; NaN: not seen.
+        residual_m: (5,) distance at which FABRIK left the marker on a finger's end from its target; NaN: not seen.
         iterations: (5,) of FABRIK.
         reached: (5,) FABRIK brought the marker onto its target.
     """

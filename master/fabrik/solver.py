@@ -77,15 +77,20 @@ class FabrikSolver:
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
         self._count = len(markers)
         self._back = self.on_hand[self._on_palm]
-        self._fingers = {
-            m: (mount.finger, Finger.of(model, mount.finger, mount.offset_m, _ON_TARGET_M))
+        self._finger_of = np.array([-1 if mount.finger is None else mount.finger for mount in mounts])
+        self._on_finger = self._finger_of >= 0
+        at_tips = {
+            int(np.flatnonzero(TIPS == mount.joint)[0]): m
             for m, mount in enumerate(mounts)
-            if mount.finger is not None
+            if mount.joint in TIPS
+        }
+        self._fingers = {
+            m: (f, Finger.of(model, f, mounts[m].offset_m, _ON_TARGET_M)) for f, m in at_tips.items()
         }
         self._memory = FingerMemory(model)
         self._last: SolvedHand | None = None
         self._last_palm: Palm | None = None
-        self._last_ns = self._seen_ns = -(2**62)
+        self._last_ns = -(2**62)
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
@@ -104,10 +109,11 @@ class FabrikSolver:
         """
         last, age_s = self._recent(instant.t_ns)
         seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
+        if last is None:
+            self._memory = FingerMemory(self._model)
         with self._stage("triangulate"):
             markers = self.triangulate(*pixels, seen_as, age_s)
             if seen_as is None:
-                self._memory = FingerMemory(self._model)
                 first = self.peek(markers.points_m, markers.cov_m2, instant.area)
                 if first is not None:
                     markers = self.triangulate(*pixels, first, 0.0)
@@ -166,7 +172,7 @@ class FabrikSolver:
         facing = towards if self._shows_back(points) else None
         if last is None:
             return self._palm(points, cov, facing)
-        shown = frozenset(f for m, (f, _) in self._fingers.items() if isfinite(points[m, 0]))
+        shown = frozenset(self._finger_of[np.isfinite(points[:, 0])].tolist()) - {-1}
         hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, _NATURAL, shown)
         return self._palm(points, cov, facing, self._last_palm, age_s, hidden)
 
@@ -196,31 +202,31 @@ class FabrikSolver:
         before, places = self._palm.pose(palm.T, fitted)
         targets, angles = np.empty_like(places), fitted.copy()
         targets_of(points, cov, palm.T, places, _FIT_M2, targets)
-        explained = np.zeros(5, np.bool_)
         for m, (f, finger) in self._fingers.items():
             if isfinite(targets[m, 0]):
                 out.residual_m[f], out.iterations[f], out.reached[f] = finger.solve(targets[m], angles[f])
-                out.seen[f], explained[f] = True, palm.surprise[m] < EXPLAINED
         angles = self._model.clamp(angles)
         joints, _ = self._palm.pose(palm.T, angles)
         joint_cov, tilt = self._palm.covariances(palm)
         off = joints.position_m - before.position_m
         joint_cov += off[:, :, None] * off[:, None, :]
         hand = SolvedHand(palm.T, angles, joints, joint_cov, tilt, _NO_WALK)
-        placed = np.isfinite(points[:, 0])
-        self._judge(out, explained, int(placed.sum()), self._shows_back(points))
+        self._judge(out, palm, np.isfinite(points[:, 0]))
         if last is not None:
             self._memory.moved(last.angles_rad, angles, age_s)
         self._last, self._last_palm, self._last_ns = hand, palm, out.t_ns
         return replace(out, solution=hand)
 
-    @staticmethod
-    def _judge(out: HandEstimate, explained: Bool, placed: int, back: bool) -> None:
-        """Write the bits of a solved hand: what is seen and explained is tracked, the rest is held."""
+    def _judge(self, out: HandEstimate, palm: Palm, placed: Bool) -> None:
+        """Write the bits of a solved hand of markers (H,) that are placed: what they explain is tracked."""
+        out.seen[self._finger_of[placed & self._on_finger]] = True
+        explained = out.seen.copy()
+        explained[self._finger_of[(palm.surprise >= EXPLAINED) & self._on_finger]] = False
         out.valid[:] = True
         out.source[CHAINS[out.seen]] = Source.SOLVED
         out.source[TIPS[out.seen]] = Source.MEASURED
-        if placed >= _PALM_MARKERS or (placed == _PALM_MARKERS - 1 and back):
+        count, back = int(placed.sum()), bool(placed[self._on_palm].any())
+        if count >= _PALM_MARKERS or (count == _PALM_MARKERS - 1 and back):
             out.tracked[_PALM_JOINTS], out.source[_PALM_JOINTS] = True, Source.SOLVED
             out.tracked[CHAINS[explained]] = True
         else:

@@ -9,11 +9,14 @@ import pytest
 from common.arrays import Float
 from common.calibration import RigCalibration, parse
 from common.errors import CalibrationError
+from common.hand_calibration import MarkerMount
+from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, decode, encode
 from master.rig import RigSetup, build_pipeline
 from master.solve import fingers_of
 from master.stages import StageTimes
-from tests.hand_helpers import MARKERS, RIGHT, camera_file, rig_file
+from master.stereo.caps import CapModel
+from tests.hand_helpers import MARKERS, RIGHT, camera_file, detections, natural_angles, palm, rig_file
 from tests.synthetic_run import SyntheticRun, hand_at, setup_of, synthetic_run
 
 FREE = tuple(f"cube-{k}" for k in range(18))
@@ -22,15 +25,15 @@ ALL = (*FREE[:7], *MARKERS[:2], *FREE[7:12], *MARKERS[2:], *FREE[12:])
 PLACES: Float = np.random.default_rng(4).uniform([-0.15, -0.12, 0.45], [0.2, 0.15, 0.65], (18, 3))
 
 
-@pytest.fixture(scope="module")
-def six() -> SyntheticRun:
-    return synthetic_run(12)
+@pytest.fixture(scope="module", params=["estimator", "fabrik"])
+def six(request: pytest.FixtureRequest) -> SyntheticRun:
+    return synthetic_run(12, solver=request.param)
 
 
 @pytest.fixture(scope="module")
 def many(six: SyntheticRun) -> SyntheticRun:
     """The same hand among 18 markers at rest."""
-    setup = setup_of(rig_file(markers=ALL, free_markers=FREE))
+    setup = setup_of(rig_file(markers=ALL, free_markers=FREE, solver=six.setup.rig.solver))
     return SyntheticRun(setup, [among(six, m) for m in six.messages])
 
 
@@ -117,3 +120,29 @@ def test_a_marker_on_no_hand_must_be_said_to_be_free() -> None:
     raw = msgspec.json.encode(rig_file(free_markers=("cube",)))
     with pytest.raises(CalibrationError, match=r"desk\.json: free_markers: 'cube' is not one of markers"):
         parse(raw, RigCalibration, "desk.json")
+
+
+@pytest.mark.parametrize("solver", ["estimator", "fabrik"])
+def test_a_marker_on_a_bone_beside_that_of_the_finger_tip_counts_for_the_hand(solver: str) -> None:
+    bone = MarkerMount("index-finger-phalanx-intermediate", (0.0, 0.009, -0.01), 0.012)
+    knuckle = MarkerMount("middle-finger-metacarpal", (0.0, 0.01, -0.02), 0.012)
+    profile = msgspec.structs.replace(
+        RIGHT.profile, markers=RIGHT.profile.markers | {"bone": bone, "knuckle": knuckle}
+    )
+    model, names = HandModel.of(profile), (*MARKERS, "bone", "knuckle")
+    rig = rig_file(markers=names, solver=solver)
+    setup = RigSetup.of(rig, {name: camera_file(name) for name in rig.cameras}, model)
+    truth, cameras = (
+        model.forward(palm(), natural_angles(np.random.default_rng(2))),
+        tuple(setup.models.values()),
+    )
+    points = model.marker_points(truth, names)
+    bias = CapModel(model, names).bias_px(truth, points, cameras)
+    told = [
+        detections(name, k, 1_000_000_000 + k * 16_666_667, setup.models[name].project(points) + bias[c])
+        for k in range(8)
+        for c, name in enumerate(rig.cameras)
+    ]
+    poses, _ = solve(SyntheticRun(setup, told))
+    assert poses[-1].tracked.all()
+    assert 1e3 * np.linalg.norm(poses[-1].position_m - truth.position_m, axis=1).mean() < 3.0
