@@ -1,6 +1,7 @@
 """Tests of rigs that are run together: several of one hand become one setup, and one of two hands becomes two."""
 
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -122,7 +123,7 @@ def test_marker_rigs_that_contradict_each_other_are_refused(
 
 
 def test_rigs_together_triangulate_whatever_law_each_has(bench: RigSetup) -> None:
-    law = {"depth_model": "power_law", "power_law": {"k_m": 37.5, "z": -1.0}}
+    law: dict[str, Any] = {"depth_model": "power_law", "power_law": {"k_m": 37.5, "z": -1.0}}
     for first, second in ((bench, aside(**law)), (setup_of(rig_file(**law)), aside())):
         both = RigSetup.joined([first, second])
         assert both.rig.depth_model == "stereo"

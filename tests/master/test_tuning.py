@@ -19,9 +19,8 @@ from common.hand_model import HandJoints
 from common.keys import new_key
 from common.messages import Command, HandPose, MarkerDetections
 from common.zenoh_bus import ZenohBus
-from master.ik.tracker import HandTracker
 from master.live import LiveSettings, run_live
-from master.rig import RigSetup, build_pipeline, load_setup
+from master.rig import RigSetup, load_setup
 from master.stages import StageTimes
 from master.stereo.caps import CapModel
 from master.tuning import LivePipeline, RigFiles, RigTuning
@@ -113,19 +112,6 @@ def test_stages_are_measured_once(exact_run: SyntheticRun) -> None:
     before = stages._count["filter"]
     pipeline.change(exact_run.setup)
     assert stages._count["filter"] == before == count
-
-
-def test_a_fresh_tracker_is_as_good_as_new(exact_run: SyntheticRun) -> None:
-    used = HandTracker(RIGHT, MARKERS)
-
-    def solved(tracker: HandTracker) -> Float:
-        pipeline = build_pipeline(exact_run.setup, StageTimes(), tracker=tracker)
-        poses = [one.pose for message in exact_run.messages[:20] for one in pipeline.push(message)]
-        return np.array([pose.position_m for pose in poses])
-
-    first = solved(used)
-    np.testing.assert_array_equal(solved(used.fresh()), first)
-    assert not np.array_equal(solved(used), first), "one that was used remembers"
 
 
 def tree(folder: Path, rig: RigCalibration | None = None) -> RigFiles:

@@ -124,7 +124,7 @@ def test_blobs_and_codes_are_the_same_on_every_grid(numba: Engine, name: str) ->
         table = pushed._table
         for grid in ((4, 0, 0), (2, 0, 0), (4, 2, 2), (4, 0, 2), (4, 3, 3)):
             codes = table.scan(image, *grid)
-            fast_codes, fast = numba.scan_blobs(image, table, table.bits, *grid)
+            fast_codes, fast = numba.scan_blobs(image, table, table.bits, *grid, None)
             np.testing.assert_array_equal(fast_codes, codes)
             assert_same_blobs(find_blobs(codes, table.bits, *grid), fast)
             seen += sum(map(len, fast))
@@ -161,7 +161,7 @@ def test_noise_of_all_colours_has_the_same_blobs_in_tables_of_every_width(numba:
     rng = np.random.default_rng(count)
     for size in ((90, 101, 3), (64, 64, 3)):
         image = rng.integers(0, 256, size, dtype=np.uint8)
-        codes, found = numba.scan_blobs(image, table, table.bits, 2, 1, 1)
+        codes, found = numba.scan_blobs(image, table, table.bits, 2, 1, 1, None)
         np.testing.assert_array_equal(codes, table.scan(image, 2, 1, 1))
         assert_same_blobs(find_blobs(codes, table.bits, 2, 1, 1), found)
         blobs = [Blob(30.0, 30.0, 100.0, 20, 20, 41, 41)]
@@ -178,7 +178,7 @@ def test_under_another_light_both_engines_look_up_the_same_colours(
 ) -> None:
     image = np.asarray(cv2.LUT(render(hand()), relit_bytes(gains).T[None]), np.uint8)
     table = TABLE.relit(relit_bytes(1.0 / np.array(gains)))
-    codes, options = numba.scan_blobs(image, table, table.bits, 4, 0, 0)
+    codes, options = numba.scan_blobs(image, table, table.bits, 4, 0, 0, None)
     np.testing.assert_array_equal(codes, table.scan(image, 4))
     assert_same_blobs(find_blobs(codes, table.bits, 4), options)
     call = [b[0] for b in options if b], [bit for bit, b in zip(table.bits, options, strict=True) if b]
@@ -202,7 +202,7 @@ def test_an_image_that_must_not_be_written_is_no_new_kind_to_compile(numba: Engi
     image = render(hand())
     image.flags.writeable = False
     for picture in (image, image[:, ::-1], image[20:]):
-        _, options = numba.scan_blobs(picture, TABLE, TABLE.bits, 4, 0, 0)
+        _, options = numba.scan_blobs(picture, TABLE, TABLE.bits, 4, 0, 0, None)
         found = numba.measure(picture, TABLE, TABLE.bits, [b[0] for b in options], [True] * len(options))
         assert all(one is not None for one in found)
     after = [len(kernel.signatures) for kernel in kernels]  # pyright: ignore[reportFunctionMemberAccess]
@@ -212,7 +212,7 @@ def test_an_image_that_must_not_be_written_is_no_new_kind_to_compile(numba: Engi
 @needs_numba
 def test_nothing_gives_nothing(numba: Engine) -> None:
     image = render([], 120, 100)
-    assert numba.scan_blobs(image, TABLE, (1, 2), 4, 0, 0)[1] == [[], []]
+    assert numba.scan_blobs(image, TABLE, (1, 2), 4, 0, 0, None)[1] == [[], []]
     assert numba.measure(image, TABLE, [], [], []) == []
     assert numba.measure(image, TABLE, [1], [Blob(60.0, 50.0, 40.0, 56, 46, 64, 54)], [True]) == [None]
     beyond = [Blob(400.0, 50.0, 40.0, 396, 46, 404, 54), Blob(60.0, -50.0, 40.0, 56, -54, 64, -46)]

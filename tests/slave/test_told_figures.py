@@ -46,7 +46,7 @@ def test_a_slave_tells_what_the_checklist_judges(tmp_path: Path) -> None:
     nothing = cast(Any, None)  # neither frames nor datagrams are needed to be asked
     with ThreadPoolExecutor(1) as workers:
         line = live._marker_line(
-            "left", files, nothing, nothing, clock, "follow", NUMPY, stop, workers, Service({})
+            "left", files, nothing, nothing, clock, "follow", "full", NUMPY, stop, workers, Service({})
         )
     tuning = CameraTuning(files, Camera(), line.prepare, lambda: True, line.picker)
     reporter = Reporter(

@@ -21,6 +21,7 @@ from master.keys_folder import AUTHORITY_KEY, files_of_device, make
 # What simulated cameras can look at: scene -> text. "still" is the hand before its motion begins.
 VIEWS = {
     "board": "a calibration board",
+    "card": "a painted card at known distances, for the depth of a pair",
     "still": "a hand held still",
     "standard": "a hand that moves",
     "lights": "a hand under light that changes",
