@@ -92,6 +92,11 @@ class FabrikSolver:
         self._last_palm: Palm | None = None
         self._last_ns = -(2**62)
 
+    @property
+    def continuous(self) -> bool:
+        """Whether instants follow each other; else nothing is remembered."""
+        return self._one_euro is not None
+
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
         return [self.solve(instant) for instant in self.sync.push(message)]
@@ -161,7 +166,7 @@ class FabrikSolver:
     def _recent(self, t_ns: int) -> tuple[SolvedHand | None, float]:
         """The last hand, if it still says anything, and how long ago it held [s]."""
         age_s = (t_ns - self._last_ns) * 1e-9
-        if self._one_euro is None or self._last is None or not 0.0 < age_s <= FORGET_S:
+        if not self.continuous or self._last is None or not 0.0 < age_s <= FORGET_S:
             return None, 0.0
         return self._last, age_s
 

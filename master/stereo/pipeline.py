@@ -18,7 +18,7 @@ from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
-from master.fabrik.estimate import HandEstimate
+from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.fabrik.solver import FabrikSolver
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import HandOneEuro
@@ -173,41 +173,50 @@ class MarkerPipeline:
             instant = self._without_rivals(instant)
         line = self._line.solve(instant, last)
         hand: HandEstimate | TrackedHand = line
+        markers = found = line.markers
         if self._tracker is not None:
-            hand = self._refined(self._tracker, instant, line, last, age_s)
-        else:
-            self._count("apart", line.markers.apart)
-            self.counts["epipolar_misfits"] += int(line.markers.apart.sum())
-        markers = line.markers
+            found = self._located_of(instant, line, last, age_s)
+            hand = self._refined(self._tracker, instant, line, found, last, age_s)
+        self._count_odd(found, instant)
         pose = pose_of(
             hand, self.model, instant.t_ns, line.smooth_m, markers.points_m, markers.cov_m2, self._volume
         )
-        self._past.saw(instant.t_ns, markers.points_m)
+        if self._line.continuous:
+            self._past.saw(instant.t_ns, markers.points_m)
         self.counts["poses"] += 1
         self.counts["outside_volume"] += int(not pose.inside_volume[pose.valid].all())
         self.counts["instants_with_missing_camera"] += int(instant.missing.any())
         return SolvedPose(pose, instant.ready_t_ns)
+
+    def _located_of(
+        self, instant: Instant, line: HandEstimate, last: HandSolution | None, age_s: float
+    ) -> Located:
+        """The markers by the rays of all cameras: the line's own, unless that goes by a law of disparity."""
+        if isinstance(line.markers, Located):
+            return line.markers
+        with self._stage("triangulate"):
+            return self._located(instant.uv, instant.sigma_px, instant.area, last or line.solution, age_s)
 
     def _refined(
         self,
         tracker: HandTracker,
         instant: Instant,
         line: HandEstimate,
+        found: Located,
         last: HandSolution | None,
         age_s: float,
     ) -> TrackedHand:
         """The hand that explains the pixels of one instant best, from the line's hand or the last one `age_s` ago."""
-        near = last or line.solution
-        found = line.markers
-        if not isinstance(found, Located):  # the line triangulates by a law of disparity
-            with self._stage("triangulate"):
-                found = self._located(instant.uv, instant.sigma_px, instant.area, near, age_s)
         with self._stage("hand"):
             # The covariances are those of the points before the filter, which do not lag: the fit takes these.
             points, cov = found.points_m, found.cov_m2
             aims = self._with_rays(instant, points, cov + found.repeated, last, age_s)
             measured = np.isfinite(points[self._on_hand, 0])
-            turned = None if self._orientation is None else self._orientation.at(instant.t_ns, near)
+            turned = (
+                None
+                if self._orientation is None
+                else self._orientation.at(instant.t_ns, last or line.solution)
+            )
             told = None if self._others is None else self._others.at(instant.t_ns)
             hand = tracker.push(
                 instant.t_ns,
@@ -225,18 +234,13 @@ class MarkerPipeline:
                     instant.t_ns, hand, found.noise_m2[self._on_hand], points[self._on_hand]
                 )
             on_hand = np.isfinite(instant.uv[:, self._on_hand, 0])
-            hand = self._drift.push(
+            return self._drift.push(
                 instant.t_ns,
                 hand,
                 placed=bool(measured.any()),
                 seen=bool(on_hand.any()),
                 sight=self._sight(hand, on_hand),
             )
-        self._count("apart", found.apart)
-        self.counts["epipolar_misfits"] += int(found.apart.sum())
-        if found.left_out.any():
-            self._count_left_out(found, instant)
-        return hand
 
     def _without_rivals(self, instant: Instant) -> Instant:
         """The instant with one place for each marker; the usual one has no rival and is passed on."""
@@ -266,6 +270,13 @@ class MarkerPipeline:
         """Count an event of each of the markers (M,) by name."""
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
+
+    def _count_odd(self, found: MarkerPositions, instant: Instant) -> None:
+        """Count markers whose rays do not meet, and cameras that were left out."""
+        self._count("apart", found.apart)
+        self.counts["epipolar_misfits"] += int(found.apart.sum())
+        if isinstance(found, Located) and found.left_out.any():
+            self._count_left_out(found, instant)
 
     def _count_left_out(self, found: Located, instant: Instant) -> None:
         """Count what was left out of each camera, and instants at which that is most of what it sees."""
