@@ -45,7 +45,7 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
     cosine = min(max(cosine, -1.0), 1.0)
     last = caps.looks.shape[1] - 1
     place = acos(cosine) * (last / np.pi)
-    low = min(int(place), last - 1)
+    low = min(max(int(place), 0), last - 1) if place >= 0.0 else 0  # NaN is not
     part = place - low
     along = (1.0 - part) * caps.looks[row, low, 0] + part * caps.looks[row, low + 1, 0]
     towards = (1.0 - part) * caps.looks[row, low, 1] + part * caps.looks[row, low + 1, 1]
