@@ -86,7 +86,7 @@ def test_held_frames_differ_by_noise_alone_and_moved_ones_by_the_card() -> None:
     assert (first != second).any()
     again = renderer.render(0.0)
     np.testing.assert_array_equal(again, first)  # of what was kept as of what is drawn afresh
-    moved = renderer.render(HELD_S + 0.5 * MOVED_S)
+    moved = renderer.render(14 * (HELD_S + MOVED_S) + HELD_S + 0.5 * MOVED_S)
     assert np.abs(second.astype(int) - first).max() < 25 < np.abs(moved.astype(int) - first).max()
 
 
