@@ -120,7 +120,7 @@ def _law_rows(desk: RigSetup) -> Iterator[Row]:
             uv = np.stack([camera.project(some) for camera in cameras])
             seen = ((uv > 0.0) & (uv < [cameras[0].width_px, cameras[0].height_px])).all(axis=(0, 2))
             uv = uv + rng.normal(0.0, noise_px, uv.shape)
-            by_law = line.triangulate(uv, np.full((2, count), 0.1), nothing, None, 0.0).points_m
+            by_law = line.triangulate(uv, np.full((2, count), 0.1), nothing, None, 0.0, as_seen=True).points_m
             by_rays = Triangulator.of(cameras).triangulate(uv, 0.1).points
             off.append((by_law - by_rays)[seen, 2])
             inside.append(some[seen, 2])

@@ -30,7 +30,12 @@ from common.session import MAX_CAMERAS
 from master.rig import load_setup
 
 BUILDING = "building"
-PER_HAND = ("hand", "filter", "fabrik", "gestures")  # stages whose cost has nothing to do with the number of cameras
+PER_HAND = (
+    "hand",
+    "filter",
+    "fabrik",
+    "gestures",
+)  # stages whose cost has nothing to do with the number of cameras
 _EXAMPLES = """examples:
   python -m bench.scale                                  everything once, about three minutes
   python -m bench.scale --repeat 3 --page docs/scale.html the medians of three runs, into the page

@@ -120,8 +120,7 @@ class FabrikSolver:
             markers = self.triangulate(*pixels, seen_as, age_s)
             if seen_as is None:
                 first = self.peek(markers.points_m, markers.cov_m2, instant.area)
-                if first is not None:
-                    markers = self.triangulate(*pixels, first, 0.0)
+                markers = self.triangulate(*pixels, first, 0.0, as_seen=first is None)
         with self._stage("filter"):
             smooth = markers.points_m
             if self._one_euro is not None:

@@ -34,6 +34,9 @@ from master.stereo.depth import AffineDisparity, PowerLaw, disparity_on_axis
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])
 _LAW_TURNS = 3  # each leaves a thousandth of the correction off the axis
+_ANYHOW_RAD = (
+    1.0  # standard deviation of the direction of a finger that shows its end, from that to the cameras
+)
 _ANYHOW_M2 = (4e-3) ** 2  # of a cap's seen centroid while nothing tells where the finger points
 _RELIEF_M2 = (0.4e-3) ** 2  # a flat marker on a back that is not flat
 _RADIUS = 0.1  # relative error of a profile's radii
@@ -339,15 +342,23 @@ class Triangulate(Protocol):
     """Positions of the M markers of one instant by the depth model of a rig: the law, or the rays of all cameras."""
 
     def __call__(
-        self, uv: Float, sigma_px: Float, area_px2: Float, hand: SolvedHand | None, age_s: float
+        self,
+        uv: Float,
+        sigma_px: Float,
+        area_px2: Float,
+        hand: SolvedHand | None,
+        age_s: float,
+        *,
+        as_seen: bool = False,
     ) -> MarkerPositions:
         """Triangulate.
 
         Args:
             uv: (C, M, 2) centroids [px]; NaN: not seen.
             sigma_px, area_px2: (C, M).
-            hand: A hand of `age_s` [s] ago, which tells what side of each cap is seen; None: nothing tells.
+            hand: A hand of `age_s` [s] ago, which tells what side of each cap is seen; None: any that shows it.
             age_s: Its age.
+            as_seen: Nothing tells of a hand: what is seen of a marker is taken for its centroid.
         """
         ...
 
@@ -360,14 +371,22 @@ class DepthTriangulator:
         self._tables, self._caps, self._views = tables, caps, CapTables.of(caps)
 
     def __call__(
-        self, uv: Float, sigma_px: Float, area_px2: Float, hand: SolvedHand | None, age_s: float
+        self,
+        uv: Float,
+        sigma_px: Float,
+        area_px2: Float,
+        hand: SolvedHand | None,
+        age_s: float,
+        *,
+        as_seen: bool = False,
     ) -> MarkerPositions:
         """As `Triangulate`; only the first two cameras count."""
         count = uv.shape[1]
-        if hand is None:
-            ahead, tilt = np.full((count, 3), np.nan), np.zeros((count, 3, 3))
-        else:
+        ahead, tilt = np.full((count, 3), np.nan), np.zeros((count, 3, 3))
+        if hand is not None:
             ahead, tilt = self._caps.pointing(hand, age_s)
+        elif not as_seen:
+            ahead[self._caps.on_finger], tilt[:] = -self._tables.R[:, 2], _ANYHOW_RAD**2 * np.eye(3)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         triangulate(self._tables, self._views, uv, sigma_px, area_px2, ahead, tilt, points, cov, noise, apart)

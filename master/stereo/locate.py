@@ -72,6 +72,8 @@ class CapLocator:
         area_px2: Float,
         hand: SolvedHand | None,
         age_s: float,
+        *,
+        as_seen: bool = False,
     ) -> Located:
         """Locate the markers of one instant.
 
@@ -79,16 +81,17 @@ class CapLocator:
             uv: (C, M, 2) [px]; NaN: not seen.
             sigma_px: (C, M).
             area_px2: (C, M).
-            hand: The hand known so far; None: the markers may be on anything, so what is seen of them is taken for
-                their centroid, and the whole correction for doubt.
+            hand: The hand known so far; None: a cap may point anywhere where it is seen.
             age_s: How long ago it was so [s].
+            as_seen: Nothing tells of a hand, so the markers may be on something flat: what is seen of them is taken
+                for their centroid, and the whole correction for doubt.
         """
-        found = self._once(uv, sigma_px, area_px2, hand, age_s)
+        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
         if not found.left_out.any():
             return found
         out = found.left_out
         uv, area_px2 = np.where(out[..., None], np.nan, uv), np.where(out, np.nan, area_px2)
-        found = self._once(uv, sigma_px, area_px2, hand, age_s)
+        found = self._once(uv, sigma_px, area_px2, hand, age_s, as_seen=as_seen)
         return replace(found, left_out=out & ~found.apart)
 
     def _once(
@@ -98,11 +101,13 @@ class CapLocator:
         area_px2: Float,
         hand: SolvedHand | None,
         age_s: float,
+        *,
+        as_seen: bool,
     ) -> Located:
         """As `__call__`, but `left_out` is only told, not yet left out."""
         points = self._place.roughly(uv, sigma_px)
         look = self.look(points, hand, age_s)
-        if hand is None:
+        if as_seen:
             look.bias_px[0] = 0.0
         doubt = self._caps.doubt_px(area_px2, points, self._cameras, look.whole_m2)
         caps_uv, sure_px = uv - look.bias_px[0], np.hypot(sigma_px, doubt)

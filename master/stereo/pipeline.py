@@ -195,7 +195,10 @@ class MarkerPipeline:
         if isinstance(line.markers, Located):
             return line.markers
         with self._stage("triangulate"):
-            return self._located(instant.uv, instant.sigma_px, instant.area, last or line.solution, age_s)
+            near = last or line.solution
+            return self._located(
+                instant.uv, instant.sigma_px, instant.area, near, age_s, as_seen=near is None
+            )
 
     def _refined(
         self,

@@ -63,5 +63,7 @@ def _by_law(setup: RigSetup, uv: Float) -> Float:
     for start in range(0, uv.shape[1], most):
         part = np.ascontiguousarray(uv[:, start : start + most])
         sigma_px = np.full(part.shape[:2], 0.1)
-        parts.append(triangulate(part, sigma_px, np.full(part.shape[:2], np.nan), None, 0.0).points_m)
+        parts.append(
+            triangulate(part, sigma_px, np.full(part.shape[:2], np.nan), None, 0.0, as_seen=True).points_m
+        )
     return np.concatenate(parts)
