@@ -147,8 +147,11 @@ def place_centroids(
         ray, point: Written, rig frame; not where the depth is NaN.
     """
     across, down = u / tables.cell_px[0], v / tables.cell_px[1]
+    if not np.isfinite(across + down + right_u + right_v):
+        return np.nan, np.nan
     last = tables.table.shape[0] - 2
-    i, j = min(max(int(down), 0), last), min(max(int(across), 0), last)
+    # Cut before they are whole numbers: what is beyond those is any cell, or none.
+    i, j = int(min(max(down, 0.0), float(last))), int(min(max(across, 0.0), float(last)))
     q, p = across - j, down - i
     cell = np.empty(6)
     for c in range(6):
@@ -277,6 +280,8 @@ def triangulate(
                 ray,
                 point,
             )
+            if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
+                continue
             for k in range(3):
                 by[k, 0] = _RADIUS * (point[k] - aim[k])
             for a in range(3):
@@ -294,6 +299,7 @@ def triangulate(
                 cap_bias(tables, caps, row, aim, point, bias, shown)
                 for c in range(2):
                     whole[c] = max(whole[c], shown[c])
+                off[:] = np.nan
                 place_centroids(
                     tables,
                     uv[0, m, 0] - bias[0, 0],
@@ -333,6 +339,10 @@ def triangulate(
                     left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
                 )
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
+        if not np.isfinite(cov[m].sum()):  # a point is placed with its covariance, or not at all
+            points[m, :] = np.nan
+            cov[m, :, :] = np.nan
+            noise[m, :, :] = np.nan
 
 
 class Triangulate(Protocol):
