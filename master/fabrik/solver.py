@@ -72,7 +72,7 @@ class FabrikSolver:
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
-        self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
+        self._ahead = -next(iter(cameras.values())).T_rig_camera[:3, 2]
         mounts = [model.mount(name) for name in hand_markers]
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
         self._count = len(markers)
@@ -105,21 +105,25 @@ class FabrikSolver:
         """At the end of a recording: the hands that still wait for a camera."""
         return [self.solve(instant) for instant in self.sync.flush()]
 
-    def solve(self, instant: Instant, near: SolvedHand | None = None) -> HandEstimate:
+    def solve(
+        self, instant: Instant, near: SolvedHand | None = None, near_age_s: float = 0.0
+    ) -> HandEstimate:
         """Solve one instant.
 
         Args:
             instant: What the cameras see of it.
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
+            near_age_s: How long ago that held [s].
         """
         last, age_s = self._recent(instant.t_ns)
-        seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
+        seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
+        pixels = instant.uv, instant.sigma_px, instant.area
         if last is None:
             self._memory = FingerMemory(self._model)
         with self._stage("triangulate"):
-            markers = self.triangulate(*pixels, seen_as, age_s)
+            markers = self.triangulate(*pixels, seen_as, seen_age_s)
             if seen_as is None:
-                first = self.peek(markers.points_m, markers.cov_m2, instant.area)
+                first = self.solve_once(markers.points_m, markers.cov_m2, instant.area)
                 if first is not None:
                     markers = self.triangulate(*pixels, first, 0.0)
         with self._stage("filter"):
@@ -132,8 +136,10 @@ class FabrikSolver:
             palm = self._fit(instant.t_ns, points, cov, out.facing, last, age_s)
             return self._estimate(out, points, cov, palm)
 
-    def peek(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
-        """The hand by points alone, and nothing remembered; a finger that is not seen may be anywhere natural.
+    def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
+        """Solve from points alone and remember nothing.
+
+        A finger that is not seen may be anywhere natural.
 
         Args:
             points, cov: (M, 3) [m] and (M, 3, 3) [m^2] of all markers; NaN: not placed.
@@ -154,7 +160,7 @@ class FabrikSolver:
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
         points[self.on_hand], cov[self.on_hand] = places @ _AWAY[:3, :3].T + _AWAY[:3, 3], 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
-        first = self.peek(points, cov, seen)
+        first = self.solve_once(points, cov, seen)
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         if first is not None:
             for m, (f, finger) in self._fingers.items():
