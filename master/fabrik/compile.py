@@ -1,4 +1,4 @@
-"""Says that kernels are compiled, which takes about 15 s on the first start of a version."""
+"""Say that kernels are compiled, about 15 s on a version's first start."""
 
 import logging
 import threading

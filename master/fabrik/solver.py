@@ -1,4 +1,4 @@
-"""The card: both slaves' centroids at one instant, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
+"""The card: centroids, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
 
 Push machine without clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
 """
@@ -98,7 +98,7 @@ class FabrikSolver:
         return self._one_euro is not None
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
-        """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
+        """Take one camera's centroids; return the hands they complete, oldest first."""
         return [self.solve(instant) for instant in self.sync.push(message)]
 
     def flush(self) -> list[HandEstimate]:
@@ -179,7 +179,7 @@ class FabrikSolver:
     def _fit(
         self, t_ns: int, points: Float, cov: Float, towards: Float, last: SolvedHand | None, age_s: float
     ) -> Palm | None:
-        """The palm of an instant from the hand's points (H, 3) [m]; `last` as of `_recent`."""
+        """Fit the palm to the hand's points (H, 3) [m]; `last` as of `_recent`."""
         facing = towards if self._shows_back(points) else None
         if last is None:
             return self._palm(points, cov, facing)
@@ -192,7 +192,10 @@ class FabrikSolver:
         return bool(np.isfinite(points[self._on_palm, 0]).any())
 
     def towards(self, points: Float, area_px2: Float) -> Float:
-        """Unit vector (3,) from the hand's points (H, 3) [m] to the cameras that see most of its back (C, M) [px^2]."""
+        """Return the unit vector (3,) to the cameras that see most of the back.
+
+        Of the hand's points (H, 3) [m], by the areas of all markers (C, M) [px^2].
+        """
         out = self._ahead.copy()
         facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
@@ -204,7 +207,7 @@ class FabrikSolver:
         return SolvedHand(palm.T, angles, joints, *self._palm.covariances(palm), _NO_WALK)
 
     def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Palm | None) -> HandEstimate:
-        """Bring the fingers of a palm onto their markers; without a palm the last hand is held."""
+        """Bring a palm's fingers onto their markers; without a palm hold the last hand."""
         last, age_s = self._recent(out.t_ns)
         if palm is None:
             out.valid[:] = last is not None
@@ -229,7 +232,10 @@ class FabrikSolver:
         return replace(out, solution=hand)
 
     def _judge(self, out: HandEstimate, palm: Palm, placed: Bool) -> None:
-        """Write the bits of a solved hand of markers (H,) that are placed: what they explain is tracked."""
+        """Write the bits of a solved hand; `placed`: (H,) which markers are.
+
+        What they explain is tracked.
+        """
         out.seen[self._finger_of[placed & self._on_finger]] = True
         explained = out.seen.copy()
         explained[self._finger_of[(palm.surprise >= EXPLAINED) & self._on_finger]] = False
