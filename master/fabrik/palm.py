@@ -125,7 +125,7 @@ class PalmFitter:
         alone += self.parameters.anywhere
         scale = max(1.0, float(surprise.sum()) / (3.0 * int(seen.sum())))
         cov = np.empty((size, size))
-        if not inverse(normal, scale, cov):  # by rounding: what says most of the hand has nothing of its own to say
+        if not inverse(normal, scale, cov):  # by rounding: nothing is known but limits
             cov[:] = np.diag(1.0 / self.parameters.anywhere)
         return Palm(T, x, cov, cost, surprise)
 

@@ -25,7 +25,10 @@ from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run
 
 LAWS: list[dict[str, object]] = [
-    {"depth_model": "affine_disparity", "affine_disparity": AffineDisparityCalibration(a_m_px=37.5, x0_px=0.0)},
+    {
+        "depth_model": "affine_disparity",
+        "affine_disparity": AffineDisparityCalibration(a_m_px=37.5, x0_px=0.0),
+    },
     {"depth_model": "power_law", "power_law": PowerLawCalibration(k_m=37.5, z=-1.0)},
     {"depth_model": "stereo"},
 ]
