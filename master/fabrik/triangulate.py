@@ -253,7 +253,8 @@ def triangulate(
         sigma_px, area_px2: (2, M).
         ahead: (M, 3) unit vectors in which the fingers point, rig frame; NaN: not known, what is seen is taken.
         tilt: (M, 3, 3) [rad^2] covariance of these.
-        points: (M, 3) [m], written; NaN: a camera does not see the marker, or there is no such disparity.
+        points: (M, 3) [m], written; NaN: a camera does not see the marker, there is no such
+            disparity, or its standard deviation exceeds half of its depth.
         cov, noise: (M, 3, 3) [m^2] covariance and its noise part, written; NaN where the point is.
         apart: (M,) written: the rows disagree.
     """
@@ -347,7 +348,8 @@ def triangulate(
                     left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
                 )
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
-        if not np.isfinite(cov[m].sum()):  # a point is placed with its covariance, or not at all
+        # A point is placed with its covariance, and where its depth is determined (`master.stereo.triangulate`).
+        if not 4.0 * (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) < z * z or not np.isfinite(cov[m].sum()):
             points[m, :] = np.nan
             cov[m, :, :] = np.nan
             noise[m, :, :] = np.nan
