@@ -11,7 +11,7 @@ from common.arrays import Float
 from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
-from master.fabrik.compile import told_if_slow
+from master.fabrik.compile import log_if_slow
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver
@@ -110,7 +110,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         palm=PalmFitter(setup.hand, setup.hand_markers),
         stage=stage,
     )
-    with told_if_slow():
+    with log_if_slow():
         line.rehearse()
     return line
 

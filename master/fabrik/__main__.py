@@ -1,4 +1,4 @@
-"""Compile the kernels of the solvers ahead of time: `python -m master.fabrik`, as `make install` does."""
+"""Compile the solvers ahead of time: `python -m master.fabrik`."""
 
 import time
 from pathlib import Path

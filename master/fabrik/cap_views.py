@@ -1,4 +1,4 @@
-"""What a camera sees of a painted cap, as kernels over the tables of `master.stereo.caps`."""
+"""Kernels over the tables of `master.stereo.caps`: what a camera sees of a cap."""
 
 from math import acos, sqrt
 from typing import NamedTuple
@@ -34,14 +34,17 @@ class CapTables(NamedTuple):
 
 @kernel
 def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float) -> float:
-    """Write the seen centroid of a cap less its own (3,) [m]; return the area seen [m^2].
+    """Write a cap's seen centroid less its own (3,) [m]; return the area seen [m^2].
 
     Args:
         caps, row: The cap.
-        ahead, back: Unit vectors (3,) along the finger and to the eye.
+        ahead, back: Unit vectors (3,) along the finger and to the eye; NaN: so is what is seen.
         out: Written.
     """
     cosine = ahead[0] * back[0] + ahead[1] * back[1] + ahead[2] * back[2]
+    if not np.isfinite(cosine):  # no row of the table
+        out[:] = np.nan
+        return np.nan
     cosine = min(max(cosine, -1.0), 1.0)
     last = caps.looks.shape[1] - 1
     place = acos(cosine) * (last / np.pi)
@@ -57,7 +60,9 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
 
 @kernel
 def hidden_part(area_px2: Float, scale_m: Float, whole_m2: Float, radius_m: float, out: Float) -> None:
-    """Write the variance (2,) [px^2] of centroids of a marker that shows less than it must (`CapModel.doubt_px`).
+    """Write the variance (2,) [px^2] of centroids of a partly hidden marker.
+
+    It is one that shows less than it must (`CapModel.doubt_px`).
 
     Args:
         area_px2: (2,) seen areas; NaN: not measured.

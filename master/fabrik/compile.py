@@ -1,4 +1,4 @@
-"""Says that kernels are compiled, which takes about 15 s on the first start of a version."""
+"""Say that kernels are compiled, about 15 s on a version's first start."""
 
 import logging
 import threading
@@ -10,7 +10,7 @@ _LOG = logging.getLogger(__name__)
 
 
 @contextmanager
-def told_if_slow() -> Generator[None]:
+def log_if_slow() -> Generator[None]:
     """Log that kernels are compiled, where that takes longer than loading them does."""
     timer = threading.Timer(
         _SLOW_S, _LOG.warning, ("compiling the solvers, once for each version: about 15 s ...",)

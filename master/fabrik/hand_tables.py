@@ -80,7 +80,13 @@ class HandTables(NamedTuple):
 
 
 class Mounts(NamedTuple):
-    """Where M markers sit: chain (-1: the palm), joint of the chain, and place in that joint's frame (M, 3) [m]."""
+    """Where M markers sit on a hand.
+
+    Attributes:
+        finger: (M,) chain; -1: the palm.
+        level: (M,) joint of the chain.
+        offset_m: (M, 3) [m] place in that joint's frame.
+    """
 
     finger: Int
     level: Int

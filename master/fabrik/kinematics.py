@@ -1,4 +1,4 @@
-"""Kernels of a hand: its joints, points fixed to them, how these move with its angles, how well they are known."""
+"""Kernels of a hand: joints, points on them, derivatives, covariances."""
 
 from math import cos, sin, sqrt
 
@@ -11,7 +11,10 @@ from master.fabrik.hand_tables import HandTables, Mounts
 
 @kernel
 def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
-    """Write all angles (20,) [rad] of the free ones (n,), and their derivatives (20, n) (`HandParameters.angles`)."""
+    """Write all angles (20,) [rad] of the free ones (n,), and derivatives (20, n).
+
+    As `HandParameters.angles`.
+    """
     n = x.shape[0]
     for a in range(20):
         total = 0.0
@@ -32,7 +35,10 @@ def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
 
 @kernel
 def chains(tables: HandTables, angles: Float, R: Float, P: Float) -> None:
-    """Write joint rotations R (5, 4, 3, 3) and places P (5, 4, 3) [m], palm frame, of angles (20,) [rad]."""
+    """Write joint rotations and places, palm frame, of angles (20,) [rad].
+
+    R: (5, 4, 3, 3); P: (5, 4, 3) [m].
+    """
     local, frame = np.empty((3, 3)), np.empty((3, 3))
     for f in range(5):
         for k in range(4):
@@ -83,13 +89,13 @@ def pose(
     rotation: Float,
     places: Float,
 ) -> None:
-    """Write the joints of a hand (26, 3) [m] and (26, 3, 3), rig frame, and its markers (M, 3) [m], palm frame.
+    """Write the joints of a hand, rig frame, and its markers, palm frame.
 
     Args:
         tables, mounts: The hand and its markers.
         T: (4, 4) palm.
         angles: (20,) [rad].
-        position, rotation, places: Written.
+        position, rotation, places: Written: (26, 3) [m], (26, 3, 3), (M, 3) [m].
     """
     R, P = np.empty((5, 4, 3, 3)), np.empty((5, 4, 3))
     chains(tables, angles, R, P)
@@ -149,7 +155,7 @@ def axes_of(tables: HandTables, f: int, R: Float, axes: Float) -> None:
 def point_slopes(
     tables: HandTables, by: Float, f: int, level: int, point: Float, R: Float, P: Float, out: Float
 ) -> None:
-    """Write the derivatives (n, 3) [m/rad] of a point of finger f, palm frame, by the free angles."""
+    """Write derivatives (n, 3) [m/rad] of a point of finger f by the free angles."""
     axes, arms = np.empty((4, 3)), np.empty((4, 3))
     axes_of(tables, f, R, axes)
     for k in range(4):
@@ -160,7 +166,7 @@ def point_slopes(
 
 @kernel
 def rig_slopes(T: Float, arm: Float, by_x: Float, shifted: bool, J: Float, used: Int) -> int:
-    """Write derivatives in the rig frame by the palm's turn, its shift and the free angles; count those not 0.
+    """Write derivatives by palm and free angles, rig frame; count those not 0.
 
     Args:
         T: (4, 4) palm.
@@ -204,14 +210,14 @@ def _covariance_of(J: Float, used: Int, count: int, C: Float, out: Float) -> Non
 
 @kernel
 def covariances(tables: HandTables, T: Float, x: Float, C: Float, cov: Float, tilt: Float) -> None:
-    """Write the covariances of the joints (26, 3, 3) [m^2] and of the last phalanges' directions (5, 3, 3) [rad^2].
+    """Write covariances of the joints and of the last phalanges' directions.
 
     Args:
         tables: The hand.
         T: (4, 4) palm.
         x: (n,) [rad] free angles.
         C: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m], rig frame, and of x.
-        cov, tilt: Written.
+        cov, tilt: Written: (26, 3, 3) [m^2], (5, 3, 3) [rad^2].
     """
     n = x.shape[0]
     angles, by = np.empty(20), np.empty((20, n))

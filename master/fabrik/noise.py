@@ -1,4 +1,4 @@
-"""Measures the noise of signals while they move: what second differences of their samples show.
+"""Measure the noise of moving signals by second differences of samples.
 
 With x the samples, steps of equal length, noise of standard deviation s that is new in every sample makes second
 differences of variance 6 s^2; of steps dt, k dt it is 2 (1 + k + k^2) s^2 where the first is scaled by k. Of noise that

@@ -1,4 +1,4 @@
-"""Smooths what is measured as it arrives: the 1 € filter of many signals at once, of points and of the solved hand.
+"""The 1 € filter of many signals at once: of points, and of the solved hand.
 
 Casiez, Roussel, Vogel, "1 € Filter", CHI 2012. A low pass whose cut-off rises with speed, so that a hand
 at rest does not tremble and a fast one does not lag. Per signal, with x^ the filtered value and dt the time
@@ -89,7 +89,7 @@ class OneEuroParameters:
 
 
 class OneEuro:
-    """Push machine; holds each signal's filtered value, its speed and when it was last seen."""
+    """Push machine; holds each signal's filtered value, speed and last time."""
 
     def __init__(self, parameters: OneEuroParameters, groups: Sequence[int] | None = None) -> None:
         """Set up.
@@ -174,7 +174,10 @@ class OneEuro:
 
 
 class PointFilter:
-    """Push machine for points in space; holds the filter of their coordinates along the axes of the view."""
+    """Push machine for points in space, filtered along the axes of the view.
+
+    Holds the filter of their coordinates.
+    """
 
     def __init__(self, parameters: OneEuroParameters, R_view_rig: Float) -> None:
         """Set up.
@@ -187,7 +190,9 @@ class PointFilter:
         self._R = R_view_rig
 
     def push(self, t_ns: int, points: Float, cov: Float) -> Float:
-        """Filter points (M, 3) [m], rig frame, with covariances (M, 3, 3) [m^2] of their noise; NaN: not seen.
+        """Filter points (M, 3) [m], rig frame; NaN: not seen.
+
+        `cov`: (M, 3, 3) [m^2] covariances of their noise.
 
         Times as in `OneEuro.push`.
         """
@@ -258,5 +263,8 @@ def _step(
 
 @kernel
 def _gain_in_motion(u2: float) -> float:
-    """Gain of the steady Kalman filter of a random walk, of u squared: its step's variance by that of the noise."""
+    """Gain of the steady Kalman filter of a random walk.
+
+    u2: variance of its step by that of the noise.
+    """
     return 2.0 / (1.0 + (1.0 + 4.0 / u2) ** 0.5) if u2 > 0.0 else 0.0

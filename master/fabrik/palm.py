@@ -1,4 +1,7 @@
-"""The palm of an instant: from the last one where that explains the markers, else from several starts."""
+"""Fit the palm of an instant: from the last one, or from several starts.
+
+From the last one where that explains the markers.
+"""
 
 from dataclasses import dataclass
 
@@ -122,7 +125,8 @@ class PalmFitter:
         alone += self.parameters.anywhere
         scale = max(1.0, float(surprise.sum()) / (3.0 * int(seen.sum())))
         cov = np.empty((size, size))
-        inverse(normal, scale, cov)
+        if not inverse(normal, scale, cov):  # by rounding: nothing is known but limits
+            cov[:] = np.diag(1.0 / self.parameters.anywhere)
         return Palm(T, x, cov, cost, surprise)
 
     def _shown(self, seen: Bool) -> Bool:
@@ -144,7 +148,10 @@ class PalmFitter:
         return self._prior(x, weight, last.T, self.priors.palm_weight(age_s), facing)
 
     def _unexpected(self, seen: Bool, facing: Float | None, hidden: HiddenFingers | None) -> PalmPrior:
-        """The prior where no last palm is known: a hidden finger is curled, but not one between two that show."""
+        """The prior where no last palm is known: a hidden finger is curled.
+
+        But not one between two that show.
+        """
         shown = frozenset(self.attached.finger[seen & self._on_finger].tolist())
         like = frozenset(f for f in (2, 3) if hidden is None and {f - 1, f + 1} <= shown) - shown
         known = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
@@ -179,7 +186,7 @@ class PalmFitter:
         )
 
     def _starts(self, points: Float, seen: Bool, facing: Float | None) -> tuple[Float, Float]:
-        """Three hands, open to closed, each laid on the markers as a rigid body: (3, 4, 4), (3, n)."""
+        """Lay three hands, open to closed, on the markers: (3, 4, 4), (3, n)."""
         weight = np.where(self._on_finger[seen], 1.0, _PALM_WEIGHT)
         observed, expected = points[seen], self._shapes_m[:, seen]
         if facing is not None:
@@ -190,13 +197,19 @@ class PalmFitter:
         return fit_rigid(observed, expected, weight), self._postures
 
     def covariances(self, palm: Palm) -> tuple[Float, Float]:
-        """Of the joints (26, 3, 3) [m^2], and of the last phalanges' directions (5, 3, 3) [rad^2]."""
+        """Return covariances of the joints and of the last phalanges' directions.
+
+        (26, 3, 3) [m^2] and (5, 3, 3) [rad^2].
+        """
         cov, tilt = np.empty((26, 3, 3)), np.empty((5, 3, 3))
         covariances(self.tables, palm.T, palm.x, palm.cov, cov, tilt)
         return cov, tilt
 
     def pose(self, T: Float, angles_rad: Float) -> tuple[HandJoints, Float]:
-        """The joints of a palm (4, 4) and angles (5, 4) [rad], and the markers (M, 3) [m] in the palm frame."""
+        """Return the joints, and the markers (M, 3) [m] in the palm frame.
+
+        Of a palm (4, 4) and angles (5, 4) [rad].
+        """
         position, rotation = np.empty((26, 3)), np.empty((26, 3, 3))
         places = np.empty((len(self.attached.offset_m), 3))
         pose(self.tables, self.mounts, T, angles_rad.ravel(), position, rotation, places)

@@ -1,4 +1,4 @@
-"""Kernel of the palm's fit: six numbers, in which the fingers count as far as hands bend them.
+"""Kernel of the palm's fit: six numbers, and the angles beside them.
 
 Where three markers lie on the back they fix the palm. With one, its turn is open: every finger reaches its tip from
 many palms, and what tells them apart is how hands bend. So the fit has the fingers' free angles beside the palm's six
@@ -58,7 +58,10 @@ def linearise(
     normal: Float,
     surprise: Float,
 ) -> float:
-    """Return half the sum of squared residuals; write its gradient, normal matrix and markers' part."""
+    """Return half the sum of squared residuals; write its derivatives.
+
+    Written are gradient, normal matrix, and chi square of each marker. Arguments as of `fit`.
+    """
     n = x.shape[0]
     angles, by = np.empty(20), np.empty((20, n))
     angles_of(tables, x, angles, by)
@@ -148,7 +151,7 @@ def linearise(
 
 @kernel
 def rotate_by(step: Float, T: Float, out: Float) -> None:
-    """Write T (4, 4) turned by a rotation vector step[:3] [rad] in front, and shifted by step[3:6] [m]."""
+    """Write T (4, 4) turned in front by step[:3] [rad], shifted by step[3:6] [m]."""
     x, y, z = step[0], step[1], step[2]
     angle = sqrt(x * x + y * y + z * z)
     a = sin(angle) / angle if angle > 1e-9 else 1.0
@@ -177,14 +180,14 @@ def fit(
     surprise: Float,
     tolerance: float,
 ) -> tuple[float, int]:
-    """Descend from T (4, 4) and x (n,), both in place, to the least cost; return it and the iterations.
+    """Descend from T and x, in place, to the least cost; return it and the steps.
 
     Args:
         tables, mounts, prior: The hand, its markers, what is known of it.
         points: (M, 3) [m], rig frame.
         information: (M, 3, 3) [1/m^2] inverse covariances.
         seen: (M,).
-        T, x: Start, and then the end.
+        T, x: (4, 4), (n,) start, and then the end.
         normal: (6 + n, 6 + n) Gauss-Newton normal matrix at the end.
         surprise: (M,) chi square of each marker at the end; 0: not seen.
         tolerance: Of half chi square that a further step may gain.
@@ -258,7 +261,10 @@ def fit(
 
 @kernel
 def informations(points: Float, cov: Float, model_m2: float, seen: Bool, out: Float) -> int:
-    """Write which markers are seen (M,) and the inverses (M, 3, 3) of cov + model_m2 I; return how many they are."""
+    """Write which markers are seen and their inverse covariances; count them.
+
+    `out`: (M, 3, 3) inverses of cov + model_m2 I, of those `seen` (M,).
+    """
     count = 0
     for m in range(points.shape[0]):
         total = points[m, 0] + points[m, 1] + points[m, 2]
@@ -273,7 +279,7 @@ def informations(points: Float, cov: Float, model_m2: float, seen: Bool, out: Fl
 
 @kernel
 def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, out: Float) -> bool:
-    """Write the unit vector (3,) from a hand to the cameras that see its back; False where no marker is placed.
+    """Write the unit vector from a hand to the cameras that see its back.
 
     A flat marker shows each camera its area times the cosine of its tilt, so the directions to the cameras, weighed by
     what each sees, add up to where it faces, as far as they tell.
@@ -282,7 +288,10 @@ def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, o
         points: (M, 3) [m] its markers, rig frame; NaN: not placed.
         area_px2: (C, K) of those on its back as each camera sees them; NaN: not seen.
         centres, focal_px: (C, 3) [m] and (C,) of the cameras.
-        out: Written.
+        out: (3,) written.
+
+    Returns:
+        Whether a marker is placed; else nothing is written.
     """
     count = 0
     middle, back = np.zeros(3), np.empty(3)
@@ -321,7 +330,9 @@ def facing_of(points: Float, area_px2: Float, centres: Float, focal_px: Float, o
 
 @kernel
 def targets_of(points: Float, cov: Float, T: Float, places: Float, fit_m2: float, out: Float) -> None:
-    """Write where fingers are to bring their markers (M, 3) [m], palm frame: measured, as far as that is surer.
+    """Write where fingers are to bring their markers (M, 3) [m], palm frame.
+
+    Where they are measured, as far as that is surer than the fit.
 
     Args:
         points, cov: (M, 3) [m] and (M, 3, 3) [m^2] measured, rig frame; NaN: not seen.

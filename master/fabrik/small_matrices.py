@@ -10,7 +10,10 @@ from common.kernels import kernel
 
 @kernel
 def factor(A: Float, held: Bool, L: Float) -> bool:
-    """Write Cholesky's factor (n, n) of A without the `held` unknowns; False where A is not positive definite."""
+    """Write Cholesky's factor of A (n, n); False where it is not positive definite.
+
+    Without the `held` unknowns.
+    """
     n = A.shape[0]
     for j in range(n):
         total = 1.0 if held[j] else A[j, j]
@@ -45,7 +48,10 @@ def substitute(L: Float, b: Float, held: Bool, out: Float) -> None:
 
 @kernel
 def inverse(A: Float, scale: float, out: Float) -> bool:
-    """Write scale times the inverse (n, n) of a positive definite matrix; False where it is none."""
+    """Write scale times the inverse of A (n, n); False: not positive definite.
+
+    Then `out` means nothing.
+    """
     n = A.shape[0]
     L, one, column = np.zeros((n, n)), np.zeros(n), np.empty(n)
     free = np.zeros(n, np.bool_)
@@ -62,7 +68,7 @@ def inverse(A: Float, scale: float, out: Float) -> bool:
 
 @kernel
 def inverse_3(A: Float, extra: float, out: Float) -> None:
-    """Write the inverse (3, 3) of a symmetric matrix with `extra` added to its diagonal, by cofactors."""
+    """Write the inverse (3, 3) of symmetric A + `extra` I, by cofactors."""
     a, b, c = A[0, 0] + extra, A[0, 1], A[0, 2]
     d, e, f = A[1, 1] + extra, A[1, 2], A[2, 2] + extra
     out[0, 0], out[0, 1], out[0, 2] = d * f - e * e, c * e - b * f, b * e - c * d

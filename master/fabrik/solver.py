@@ -1,4 +1,4 @@
-"""The card: both slaves' centroids at one instant, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
+"""The card: centroids, disparity, depth, 1 €, palm, FABRIK per finger: a hand.
 
 Push machine without clock, socket or thread. It holds what joins the cameras in time, the filter and the last hand.
 """
@@ -72,7 +72,7 @@ class FabrikSolver:
         self.on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
         self._centres = np.array([camera.centre for camera in cameras.values()])
         self._focal_px = np.array([camera.matrix[0, 0] for camera in cameras.values()])
-        self._ahead = -np.array([camera.T_rig_camera[:3, 2] for camera in cameras.values()])[0]
+        self._ahead = -next(iter(cameras.values())).T_rig_camera[:3, 2]
         mounts = [model.mount(name) for name in hand_markers]
         self._on_palm = np.array([mount.joint is None for mount in mounts], np.bool_)
         self._count = len(markers)
@@ -98,28 +98,32 @@ class FabrikSolver:
         return self._one_euro is not None
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
-        """Take one camera's centroids; return the hands of the instants that they complete, oldest first."""
+        """Take one camera's centroids; return the hands they complete, oldest first."""
         return [self.solve(instant) for instant in self.sync.push(message)]
 
     def flush(self) -> list[HandEstimate]:
         """At the end of a recording: the hands that still wait for a camera."""
         return [self.solve(instant) for instant in self.sync.flush()]
 
-    def solve(self, instant: Instant, near: SolvedHand | None = None) -> HandEstimate:
+    def solve(
+        self, instant: Instant, near: SolvedHand | None = None, near_age_s: float = 0.0
+    ) -> HandEstimate:
         """Solve one instant.
 
         Args:
             instant: What the cameras see of it.
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
+            near_age_s: How long ago that held [s].
         """
         last, age_s = self._recent(instant.t_ns)
-        seen_as, pixels = near or last, (instant.uv, instant.sigma_px, instant.area)
+        seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
+        pixels = instant.uv, instant.sigma_px, instant.area
         if last is None:
             self._memory = FingerMemory(self._model)
         with self._stage("triangulate"):
-            markers = self.triangulate(*pixels, seen_as, age_s)
+            markers = self.triangulate(*pixels, seen_as, seen_age_s)
             if seen_as is None:
-                first = self.peek(markers.points_m, markers.cov_m2, instant.area)
+                first = self.solve_once(markers.points_m, markers.cov_m2, instant.area)
                 markers = self.triangulate(*pixels, first, 0.0, as_seen=first is None)
         with self._stage("filter"):
             smooth = markers.points_m
@@ -131,8 +135,10 @@ class FabrikSolver:
             palm = self._fit(instant.t_ns, points, cov, out.facing, last, age_s)
             return self._estimate(out, points, cov, palm)
 
-    def peek(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
-        """The hand by points alone, and nothing remembered; a finger that is not seen may be anywhere natural.
+    def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
+        """Solve from points alone and remember nothing.
+
+        A finger that is not seen may be anywhere natural.
 
         Args:
             points, cov: (M, 3) [m] and (M, 3, 3) [m^2] of all markers; NaN: not placed.
@@ -153,7 +159,7 @@ class FabrikSolver:
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)
         points[self.on_hand], cov[self.on_hand] = places @ _AWAY[:3, :3].T + _AWAY[:3, 3], 1e-6 * np.eye(3)
         seen = np.ones((len(self._centres), self._count))
-        first = self.peek(points, cov, seen)
+        first = self.solve_once(points, cov, seen)
         self.triangulate(100.0 * np.stack([seen, seen], axis=-1), seen, seen, first, 0.0)
         if first is not None:
             for m, (f, finger) in self._fingers.items():
@@ -172,7 +178,7 @@ class FabrikSolver:
     def _fit(
         self, t_ns: int, points: Float, cov: Float, towards: Float, last: SolvedHand | None, age_s: float
     ) -> Palm | None:
-        """The palm of an instant from the hand's points (H, 3) [m]; `last` as of `_recent`."""
+        """Fit the palm to the hand's points (H, 3) [m]; `last` as of `_recent`."""
         facing = towards if self._shows_back(points) else None
         if last is None:
             return self._palm(points, cov, facing)
@@ -185,7 +191,10 @@ class FabrikSolver:
         return bool(np.isfinite(points[self._on_palm, 0]).any())
 
     def towards(self, points: Float, area_px2: Float) -> Float:
-        """Unit vector (3,) from the hand's points (H, 3) [m] to the cameras that see most of its back (C, M) [px^2]."""
+        """Return the unit vector (3,) to the cameras that see most of the back.
+
+        Of the hand's points (H, 3) [m], by the areas of all markers (C, M) [px^2].
+        """
         out = self._ahead.copy()
         facing_of(points, area_px2[:, self._back], self._centres, self._focal_px, out)
         return out
@@ -197,7 +206,7 @@ class FabrikSolver:
         return SolvedHand(palm.T, angles, joints, *self._palm.covariances(palm), _NO_WALK)
 
     def _estimate(self, out: HandEstimate, points: Float, cov: Float, palm: Palm | None) -> HandEstimate:
-        """Bring the fingers of a palm onto their markers; without a palm the last hand is held."""
+        """Bring a palm's fingers onto their markers; without a palm hold the last hand."""
         last, age_s = self._recent(out.t_ns)
         if palm is None:
             out.valid[:] = last is not None
@@ -222,7 +231,10 @@ class FabrikSolver:
         return replace(out, solution=hand)
 
     def _judge(self, out: HandEstimate, palm: Palm, placed: Bool) -> None:
-        """Write the bits of a solved hand of markers (H,) that are placed: what they explain is tracked."""
+        """Write the bits of a solved hand; `placed`: (H,) which markers are.
+
+        What they explain is tracked.
+        """
         out.seen[self._finger_of[placed & self._on_finger]] = True
         explained = out.seen.copy()
         explained[self._finger_of[(palm.surprise >= EXPLAINED) & self._on_finger]] = False

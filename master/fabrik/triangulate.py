@@ -1,4 +1,4 @@
-"""Points from the centroids of two cameras by the depth model of the rig: disparity, D = k x^z, X, Y, Z, covariance.
+"""Triangulate centroids: disparity, D = k x^z, X, Y, Z, covariance.
 
 Kalbfleisch measures x = u_left - u_right on the images as they are, not rectified, and fits D = k x^z with a target on
 the axis, before the middle between the lenses (section VI). There the law contains how the cameras are misaligned.
@@ -82,7 +82,10 @@ def disparity_tables(
     row_sigma_px: float,
     row_limit: float,
 ) -> DisparityTables:
-    """Tabulate the geometry of the first two cameras over the left image; arguments as of `DisparityTables`."""
+    """Tabulate the geometry of the first two cameras over the left image.
+
+    Arguments as of `DisparityTables`.
+    """
     left, right = cameras[:2]
     u = np.linspace(0.0, left.width_px, GRID + 1)
     v = np.linspace(0.0, left.height_px, GRID + 1)
@@ -141,17 +144,20 @@ def metres_per_pixel(tables: DisparityTables, depth_m: float) -> float:
 def place_centroids(
     tables: DisparityTables, u: float, v: float, right_u: float, right_v: float, ray: Float, point: Float
 ) -> tuple[float, float]:
-    """Return the depth [m] and by how much the rows disagree [px]; write the ray (3,) of depth 1 and the point (3,).
+    """Return the depth [m] and how far the rows disagree [px]; write the point.
 
     Args:
         tables: The pair.
         u, v: Centroid in the left image [px].
         right_u, right_v: In the right one.
-        ray, point: Written, rig frame; not where the depth is NaN.
+        ray, point: Written: (3,) of depth 1, and (3,) [m], rig frame; not where the depth is NaN.
     """
     across, down = u / tables.cell_px[0], v / tables.cell_px[1]
+    if not np.isfinite(across + down + right_u + right_v):
+        return np.nan, np.nan
     last = tables.table.shape[0] - 2
-    i, j = min(max(int(down), 0), last), min(max(int(across), 0), last)
+    # Cut before they are whole numbers: what is beyond those is any cell, or none.
+    i, j = int(min(max(down, 0.0), float(last))), int(min(max(across, 0.0), float(last)))
     q, p = across - j, down - i
     cell = np.empty(6)
     for c in range(6):
@@ -174,14 +180,14 @@ def place_centroids(
 def cap_bias(
     tables: DisparityTables, caps: CapTables, row: int, ahead: Float, point: Float, bias: Float, shown: Float
 ) -> None:
-    """Write by how much each camera sees a cap's centroid off its own (2, 2) [px], and the area it shows (2,) [m^2].
+    """Write by how much each camera sees a cap's centroid off its own.
 
     Args:
         tables, caps: The pair and the markers.
         row: The marker's in `caps.looks`.
         ahead: (3,) unit vector in which the finger points, rig frame.
         point: (3,) [m] about where the cap is, rig frame.
-        bias, shown: Written.
+        bias, shown: Written: (2, 2) [px], and the area that it shows (2,) [m^2].
     """
     back, shift = np.empty(3), np.empty(3)
     here, there = np.empty(3), np.empty(3)
@@ -205,7 +211,10 @@ def cap_bias(
 
 @kernel
 def _across(ahead: Float, tilt: Float, out: Float) -> None:
-    """Write two directions across `ahead` (2, 3), each as long as the tilt (3, 3) [rad^2] is unsure about it [rad]."""
+    """Write two directions (2, 3) across `ahead`, as long as it is unsure [rad].
+
+    `tilt`: (3, 3) [rad^2] covariance.
+    """
     least = 0
     for k in range(1, 3):
         if abs(ahead[k]) < abs(ahead[least]):
@@ -239,7 +248,7 @@ def triangulate(
     noise: Float,
     apart: Bool,
 ) -> None:
-    """Write points (M, 3) [m], covariances and their noise part (M, 3, 3) [m^2], and which rows disagree (M,).
+    """Triangulate M markers with covariance.
 
     Args:
         tables, caps: The pair and the markers.
@@ -247,7 +256,10 @@ def triangulate(
         sigma_px, area_px2: (2, M).
         ahead: (M, 3) unit vectors in which the fingers point, rig frame; NaN: not known, what is seen is taken.
         tilt: (M, 3, 3) [rad^2] covariance of these.
-        points, cov, noise, apart: Written; NaN where a camera does not see the marker or the disparity is none.
+        points: (M, 3) [m], written; NaN: a camera does not see the marker, there is no such
+            disparity, or its standard deviation exceeds half of its depth.
+        cov, noise: (M, 3, 3) [m^2] covariance and its noise part, written; NaN where the point is.
+        apart: (M,) written: the rows disagree.
     """
     ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
     bias, shown, tilted = np.zeros((2, 2)), np.empty(2), np.empty((2, 3))
@@ -280,6 +292,8 @@ def triangulate(
                 ray,
                 point,
             )
+            if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
+                continue
             for k in range(3):
                 by[k, 0] = _RADIUS * (point[k] - aim[k])
             for a in range(3):
@@ -297,6 +311,7 @@ def triangulate(
                 cap_bias(tables, caps, row, aim, point, bias, shown)
                 for c in range(2):
                     whole[c] = max(whole[c], shown[c])
+                off[:] = np.nan
                 place_centroids(
                     tables,
                     uv[0, m, 0] - bias[0, 0],
@@ -336,10 +351,18 @@ def triangulate(
                     left2 * (by[a, 0] * by[b, 0] + by[a, 1] * by[b, 1]) + right2 * by[a, 2] * by[b, 2]
                 )
                 cov[m, a, b] += noise[m, a, b] + law2 * ray[a] * ray[b]
+        # A point is placed with its covariance, and where its depth is determined (`master.stereo.triangulate`).
+        if not 4.0 * (cov[m, 0, 0] + cov[m, 1, 1] + cov[m, 2, 2]) < z * z or not np.isfinite(cov[m].sum()):
+            points[m, :] = np.nan
+            cov[m, :, :] = np.nan
+            noise[m, :, :] = np.nan
 
 
 class Triangulate(Protocol):
-    """Positions of the M markers of one instant by the depth model of a rig: the law, or the rays of all cameras."""
+    """Triangulates the M markers of an instant by the depth model of a rig.
+
+    By its law, or by the rays of all cameras.
+    """
 
     def __call__(
         self,
@@ -364,7 +387,7 @@ class Triangulate(Protocol):
 
 
 class DepthTriangulator:
-    """Triangulates the markers of a rig by its depth law. Holds no state between calls."""
+    """Triangulates the markers of a rig by its depth law. Holds no state."""
 
     def __init__(self, tables: DisparityTables, caps: CapModel) -> None:
         """Triangulate these markers with this pair."""

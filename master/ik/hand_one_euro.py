@@ -1,4 +1,4 @@
-"""Smooths the solved hand as it arrives by the rig's 1 € filter, and blends over where it would leap.
+"""Smooth the solved hand by the rig's 1 € filter, and blend over leaps.
 
 **Signals.** Position and rotation of the palm and the angles go through one filter (`master.fabrik.one_euro`), the
 palm and each finger as a group. All 26 signals are in metres, so that the rig's settings mean for the hand what they
@@ -49,7 +49,7 @@ _FORGET_S = 0.5  # after this long without a hand the next one begins anew
 
 @dataclass(slots=True, eq=False)
 class _Shown:
-    """What was shown last, and what is left of leaps; renewed when a hand begins anew.
+    """What was shown last, and what is left of leaps; a new hand has a new one.
 
     Attributes:
         noise: Measures the noise of the signals.
@@ -88,7 +88,7 @@ class _Shown:
 
 
 class HandOneEuro:
-    """Push machine. Holds what was shown last, the filters' state, and what is left of leaps."""
+    """Push machine. Holds what was shown last, the filter, what is left of leaps."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class HandOneEuro:
         self._shown: _Shown | None = None
 
     def push(self, t_ns: int, hand: TrackedHand, cov_m2: Float, points_m: Float | None = None) -> TrackedHand:
-        """The hand as it is to be shown: palm, angles, joints and their covariance; the rest of it stays.
+        """Filter palm, angles and joints of a hand; the rest of it stays.
 
         Args:
             t_ns: The instant; a hand that is not after the last one is passed on as it is.
@@ -206,7 +206,10 @@ class HandOneEuro:
         return self._model.joints(rigid(rotation, wrist), self._model.chains(angles)), angles
 
     def _noise(self, cov_m2: Float, seen: Bool) -> Float:
-        """Variances (26,) [m^2] of the markers each part rests on, a finger on its own and the palm's; NaN: none."""
+        """Return variances (26,) [m^2] of the markers that each part rests on.
+
+        A finger rests on its own and the palm's; NaN: on none.
+        """
         noise = np.full(26, np.nan)
         axes = cov_m2.reshape(-1, 9)[:, ::4]
         measured = axes[axes[:, 0] > 0.0]  # NaN is not
@@ -223,7 +226,10 @@ class HandOneEuro:
 
 
 def _turn(rotation: Float) -> Float:
-    """Rotation vector (3,) of a rotation (3, 3), as `matrix_to_rotation_vector` in a third of the time."""
+    """Return the rotation vector (3,) of a rotation (3, 3).
+
+    As `matrix_to_rotation_vector`, in a third of the time.
+    """
     vector = unskew(rotation)
     sine = float(vector @ vector) ** 0.5
     if sine < 1e-6:  # none, or half a turn

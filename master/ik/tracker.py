@@ -22,7 +22,7 @@ from master.fabrik.estimate import HandEstimate, SolvedHand
 from master.ik.arcs import Arcs
 from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
-from master.ik.hand import EXPLAINED, HandSolution, HandSolver, seen_markers
+from master.ik.hand import EXPLAINED, HandSolution, HandSolver, determined, seen_markers
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
 from master.ik.priors import Priors
@@ -144,7 +144,13 @@ class HandTracker:
         palm_rests = self._palm_rests(seen, orientation)
         tells_palm = palm_rests > 0
         last, dt_s = self.recent(t_ns)
-        if last is not None and start is not None and self._leapt(last, dt_s, start, points_m, cov_m2):
+        facing = towards_cameras if (seen & self._on_palm).any() else None
+        if (
+            last is not None
+            and start is not None
+            and determined(points_m[seen], facing, orientation)  # else there is no hand without the last one
+            and self._leapt(last, dt_s, start, points_m, cov_m2)
+        ):
             last = None
         if last is None:
             self._forget()
@@ -157,7 +163,6 @@ class HandTracker:
                 wrong = self._elsewhere(others, before.T_rig_palm, points_m, cov_m2)
                 others = others.without(wrong) if wrong.any() else others
             told[:5] |= others.told
-        facing = towards_cameras if (seen & self._on_palm).any() else None
         hidden = None
         if last is not None:
             known = frozenset(np.flatnonzero(told[:5]).tolist())

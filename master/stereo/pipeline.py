@@ -171,7 +171,7 @@ class MarkerPipeline:
             if self._lens_shift.any:
                 instant = replace(instant, uv=self._lens_shift.centres(instant.uv, instant.area))
             instant = self._without_rivals(instant)
-        line = self._line.solve(instant, last)
+        line = self._line.solve(instant, last, age_s)
         hand: HandEstimate | TrackedHand = line
         markers = found = line.markers
         if self._tracker is not None:
@@ -254,7 +254,7 @@ class MarkerPipeline:
             return replace(instant, rival_uv=None)
         first = self._place(instant.uv, instant.sigma_px)
         clear = np.where((in_doubt | first.apart(instant.uv))[:, None], np.nan, first.points)
-        others = self._line.peek(clear, first.cov, instant.area)
+        others = self._line.solve_once(clear, first.cov, instant.area)
         chosen = self._choose(
             instant.uv,
             instant.sigma_px,

@@ -1,4 +1,4 @@
-"""Look for blobs of the markers' colours: in the whole frame, or only where markers are expected.
+"""Scan for blobs of the markers' colours: a whole frame, or windows of it.
 
     whole    one table look-up on every fourth pixel of every fourth row, and on a further grid where a colour shows on
              none of these points
@@ -43,7 +43,7 @@ class Scanned(NamedTuple):
     blobs: list[list[Blob]]
 
     def skin_share(self, skin: int, blob: Blob) -> float:
-        """Share of the points around one of the blobs that are skin, 0..1; `skin`: its bit."""
+        """Return the share 0..1 of skin around one of the blobs; `skin`: its bit."""
         x, y = blob.u / SCALE, blob.v / SCALE
         for (x0, y0, x1, y1), codes in self.parts:
             if x0 <= x <= x1 and y0 <= y <= y1:
@@ -54,7 +54,7 @@ class Scanned(NamedTuple):
 
 
 class Scanner:
-    """Scans the frames of one camera. Holds which further grid and which strip are next."""
+    """Scans the frames of one camera. Holds which grid and strip are next."""
 
     def __init__(self, width: int, height: int, engine: Engine) -> None:
         """Scan frames of this size [px] by `engine`."""
@@ -123,7 +123,7 @@ class Scanner:
         return Scanned([(part, codes) for part, codes, _ in scanned], found)
 
     def _search(self, image: Image, table: ColourTable, lost: Sequence[int]) -> dict[int, list[Blob]]:
-        """What the next strip shows of the colours of lost markers: row of the marker -> blobs."""
+        """Scan the next strip for lost markers: row of the marker -> blobs."""
         rows, k = self._rows, self._strip
         self._strip = (k + 1) % STRIPS
         strip = 0, rows * k // STRIPS, self._columns, rows * (k + 1) // STRIPS
@@ -185,7 +185,7 @@ class Scanner:
 
 
 def merged(parts: Iterable[Part]) -> list[Part]:
-    """Parts of which no two meet, so that no blob lies in two, and that hold all of these; empty ones are left out."""
+    """Merge parts that meet, so that no blob lies in two; leave out empty ones."""
     apart: list[Part] = []
     for part in parts:
         left, top, right, bottom = part

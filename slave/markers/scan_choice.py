@@ -1,4 +1,4 @@
-"""Choose whether the detector scans whole frames or only windows: by name, or by what whole frames cost.
+"""Choose whole frames or windows: by name, or by what whole frames cost.
 
 What counts is the processor time of the detection, of which a busy machine takes nothing away, against the time between
 two frames of the camera's file. Windows are for where a whole frame does not fit; from time to time one frame is
@@ -22,7 +22,7 @@ _LOG = logging.getLogger(__name__)
 
 
 class ScanChoice:
-    """Push machine. Holds the choice, what whole frames of late cost, and how many frames were scanned in windows.
+    """Push machine. Holds the choice, and what whole frames of late cost.
 
     Attributes:
         frames: Frames that were scanned in windows only.
@@ -57,7 +57,7 @@ class ScanChoice:
         return self._scan == "auto" and self._since >= PROBE_EVERY
 
     def push(self, spent_ns: int) -> None:
-        """Take in the processor time [ns] of the detection in the frame that was scanned as `windows` said."""
+        """Take the processor time [ns] of a frame that was scanned as `windows` said."""
         if self.windows:
             self.frames += 1
             self._since += 1

@@ -192,7 +192,7 @@ def test_a_hand_that_the_others_show_has_each_marker_within_its_covariance() -> 
         true = RIGHT.marker_points(RIGHT.forward(palm(rng.uniform(-20, 20, 3)), natural_angles(rng)), MARKERS)
         clear = true.copy()
         clear[doubtful] = np.nan
-        belief = believe(line.peek(clear, small_cov(), np.full((2, 6), 100.0)), clear)
+        belief = believe(line.solve_once(clear, small_cov(), np.full((2, 6), 100.0)), clear)
         off = true[doubtful] - belief.points[doubtful]
         squared.append(float(off @ np.linalg.solve(belief.cov[doubtful], off)))
         assert np.sqrt(np.trace(belief.cov[doubtful])) < 0.2

@@ -1,5 +1,7 @@
 """Tests of one hand over time: a lost finger is held and its doubt grows, and nothing jumps when it returns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -268,6 +270,23 @@ def test_a_hand_that_comes_back_elsewhere_is_as_good_as_one_that_is_new() -> Non
             error = np.linalg.norm(hand.solution.joints.position_m - true.position_m, axis=1)
             off[known].append(1e3 * float(error.mean()))
     assert np.mean(off[True]) < 1.3 * np.mean(off[False])
+
+
+@pytest.mark.parametrize("shown", [(MARKER_INDEX,), (0, MARKER_INDEX)])
+def test_a_leap_of_markers_that_are_no_hand_by_themselves_leaves_no_gap(shown: tuple[int, ...]) -> None:
+    """Another solver's hand explains them better, but without the last one there is none."""
+    tracker = HandTracker(RIGHT, MARKERS)
+    last = run(tracker, range(5))[-1].solution
+    assert last is not None
+    leap = np.array([0.2, 0.0, 0.1])
+    T = last.T_rig_palm.copy()
+    T[:3, 3] += leap
+    there = replace(last, T_rig_palm=T, joints=RIGHT.forward(T, last.angles_rad))
+    points = points_of(bent(5 / 60.0), tuple(m for m in range(6) if m not in shown)) + leap
+    hand = tracker.push(5 * STEP_NS, points, small_cov(), FACING, start=there)
+    assert hand.solution is not None
+    assert hand.valid.all()
+    assert np.isfinite(hand.solution.joints.position_m).all()
 
 
 @pytest.mark.parametrize(("heading_rad", "told"), [(0.03, True), (10.0, False)])

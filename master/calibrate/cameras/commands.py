@@ -159,7 +159,7 @@ def stereo(
     written = [] if out is None else write_files(out, files, {rig: new})
     if rig_known is None and written:
         typer.echo(f"rig {rig!r} is new: its hand is 'default-right', its frame that of {views.cameras[0]}")
-    if dropped:
+    if dropped and written:
         typer.echo(dropped)
     _written(written, known)
 

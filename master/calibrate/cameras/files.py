@@ -126,14 +126,12 @@ def without_wrong_law(
     models = [CameraModel.of(file, rig.camera_pose(file.name)) for file in files if file is not None]
     try:
         wrong = law_contradicts(rig, models)
-    except CalibrationError as error:
-        wrong = str(error)
+        then = f"; `phalanx-master calibrate depth --use {rig.depth_model}` fits it anew"
+    except CalibrationError as error:  # these cameras can have no such law
+        wrong, then = str(error), ""
     if not wrong:
         return rig, ""
-    return (
-        msgspec.structs.replace(rig, depth_model="stereo"),
-        f"{wrong}: depth_model is 'stereo' now; `phalanx-master calibrate depth --use {rig.depth_model}` fits it anew",
-    )
+    return msgspec.structs.replace(rig, depth_model="stereo"), f"{wrong}: depth_model is 'stereo' now{then}"
 
 
 def lens_provenance(result: CamerasResult, camera: str, tool: str, data: tuple[str, ...]) -> Provenance:

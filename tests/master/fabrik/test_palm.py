@@ -204,3 +204,17 @@ def test_the_covariance_of_a_fit_holds_the_palm() -> None:
         off = found.T[:3, 3] - T[:3, 3]
         inside.append(bool(off @ np.linalg.solve(cov[1], off) < 7.81))
     assert np.mean(inside) > 0.9
+
+
+def test_where_rounding_leaves_no_inverse_nothing_is_known_but_limits(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def none(*_: object) -> bool:
+        return False
+
+    fitter = PalmFitter(RIGHT, MARKERS)
+    points = RIGHT.marker_points(RIGHT.forward(palm(), natural_angles(np.random.default_rng(9))), MARKERS)
+    monkeypatch.setattr("master.fabrik.palm.inverse", none)
+    found = fitter(points, small_cov(), FACING)
+    assert found is not None
+    np.testing.assert_array_equal(found.cov, np.diag(1.0 / fitter.parameters.anywhere))

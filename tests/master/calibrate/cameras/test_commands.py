@@ -15,9 +15,10 @@ from common.errors import CalibrationError, PhalanxError, RecordingError
 from common.geometry import invert
 from master.calibrate.cameras.boards import Checkerboard, grid_edges
 from master.calibrate.cameras.detect import find_board
-from master.calibrate.cameras.files import write_files
+from master.calibrate.cameras.files import without_wrong_law, write_files
 from master.calibrate.cameras.image_sets import image_sets
 from master.calibrate.cli import calibrate_app
+from tests.hand_helpers import camera_file, rig_file
 from tests.master.calibrate.cameras.board_images import render
 from tests.master.calibrate.cameras.board_scenes import scene
 
@@ -145,22 +146,33 @@ def test_a_rig_that_is_there_keeps_everything_but_the_places_and_a_law_that_they
         T_rig_camera={"right": T_rig_right, "left": T_rig_left}, power_law=law, depth_model="power_law",
     )  # fmt: skip
     save(out / "rigs" / "pair.json", kept)
-    said = run(
-        "stereo", views, *BOARD, "--rig", "pair", "--keep-intrinsics", "--calibration", out, "--out", out
-    )
+    words = ("stereo", views, *BOARD, "--rig", "pair", "--keep-intrinsics", "--calibration", out)
+    assert "depth_model" not in run(*words)  # nothing is written
+    said = run(*words, "--out", out)
     assert "(held)" in said
     rig = load(out / "rigs" / "pair.json", RigCalibration)
     assert (rig.power_law, rig.hand, rig.cameras) == (law, "mine", ("right", "left"))
     # The law was that of other cameras.
     assert rig.depth_model == "stereo"
-    assert (
-        "depth_model is 'stereo' now; `phalanx-master calibrate depth --use power_law` fits it anew" in said
-    )
+    assert "turn them, or use 'stereo': depth_model is 'stereo' now\n" in said
     assert rig.T_rig_camera["right"] == T_rig_right  # the rig's frame stays where it was
     truth = scene(31, 2, 8).T_camera_rig
     found = invert(rig.camera_pose("right")) @ rig.camera_pose("left")
     assert 1e3 * np.linalg.norm((found - truth["right"] @ invert(truth["left"]))[:3, 3]) < 1.0
     assert load(out / "cameras" / "right.json", CameraCalibration) == before
+
+
+@pytest.mark.parametrize(("k_m", "kept"), [(37.5, True), (38.2, True), (38.5, False)])
+def test_a_law_that_new_places_contradict_is_to_be_fitted_anew(k_m: float, kept: bool) -> None:
+    """Cameras of 500 px focal length, 75 mm apart: k is 37.5 m px, and 2 % are allowed."""
+    rig = rig_file(depth_model="power_law", power_law=PowerLawCalibration(k_m=k_m, z=-1.0))
+    cameras = {name: camera_file(name) for name in rig.cameras}
+    new, said = without_wrong_law(rig, cameras)
+    assert new.depth_model == ("power_law" if kept else "stereo")
+    assert new.power_law == rig.power_law
+    again = "depth_model is 'stereo' now; `phalanx-master calibrate depth --use power_law` fits it anew"
+    assert said == "" if kept else again in said
+    assert without_wrong_law(rig, {**cameras, "left": None}) == (rig, "")
 
 
 def test_images_of_another_mode_than_the_file_are_refused(tmp_path: Path) -> None:
