@@ -21,6 +21,8 @@ solved now is added to the solution and fades within a tenth of a second, as net
 the server says it is: the motion goes on, the error goes. While it fades, the covariance of a joint contains the square
 of how far it is shown from where it is solved to be.
 
+A hand that was wrong a moment ago, as its tracker says, is shown at once where it is, and the filter begins anew.
+
 A hand that several kinds of sensors watch leaps more often, and is led in as `master.ik.lead` has it. A joint of it is
 not called tracked while it is shown more than 5 mm from where it is solved to be.
 
@@ -139,7 +141,7 @@ class HandOneEuro:
         rests = hand.rests
         seen: Bool = rests > 0
         gap_s = 0.0 if shown is None else (t_ns - shown.t_ns) * 1e-9
-        if shown is None or gap_s > _FORGET_S:
+        if shown is None or gap_s > _FORGET_S or (hand.anew and self._lead is None):
             shown, gap_s = self._begin(t_ns, solution, rests), 0.0
             self._shown = shown
         elif gap_s <= 0.0:

@@ -53,6 +53,7 @@ class TrackedHand:
         rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
             a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
             the palm one of the former and which markers are seen.
+        anew: The hand of a moment ago was wrong: nothing of it is in this one.
     """
 
     solution: HandSolution | None
@@ -60,6 +61,7 @@ class TrackedHand:
     tracked: Bool
     source: Code
     rests: Int
+    anew: bool = False
 
 
 class HandTracker:
@@ -144,6 +146,7 @@ class HandTracker:
         palm_rests = self._palm_rests(seen, orientation)
         tells_palm = palm_rests > 0
         last, dt_s = self.recent(t_ns)
+        known = last is not None
         facing = towards_cameras if (seen & self._on_palm).any() else None
         if (
             last is not None
@@ -165,13 +168,15 @@ class HandTracker:
             told[:5] |= others.told
         hidden = None
         if last is not None:
-            known = frozenset(np.flatnonzero(told[:5]).tolist())
-            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, known)
+            shown = frozenset(np.flatnonzero(told[:5]).tolist())
+            hidden = self._memory.belief(t_ns, self._last_ns, last.angles_rad, last.natural, shown)
         held = None if hidden is None else (hidden.angles_rad, hidden.sigma_rad)
         age_s = self._ages_s(t_ns, dt_s, told)
 
-        def solve(known: HandSolution | None) -> HandSolution | None:
-            return self._solve(points_m, cov_m2, known, dt_s, held, facing, orientation, age_s, others, start)
+        def solve(from_last: HandSolution | None) -> HandSolution | None:
+            return self._solve(
+                points_m, cov_m2, from_last, dt_s, held, facing, orientation, age_s, others, start
+            )
 
         solution = solve(before)
         if solution is not None and last is not None and start is not None:
@@ -192,7 +197,7 @@ class HandTracker:
         bits = self._bits(t_ns, solution, seen, placed, others, palm_rests, held=hidden is not None)
         if solution is not None:
             self.last, self._last_ns = solution, t_ns
-        return bits
+        return replace(bits, anew=True) if known and last is None else bits
 
     def _solve(
         self,

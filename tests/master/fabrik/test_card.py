@@ -15,7 +15,7 @@ from common.messages import HandPose, MarkerDetections
 from master.fabrik.finger import Finger
 from master.fabrik.one_euro import OneEuro
 from master.fabrik.triangulate import DepthTriangulator
-from master.ik.tracker import HandTracker
+from master.ik.tracker import HandTracker, TrackedHand
 from master.rig import RigSetup, build_pipeline, load_setup
 from master.stages import StageTimes
 from master.stereo.caps import CapModel
@@ -140,3 +140,30 @@ def test_without_a_planted_jump_nothing_begins_anew(
     monkeypatch.setattr(HandTracker, "_forget", spied)
     assert len([solved for message in run.messages for solved in pipeline.push(message)]) > 30
     assert forgot["hands"] == 1  # the first frame
+
+
+def test_what_was_shown_of_a_wrong_hand_does_not_linger(
+    run: SyntheticRun, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The markers are elsewhere, and in reverse order, for a while: the hand leaps there and back."""
+    solved, shown, began = list[Float](), list[Float](), list[bool]()
+    push = HandTracker.push
+
+    def spied(tracker: HandTracker, *told: Any) -> TrackedHand:
+        hand = push(tracker, *told)
+        assert hand.solution is not None
+        solved.append(hand.solution.joints.position_m)
+        began.append(hand.anew)
+        return hand
+
+    monkeypatch.setattr(HandTracker, "push", spied)
+    pipeline, shift_px = build_pipeline(run.setup, StageTimes()), np.array([150.0, 60.0])
+    for message in run.messages:
+        uv = message.uv[::-1] - shift_px if 10 <= message.seq < 25 else message.uv
+        told = detections(message.camera, message.seq, message.t_ns, uv)
+        shown += [one.pose.position_m for one in pipeline.push(told)]
+    assert began[10]
+    assert any(began[25:28])
+    assert np.linalg.norm(shown[12] - shown[8], axis=1).mean() > 0.1
+    late = np.linalg.norm(np.array(shown) - np.array(solved), axis=2).mean(axis=1)
+    assert late[25:].max() < 5e-3
