@@ -166,4 +166,4 @@ def test_what_was_shown_of_a_wrong_hand_does_not_linger(
     assert any(began[25:28])
     assert np.linalg.norm(shown[12] - shown[8], axis=1).mean() > 0.1
     late = np.linalg.norm(np.array(shown) - np.array(solved), axis=2).mean(axis=1)
-    assert late[25:].max() < 5e-3
+    assert late[25:].max() < 8e-3  # without, 20 mm for six frames
