@@ -1,4 +1,4 @@
-"""A painted card before a pair of cameras, held at known distances: what `calibrate depth` is measured with.
+"""A painted card at known distances, for `calibrate depth` without hardware.
 
 The published target, 75 x 50 mm in the paint of a finger (Kalbfleisch, section VI), stands between the lenses and faces
 them, before a wall of the grey of the desk. It is drawn as the checkerboard is; its colour is that of a flat marker in
@@ -26,7 +26,9 @@ DISTANCES_M = (*(round(0.88 - 0.03 * k, 2) for k in range(15)), 0.40, 0.35)  # c
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CardScene(BoardScene):
-    """A card held at DISTANCES_M along the axis of a rig's first camera, in the middle between the first two lenses.
+    """A card held at DISTANCES_M before the middle between the first two lenses.
+
+    It moves along the axis of the first camera.
 
     Its frame: origin in its middle, z the axis of the first camera, x and y that camera's, turned by ROLL_RAD.
     """

@@ -114,7 +114,9 @@ def rig_with_places(
 def without_wrong_law(
     rig: RigCalibration, cameras: Mapping[str, CameraCalibration | None]
 ) -> tuple[RigCalibration, str]:
-    """The rig with `depth_model` "stereo" where its law does not fit its places, and what to say of that.
+    """Return the rig without a law that contradicts its places, and why.
+
+    Its `depth_model` is "stereo" then; the numbers of the law stay.
 
     Args:
         rig: With new places.
