@@ -79,11 +79,7 @@ class FabrikSolver:
         self._back = self.on_hand[self._on_palm]
         self._finger_of = np.array([-1 if mount.finger is None else mount.finger for mount in mounts])
         self._on_finger = self._finger_of >= 0
-        at_tips = {
-            int(np.flatnonzero(TIPS == mount.joint)[0]): m
-            for m, mount in enumerate(mounts)
-            if mount.joint in TIPS
-        }
+        at_tips = {int(self._finger_of[m]): m for m, mount in enumerate(mounts) if mount.joint in TIPS}
         self._fingers = {
             m: (f, Finger.of(model, f, mounts[m].offset_m, _ON_TARGET_M)) for f, m in at_tips.items()
         }

@@ -262,7 +262,7 @@ def triangulate(
         apart: (M,) written: the rows disagree.
     """
     ray, point, off, aim = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    bias, shown, tilted = np.zeros((2, 2)), np.empty(2), np.empty((2, 3))
+    bias, shown, tilted = np.empty((2, 2)), np.empty(2), np.empty((2, 3))
     whole, variance, by = np.empty(2), np.empty(2), np.empty((3, 3))
     for m in range(uv.shape[1]):
         points[m, :] = np.nan
@@ -271,14 +271,12 @@ def triangulate(
         apart[m] = False
         if not np.isfinite(uv[0, m, 0] + uv[0, m, 1] + uv[1, m, 0] + uv[1, m, 1]):
             continue
-        bias[:, :] = 0.0
         whole[:] = 0.0
         row = caps.row[m]
         known = row >= 0 and np.isfinite(ahead[m, 0])
         z, rows = place_centroids(tables, uv[0, m, 0], uv[0, m, 1], uv[1, m, 0], uv[1, m, 1], ray, point)
         if not np.isfinite(z):
             continue
-        spread2 = 0.0
         if known:
             cap_bias(tables, caps, row, ahead[m], point, bias, whole)
             for k in range(3):

@@ -31,9 +31,8 @@ from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid
 _NEVER_NS = -(2**61)
-_MISLED = (
-    2.0 * EXPLAINED
-)  # chi square by which another hand explains the markers better than one led here by the last
+# Chi square by which another hand explains the markers better than one that the last hand has led astray.
+_MISLED = 2.0 * EXPLAINED
 _MODEL_M2 = 1e-3**2 * np.eye(3)  # bones and caps are known to about 1 mm
 ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
 _FIRST_MARKER = 8  # bit
