@@ -26,9 +26,9 @@ from common.sim.motion import REST, HandState, angles_of, base_pose
 from common.sim.render import Renderer
 from common.sim.scene import Scene, view_centre
 from master.calibrate.depth.fit import fit_affine_disparity, fit_power_law, ideal_of, relative_error
+from master.fabrik.depth import AffineDisparity
 from master.rig import RigSetup, build_pipeline, load_setup
 from master.stages import StageTimes
-from master.stereo.depth import AffineDisparity
 from slave.markers.detector import MarkerDetector
 
 ROOT = Path(__file__).resolve().parents[1]

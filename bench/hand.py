@@ -19,8 +19,8 @@ from bench.row import Row
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
+from master.estimator.parameters import HandParameters
 from master.ik.hand import HandSolution, HandSolver
-from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
 
 FRAMES = 240

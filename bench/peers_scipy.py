@@ -9,9 +9,9 @@ from bench.hand_draws import MARKERS, Noise
 from common.arrays import Float
 from common.geometry import rigid, rotation_vector_to_matrix
 from common.hand_model import HandModel
+from master.estimator.parameters import HandParameters
 from master.fabrik.finger import FingerSolver
 from master.fabrik.rotations import Vector
-from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
 
 _INSIDE_RAD = 1e-6  # it refuses a start on a bound, and bounds that leave no room

@@ -12,6 +12,7 @@ from common.errors import CalibrationError
 from common.geometry import cross
 from common.messages import Detections
 from master.fabrik.compile import log_if_slow
+from master.fabrik.depth import LAW_MISFIT, depth_law, law_contradicts, law_misfit
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver
@@ -22,7 +23,6 @@ from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
 from master.rig_setup import RigSetup
 from master.stereo.caps import CapModel
-from master.stereo.depth import LAW_MISFIT, depth_law, law_contradicts, law_misfit
 from master.stereo.locate import CapLocator
 from master.stereo.misfit import RIG_PX, limits
 from master.stereo.pairing import Pairing

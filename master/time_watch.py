@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 from common.clock_offset import ClockEstimate
 from common.messages import Detections, MarkerDetections, restamped
+from master.monitor.timing import ResidualTiming
+from master.monitor.timing_fit import TimeOffset
 from master.phases import CameraPhases
 from master.rig import RigSetup
-from master.stereo.timing import ResidualTiming
-from master.stereo.timing_fit import TimeOffset
 
 WARN_NS = 1e6
 WARN_SIGMAS = 3.0

@@ -34,7 +34,7 @@ LIVE = (
     "tests/master/export/test_export_gltf.py",
 )
 
-_KERNELS = ("common/kernels.py", "master/fabrik/*.py")
+_KERNELS = ("common/kernels.py", "master/fabrik/*.py", "master/estimator/*.py")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,7 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if known.is_file() and known.read_text() == now:
         return
     if known.is_file():
-        for code in (ROOT / "master" / "fabrik" / "__pycache__").glob("*.nb[ci]"):
+        for code in (ROOT / "master").glob("[ef]*/__pycache__/*.nb[ci]"):
             code.unlink(missing_ok=True)
     known.parent.mkdir(exist_ok=True)
     known.write_text(now)

@@ -27,9 +27,9 @@ from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.kernels import kernel
 from master.fabrik.cap_views import CapTables, hidden_part, seen_shift
+from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.stereo.caps import CapModel
-from master.stereo.depth import AffineDisparity, PowerLaw, disparity_on_axis
 
 GRID = 48  # cells of the table along each side of the image
 _DEPTHS_M = np.array([0.35, 0.45, 0.6, 0.8, 1.1])

@@ -31,7 +31,7 @@ _STILL_S = 0.1  # a speed is taken over no longer than this
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedFingers:
-    """Fingers at one instant; angles and worth as of `master.ik.sensed_hand.SensedHand`.
+    """Fingers at one instant; angles and worth as of `master.fusion.sensed_hand.SensedHand`.
 
     Attributes:
         t_ns: The instant.

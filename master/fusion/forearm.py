@@ -29,9 +29,9 @@ from master.fusion.forearm_state import (
     SeenForearm,
     bend_axes,
 )
+from master.fusion.orientation_samples import Between
 from master.fusion.told_forearm import ToldForearm
 from master.ik.orientation import TURN_RAD_S, turn_of
-from master.ik.orientation_samples import Between
 from master.ik.palm import Orientation
 from master.wrist.palm_world import NO_WORLD, PalmWorld
 

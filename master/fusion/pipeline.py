@@ -1,7 +1,7 @@
 """One hand from marker cameras, a wrist device and its IMU: not a switch between them but one fit.
 
 `FusedPipeline` is a push machine without clock, socket or thread. Every pose is the marker line's (`master.stereo`),
-with one belief more in its fit (`master.ik.sensed_hand`), of two parts that share the doubt of the wrist's bend:
+with one belief more in its fit (`master.fusion.sensed_hand`), of two parts that share the doubt of the wrist's bend:
 
 - the fingers' angles as the wrist device has them, each with its covariance (`finger_track`),
 - the palm's turn as the IMU on the forearm has it, through wrist and heading that are learnt while markers tell the
@@ -21,11 +21,11 @@ import numpy as np
 from common.arrays import Bool, Code, Float
 from common.messages import Detections, HandPose, WristDetections
 from common.wrist_bend import STRAIGHT
+from master.estimator.parameters import HandParameters
 from master.fusion.finger_track import REACH_NS, FingerTrack
 from master.fusion.forearm import Forearm
+from master.fusion.sensed_hand import SensedHand
 from master.fusion.told_forearm import told_forearm
-from master.ik.parameters import HandParameters
-from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import ON_MARKERS, TrackedHand
 from master.stereo.pipeline import MarkerPipeline, SolvedPose, Stage
 from master.wrist.fingers import SeenFingers, WristFingers

@@ -6,7 +6,7 @@ known so tells that. So the two are told together, as information and pull about
 
     cost(u) = u' information u / 2 - pull' u + constant,   u = (turn of the palm from there, bend less the believed one)
 
-In the fit (`master.ik.sensed_hand`) the bend is integrated out. In a least-squares fit information adds up, and at its
+In the fit (`master.fusion.sensed_hand`) the bend is integrated out. In a least-squares fit information adds up, at its
 solution the pulls of all that is known cancel. So what the other sensors said is taken out of both, and what sights
 tell of fingers put in again, now with the bend as an unknown of which nothing is believed. Then shift and free angles
 are integrated out (Schur complement). What the IMU said of the palm is not in it.
@@ -20,9 +20,9 @@ import numpy as np
 
 from common.arrays import Float
 from common.geometry import rotation_vector_to_matrix
+from master.estimator.parameters import HandParameters
+from master.fusion.sensed_hand import SensedHand
 from master.ik.hand import HandSolution
-from master.ik.parameters import HandParameters
-from master.ik.sensed_hand import SensedHand
 
 _TURN, _PALM, _ANGLES, _SIGHTS = 3, 6, 20, 22
 _EACH_RAD = radians(5.0)  # what one finger seems bent by, as by a wrist: a thumb alone tells no wrist

@@ -25,9 +25,9 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import skew
 from common.hand_model import CHAINS, HandModel
+from master.estimator.parameters import HandParameters
 from master.ik.attached import Attached
 from master.ik.hand import HandSolution
-from master.ik.parameters import HandParameters
 
 _STRAIGHT_RAD = np.radians(3.0)  # a turn by less is straight: 0.2 mm off the tangent at the far end of a hand
 _ANYWHERE_RAD = 1.0  # a turn that is less sure than this leads nowhere farther

@@ -12,7 +12,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from common.geometry import skew
 from common.hand_model import CHAINS, Chains, HandJoints, HandModel
-from master.ik.parameters import HandParameters
+from master.estimator.parameters import HandParameters
 
 _AXIS_JOINT: Int = np.array([0, 0, 1, 2])  # joint of the chain at which abduction, flexion, PIP, DIP turn
 

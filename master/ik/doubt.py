@@ -23,10 +23,10 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.hand_model import PALM
+from master.estimator.parameters import HandParameters
 from master.ik.arcs import Arcs
 from master.ik.hand import HandSolution
 from master.ik.hidden import HiddenFingers, strayed_rad2
-from master.ik.parameters import HandParameters
 from master.ik.priors import Priors
 
 # A palm without markers: about each axis, and along it beside what it was moving at.

@@ -16,14 +16,14 @@ from common.arrays import Bool, Float, Int
 from common.geometry import fit_rigid, skew
 from common.hand_model import CHAINS, HandModel
 from common.messages import Level
+from master.estimator.parameters import HandParameters
 from master.fabrik.estimate import SolvedHand
+from master.fusion.sensed_hand import SensedHand
 from master.ik.attached import Attached
 from master.ik.hand_problem import ENOUGH, MAX_ITERATIONS, HandProblem, Minimum
 from master.ik.mixture import Mixture
 from master.ik.palm import Facing, Orientation, PalmPrior
-from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors, hidden_belief, last_belief
-from master.ik.sensed_hand import SensedHand
 
 _SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
 _LENGTH_M = 20e-3  # a line shorter than this has no direction

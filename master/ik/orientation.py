@@ -19,7 +19,7 @@ from common.calibration import ImuCalibration, Quaternion
 from common.errors import CalibrationError
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix, rotation_vector_to_matrix
 from master.fabrik.estimate import SolvedHand
-from master.ik.orientation_samples import OrientationSamples
+from master.fusion.orientation_samples import OrientationSamples
 from master.ik.palm import Orientation
 
 TURN_RAD_S = 3.0  # as fast as a palm turns unseen: `Priors.palm_walk_rad_s`

@@ -15,7 +15,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.hand_model import HandModel
-from master.ik.parameters import HandParameters
+from master.estimator.parameters import HandParameters
 
 _DIP_PER_PIP = 2.0 / 3.0  # where no coupling fixes the DIP, it still tends to this
 _NARROWEST_RAD = 1e-3  # limits that leave an angle no room

@@ -19,6 +19,7 @@ from common.geometry import matrix_to_quaternion
 from common.hand_model import CHAINS, METACARPALS, PALM, TIPS, WRIST, HandModel
 from common.messages import HandPose, Source
 from master.fabrik.estimate import HandEstimate, SolvedHand
+from master.fusion.sensed_hand import MarkerCheck, SensedHand
 from master.ik.arcs import Arcs
 from master.ik.attached import Attached
 from master.ik.doubt import JointDoubt
@@ -26,7 +27,6 @@ from master.ik.hand import EXPLAINED, HandSolution, HandSolver, determined, seen
 from master.ik.hidden import FingerMemory
 from master.ik.palm import Orientation
 from master.ik.priors import Priors
-from master.ik.sensed_hand import MarkerCheck, SensedHand
 from master.volume import inside
 
 _FORGET_S = 0.5  # after this long without any marker the pose is no longer valid

@@ -17,8 +17,8 @@ import numpy as np
 from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
+from master.fabrik.blob_bias import LensShift
 from master.objects.features import Features
-from master.stereo.blob_bias import LensShift
 from master.stereo.tracks import SIGHTINGS
 
 HISTORY = 8

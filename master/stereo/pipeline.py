@@ -18,14 +18,14 @@ from common.calibration import ImuCalibration, Volume
 from common.camera_model import CameraModel
 from common.hand_model import HandModel
 from common.messages import HandPose, MarkerDetections, restamped
+from master.fabrik.blob_bias import LensShift
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.fabrik.solver import FabrikSolver
+from master.fusion.sensed_hand import SensedHand
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import HandOneEuro
 from master.ik.orientation import OrientationTrack
-from master.ik.sensed_hand import SensedHand
 from master.ik.tracker import HandTracker, TrackedHand, pose_of
-from master.stereo.blob_bias import LensShift
 from master.stereo.caps import CapModel
 from master.stereo.drift import DepthDrift
 from master.stereo.locate import CapLocator, Located

@@ -18,8 +18,8 @@ import numpy as np
 from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.geometry import matrix_to_quaternion, quaternion_to_matrix
+from master.fusion.orientation_samples import OrientationSamples
 from master.ik.orientation import TURN_RAD_S, turn_of
-from master.ik.orientation_samples import OrientationSamples
 
 _ANYWHERE_RAD = pi / sqrt(3.0)  # standard deviation of a uniform circle
 NO_WORLD = np.full(4, np.nan), np.full(2, np.nan)

@@ -16,7 +16,7 @@ from common.calibration import RigCalibration, load, save
 from common.clock import SystemClock, Ticker
 from common.keys import new_key
 from common.messages import MarkerDetections
-from master.stereo.depth import AffineDisparity
+from master.fabrik.depth import AffineDisparity
 from slave.uplink import Uplink
 from tests.hand_helpers import camera_file, rig_file
 from tests.network_helpers import PATIENCE_S, free_udp_port

@@ -12,7 +12,7 @@ import pytest
 from common.calibration import CameraCalibration, RigCalibration, parse
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
-from master.stereo.depth import depth_law
+from master.fabrik.depth import depth_law
 from master.stereo.triangulate import Triangulator
 from tests.common.file_values import bounds_of, edited
 

@@ -14,7 +14,7 @@ from common.calibration import (
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import axis_rotation, rigid
-from master.stereo.depth import (
+from master.fabrik.depth import (
     AffineDisparity,
     DepthLaw,
     PowerLaw,

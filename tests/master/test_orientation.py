@@ -14,9 +14,9 @@ from common.arrays import Float
 from common.calibration import ImuCalibration
 from common.errors import CalibrationError
 from common.geometry import axis_rotation, matrix_to_quaternion, quaternion_to_matrix
+from master.fusion.orientation_samples import REACH_NS, slerp
 from master.ik.hand import HandSolution
 from master.ik.orientation import OrientationTrack
-from master.ik.orientation_samples import REACH_NS, slerp
 from master.ik.palm import Orientation
 from tests.hand_helpers import any_rotation
 

@@ -6,10 +6,10 @@ import pytest
 from common.arrays import Float
 from common.hand_model import CHAINS
 from common.messages import Level, Source
+from master.estimator.parameters import HandParameters
+from master.fusion.sensed_hand import MarkerCheck, SensedHand
 from master.ik.hand import HandSolver
 from master.ik.palm import Orientation
-from master.ik.parameters import HandParameters
-from master.ik.sensed_hand import MarkerCheck, SensedHand
 from master.ik.tracker import HandTracker
 from tests.hand_helpers import FACING, MARKERS, RIGHT, natural_angles, palm, small_cov
 

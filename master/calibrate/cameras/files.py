@@ -14,7 +14,7 @@ from common.geometry import invert
 from master.calibrate.cameras.lens_files import matrix_of
 from master.calibrate.cameras.result import CamerasResult
 from master.calibrate.tree_files import provenance, write_camera, write_rig
-from master.stereo.depth import law_contradicts
+from master.fabrik.depth import law_contradicts
 
 NEUTRAL = "mode, exposure, gain, colours and row time are neutral values, not measured"
 

@@ -26,6 +26,7 @@ from master.calibrate.depth.source import (
 )
 from master.calibrate.depth.sweep import checked
 from master.calibrate.depth.verify import laws_of
+from master.fabrik.depth import DepthLaw
 from master.options import (
     CALIB_JSON,
     HERE_BEACON,
@@ -38,7 +39,6 @@ from master.options import (
     ResultTree,
     address,
 )
-from master.stereo.depth import DepthLaw
 from master.summary import write_summary
 
 Source = Annotated[

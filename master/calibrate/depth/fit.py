@@ -24,7 +24,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
-from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw, ideal_law
+from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw, ideal_law
 
 Fit = Callable[[Float, Float], tuple[DepthLaw, Float]]
 

@@ -16,7 +16,7 @@ from master.calibrate.depth.fit import (
     relative_error,
 )
 from master.calibrate.depth.sweep import Sweep, check_enough
-from master.stereo.depth import AffineDisparity, DepthLaw, PowerLaw
+from master.fabrik.depth import AffineDisparity, DepthLaw, PowerLaw
 
 MOST_OUT = 0.2  # of all distances; with more out, it is not single ones that are wrong
 

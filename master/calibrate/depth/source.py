@@ -17,7 +17,7 @@ from master.calibrate.depth.recording import Pairs, by_file, by_list, by_truth, 
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import parse_distances, read_table
 from master.calibrate.tree_files import load_marker_rig
-from master.stereo.blob_bias import card_outline, centre_of_blob, round_outline
+from master.fabrik.blob_bias import card_outline, centre_of_blob, round_outline
 
 _LEFT_RIGHT = ("left", "right")
 _TOLD_PX = 0.02  # shift of a centroid worth a line

@@ -1,7 +1,7 @@
 """How right a rig is: the published table of 20...100 cm for every depth model it has, and what was to be expected.
 
 Three things stand side by side and must not be mixed: what a sweep *measured*, at the angles at which the target
-stood; what *noise and time* cost by the derivatives of the ideal law (`master.stereo.depth.error_budget`); and what a
+stood; what *noise and time* cost by the derivatives of the ideal law (`master.fabrik.depth.error_budget`); and what a
 law of raw disparity costs *off the axis*, where it was not fitted, by projecting points with the rig's own cameras.
 The last is exact for the model, and as true as the rig's stereo calibration is.
 """
@@ -17,7 +17,7 @@ from common.camera_model import CameraModel
 from common.geometry import invert, transform
 from master.calibrate.depth.fit import ideal_of
 from master.calibrate.depth.sweep import Sweep
-from master.stereo.depth import AffineDisparity, DepthLaw, ErrorBudget, PowerLaw, error_budget
+from master.fabrik.depth import AffineDisparity, DepthLaw, ErrorBudget, PowerLaw, error_budget
 from master.stereo.triangulate import Triangulator
 
 Cameras = tuple[CameraModel, CameraModel]

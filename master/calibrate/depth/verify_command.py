@@ -29,8 +29,8 @@ from master.calibrate.depth.verify_report import (
     off_axis_lines,
     verified_json,
 )
+from master.fabrik.depth import tolerable_skew_s
 from master.options import CALIB_JSON, JsonFile, RecordingRig
-from master.stereo.depth import tolerable_skew_s
 from master.summary import write_summary
 
 _WANTED = 0.02  # of the depth, as the published rig

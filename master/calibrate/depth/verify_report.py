@@ -6,7 +6,7 @@ import numpy as np
 
 from common.arrays import Float
 from master.calibrate.depth.verify import Noise, Verified
-from master.stereo.depth import ErrorBudget
+from master.fabrik.depth import ErrorBudget
 
 
 def measured_lines(found: Verified) -> list[str]:

@@ -6,8 +6,8 @@ import numpy as np
 
 from common.arrays import Float
 from master.calibrate.mounting.unknown import CAMERA_LATE, UNKNOWN
+from master.estimator.parameters import HandParameters
 from master.ik.hand_problem import HandProblem, Linear
-from master.ik.parameters import HandParameters
 
 _LITTLE = 1e-5
 _NOTHING = 1e-9  # information of what nothing tells

@@ -47,9 +47,9 @@ from master.calibrate.mounting.unknown import (
     believed,
 )
 from master.calibrate.mounting.wrists import bends, bends_by_turn
+from master.estimator.parameters import HandParameters
 from master.ik.attached import Attached
 from master.ik.hand_problem import HandProblem, moved
-from master.ik.parameters import HandParameters
 from master.ik.priors import AnglePrior, Priors
 
 _SKIN_M, _TIP_M = 8e-4, 1e-3  # skin of another shape than the cones; a tip is seen anywhere on its pulp

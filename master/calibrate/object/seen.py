@@ -11,7 +11,7 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
-from master.stereo.blob_bias import LensShift
+from master.fabrik.blob_bias import LensShift
 from master.stereo.pairing import Instant, Pairing
 from master.stereo.place import CalibrationResidual, Placement
 

@@ -1,6 +1,6 @@
 """How much later each camera's frames are than its stamps say, from a recording of a moving hand.
 
-The estimator is that of the running master (`master.stereo.timing`), over the whole recording and every frame. It is
+The estimator is that of the running master (`master.monitor.timing`), over the whole recording and every frame. It is
 linear in the offset, so the recording is measured again, and a third time, with the stamps as they were found before.
 """
 
@@ -13,8 +13,8 @@ import numpy as np
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import MarkerDetections
-from master.stereo.timing import ResidualTiming
-from master.stereo.timing_fit import TimeOffset
+from master.monitor.timing import ResidualTiming
+from master.monitor.timing_fit import TimeOffset
 
 SIGMA_AT_MOST_NS = 1e6
 """Less sure than this an offset is not written: 1.5 ms are 2 % of depth at half a metre and 1 m/s (B = 75 mm)."""

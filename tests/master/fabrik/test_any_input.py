@@ -15,12 +15,12 @@ from common.hand_calibration import Couplings
 from common.hand_model import HandModel
 from common.message_parts import MAX_PICTURE
 from common.messages import HandPose, MarkerDetections, decode, encode
+from master.fabrik.depth import PowerLaw
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig import build_pipeline
 from master.rig_pipeline import line_of
 from master.stages import StageTimes
 from master.stereo.caps import CapModel
-from master.stereo.depth import PowerLaw
 from tests.hand_helpers import LEFT, MARKERS, RIGHT
 from tests.synthetic_run import SyntheticRun, synthetic_run
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from common.arrays import Float
+from master.fabrik.depth import depth_law, law_misfit
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables
 from master.rig import RigSetup, load_setup
 from master.stereo.caps import CapModel
-from master.stereo.depth import depth_law, law_misfit
 from master.stereo.misfit import RIG_PX, limits
 from master.stereo.place import CalibrationResidual
 from master.stereo.triangulate import Triangulator

@@ -8,10 +8,10 @@ from common.camera_model import CameraModel
 from common.geometry import axis_rotation, rigid
 from common.hand_model import TIPS
 from master.fabrik.cap_views import CapTables, hidden_part
+from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import SolvedHand
 from master.fabrik.triangulate import DepthTriangulator, disparity_tables, place_centroids
 from master.stereo.caps import CapModel
-from master.stereo.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from tests.hand_helpers import MARKERS, RIGHT, cap_areas_px2, natural_angles, palm
 
 DISTORTED = np.array([0.105, -0.21, 0.0006, -0.0009, 0.05])

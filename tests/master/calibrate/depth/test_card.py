@@ -12,7 +12,7 @@ from common.sim.card import DISTANCES_M, MARKER, CardScene
 from master.calibrate.depth.fit import FITS
 from master.calibrate.depth.source import pair_of, parse_target, straightened
 from master.calibrate.depth.sweep import Sweep, checked
-from master.stereo.depth import law_misfit
+from master.fabrik.depth import law_misfit
 from slave.markers.following import FollowingDetector
 from slave.markers.workers import Inline
 

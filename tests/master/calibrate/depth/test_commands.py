@@ -21,7 +21,7 @@ from common.errors import CalibrationError, FitError, PhalanxError
 from common.geometry import axis_rotation, rigid
 from master.calibrate.cli import calibrate_app
 from master.calibrate.depth.source import load_pair
-from master.stereo.depth import AffineDisparity
+from master.fabrik.depth import AffineDisparity
 from tests.hand_helpers import camera_file, rig_file
 
 RIG = AffineDisparity(37.3, 2.64)

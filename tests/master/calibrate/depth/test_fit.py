@@ -16,7 +16,7 @@ from master.calibrate.depth.fit import (
 )
 from master.calibrate.depth.report import fit_depth
 from master.calibrate.depth.sweep import Sweep
-from master.stereo.depth import AffineDisparity, PowerLaw
+from master.fabrik.depth import AffineDisparity, PowerLaw
 
 PUBLISHED_M = np.arange(1.0, 0.19, -0.1)
 PUBLISHED_PX = np.array([39.93, 44.21, 49.54, 56.36, 65.41, 78.01, 96.79, 127.80, 189.09])

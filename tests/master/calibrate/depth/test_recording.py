@@ -23,7 +23,7 @@ from master.calibrate.depth.recording import (
 )
 from master.calibrate.depth.sweep import Sweep
 from master.calibrate.depth.tables import parse_distances, read_table, write_table
-from master.stereo.depth import AffineDisparity
+from master.fabrik.depth import AffineDisparity
 
 CAMERAS = ("left", "right")
 NAMES = ("thumb", "index", "middle", "ring", "little", "back")

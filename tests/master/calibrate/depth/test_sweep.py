@@ -9,7 +9,7 @@ from common.arrays import Float
 from common.errors import FitError
 from master.calibrate.depth.report import fit_depth
 from master.calibrate.depth.sweep import Sweep, checked
-from master.stereo.depth import AffineDisparity
+from master.fabrik.depth import AffineDisparity
 
 CAMERAS = ("left", "right")
 SIZE = (640, 480)

@@ -13,7 +13,7 @@ step with the velocity:
   about the hand's path is made.
 
 Fingers do change distances, but not in step with the velocity of the hand; what that leaves is for the statistics
-(`master.stereo.timing_fit`).
+(`master.monitor.timing_fit`).
 
 Velocity is measured and noisy, from the same frames as the position. So each equation also gets an *instrument*
 (Durbin, "Errors in variables", 1954): the velocity that the first camera saw, from frames other than the one compared.

@@ -6,7 +6,7 @@ import numpy as np
 
 from common.arrays import Float, Int
 from common.kernels import kernel
-from master.fabrik.hand_tables import HandTables, Mounts
+from master.estimator.hand_tables import HandTables, Mounts
 
 
 @kernel

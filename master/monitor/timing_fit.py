@@ -26,8 +26,8 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from common.arrays import Bool, Float, Int
+from master.monitor.timing_evidence import Evidence
 from master.stereo.misfit import RIG_PX
-from master.stereo.timing_evidence import Evidence
 
 TENTHS = 10  # of a block, the shortest batches
 MISFIT_FLOOR_PX, DISTANCE_FLOOR_M = 0.2, 1e-3

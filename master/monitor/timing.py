@@ -1,7 +1,7 @@
 """The residual time between cameras, measured from the tracks themselves while they run.
 
 A stamp can lie: a USB camera without a clock of its own is stamped when its first packet arrives, late by exposure and
-transfer, 8 to 10 ms; and nothing that travels with the frame tells. The tracks do (`master.stereo.timing_evidence`).
+transfer, 8 to 10 ms; and nothing that travels with the frame tells. The tracks do (`master.monitor.timing_evidence`).
 
 `ResidualTiming` takes every message and compares a second at once, some frames later, one step of the work with each
 message: most cost no more than being kept, a few in a second a fraction of a millisecond. What it finds is corrected
@@ -16,8 +16,8 @@ import numpy as np
 from common.arrays import Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
-from master.stereo.timing_evidence import CameraPair, Track
-from master.stereo.timing_fit import TENTHS, TimeOffset, fit_offset, unit_sums
+from master.monitor.timing_evidence import CameraPair, Track
+from master.monitor.timing_fit import TENTHS, TimeOffset, fit_offset, unit_sums
 
 BLOCK_NS = 1_000_000_000
 KEPT_BLOCKS = 32

@@ -1,0 +1,1 @@
+"""One state of a hand, fitted to the pixels of all sensors; compiled."""

@@ -1,0 +1,1 @@
+"""Watch what the rig measures for what is wrong with it: clocks that lag."""
