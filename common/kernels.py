@@ -1,15 +1,19 @@
 """Compile numeric functions; plain Python where NUMBA_DISABLE_JIT=1."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
 
 F = TypeVar("F", bound=Callable[..., Any])
+R = TypeVar("R")
+Shape = int | tuple[int, ...]
 
 # A division by 0 gives infinity, as in numpy.
 _OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+# Without reference counts, of which a call with many arrays has as many; so nothing may be allocated.
+_INNER = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
 
 
 def kernel(function: F) -> F:
@@ -22,9 +26,13 @@ def kernel(function: F) -> F:
 
 
 def inner(function: F) -> F:
-    """As `kernel`, for a function that only kernels call; compiles in half the time."""
-    alone = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return cast(F, cast(Any, numba).njit(**_OPTIONS, **alone)(function))
+    """As `kernel`, for a function that only kernels call and that allocates nothing."""
+    return cast(F, cast(Any, numba).njit(**_OPTIONS, **_INNER)(function))
+
+
+def inlined(function: F) -> F:
+    """As `inner`, for a small function in a hot loop: it becomes part of those that call it."""
+    return cast(F, cast(Any, numba).njit(**_OPTIONS, **_INNER, forceinline=True)(function))
 
 
 def constant(number: int) -> int:
@@ -33,3 +41,36 @@ def constant(number: int) -> int:
     Python's own would be a literal, a type of its own, and numba compiles what is called anew for every literal.
     """
     return cast(int, np.int64(number))
+
+
+def record(kind: type[R], **fields: Shape | tuple[str, Shape] | object) -> R:
+    """Allocate a struct of arrays with fixed shapes, all zero: kernels take it as one pointer.
+
+    Args:
+        kind: A class that declares the fields; never called.
+        fields: Shape of each, of float64; or data type and shape; or another record, which is copied into it.
+    """
+    types: list[tuple[str, Any] | tuple[str, Any, Any]] = []
+    for name, of in fields.items():
+        if isinstance(of, np.void):
+            types.append((name, of.dtype))
+        elif isinstance(of, tuple) and isinstance(cast(Any, of)[0], str):
+            kind_of, shape = cast(tuple[str, Shape], of)
+            types.append((name, kind_of, shape if isinstance(shape, tuple) else (shape,)))
+        else:
+            types.append((name, "f8", of if isinstance(of, tuple) else (of,)))
+    out = np.zeros(1, np.dtype(types, align=True)).view(np.recarray)[0]
+    for name, of in fields.items():
+        if isinstance(of, np.void):
+            out[name] = of
+    return cast(R, out)
+
+
+def filled(kind: type[R], values: Mapping[str, Any]) -> R:
+    """A record of copies of arrays: whole numbers and truths as such, all else as float64."""
+    types = {"i": "i8", "u": "u1", "b": "u1"}
+    fields = {name: (types.get(value.dtype.kind, "f8"), value.shape) for name, value in values.items()}
+    out = record(kind, **fields)
+    for name, value in values.items():
+        cast(Any, out)[name] = value
+    return out

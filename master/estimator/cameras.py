@@ -8,7 +8,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.camera_model import CameraModel
-from common.kernels import kernel
+from common.kernels import inlined
 
 _NEWTON_STEPS = 12
 _SETTLED = 1e-10  # normalised: the error after a step so small is its square, about
@@ -52,7 +52,7 @@ class CameraArrays(NamedTuple):
         )
 
 
-@kernel
+@inlined
 def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) -> bool:
     """Write where camera c sees a point, and how that moves with it.
 
@@ -99,7 +99,7 @@ def project(cameras: CameraArrays, c: int, point: Float, uv: Float, J: Float) ->
     return True
 
 
-@kernel
+@inlined
 def undistort(cameras: CameraArrays, c: int, u: float, v: float, out: Float) -> bool:
     """Write the normalised image point (x/z, y/z) of a pixel, by Newton's method.
 

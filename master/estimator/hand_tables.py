@@ -1,16 +1,19 @@
 """A hand profile and its markers as flat arrays, for kernels."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from common.arrays import Float, Int
+from common.arrays import Bool, Float, Int
 from common.hand_model import CHAINS, HandModel
+from common.kernels import filled
 from master.estimator.parameters import HandParameters
-from master.ik.attached import Attached
+
+_STIFF_RAD = 1e-9  # an angle whose highest flexion is 0 narrows nothing
 
 
-class HandTables(NamedTuple):
+class HandTables:
     """A hand profile with n free angles.
 
     Attributes:
@@ -19,11 +22,15 @@ class HandTables(NamedTuple):
         root_m: (5, 3) first joint of each chain, palm frame [m].
         bone_m: (5, 3, 3) bones in the frames of their joints [m].
         abduction_axis: (5, 3) palm frame.
-        complete: (20, n) all angles by the free ones, abductions before they narrow.
-        abduction, flexion: (5,) columns of the free angles; -1: nothing narrows the finger's abduction.
+        first: (6,) column of the first free angle of each finger; those of finger f are first[f] ... first[f + 1] - 1.
+        complete: (20, 4) all angles by the free ones of their finger, abductions before they narrow.
+        narrows: (5,) whether flexion narrows the finger's abduction.
         most: (5,) [rad] highest flexion.
         left: (5,) share of the abduction left there.
         low, high: (n,) [rad] limits of the free angles.
+        rests: (n,) whether it often stands at its low limit, as that of a straight finger.
+        anywhere: (6 + n,) inverse variances of a hand of which nothing is known but its limits.
+        limits: (5, 4, 2) [rad] low and high of all angles, abductions before they narrow.
         finger: (26,) chain of each joint, -1: fixed to the palm.
         level: (26,) its place in the chain.
         rest_m, rest_R: (26, 3) [m], (26, 3, 3) place and rotation of those fixed to the palm, palm frame.
@@ -34,13 +41,16 @@ class HandTables(NamedTuple):
     root_m: Float
     bone_m: Float
     abduction_axis: Float
+    first: Int
     complete: Float
-    abduction: Int
-    flexion: Int
+    narrows: Bool
     most: Float
     left: Float
     low: Float
     high: Float
+    rests: Bool
+    anywhere: Float
+    limits: Float
     finger: Int
     level: Int
     rest_m: Float
@@ -48,35 +58,41 @@ class HandTables(NamedTuple):
 
     @classmethod
     def of(cls, model: HandModel, parameters: HandParameters) -> "HandTables":
-        """Lay out a hand."""
+        """Lay out a hand model."""
         axis = np.zeros((5, 3))
         axis[:, 1] = model.side_sign
         axis[0] = model.side_sign * model.rest_rotation[CHAINS[0, 0]][:, 1]
         finger, level = np.full(26, -1, np.int64), np.zeros(26, np.int64)
         for f, chain in enumerate(CHAINS):
             finger[chain], level[chain] = f, np.arange(4)
-        abduction, flexion = np.full(5, -1, np.int64), np.full(5, -1, np.int64)
+        first = np.searchsorted(parameters.free, 4 * np.arange(6)).astype(np.int64)
+        complete = np.zeros((20, 4))
+        for f in range(5):
+            own = parameters.complete[4 * f : 4 * f + 4, first[f] : first[f + 1]]
+            complete[4 * f : 4 * f + 4, : own.shape[1]] = own
         most = np.ascontiguousarray(model.limits_rad[:, 1, 1])
-        for f in np.flatnonzero((model.spread_at_full_flexion < 1.0) & (most > 0.0)):
-            abduction[f], flexion[f] = np.searchsorted(parameters.free, (4 * f, 4 * f + 1))
-        return cls(
-            np.ascontiguousarray(model.swing),
-            np.ascontiguousarray(model.turn[:, 2]),
-            np.ascontiguousarray(model.rest_position_m[CHAINS[:, 0]]),
-            np.ascontiguousarray(model.bone_m),
-            axis,
-            np.ascontiguousarray(parameters.complete),
-            abduction,
-            flexion,
-            most,
-            np.ascontiguousarray(model.spread_at_full_flexion, np.float64),
-            np.ascontiguousarray(parameters.low),
-            np.ascontiguousarray(parameters.high),
-            finger,
-            level,
-            np.ascontiguousarray(model.rest_position_m),
-            np.ascontiguousarray(model.rest_rotation),
-        )
+        tables: dict[str, Float | Int | Bool] = {
+            "swing": model.swing,
+            "tip_turn": model.turn[:, 2],
+            "root_m": model.rest_position_m[CHAINS[:, 0]],
+            "bone_m": model.bone_m,
+            "abduction_axis": axis,
+            "first": first,
+            "complete": complete,
+            "narrows": (model.spread_at_full_flexion < 1.0) & (most > 0.0),
+            "most": np.maximum(most, _STIFF_RAD),
+            "left": model.spread_at_full_flexion,
+            "low": parameters.low,
+            "high": parameters.high,
+            "rests": parameters.rests,
+            "anywhere": parameters.anywhere,
+            "limits": model.limits_rad,
+            "finger": finger,
+            "level": level,
+            "rest_m": model.rest_position_m,
+            "rest_R": model.rest_rotation,
+        }
+        return filled(cls, tables)
 
 
 class Mounts(NamedTuple):
@@ -93,10 +109,20 @@ class Mounts(NamedTuple):
     offset_m: Float
 
     @classmethod
-    def of(cls, attached: Attached) -> "Mounts":
-        """Lay out markers."""
-        return cls(
-            np.where(attached.on_finger[:, 0], attached.finger, -1),
-            np.ascontiguousarray(attached.level),
-            np.ascontiguousarray(attached.offset_m),
-        )
+    def of(cls, model: HandModel, names: Sequence[str]) -> "Mounts":
+        """Lay out the markers of these names.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        finger, level = np.full(len(names), -1, np.int64), np.zeros(len(names), np.int64)
+        offset = np.zeros((len(names), 3))
+        for m, name in enumerate(names):
+            mount = model.mount(name)
+            offset[m] = mount.offset_m
+            if mount.finger is not None:
+                finger[m], level[m] = np.argwhere(mount.joint == CHAINS)[0]
+            elif mount.joint is not None:  # wrist and metacarpals do not move against the palm
+                R, p = model.rest_rotation[mount.joint], model.rest_position_m[mount.joint]
+                offset[m] = p + R @ mount.offset_m
+        return cls(finger, level, offset)

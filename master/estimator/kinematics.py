@@ -1,258 +1,322 @@
-"""Kernels of a hand: joints, points on them, derivatives, covariances."""
+"""Kernels of a hand: joints and points in the rig frame, and their derivatives.
+
+Unknowns are the palm's turn (3, a rotation vector in front of its rotation, rig axes) and shift (3) [m], then the free
+angles [rad]. A point on a finger moves with the palm and the angles of its own finger alone, so derivatives are kept
+as ten rows at most: six of the palm, then those of the finger (`HandTables.first`). What turns about axis a through o
+moves by a x (point - o).
+"""
 
 from math import cos, sin, sqrt
 
 import numpy as np
 
-from common.arrays import Float, Int
-from common.kernels import kernel
+from common.arrays import Float
+from common.kernels import inlined, inner, record
 from master.estimator.hand_tables import HandTables, Mounts
 
 
-@kernel
+class Scratch:
+    """Room for the intermediate results of kernels; holds nothing from one call to the next."""
+
+    back: Float  # (3,)
+    shift: Float  # (3,)
+    slope: Float  # (3, 3)
+    there: Float  # (3,)
+    uv: Float  # (2,)
+    J: Float  # (2, 3)
+    A: Float  # (2, 6)
+    K: Float  # (3, 3)
+    gain: Float  # (3,)
+    left: Float  # (6, 3)
+    gained: Float  # (6, 3)
+    H: Float  # (6, 6)
+    g: Float  # (6,)
+    by_place: Float  # (10, 3)
+    by_turn: Float  # (10, 3)
+    rows: Float  # (10, 6)
+    angles: Float  # (20,)
+    by: Float  # (20, 4)
+    R: Float  # (5, 4, 3, 3)
+    P: Float  # (5, 4, 3)
+    point: Float  # (3,)
+    arm: Float  # (3,)
+    ahead: Float  # (3,)
+
+    @classmethod
+    def empty(cls) -> "Scratch":
+        """Allocate it."""
+        return record(
+            cls,
+            back=3,
+            shift=3,
+            slope=(3, 3),
+            there=3,
+            uv=2,
+            J=(2, 3),
+            A=(2, 6),
+            K=(3, 3),
+            gain=3,
+            left=(6, 3),
+            gained=(6, 3),
+            H=(6, 6),
+            g=6,
+            by_place=(10, 3),
+            by_turn=(10, 3),
+            rows=(10, 6),
+            angles=20,
+            by=(20, 4),
+            R=(5, 4, 3, 3),
+            P=(5, 4, 3),
+            point=3,
+            arm=3,
+            ahead=3,
+        )
+
+
+@inner
 def angles_of(tables: HandTables, x: Float, angles: Float, by: Float) -> None:
-    """Write all angles (20,) [rad] of the free ones (n,), and derivatives (20, n).
+    """Write all angles (20,) [rad] of the free ones (n,), and derivatives.
 
-    As `HandParameters.angles`.
+    `by`: (20, 4), by the free angles of the same finger. As `HandParameters.angles`.
     """
-    n = x.shape[0]
-    for a in range(20):
-        total = 0.0
-        for c in range(n):
-            by[a, c] = tables.complete[a, c]
-            total += tables.complete[a, c] * x[c]
-        angles[a] = total
     for f in range(5):
-        a, c = tables.abduction[f], tables.flexion[f]
-        if a < 0:
-            continue
-        flexed = min(max(x[c], 0.0), tables.most[f]) / tables.most[f]
-        share = 1.0 - (1.0 - tables.left[f]) * flexed * flexed
-        angles[4 * f] = share * x[a]
-        by[4 * f, a] = share
-        by[4 * f, c] = -2.0 * (1.0 - tables.left[f]) * flexed / tables.most[f] * x[a]
+        start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
+        for a in range(4 * f, 4 * f + 4):
+            total = 0.0
+            for k in range(count):
+                by[a, k] = tables.complete[a, k]
+                total += tables.complete[a, k] * x[start + k]
+            angles[a] = total
+        if tables.narrows[f]:  # abduction and flexion are always free
+            flexed = min(max(x[start + 1], 0.0), tables.most[f]) / tables.most[f]
+            share = 1.0 - (1.0 - tables.left[f]) * flexed * flexed
+            angles[4 * f] = share * x[start]
+            by[4 * f, 0] = share
+            by[4 * f, 1] = -2.0 * (1.0 - tables.left[f]) * flexed / tables.most[f] * x[start]
 
 
-@kernel
-def chains(tables: HandTables, angles: Float, R: Float, P: Float) -> None:
-    """Write joint rotations and places, palm frame, of angles (20,) [rad].
+@inner
+def free_of(tables: HandTables, angles: Float, x: Float) -> None:
+    """Write the free angles (n,) of all angles (20,) [rad], inside the limits.
 
-    R: (5, 4, 3, 3); P: (5, 4, 3) [m].
+    As `HandParameters.of_angles`.
     """
-    local, frame = np.empty((3, 3)), np.empty((3, 3))
+    for f in range(5):
+        start, count = tables.first[f], tables.first[f + 1] - tables.first[f]
+        for k in range(count):
+            x[start + k] = angles[4 * f + k]
+        if tables.narrows[f]:
+            flexed = min(max(x[start + 1], 0.0), tables.most[f]) / tables.most[f]
+            x[start] /= max(1.0 - (1.0 - tables.left[f]) * flexed * flexed, 1e-6)
+        for k in range(start, start + count):
+            x[k] = min(max(x[k], tables.low[k]), tables.high[k])
+
+
+@inner
+def clamp(tables: HandTables, angles: Float) -> None:
+    """Cut angles (20,) [rad] at their limits, as `HandModel.clamp`; in place."""
     for f in range(5):
         for k in range(4):
+            a = 4 * f + k
+            angles[a] = min(max(angles[a], tables.limits[f, k, 0]), tables.limits[f, k, 1])
+        if tables.narrows[f]:
+            flexed = min(max(angles[4 * f + 1], 0.0), tables.most[f]) / tables.most[f]
+            left = 1.0 - (1.0 - tables.left[f]) * flexed * flexed
+            angles[4 * f] = min(
+                max(angles[4 * f], left * tables.limits[f, 0, 0]), left * tables.limits[f, 0, 1]
+            )
+
+
+@inner
+def chains(tables: HandTables, T: Float, angles: Float, R: Float, P: Float) -> None:
+    """Write joint rotations and places, rig frame, of a palm and all angles.
+
+    Args:
+        tables: The hand.
+        T: (4, 4) palm.
+        angles: (20,) [rad].
+        R, P: Written: (5, 4, 3, 3) and (5, 4, 3) [m].
+    """
+    for f in range(5):
+        local = R[f, 3]  # until it is the tip's
+        for i in range(3):
+            P[f, 0, i] = T[i, 3]
+            for j in range(3):
+                P[f, 0, i] += T[i, j] * tables.root_m[f, j]
+        for k in range(4):
             c, s = cos(angles[4 * f + k]), sin(angles[4 * f + k])
+            before, after = max(k - 2, 0), max(k - 1, 0)
             for i in range(3):
                 for j in range(3):
                     turned = c * tables.swing[1, f, k, i, j] + s * tables.swing[2, f, k, i, j]
                     local[i, j] = tables.swing[0, f, k, i, j] + turned
-            if k == 0:
-                frame[:, :] = local
-                continue
             for i in range(3):
-                a, b, d = frame[i, 0], frame[i, 1], frame[i, 2]
+                a, b, d = R[f, before, i, 0], R[f, before, i, 1], R[f, before, i, 2]
+                if k == 0:
+                    a, b, d = T[i, 0], T[i, 1], T[i, 2]
                 for j in range(3):
-                    frame[i, j] = a * local[0, j] + b * local[1, j] + d * local[2, j]
-                    R[f, k - 1, i, j] = frame[i, j]
+                    R[f, after, i, j] = a * local[0, j] + b * local[1, j] + d * local[2, j]
         for i in range(3):
-            a, b, d = frame[i, 0], frame[i, 1], frame[i, 2]
+            a, b, d = R[f, 2, i, 0], R[f, 2, i, 1], R[f, 2, i, 2]
             for j in range(3):
-                R[f, 3, i, j] = (
-                    a * tables.tip_turn[f, 0, j] + b * tables.tip_turn[f, 1, j] + d * tables.tip_turn[f, 2, j]
-                )
-            P[f, 0, i] = tables.root_m[f, i]
+                turned = a * tables.tip_turn[f, 0, j] + b * tables.tip_turn[f, 1, j]
+                R[f, 3, i, j] = turned + d * tables.tip_turn[f, 2, j]
         for k in range(3):
             for i in range(3):
                 bone = R[f, k, i, 0] * tables.bone_m[f, k, 0] + R[f, k, i, 1] * tables.bone_m[f, k, 1]
                 P[f, k + 1, i] = P[f, k, i] + bone + R[f, k, i, 2] * tables.bone_m[f, k, 2]
 
 
-@kernel
-def place(mounts: Mounts, m: int, R: Float, P: Float, out: Float) -> None:
-    """Write where marker m sits in the palm frame (3,) [m]."""
+@inlined
+def marker_point(mounts: Mounts, m: int, T: Float, R: Float, P: Float, out: Float) -> None:
+    """Write where marker m sits (3,) [m], rig frame."""
     f, k = mounts.finger[m], mounts.level[m]
     for i in range(3):
-        out[i] = mounts.offset_m[m, i]
-        if f >= 0:
-            turned = R[f, k, i, 0] * mounts.offset_m[m, 0] + R[f, k, i, 1] * mounts.offset_m[m, 1]
-            out[i] = P[f, k, i] + turned + R[f, k, i, 2] * mounts.offset_m[m, 2]
+        total = P[f, k, i] if f >= 0 else T[i, 3]
+        for j in range(3):
+            total += (R[f, k, i, j] if f >= 0 else T[i, j]) * mounts.offset_m[m, j]
+        out[i] = total
 
 
-@kernel
-def pose(
-    tables: HandTables,
-    mounts: Mounts,
-    T: Float,
-    angles: Float,
-    position: Float,
-    rotation: Float,
-    places: Float,
-) -> None:
-    """Write the joints of a hand, rig frame, and its markers, palm frame.
+@inner
+def markers_of(tables: HandTables, mounts: Mounts, T: Float, x: Float, work: Scratch, out: Float) -> None:
+    """Write where the markers of a hand are (M, 3) [m], rig frame."""
+    angles_of(tables, x, work.angles, work.by)
+    chains(tables, T, work.angles, work.R, work.P)
+    for m in range(mounts.finger.shape[0]):
+        marker_point(mounts, m, T, work.R, work.P, out[m])
+
+
+@inner
+def joints(tables: HandTables, T: Float, R: Float, P: Float, position: Float, rotation: Float) -> None:
+    """Write the 26 joints, rig frame, of chains (`chains`).
 
     Args:
-        tables, mounts: The hand and its markers.
-        T: (4, 4) palm.
-        angles: (20,) [rad].
-        position, rotation, places: Written: (26, 3) [m], (26, 3, 3), (M, 3) [m].
+        tables, T, R, P: The hand.
+        position, rotation: Written: (26, 3) [m], (26, 3, 3).
     """
-    R, P = np.empty((5, 4, 3, 3)), np.empty((5, 4, 3))
-    chains(tables, angles, R, P)
     for joint in range(26):
         f, k = tables.finger[joint], tables.level[joint]
         for i in range(3):
-            total = T[i, 3]
-            for j in range(3):
-                total += T[i, j] * (P[f, k, j] if f >= 0 else tables.rest_m[joint, j])
-            position[joint, i] = total
-            for c in range(3):
-                turned = 0.0
+            if f >= 0:
+                position[joint, i] = P[f, k, i]
                 for j in range(3):
-                    turned += T[i, j] * (R[f, k, j, c] if f >= 0 else tables.rest_R[joint, j, c])
-                rotation[joint, i, c] = turned
-    for m in range(mounts.finger.shape[0]):
-        place(mounts, m, R, P, places[m])
+                    rotation[joint, i, j] = R[f, k, i, j]
+                continue
+            position[joint, i] = T[i, 3]
+            for j in range(3):
+                position[joint, i] += T[i, j] * tables.rest_m[joint, j]
+                turned = T[i, 0] * tables.rest_R[joint, 0, j] + T[i, 1] * tables.rest_R[joint, 1, j]
+                rotation[joint, i, j] = turned + T[i, 2] * tables.rest_R[joint, 2, j]
 
 
-@kernel
-def turn_slopes(by: Float, axes: Float, f: int, level: int, arms: Float, out: Float) -> None:
-    """Write the sum over a finger's axes of (axis x arm) by the free angles (n, 3).
+@inlined
+def palm_slopes(arm: Float, J: Float) -> None:
+    """Write derivatives by the palm of a point `arm` (3,) from its origin.
 
-    Args:
-        by: (20, n) derivatives of all angles by the free ones.
-        axes: (4, 3) axes of abduction, flexion, PIP and DIP.
-        f, level: Finger, and joint of its chain up to which axes count.
-        arms: (4, 3) from each axis to what it turns.
-        out: Written.
+    `J`: (10, 3), the first six rows.
     """
-    n = by.shape[1]
-    for c in range(n):
-        for i in range(3):
-            out[c, i] = 0.0
-    for k in range(min(level, 2) + 2):
-        tx = axes[k, 1] * arms[k, 2] - axes[k, 2] * arms[k, 1]
-        ty = axes[k, 2] * arms[k, 0] - axes[k, 0] * arms[k, 2]
-        tz = axes[k, 0] * arms[k, 1] - axes[k, 1] * arms[k, 0]
-        for c in range(n):
-            share = by[4 * f + k, c]
-            if share != 0.0:
-                out[c, 0] += share * tx
-                out[c, 1] += share * ty
-                out[c, 2] += share * tz
-
-
-@kernel
-def axes_of(tables: HandTables, f: int, R: Float, axes: Float) -> None:
-    """Write the axes (4, 3) of a finger's angles, palm frame."""
     for i in range(3):
-        axes[0, i] = tables.abduction_axis[f, i]
-        for k in range(3):
-            axes[k + 1, i] = -R[f, k, i, 0]
-
-
-@kernel
-def point_slopes(
-    tables: HandTables, by: Float, f: int, level: int, point: Float, R: Float, P: Float, out: Float
-) -> None:
-    """Write derivatives (n, 3) [m/rad] of a point of finger f by the free angles."""
-    axes, arms = np.empty((4, 3)), np.empty((4, 3))
-    axes_of(tables, f, R, axes)
-    for k in range(4):
-        for i in range(3):
-            arms[k, i] = point[i] - P[f, max(k - 1, 0), i]
-    turn_slopes(by, axes, f, level, arms, out)
-
-
-@kernel
-def rig_slopes(T: Float, arm: Float, by_x: Float, shifted: bool, J: Float, used: Int) -> int:
-    """Write derivatives by palm and free angles, rig frame; count those not 0.
-
-    Args:
-        T: (4, 4) palm.
-        arm: (3,) of what is turned, from the palm's origin, rig frame.
-        by_x: (n, 3) derivatives by the free angles, palm frame.
-        shifted: Whether it is a place; else a direction, which no shift moves.
-        J, used: (6 + n, 3) and (6 + n,): the rows and which unknowns they belong to; written.
-    """
-    J[:6, :] = 0.0
+        for j in range(3):
+            J[i, j] = 0.0
+            J[3 + i, j] = 1.0 if i == j else 0.0
     J[0, 1], J[0, 2] = -arm[2], arm[1]  # axis x arm
     J[1, 0], J[1, 2] = arm[2], -arm[0]
     J[2, 0], J[2, 1] = -arm[1], arm[0]
-    count = 3
-    if shifted:
-        J[3, 0], J[4, 1], J[5, 2] = 1.0, 1.0, 1.0
-        count = 6
-    for i in range(count):
-        used[i] = i
-    for c in range(by_x.shape[0]):
-        if by_x[c, 0] != 0.0 or by_x[c, 1] != 0.0 or by_x[c, 2] != 0.0:
-            for i in range(3):
-                J[count, i] = T[i, 0] * by_x[c, 0] + T[i, 1] * by_x[c, 1] + T[i, 2] * by_x[c, 2]
-            used[count] = 6 + c
-            count += 1
-    return count
 
 
-@kernel
-def _covariance_of(J: Float, used: Int, count: int, C: Float, out: Float) -> None:
-    """Write J' C J (3, 3) of the rows in use."""
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = 0.0
-    for a in range(count):
-        for b in range(count):
-            c = C[used[a], used[b]]
-            for i in range(3):
-                for j in range(3):
-                    out[i, j] += J[a, i] * c * J[b, j]
-
-
-@kernel
-def covariances(tables: HandTables, T: Float, x: Float, C: Float, cov: Float, tilt: Float) -> None:
-    """Write covariances of the joints and of the last phalanges' directions.
+@inlined
+def finger_slopes(
+    tables: HandTables,
+    by: Float,
+    T: Float,
+    R: Float,
+    P: Float,
+    f: int,
+    level: int,
+    point: Float,
+    turned: bool,
+    J: Float,
+) -> None:
+    """Write derivatives by the free angles of finger f.
 
     Args:
-        tables: The hand.
-        T: (4, 4) palm.
-        x: (n,) [rad] free angles.
-        C: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m], rig frame, and of x.
-        cov, tilt: Written: (26, 3, 3) [m^2], (5, 3, 3) [rad^2].
+        tables, by, T, R, P: The hand (`angles_of`, `chains`).
+        f, level: Finger, and joint of its chain that carries what moves.
+        point: (3,) [m] of the finger, rig frame; of what is only turned, the direction (3,).
+        turned: Whether it is a direction.
+        J: (10, 3), written from row 6 on, as many as the finger has free angles.
     """
-    n = x.shape[0]
-    angles, by = np.empty(20), np.empty((20, n))
-    R, P = np.empty((5, 4, 3, 3)), np.empty((5, 4, 3))
-    angles_of(tables, x, angles, by)
-    chains(tables, angles, R, P)
-    point, arm, by_x = np.empty(3), np.empty(3), np.empty((n, 3))
-    axes, arms = np.empty((4, 3)), np.empty((4, 3))
-    J, used = np.empty((6 + n, 3)), np.empty(6 + n, np.int64)
-    for joint in range(26):
-        f, k = tables.finger[joint], tables.level[joint]
-        for c in range(n):
-            for i in range(3):
-                by_x[c, i] = 0.0
+    count = tables.first[f + 1] - tables.first[f]
+    for c in range(count):
         for i in range(3):
-            point[i] = P[f, k, i] if f >= 0 else tables.rest_m[joint, i]
-        if f >= 0:
-            point_slopes(tables, by, f, k, point, R, P, by_x)
+            J[6 + c, i] = 0.0
+    for k in range(min(level, 2) + 2):
+        if k == 0:
+            ax = ay = az = 0.0
+            for j in range(3):
+                ax += T[0, j] * tables.abduction_axis[f, j]
+                ay += T[1, j] * tables.abduction_axis[f, j]
+                az += T[2, j] * tables.abduction_axis[f, j]
+        else:
+            ax, ay, az = -R[f, k - 1, 0, 0], -R[f, k - 1, 1, 0], -R[f, k - 1, 2, 0]
+        dx, dy, dz = point[0], point[1], point[2]
+        if not turned:
+            joint = max(k - 1, 0)
+            dx, dy, dz = dx - P[f, joint, 0], dy - P[f, joint, 1], dz - P[f, joint, 2]
+        tx, ty, tz = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+        for c in range(count):
+            share = by[4 * f + k, c]
+            if share != 0.0:
+                J[6 + c, 0] += share * tx
+                J[6 + c, 1] += share * ty
+                J[6 + c, 2] += share * tz
+
+
+@inlined
+def rotate_by(step: Float, T: Float, out: Float) -> None:
+    """Write T (4, 4) turned in front by step[:3] [rad], shifted by step[3:6] [m].
+
+    Rodrigues' formula.
+    """
+    x, y, z = step[0], step[1], step[2]
+    angle = sqrt(x * x + y * y + z * z)
+    a = sin(angle) / angle if angle > 1e-9 else 1.0
+    b = (1.0 - cos(angle)) / (angle * angle) if angle > 1e-5 else 0.5
+    r00, r01, r02 = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+    r10, r11, r12 = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+    r20, r21, r22 = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    for j in range(3):
+        u, v, w = T[0, j], T[1, j], T[2, j]
+        out[0, j] = r00 * u + r01 * v + r02 * w
+        out[1, j] = r10 * u + r11 * v + r12 * w
+        out[2, j] = r20 * u + r21 * v + r22 * w
+    for i in range(3):
+        out[i, 3] = T[i, 3] + step[3 + i]
+    for j in range(4):
+        out[3, j] = T[3, j]
+
+
+@inlined
+def turn_between(A: Float, B: Float, c: Float, out: Float) -> None:
+    """Write the rotation vector (3,) of A B' of rotations (>= 3, >= 3); `c`: (3, 3) scratch."""
+    for i in range(3):
+        for j in range(3):
+            c[i, j] = A[i, 0] * B[j, 0] + A[i, 1] * B[j, 1] + A[i, 2] * B[j, 2]
+    out[0] = 0.5 * (c[2, 1] - c[1, 2])
+    out[1] = 0.5 * (c[0, 2] - c[2, 0])
+    out[2] = 0.5 * (c[1, 0] - c[0, 1])
+    sine = sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+    cosine = 0.5 * (c[0, 0] + c[1, 1] + c[2, 2] - 1.0)
+    if sine > 1e-6:
+        scale = np.arctan2(sine, cosine) / sine
         for i in range(3):
-            arm[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2]
-        count = rig_slopes(T, arm, by_x, True, J, used)
-        _covariance_of(J, used, count, C, cov[joint])
-    for f in range(5):
-        length = 0.0
+            out[i] *= scale
+    elif cosine < 0.0:  # half a turn: about the axis whose diagonal is largest
+        k = 0
+        for i in range(1, 3):
+            if c[i, i] > c[k, k]:
+                k = i
+        length = sqrt(max(0.5 * (1.0 + c[k, k]), 1e-12))
         for i in range(3):
-            point[i] = P[f, 3, i] - P[f, 2, i]
-            length += point[i] * point[i]
-        for i in range(3):
-            point[i] /= sqrt(length)
-        axes_of(tables, f, R, axes)
-        for k in range(4):
-            for i in range(3):
-                arms[k, i] = point[i]
-        turn_slopes(by, axes, f, 3, arms, by_x)
-        for i in range(3):
-            arm[i] = T[i, 0] * point[0] + T[i, 1] * point[1] + T[i, 2] * point[2]
-        count = rig_slopes(T, arm, by_x, False, J, used)
-        _covariance_of(J, used, count, C, tilt[f])
+            out[i] = np.pi * (length if i == k else 0.25 * (c[i, k] + c[k, i]) / length)

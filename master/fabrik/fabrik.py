@@ -238,7 +238,7 @@ def _bend(chain: ChainArrays, share: float, front: float, back: float, angles: F
     clamp_angles(chain, angles)
 
 
-@inner
+@kernel
 def _attempt(
     chain: ChainArrays, goal: Vector, tolerance_m: float, max_iterations: int, angles: Float
 ) -> tuple[float, int]:

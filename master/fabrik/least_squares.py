@@ -12,7 +12,7 @@ a / (share of the range that is left at this flexion): its limits are constant, 
 import numpy as np
 
 from common.arrays import Float
-from common.kernels import inner
+from common.kernels import inner, kernel
 from master.fabrik.chain_arrays import (
     ROOT,
     START,
@@ -33,7 +33,7 @@ _LEAST_GAIN = 1e-7
 _COUPLED_RAD = 1e-12
 
 
-@inner
+@kernel
 def least_squares(chain: ChainArrays, goal: Vector, enough_m: float, max_steps: int, angles: Float) -> float:
     """Improve a finger's angles until the target is hit or no legal step helps.
 
@@ -74,7 +74,7 @@ def least_squares(chain: ChainArrays, goal: Vector, enough_m: float, max_steps: 
     return length(left)
 
 
-@inner
+@kernel
 def _evaluate(chain: ChainArrays, goal: Vector, unknowns: Float, angles: Float, columns: Float) -> Vector:
     """Clamp the unknowns, write angles and Jacobian's columns (4, 3); what is left."""
     limits = limits_of(chain, ROOT)

@@ -1,0 +1,467 @@
+"""The estimator: a hand at each epoch, predicted from the one before and fitted to what is measured."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from common.arrays import Bool, Code, Float, Int
+from common.camera_model import CameraModel
+from common.geometry import fit_rigid
+from common.hand_model import HandJoints, HandModel
+from master.estimator.cameras import CameraArrays
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.parameters import HandParameters
+from master.estimator.posterior import Blank
+from master.estimator.priors import Habits, curled, habits_of
+from master.estimator.residuals import Observations, observe_rays
+from master.estimator.settings import DEFAULT, Settings
+from master.estimator.solve import MAX_ITERATIONS, Rig
+from master.estimator.state import HandState
+from master.estimator.update import (
+    BEGIN,
+    LOST,
+    ROUGH,
+    TAKE_OVER,
+    TRACK,
+    TRACKED_ON,
+    Estimate,
+    Start,
+    Workspace,
+    epoch,
+)
+from master.fabrik.cap_views import CapTables
+from master.fabrik.estimate import SolvedHand
+from master.ik.attached import Attached
+
+_BENDS_RAD = (0.1, 0.7, 1.3)  # of the PIP, from which a search afresh begins: open to closed
+_MCP_PER_PIP = 0.6
+_ABOVE_M, _ABOVE_WEIGHT, _PALM_WEIGHT = 0.05, 0.3, 3.0
+_PALM_BY = 3
+_STEP = 16
+_SPREAD_M = 5e-3  # markers nearer than this to one line do not turn a hand about it
+_LENGTH_M = 20e-3  # a line shorter than this has no direction
+_ACROSS = 0.9  # cosine to the sight, at most
+_SOMEWHERE_M = 0.1  # about each axis: a hand that is known no better than this is lost
+ON_MARKERS, ON_OTHERS, BY_MARKERS = 1, 2, 16
+_FIRST_MARKER = 8  # bit
+_EYE = np.eye(3)
+_NO_T, _NONE = np.eye(4), frozenset[int]()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch:
+    """What is measured at one time.
+
+    Attributes:
+        t_ns: When.
+        uv: (C, A, 2) [px] centroids of all markers of the rig; NaN: not seen, or gated out.
+        variance_px2: (C, A) of each camera's own errors.
+        own_m2: (A, 3, 3) of what is wrong with each marker itself.
+        points_m: (A, 3) where rays place the markers; NaN: they do not.
+        facing: (3,) unit vector from the hand to the cameras that see its back.
+        sensed: What other sensors say of the palm's turn and of angles; None: nothing.
+        start: Another hand of this epoch; None: there is none.
+    """
+
+    t_ns: int
+    uv: Float
+    variance_px2: Float
+    own_m2: Float
+    points_m: Float
+    facing: Float
+    sensed: "Sensed | None"
+    start: SolvedHand | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sensed:
+    """What other sensors say of the palm's turn and the free angles, as normal equations.
+
+    Attributes:
+        rotation: (3, 3) palm -> rig about which turns count; None: only angles are known.
+        sure: Whether it says about every axis how the palm lies.
+        information, pull, constant: (3 + n, 3 + n), (3 + n,) and a number, of turn and free angles.
+        told: (5,) fingers that are told, and `level` (5,) from what (`Level`).
+        angles: (n,) the angles of those, where a search may begin.
+    """
+
+    rotation: Float | None
+    sure: bool
+    information: Float
+    pull: Float
+    constant: float
+    told: Bool
+    level: Code
+    angles: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FittedHand(SolvedHand):
+    """A hand fitted by the estimator.
+
+    Attributes:
+        alone: (6 + n, 6 + n) covariance of the palm's turn [rad] and shift [m] and of the free angles [rad], by this
+            instant alone.
+        x: (n,) free angles.
+        scale: By how much the misfit of the instant has scaled `alone`.
+        natural: Probability that the hand obeys habits.
+        surprise: (M,) chi square of each marker.
+        steps: Of the search.
+    """
+
+    alone: Float
+    x: Float
+    scale: float
+    natural: float
+    surprise: Float
+    steps: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """What the estimator says at an epoch.
+
+    Attributes:
+        hand: None: nothing is known of it.
+        valid, tracked, source: (26,) as of `HandPose`.
+        rests: (6,) what thumb ... little and the palm rest on now; 0: on nothing. Equal numbers are equal grounds: for
+            a finger the sum of `ON_MARKERS`, `BY_MARKERS` where its own is placed, and `ON_OTHERS` by its level; for
+            the palm one of the former and which markers are seen.
+        anew: The hand of a moment ago was wrong: nothing of it is in this one.
+    """
+
+    hand: FittedHand | None
+    valid: Bool
+    tracked: Bool
+    source: Code
+    rests: Int
+    anew: bool
+
+
+class Estimator:
+    """Push machine. Holds the state of one hand (`HandState`), and tables."""
+
+    def __init__(
+        self,
+        cameras: Sequence[CameraModel],
+        model: HandModel,
+        markers: tuple[str, ...],
+        hand_markers: tuple[str, ...],
+        caps: CapTables,
+        *,
+        continuous: bool = True,
+        settings: Settings = DEFAULT,
+    ) -> None:
+        """Prepare.
+
+        Args:
+            cameras: In the rig's order.
+            model: The hand.
+            markers: Names in the order of every marker array.
+            hand_markers: Those of them that are on this hand.
+            caps: Of the hand's markers, in that order.
+            continuous: False: every epoch is an unrelated pose, nothing is remembered.
+            settings: Every number that tunes it.
+
+        Raises:
+            CalibrationError: The profile mounts no marker of one of the names.
+        """
+        self.model, self.settings, self._continuous = model, settings, continuous
+        self.parameters = HandParameters.of(model)
+        self._on_hand = np.array([markers.index(name) for name in hand_markers], np.int64)
+        mounts = Mounts.of(model, hand_markers)
+        self._rig = Rig(HandTables.of(model, self.parameters), mounts, CameraArrays.of(cameras), caps)
+        n, count = len(self.parameters.free), len(hand_markers)
+        self._observed = Observations.empty(len(cameras), count)
+        self._space = Workspace.empty(n, _capacity(count))
+        self._blank = Blank.of(n, len(cameras), count)
+        self.state = HandState.unknown(n)
+        self._habits = {_NONE: habits_of(model, self.parameters, settings)}
+        self._finger = mounts.finger
+        self._on_palm = np.array([model.mount(name).joint is None for name in hand_markers])
+        self._carries = self._finger == np.arange(5)[:, None]  # (5, M)
+        bent = np.zeros((len(_BENDS_RAD), 5, 4))
+        bent[:, 1:, 1:3] = np.multiply.outer(_BENDS_RAD, (_MCP_PER_PIP, 1.0))[:, None]
+        self._postures = np.array([self.parameters.of_angles(angles) for angles in bent])
+        self._natural = self._likeliest()
+        self._attached = Attached.markers(model, self.parameters, hand_markers)
+        self._bit = 1 << np.arange(_FIRST_MARKER, _FIRST_MARKER + count)
+        self._finger_of_free = self.parameters.free // 4
+        self._turn: Float | None = None
+        self._out, self._numbers = Estimate.empty(), settings.record()
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a hand to go on from."""
+        return bool(self.state.known[0])
+
+    def recent(self, t_ns: int) -> bool:
+        """Whether the state still says anything at `t_ns`."""
+        age_s = (t_ns - int(self.state.t_ns[0])) * 1e-9
+        return self._continuous and self.known and 0.0 < age_s <= self.settings.forget_s
+
+    def push(self, at: Epoch) -> Fitted:
+        """Fit one epoch."""
+        observed, sensed = self._observed, at.sensed
+        count = observe_rays(at.uv, at.variance_px2, at.own_m2, self._on_hand, observed)
+        seen, rays = observed.seen, (observed.weight > 0.0).sum(axis=0)
+        back = bool((seen & self._on_palm).any())
+        sure = sensed is not None and sensed.sure
+        shown = (self._carries & seen).any(axis=1)
+        numbers = 3.0 * int((rays > 1).sum()) + 2.0 * int((rays == 1).sum()) + (2.0 if back else 0.0)
+        if sensed is not None:
+            shown |= sensed.told
+            numbers += 3.0 * int(sensed.told.sum())
+        by_markers = count >= _PALM_BY or (count == _PALM_BY - 1 and back)
+        palm_shown = by_markers or (sure and count > 0)
+        now = _Now(at, shown, palm_shown, numbers, self._enough(at, back, sure))
+        known = self.recent(at.t_ns)
+        self._believe(at, back, rays, known=known)
+        out = Estimate.empty()
+        solved, anew = known and self._track(now, out), False
+        if not solved and now.enough:
+            self._begin(now)
+            self._epoch(
+                TAKE_OVER, now, self._habits_of(_NONE), Start(_NO_T, self._natural, False, False), _EYE, out
+            )
+            solved, anew = True, known
+        self._turn = None if sensed is None else sensed.rotation
+        if count > 0 or (sensed is not None and bool(sensed.told.any()) and self._knows_place()):
+            self.state.seen_ns[0] = at.t_ns
+        rests = self._rests(now, rays, by_markers=by_markers)
+        return self._fitted(at.t_ns, out, rests, anew=anew) if solved else _unknown(rests)
+
+    def _track(self, now: "_Now", out: Estimate) -> bool:
+        """Go on from the state; False: another hand of this epoch takes its place, or there is none."""
+        start, may_leave = now.epoch.start, now.enough
+        T, x = _NO_T, self._natural
+        if start is not None:
+            T, x = start.T_rig_palm, self.parameters.of_angles(start.angles_rad)
+        turned, then = _EYE, self._turn
+        if now.epoch.sensed is not None and now.epoch.sensed.rotation is not None and then is not None:
+            turned = now.epoch.sensed.rotation @ then.T
+        while True:
+            other = Start(T, x, start is not None, may_leave)
+            said = self._epoch(TRACK, now, self._habits_of(_NONE), other, turned, out)
+            if said == TRACKED_ON:
+                return True
+            if said == LOST:
+                return False
+            wrong = float(self._space.found.wrong[0])
+            if wrong > self.settings.misled + self._begin(now):
+                return False
+            may_leave = False  # nothing is better: keep what was found
+
+    def _begin(self, now: "_Now") -> float:
+        """Fit without the state, from the other hand or from several starts; return chi square of the markers.
+
+        A finger between two that show is rather bent as they are: no hand curls it alone. But straight it would show.
+        """
+        shown = frozenset(np.flatnonzero(now.shown).tolist())
+        like = frozenset(f for f in (2, 3) if f not in shown and {f - 1, f + 1} <= shown)
+        chi2 = self._begin_with(now, shown, like)
+        angles = self.parameters.angles(self._space.found.x)
+        straight = frozenset(f for f in like if angles[f, 1:].sum() < self.settings.shows_rad)
+        return self._begin_with(now, shown, like - straight) if straight else chi2
+
+    def _begin_with(self, now: "_Now", shown: frozenset[int], like: frozenset[int]) -> float:
+        """As `_begin`, while the hidden fingers of `like` are bent as their neighbours."""
+        apart, belief, found = frozenset(range(5)) - shown - like, self._space.belief, self._space.found
+        fingers = np.isin(np.arange(5), list(apart))
+        belief.own_w2[:], belief.own[:] = curled(self.parameters, self.settings, fingers)
+        habits = self._habits_of(apart)
+        start = now.epoch.start
+        try:
+            if start is not None:
+                shows = now.shown[self._finger_of_free]
+                x = np.where(shows, self.parameters.of_angles(start.angles_rad), self._natural)
+                chi2 = self._fit(now, habits, start.T_rig_palm, self._as_sensed(x, now.epoch.sensed))
+                if (
+                    found.steps[0] < MAX_ITERATIONS
+                    and not (found.surprise[: len(self._on_hand)] > self.settings.explained).any()
+                ):
+                    return chi2
+            best, cost = None, np.inf
+            for T, x in self._starts(now):
+                here = self._epoch(ROUGH, now, habits, Start(T, x, True, False), _EYE, self._out)
+                if here < cost:
+                    best, cost = (T, x), here
+            assert best is not None
+            return self._fit(now, habits, *best)
+        finally:
+            belief.own_w2[:] = 0.0
+
+    def _fit(self, now: "_Now", habits: Habits, T: Float, x: Float) -> float:
+        return self._epoch(
+            BEGIN, now, habits, Start(np.ascontiguousarray(T), x, True, False), _EYE, self._out
+        )
+
+    def _epoch(
+        self, what: int, now: "_Now", habits: Habits, start: Start, turned: Float, out: Estimate
+    ) -> float:
+        """The kernel, with all that is the same."""
+        return epoch(
+            what,
+            self._rig,
+            self._numbers,
+            habits,
+            self.state,
+            now.epoch.t_ns,
+            self._observed,
+            now.shown,
+            now.palm_shown,
+            now.numbers,
+            turned,
+            start,
+            self._blank,
+            self._space,
+            out,
+        )
+
+    def _starts(self, now: "_Now") -> list[tuple[Float, Float]]:
+        """Three hands, open to closed, each laid on the markers as a rigid body."""
+        epoch, sensed = now.epoch, now.epoch.sensed
+        placed = np.isfinite(epoch.points_m[self._on_hand, 0])
+        weight = np.where(self._finger[placed] >= 0, 1.0, _PALM_WEIGHT)
+        observed = epoch.points_m[self._on_hand][placed]
+        starts: list[tuple[Float, Float]] = []
+        for posture in self._postures:
+            x = self._as_sensed(posture.copy(), sensed)
+            expected = self._attached.place(self.model.chains(self.parameters.angles(x)))[placed]
+            if sensed is not None and sensed.sure and sensed.rotation is not None:
+                T = np.eye(4)
+                T[:3, :3] = sensed.rotation
+                T[:3, 3] = np.average(observed - expected @ sensed.rotation.T, axis=0, weights=weight)
+            elif self._space.belief.facing_w2[0] > 0.0:
+                # A point above the wrist stands for "the back of the hand faces the cameras".
+                above = expected.mean(axis=0) + np.array([0.0, _ABOVE_M, 0.0])
+                towards = observed.mean(axis=0) + _ABOVE_M * epoch.facing
+                T = fit_rigid(
+                    np.vstack([observed, towards]),
+                    np.vstack([expected, above]),
+                    np.append(weight, _ABOVE_WEIGHT),
+                )
+            else:
+                T = fit_rigid(observed, expected, weight)
+            starts.append((np.ascontiguousarray(T), x))
+        return starts
+
+    def _as_sensed(self, x: Float, sensed: "Sensed | None") -> Float:
+        """Free angles (n,) with those of fingers that another sensor tells."""
+        if sensed is None or not sensed.told.any():
+            return x
+        return np.where(sensed.told[self._finger_of_free], sensed.angles, x)
+
+    def _believe(self, epoch: Epoch, back: bool, rays: Int, *, known: bool) -> None:
+        """Write what is believed beside the past and habits."""
+        belief, sensed = self._space.belief, epoch.sensed
+        belief.facing[:] = epoch.facing
+        belief.facing_w2[0] = self.settings.facing_rad**-2.0 if back else 0.0
+        belief.depth_w2[0] = 0.0
+        if known and rays.max() == 1:
+            alone = self._rig.cameras.centre[(self._observed.weight > 0.0).sum(axis=1).argmax()]
+            sight = self.state.T[:3, 3] - alone
+            belief.sight[:] = sight / np.sqrt(sight @ sight)
+            belief.depth_w2[0] = self.settings.held_depth_m**-2.0
+        belief.sensed_known[0] = 0.0 if sensed is None else 1.0
+        if sensed is not None:
+            belief.turn[:] = _EYE if sensed.rotation is None else sensed.rotation
+            belief.sensed[:], belief.sensed_pull[:] = sensed.information, sensed.pull
+            belief.sensed_constant[0] = sensed.constant
+
+    def _enough(self, epoch: Epoch, back: bool, sure: bool) -> bool:
+        """Whether the markers fix a hand: not all in one line, or in a line across `facing`.
+
+        What faces the cameras turns the hand about a line of markers, but not about one that points at them. With an
+        orientation that is known any one marker is enough.
+        """
+        points = epoch.points_m[self._on_hand]
+        points = points[np.isfinite(points[:, 0])]
+        if sure:
+            return len(points) > 0
+        if len(points) < 2:
+            return False
+        _, extent, axes = np.linalg.svd(points - points.mean(axis=0))
+        if len(points) > 2 and extent[1] > _SPREAD_M:
+            return True
+        return back and bool(extent[0] > _LENGTH_M and abs(axes[0] @ epoch.facing) < _ACROSS)
+
+    def _knows_place(self) -> bool:
+        """Whether it is still known where the hand is, when nothing but its fingers is told."""
+        return self.known and float(np.trace(self.state.cov[3:6, 3:6])) < 3.0 * _SOMEWHERE_M**2
+
+    def _habits_of(self, unlike: frozenset[int]) -> Habits:
+        """Habits while some fingers are bent unlike the others; each of the 32 sets is worked out once."""
+        if unlike not in self._habits:
+            self._habits[unlike] = habits_of(self.model, self.parameters, self.settings, unlike)
+        return self._habits[unlike]
+
+    def _likeliest(self) -> Float:
+        """Free angles (n,) of the natural hand."""
+        habits = self._habits_of(_NONE)
+        x = np.linalg.solve(habits.normal[0], habits.pull[0])
+        return np.minimum(np.maximum(x, self.parameters.low), self.parameters.high)
+
+    def _rests(self, now: "_Now", rays: Int, *, by_markers: bool) -> Int:
+        """What thumb ... little and the palm rest on now (6,), as of `Fitted`."""
+        seen, sensed = self._observed.seen, now.epoch.sensed
+        rests = np.zeros(6, np.int64)
+        rests[:5] = ON_MARKERS * (self._carries & seen).any(axis=1)
+        rests[:5] += BY_MARKERS * (self._carries & (rays > 1)).any(axis=1)
+        if sensed is not None:
+            rests[:5] += ON_OTHERS * np.where(sensed.told, sensed.level, 0)
+        if now.palm_shown:
+            rests[5] = (ON_MARKERS | BY_MARKERS) if by_markers else ON_OTHERS
+            rests[5] += int(seen @ self._bit)
+        return rests
+
+    def _fitted(self, t_ns: int, out: Estimate, rests: Int, *, anew: bool) -> Fitted:
+        found, recent = (
+            self._space.found,
+            (t_ns - int(self.state.seen_ns[0])) * 1e-9 <= self.settings.forget_s,
+        )
+        hand = FittedHand(
+            T_rig_palm=out.T,
+            angles_rad=out.angles.reshape(5, 4),
+            joints=HandJoints(out.position, out.rotation, out.T),
+            cov_m2=out.cov,
+            tilt_cov_rad2=out.tilt,
+            tilt_walk_rad2_s2=np.zeros((5, 3, 3)),
+            alone=found.cov.copy(),
+            x=found.x.copy(),
+            scale=float(found.scale[0]),
+            natural=float(found.natural[0]),
+            surprise=found.surprise[: len(self._on_hand)].copy(),
+            steps=int(found.steps[0]),
+        )
+        return Fitted(
+            hand,
+            np.full(26, recent),
+            out.tracked.astype(np.bool_) & recent,
+            out.source,
+            rests,
+            anew,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Now:
+    """An epoch, and what is measured at it: fingers (5,), the palm, how many numbers, and enough for a hand alone."""
+
+    epoch: Epoch
+    shown: Bool
+    palm_shown: bool
+    numbers: float
+    enough: bool
+
+
+def _unknown(rests: Int) -> Fitted:
+    """No hand."""
+    none = np.zeros(26, np.bool_)
+    return Fitted(None, none, none.copy(), np.zeros(26, np.uint8), rests, False)
+
+
+def _capacity(markers: int) -> int:
+    """Room for so many markers, in steps, so that kernels are compiled once for most rigs."""
+    return -(-markers // _STEP) * _STEP

@@ -1,0 +1,127 @@
+"""Kernels for symmetric matrices of one hand's size."""
+
+from math import log, sqrt
+
+from common.arrays import Float
+from common.kernels import inlined, inner
+
+
+@inner
+def cholesky(A: Float, n: int, L: Float) -> bool:
+    """Write the factor L of A = L L' (n, n), lower triangle; False: not positive definite."""
+    for j in range(n):
+        total = A[j, j]
+        for k in range(j):
+            total -= L[j, k] * L[j, k]
+        if not total > 0.0:
+            return False
+        L[j, j] = sqrt(total)
+        scale = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            total = A[i, j]
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            L[i, j] = total * scale
+    return True
+
+
+@inner
+def substitute(L: Float, n: int, b: Float) -> None:
+    """Solve L L' x = b (n,), in place."""
+    for i in range(n):
+        total = b[i]
+        for k in range(i):
+            total -= L[i, k] * b[k]
+        b[i] = total / L[i, i]
+    for i in range(n - 1, -1, -1):
+        total = b[i]
+        for k in range(i + 1, n):
+            total -= L[k, i] * b[k]
+        b[i] = total / L[i, i]
+
+
+@inner
+def inverse(L: Float, n: int, work: Float, out: Float) -> None:
+    """Write the inverse (n, n) of L L'; `work`: (n, n)."""
+    for j in range(n):
+        work[j, j] = 1.0 / L[j, j]
+        for i in range(j + 1, n):
+            total = 0.0
+            for k in range(j, i):
+                total += L[i, k] * work[k, j]
+            work[i, j] = -total / L[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(i, n):
+                total += work[k, i] * work[k, j]
+            out[i, j] = total
+            out[j, i] = total
+
+
+@inner
+def half_log_determinant(L: Float, n: int) -> float:
+    """Half the logarithm of the determinant of L L'."""
+    total = 0.0
+    for i in range(n):
+        total += log(L[i, i])
+    return total
+
+
+@inlined
+def copy(A: Float, out: Float) -> None:
+    """Copy a matrix; faster to compile than a slice."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            out[i, j] = A[i, j]
+
+
+@inlined
+def inverse_3(A: Float, B: Float, out: Float) -> None:
+    """Write the inverse (3, 3) of symmetric A + B, by cofactors."""
+    a, b, c = A[0, 0] + B[0, 0], A[1, 0] + B[1, 0], A[2, 0] + B[2, 0]
+    d, e, f = A[1, 1] + B[1, 1], A[2, 1] + B[2, 1], A[2, 2] + B[2, 2]
+    p, q, r = d * f - e * e, c * e - b * f, b * e - c * d
+    s = 1.0 / (a * p + b * q + c * r)
+    out[0, 0], out[0, 1], out[0, 2] = p * s, q * s, r * s
+    out[1, 0], out[1, 1], out[1, 2] = q * s, (a * f - c * c) * s, (b * c - a * e) * s
+    out[2, 0], out[2, 1], out[2, 2] = r * s, (b * c - a * e) * s, (a * d - b * b) * s
+
+
+@inner
+def eigen(A: Float, n: int, values: Float, vectors: Float) -> None:
+    """Write eigenvalues (n,) and eigenvectors, as columns (n, n), of a symmetric matrix, which is destroyed.
+
+    Jacobi's cyclic rotations (Golub, Van Loan, "Matrix Computations", 8.5).
+    """
+    for i in range(n):
+        for j in range(n):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off, diagonal = 0.0, 0.0
+        for i in range(n):
+            diagonal += A[i, i] * A[i, i]
+            for j in range(i):
+                off += A[i, j] * A[i, j]
+        if not off > 1e-22 * diagonal:
+            break
+        for p in range(n - 1):
+            for q in range(p + 1, n):
+                if abs(A[p, q]) <= 1e-14 * sqrt(abs(A[p, p] * A[q, q])):
+                    continue
+                theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
+                t = 1.0 / (abs(theta) + sqrt(theta * theta + 1.0))
+                t = -t if theta < 0.0 else t
+                c = 1.0 / sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(n):
+                    akp, akq = A[k, p], A[k, q]
+                    A[k, p], A[k, q] = c * akp - s * akq, s * akp + c * akq
+                for k in range(n):
+                    apk, aqk = A[p, k], A[q, k]
+                    A[p, k], A[q, k] = c * apk - s * aqk, s * apk + c * aqk
+                for k in range(n):
+                    vkp, vkq = vectors[k, p], vectors[k, q]
+                    vectors[k, p], vectors[k, q] = c * vkp - s * vkq, s * vkp + c * vkq
+    for i in range(n):
+        values[i] = A[i, i]

@@ -1,0 +1,432 @@
+"""Kernels of what an epoch says: both hypotheses, their evidence, mean and covariance.
+
+The evidence of a hypothesis is the density of the markers under it, by Laplace's approximation
+
+    log p = -cost + log density of the habits - log det(normal) / 2
+
+at its solution (MacKay 1992, "Bayesian interpolation", section 4). Whether a hand obeys habits does not change from
+frame to frame, while the evidence of one is noise in part: its logarithm is smoothed in time. Mean and covariance are
+those of the mixture: the spread between solutions is uncertainty as well. Of a free hand the mean within its limits is
+taken, of a natural one the likeliest pose (`master.estimator.truncated`).
+
+The covariance is that of this instant alone. To the fit the state before is a prior, as wide as a hand moves meanwhile.
+That holds it steady, but it is no second witness: the same habits led to it from the same markers, so a wrong direction
+of a finger is as wrong in every frame of a held pose. What is left are rows and habits. Habits hold better of some
+postures than of others: a pointing hand defies them. By how much, the misfit of the instant itself tells, which scales
+the covariance (Birge 1932), with the claimed widths as one observation more (a prior of unit information: Kass,
+Wasserman 1995):
+
+    covariance = s^2 normal^-1,   s^2 = max(1, (1 + chi^2) / (1 + f)),   f = numbers that are measured - 6
+
+A good fit makes nothing surer than it was claimed. Beliefs that contradict each other, whatever the markers, say
+nothing of the instant: their least cost is no part of chi^2.
+"""
+
+from math import exp, log
+from typing import NamedTuple
+
+import numpy as np
+
+from common.arrays import Float
+from common.kernels import inlined, inner, record
+from master.estimator.kinematics import markers_of, rotate_by, turn_between
+from master.estimator.matrices import cholesky, copy, half_log_determinant, inverse, substitute
+from master.estimator.priors import Habits
+from master.estimator.residuals import Observations
+from master.estimator.settings import Settings
+from master.estimator.solve import Belief, Rig, Search, descend, linearise, own_cost, past_cost
+from master.estimator.truncated import Cut, mean_within
+
+_LITTLE = 1e-4  # of a step: what a difference is taken over
+
+
+class Posterior:
+    """A hand by one epoch.
+
+    Attributes:
+        T, x: (4, 4) palm, (n,) free angles.
+        cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad], by this instant alone.
+        surprise: (M,) chi square of each marker.
+        cost: (1,) half the sum of squares, of the likelier hypothesis.
+        steps: (1,) of the search.
+        natural: (1,) probability that the hand obeys habits.
+        scale: (1,) by how much the misfit has scaled the covariance.
+        wrong: (1,) chi square of the markers, where another hand explains them better.
+    """
+
+    T: Float
+    x: Float
+    cov: Float
+    surprise: Float
+    cost: Float
+    steps: Float
+    natural: Float
+    scale: Float
+    wrong: Float
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Posterior":
+        """Room for one."""
+        N = 6 + n
+        return record(
+            cls,
+            T=(4, 4),
+            x=n,
+            cov=(N, N),
+            surprise=markers,
+            cost=1,
+            steps=1,
+            natural=1,
+            scale=1,
+            wrong=1,
+        )
+
+
+class Blank(NamedTuple):
+    """Of which nothing is believed: what `_onto` needs for a fit to points alone."""
+
+    habits: Habits
+    belief: Belief
+    between: Observations
+
+    @classmethod
+    def of(cls, n: int, cameras: int, markers: int) -> "Blank":
+        """For a hand with n free angles."""
+        nothing = Habits(np.zeros((1, n, n)), np.zeros((1, n)), np.zeros(1), np.zeros(1))
+        return cls(nothing, Belief.none(n), Observations.empty(cameras, markers))
+
+
+class Room:
+    """Room for two hypotheses of N = 6 + n unknowns and M markers."""
+
+    start_T: Float  # (4, 4)
+    start_x: Float  # (n,)
+    T: Float  # (2, 4, 4)
+    x: Float  # (2, n)
+    gradient: Float  # (2, N)
+    normal: Float  # (2, N, N)
+    surprise: Float  # (2, M)
+    information: Float  # (2, M, 3, 3)
+    cost: Float  # (2,)
+    apart: Float  # (2,)
+    share: Float  # (2,)
+    off: Float  # (2, N)
+    step: Float  # (2, N)
+    mean: Float  # (N,)
+    A: Float  # (N, N)
+    L: Float  # (N, N)
+    work: Float  # (N, N)
+    cov: Float  # (N, N)
+    here: Float  # (M, 3)
+    there: Float  # (M, 3)
+    cut: Cut
+    search: Search
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Room":
+        """Allocate it."""
+        N, M = 6 + n, markers
+        return record(
+            cls,
+            start_T=(4, 4),
+            start_x=n,
+            T=(2, 4, 4),
+            x=(2, n),
+            gradient=(2, N),
+            normal=(2, N, N),
+            surprise=(2, M),
+            information=(2, M, 3, 3),
+            cost=2,
+            apart=2,
+            share=2,
+            off=(2, N),
+            step=(2, N),
+            mean=N,
+            A=(N, N),
+            L=(N, N),
+            work=(N, N),
+            cov=(N, N),
+            here=(M, 3),
+            there=(M, 3),
+            cut=Cut.empty(n),
+            search=Search.empty(n, markers),
+        )
+
+
+@inner
+def _solve_each(
+    rig: Rig,
+    settings: Settings,
+    habits: Habits,
+    belief: Belief,
+    observed: Observations,
+    T: Float,
+    x: Float,
+    room: Room,
+) -> int:
+    """Search under each hypothesis from one start; return the steps of the first."""
+    steps = 0
+    for h in range(habits.constant.shape[0]):
+        T_h, x_h, gradient, normal = room.T[h], room.x[h], room.gradient[h], room.normal[h]
+        copy(T, T_h)
+        for i in range(x.shape[0]):
+            x_h[i] = x[i]
+        _, taken = descend(
+            rig,
+            habits,
+            belief,
+            observed,
+            h,
+            settings.tolerance,
+            settings.tolerance_share,
+            T_h,
+            x_h,
+            gradient,
+            normal,
+            room.search,
+        )
+        room.cost[h] = linearise(rig, habits, belief, observed, h, T_h, x_h, gradient, normal, room.search)
+        room.apart[h] = room.search.apart[0]
+        for m in range(rig.mounts.finger.shape[0]):
+            room.surprise[h, m] = room.search.surprise[m]
+            for i in range(3):
+                for j in range(3):
+                    room.information[h, m, i, j] = room.search.information[m, i, j]
+        steps = taken if h == 0 else steps
+    return steps
+
+
+@inner
+def _weigh(habits: Habits, settings: Settings, natural: float, counts: float, room: Room) -> None:
+    """Write the probability of each hypothesis, from its evidence and what it was before.
+
+    `natural` is the probability of a natural hand a moment ago, `counts` what that counts, 0 ... 1.
+    """
+    N = room.mean.shape[0]
+    room.share[0], room.share[1] = 1.0, 0.0
+    if habits.constant.shape[0] < 2:
+        return
+    odds = 0.0
+    for h in range(2):
+        known = half_log_determinant(room.L, N) if cholesky(room.normal[h], N, room.L) else 0.0
+        odds += (1.0 - 2.0 * h) * (habits.log_density[h] - room.cost[h] - known)
+    odds = min(max(odds, -settings.certain), settings.certain)
+    then = log(max(natural, 1e-9)) - log(max(1.0 - natural, 1e-9))
+    odds += counts * (min(max(then, -settings.certain), settings.certain) - odds)
+    room.share[0] = 1.0 / (1.0 + exp(-odds))
+    room.share[1] = 1.0 - room.share[0]
+
+
+@inner
+def _least(habits: Habits, belief: Belief, h: int, room: Room) -> float:
+    """The least that habits and beliefs about single angles of this instant cost: what they contradict each other."""
+    n = belief.own.shape[0]
+    x = room.cut.weight
+    for i in range(n):
+        for j in range(n):
+            room.work[i, j] = habits.normal[h, i, j]
+        room.work[i, i] += belief.own_w2[i]
+        x[i] = habits.pull[h, i] + belief.own_w2[i] * belief.own[i]
+    if not cholesky(room.work, n, room.L):
+        return 0.0
+    substitute(room.L, n, x)
+    return own_cost(habits, belief, h, x)
+
+
+@inner
+def _covariance(
+    rig: Rig, settings: Settings, habits: Habits, belief: Belief, h: int, numbers: float, room: Room
+) -> float:
+    """Write the covariance (N, N) of one hypothesis by this instant alone; return its scale."""
+    N, A = room.mean.shape[0], room.A
+    for i in range(N):
+        for j in range(i + 1):
+            A[i, j] = room.normal[h, i, j]
+        A[i, i] += rig.hand.anywhere[i] - (belief.palm_w2[i] if i < 6 else belief.past_w2[i - 6])
+    for i in range(3):
+        for j in range(i + 1):
+            A[3 + i, 3 + j] -= belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
+    if not cholesky(A, N, room.L):  # by rounding: nothing is known but limits
+        for i in range(N):
+            for j in range(N):
+                room.cov[i, j] = 1.0 / rig.hand.anywhere[i] if i == j else 0.0
+        return 1.0
+    inverse(room.L, N, room.work, room.cov)
+    past = past_cost(belief, room.T[h], room.x[h], room.search.off)
+    chi2 = 2.0 * (room.cost[h] - past - room.apart[h] - _least(habits, belief, h, room))
+    free = max(numbers - 6.0, 0.0)
+    scale = max((settings.claimed + max(chi2, 0.0)) / (settings.claimed + free), 1.0)
+    for i in range(N):
+        for j in range(N):
+            room.cov[i, j] *= scale
+    return scale
+
+
+@inner
+def _mix(
+    rig: Rig,
+    settings: Settings,
+    habits: Habits,
+    belief: Belief,
+    numbers: float,
+    room: Room,
+    out: Posterior,
+) -> int:
+    """Write mean step and covariance of the hypotheses together; return the likelier one."""
+    n, N = room.x.shape[1], room.mean.shape[0]
+    best = 0 if room.share[0] >= room.share[1] else 1
+    if room.share[best] > 1.0 - settings.negligible:
+        room.share[best], room.share[1 - best] = 1.0, 0.0
+    out.scale[0] = 0.0
+    for i in range(N):
+        room.mean[i] = 0.0
+        for j in range(N):
+            out.cov[i, j] = 0.0
+    for h in range(habits.constant.shape[0]):
+        share = room.share[h]
+        for i in range(N):
+            room.off[h, i] = room.step[h, i] = 0.0
+        if share == 0.0:
+            continue
+        if h != best:
+            turn_between(room.T[h], room.T[best], room.search.J, room.off[h])
+            for i in range(3):
+                room.off[h, 3 + i] = room.T[h, i, 3] - room.T[best, i, 3]
+            for i in range(n):
+                room.off[h, 6 + i] = room.x[h, i] - room.x[best, i]
+        out.scale[0] += share * _covariance(rig, settings, habits, belief, h, numbers, room)
+        for i in range(N):
+            for j in range(N):
+                out.cov[i, j] += share * room.cov[i, j]
+        if h > 0 and share > settings.noticed:
+            mean_within(rig.hand, room.normal[h], room.gradient[h], room.x[h], room.cut, room.step[h])
+        for i in range(N):
+            room.off[h, i] += room.step[h, i]
+            room.mean[i] += share * room.off[h, i]
+    for h in range(habits.constant.shape[0]):
+        for i in range(N):
+            for j in range(N):
+                between = (room.off[h, i] - room.mean[i]) * (room.off[h, j] - room.mean[j])
+                out.cov[i, j] += room.share[h] * between
+    return best
+
+
+@inlined
+def _ends(rig: Rig, h: int, room: Room) -> None:
+    """Write where the step of a hypothesis brings the markers, to room.here (M, 3), as if on straight lines."""
+    markers_of(rig.hand, rig.mounts, room.T[h], room.x[h], room.search.rows, room.here)
+    moves = False
+    for i in range(room.mean.shape[0]):
+        room.search.step[i] = _LITTLE * room.step[h, i]
+        moves = moves or room.step[h, i] != 0.0
+    if not moves:
+        return
+    rotate_by(room.search.step, room.T[h], room.search.T)
+    for i in range(room.x.shape[1]):
+        room.search.x[i] = room.x[h, i] + room.search.step[6 + i]
+    markers_of(rig.hand, rig.mounts, room.search.T, room.search.x, room.search.rows, room.there)
+    for m in range(rig.mounts.finger.shape[0]):
+        for i in range(3):
+            room.here[m, i] += (room.there[m, i] - room.here[m, i]) / _LITTLE
+
+
+@inner
+def _onto(
+    rig: Rig,
+    settings: Settings,
+    observed: Observations,
+    blank: Blank,
+    best: int,
+    room: Room,
+    out: Posterior,
+) -> None:
+    """Move the likelier hand by the mean step, then to where the mean of the markers is.
+
+    What is between two hands that explain the markers does so a little worse, since fingers move on arcs. So it is one
+    step, the shortest by the normal matrix, to where the mean of their markers is.
+    """
+    n, N, between = room.x.shape[1], room.mean.shape[0], blank.between
+    for m in range(rig.mounts.finger.shape[0]):
+        between.seen[m] = between.placed[m] = observed.seen[m]
+        for i in range(3):
+            between.point[m, i] = 0.0
+            for j in range(3):
+                between.information[m, i, j] = room.information[best, m, i, j]
+    for h in range(2):
+        if room.share[h] > 0.0:
+            _ends(rig, h, room)
+            for m in range(rig.mounts.finger.shape[0]):
+                for i in range(3):
+                    between.point[m, i] += room.share[h] * room.here[m, i]
+    search = room.search
+    rotate_by(room.mean, room.T[best], out.T)
+    for i in range(n):
+        out.x[i] = room.x[best, i] + room.mean[6 + i]
+    linearise(
+        rig,
+        blank.habits,
+        blank.belief,
+        between,
+        0,
+        out.T,
+        out.x,
+        search.gradient,
+        search.normal,
+        search,
+    )
+    for i in range(N):
+        search.step[i] = -search.gradient[i]
+        for j in range(i + 1):
+            room.A[i, j] = search.normal[i, j] + settings.stiff * room.normal[best, i, j]
+    if cholesky(room.A, N, room.L):
+        substitute(room.L, N, search.step)
+        copy(out.T, search.T)
+        rotate_by(search.step, search.T, out.T)
+        for i in range(n):
+            out.x[i] += search.step[6 + i]
+    for i in range(n):
+        out.x[i] = min(max(out.x[i], rig.hand.low[i]), rig.hand.high[i])
+
+
+@inner
+def posterior(
+    rig: Rig,
+    settings: Settings,
+    habits: Habits,
+    belief: Belief,
+    observed: Observations,
+    T: Float,
+    x: Float,
+    natural: float,
+    counts: float,
+    numbers: float,
+    blank: Blank,
+    room: Room,
+    out: Posterior,
+) -> None:
+    """Fit one epoch from a start.
+
+    Args:
+        rig, settings, habits, belief, observed: What is known.
+        T, x: (4, 4), (n,) where both searches begin.
+        natural, counts: Probability of a natural hand a moment ago, and what that counts, 0 ... 1.
+        numbers: How many numbers are measured.
+        blank, room: Room.
+        out: Written.
+    """
+    out.steps[0] = _solve_each(rig, settings, habits, belief, observed, T, x, room)
+    _weigh(habits, settings, natural, counts, room)
+    out.natural[0] = room.share[0]
+    best = _mix(rig, settings, habits, belief, numbers, room, out)
+    out.cost[0] = room.cost[best]
+    moves = False
+    for i in range(room.mean.shape[0]):
+        moves = moves or room.mean[i] != 0.0
+    if moves:
+        _onto(rig, settings, observed, blank, best, room, out)
+    else:
+        copy(room.T[best], out.T)
+        for i in range(x.shape[0]):
+            out.x[i] = room.x[best, i]
+    for m in range(rig.mounts.finger.shape[0]):
+        out.surprise[m] = room.surprise[best, m]

@@ -1,0 +1,179 @@
+"""Every number that tunes the estimator, each with its unit, its range and where it is from."""
+
+from dataclasses import dataclass
+from math import isfinite, radians
+from typing import Annotated, NamedTuple, Self, get_type_hints
+
+import numpy as np
+
+from common.errors import CalibrationError
+from common.kernels import filled
+
+_HANDS = "round value for hands at work; a handful compared on simulated and recorded hands, nothing fitted"
+_COORDINATION = "Hager-Ross, Schieber 2000; Ingram et al. 2008: fingers move together"
+_CHI = "quantile of chi square"
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """What a setting may be.
+
+    Attributes:
+        unit: Of the value.
+        low, high: Least and most.
+        source: Where the value is from.
+    """
+
+    unit: str
+    low: float
+    high: float
+    source: str
+
+
+class Settings(NamedTuple):
+    """The estimator's settings; kernels take it as it is."""
+
+    # Habits of a natural hand: standard deviations and means of its angles.
+    abduction_rad: Annotated[float, Range("rad", 0.01, 1.0, _HANDS)] = radians(7.0)
+    natural_flexion_rad: Annotated[float, Range("rad", 0.01, 2.0, _HANDS)] = radians(14.0)
+    neighbour_flexion_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(30.0)
+    neighbour_pip_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(35.0)
+    pip_rad: Annotated[float, Range("rad", 0.01, 3.0, _HANDS)] = radians(45.0)
+    pip_mean_rad: Annotated[float, Range("rad", 0.0, 1.5, _HANDS)] = radians(12.0)
+    loose_dip_rad: Annotated[float, Range("rad", 0.01, 1.0, _HANDS)] = radians(15.0)
+    loose_dip_per_pip: Annotated[float, Range("1", 0.0, 1.5, "Kalbfleisch: DIP = 2/3 PIP")] = 2.0 / 3.0
+    thumb_rad: Annotated[float, Range("rad", 0.01, 2.0, _HANDS)] = radians(20.0)
+    thumb_abduction_mean_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(8.0)
+    thumb_flexion_mean_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(8.0)
+    thumb_mcp_mean_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(10.0)
+    thumb_ip_mean_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(15.0)
+    # A free hand, which has none: flexions anywhere within limits, a PIP rather in the lower half of its range.
+    free_pip_rad: Annotated[float, Range("rad", 0.1, 3.0, _HANDS)] = radians(40.0)
+    free_pip_mean_rad: Annotated[float, Range("rad", 0.0, 1.5, _HANDS)] = radians(30.0)
+    natural_share: Annotated[
+        float, Range("1", 0.01, 0.99, "small: habits that fit win by their narrowness")
+    ] = 1.0 / 3.0
+    # A finger that was never seen is curled out of sight: a stretched one would show.
+    curled_rad: Annotated[float, Range("rad", 0.01, 1.5, _HANDS)] = radians(15.0)
+    curled_flexion_rad: Annotated[float, Range("rad", 0.0, 1.6, _HANDS)] = radians(65.0)
+    curled_pip_rad: Annotated[float, Range("rad", 0.0, 1.9, _HANDS)] = radians(88.0)
+    curled_thumb_abduction_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(20.0)
+    curled_thumb_flexion_rad: Annotated[float, Range("rad", -1.0, 1.0, _HANDS)] = radians(30.0)
+    curled_thumb_mcp_rad: Annotated[float, Range("rad", -1.0, 1.5, _HANDS)] = radians(25.0)
+    curled_thumb_ip_rad: Annotated[float, Range("rad", -1.0, 1.5, _HANDS)] = radians(30.0)
+    shows_rad: Annotated[
+        float, Range("rad", 0.1, 3.0, "a finger bent by less in all its joints shows its end from behind")
+    ] = radians(45.0)
+    # What is wrong with markers, bones and caps.
+    facing_rad: Annotated[
+        float, Range("rad", 0.05, 1.5, "a marker on the back that is seen well faces the cameras")
+    ] = radians(22.0)
+    bones_m: Annotated[float, Range("m", 1e-4, 1e-2, "bones and caps are known to about 1 mm")] = 1.0e-3
+    relief_m: Annotated[
+        float, Range("m", 1e-5, 1e-2, "16 mm of paint on a back of 50 mm radius bulge by 0.6 mm")
+    ] = 0.4e-3
+    radius_share: Annotated[float, Range("1", 0.0, 1.0, "relative error of a profile's radii")] = 0.1
+    # How far a hand that is seen moves in a time, as a random walk: wide, so that what is seen decides.
+    walk_rad_s: Annotated[float, Range("rad/s", 0.5, 50.0, _HANDS)] = 8.0
+    palm_walk_rad_s: Annotated[float, Range("rad/s", 0.1, 50.0, _HANDS)] = 3.0
+    palm_walk_m_s: Annotated[float, Range("m/s", 0.05, 20.0, _HANDS)] = 2.0
+    shortest_s: Annotated[
+        float, Range("s", 1e-5, 1e-2, "a shorter step would weld the hand to its last pose")
+    ] = 1e-3
+    habit_memory_s: Annotated[
+        float, Range("s", 0.0, 5.0, "how fast a hand may change from habits to none")
+    ] = 0.3
+    # Fingers that nobody sees.
+    coast_s: Annotated[float, Range("s", 0.01, 1.0, _COORDINATION)] = 0.12
+    rate_memory_s: Annotated[
+        float, Range("s", 1e-3, 1.0, "half of a new rate counts at 60 frames a second")
+    ] = 0.024
+    stray_rad: Annotated[float, Range("rad", 0.05, 2.0, "simulated scenes and recorded motion")] = radians(
+        40.0
+    )
+    stray_s: Annotated[float, Range("s", 0.05, 10.0, "simulated scenes and recorded motion")] = 1.2
+    alike: Annotated[float, Range("1", 0.0, 0.99, _COORDINATION)] = 0.7
+    held_rad: Annotated[float, Range("rad", 0.001, 0.5, "a finger that was just lost")] = radians(3.0)
+    # A palm without markers.
+    lost_turn_rad_s: Annotated[float, Range("rad/s", 0.01, 5.0, _HANDS)] = radians(20.0)
+    lost_shift_m_s: Annotated[float, Range("m/s", 0.001, 1.0, _HANDS)] = 0.02
+    lost_goes_on: Annotated[float, Range("1", 0.0, 2.0, "share of its speed, along each axis")] = 0.35
+    speed_memory_s: Annotated[
+        float, Range("s", 1e-3, 1.0, "three tenths of a new one count at 60 frames a second")
+    ] = 0.047
+    # One camera alone: perspective tells depth poorly, so it is held.
+    held_depth_m: Annotated[
+        float, Range("m", 1e-4, 0.1, "a step of depth of a hand that one camera sees")
+    ] = 0.004
+    drift_m_s: Annotated[
+        float, Range("m/s", 0.001, 1.0, "simulated hands that one camera saw: 20 to 30 mm off after 0.6 s")
+    ] = 0.08
+    drift_most_m: Annotated[float, Range("m", 0.01, 1.0, "as far as the volume goes")] = 0.15
+    # Both hypotheses.
+    certain: Annotated[float, Range("1", 1.0, 50.0, "log odds that count as certain")] = 12.0
+    negligible: Annotated[
+        float, Range("1", 0.0, 0.5, "weight of a hypothesis that changes next to nothing")
+    ] = 0.03
+    noticed: Annotated[
+        float, Range("1", 0.0, 1.0, "of one of less weight the likeliest hand is taken, not its mean")
+    ] = 0.15
+    stiff: Annotated[
+        float, Range("1", 1e-6, 1.0, "how much less than the markers the mean of hypotheses holds")
+    ] = 1e-2
+    # Covariance.
+    claimed: Annotated[
+        float, Range("1", 0.1, 100.0, "observations that the widths of habits count as; Kass, Wasserman 1995")
+    ] = 1.0
+    straight_rad: Annotated[
+        float, Range("rad", 0.0, 1.0, "a turn by less is 0.2 mm off the tangent at the far end of a hand")
+    ] = radians(3.0)
+    turns_most_rad: Annotated[float, Range("rad", 0.1, 3.0, "a turn less sure leads nowhere farther")] = 1.0
+    # Gates.
+    explained: Annotated[float, Range("chi square", 5.0, 50.0, _CHI + " of three numbers, 1 in 1000")] = 16.3
+    misled: Annotated[
+        float, Range("chi square", 5.0, 200.0, "twice that: another hand explains the markers better")
+    ] = 32.6
+    forget_s: Annotated[
+        float, Range("s", 0.05, 10.0, "after so long without a marker nothing is known of the hand")
+    ] = 0.5
+    tracked_m: Annotated[
+        float, Range("m", 0.002, 0.1, "half the largest axis of the 95 % region of a joint that is TRACKED")
+    ] = 0.025
+    tracked_age_s: Annotated[
+        float, Range("s", 0.0, 1.0, "how old the newest measurement of a TRACKED finger may be")
+    ] = 0.05
+    # The search.
+    tolerance: Annotated[float, Range("half chi square", 1e-12, 1.0, "what a step may leave")] = 1e-7
+    tolerance_share: Annotated[float, Range("1", 0.0, 0.1, "of the cost, likewise")] = 1e-4
+    rough: Annotated[
+        float, Range("half chi square", 1e-7, 1.0, "where one of several starts is to be chosen")
+    ] = 1e-2
+
+    @classmethod
+    def ranges(cls) -> dict[str, Range]:
+        """What each setting may be."""
+        hints = get_type_hints(cls, include_extras=True)
+        return {name: hints[name].__metadata__[0] for name in cls._fields}
+
+    def changed(self, name: str, value: float) -> Self:
+        """The same with one setting changed.
+
+        Raises:
+            CalibrationError: There is no such setting, or the value is out of its range.
+        """
+        ranges = self.ranges()
+        if name not in ranges:
+            raise CalibrationError(f"estimator.{name}: no such setting; there are {', '.join(ranges)}")
+        allowed = ranges[name]
+        if not (isfinite(value) and allowed.low <= value <= allowed.high):
+            raise CalibrationError(
+                f"estimator.{name}: {value} is out of range: {allowed.low} to {allowed.high} {allowed.unit}"
+            )
+        return self._replace(**{name: value})
+
+    def record(self) -> Self:
+        """The same for kernels, which take it as one pointer."""
+        return filled(type(self), {name: np.float64(value) for name, value in self._asdict().items()})
+
+
+DEFAULT = Settings()

@@ -1,0 +1,479 @@
+"""Kernels of the fit of one epoch: normal equations, and a search downhill inside the limits.
+
+Unknowns are the palm's turn and shift and the free angles (`master.estimator.kinematics`). What is minimised is half
+the sum of squares of the rows (`master.estimator.residuals`) and of what is believed:
+
+    habits    of one hypothesis (`master.estimator.priors`)
+    own       single angles, of fingers that are curled out of sight
+    past      single angles and the palm, from the state before; and its depth, where one camera sees all there is
+    facing    the back of the hand looks towards the cameras that see a marker on it
+    sensed    the palm's turn and the angles as other sensors have them
+"""
+
+from math import sqrt, tan
+from typing import NamedTuple
+
+from common.arrays import Bool, Float
+from common.kernels import inlined, inner, record
+from master.estimator.cameras import CameraArrays
+from master.estimator.hand_tables import HandTables, Mounts
+from master.estimator.kinematics import (
+    Scratch,
+    angles_of,
+    chains,
+    finger_slopes,
+    marker_point,
+    palm_slopes,
+    rotate_by,
+    turn_between,
+)
+from master.estimator.matrices import cholesky, copy, substitute
+from master.estimator.priors import Habits
+from master.estimator.residuals import Observations, marker_rows
+from master.fabrik.cap_views import CapTables
+
+MAX_ITERATIONS = 25
+_FIRST_DAMPING, _MOST_DAMPING = 1e-3, 1e6
+_SMALL_RAD = 1e-4  # below it a rotation vector counts as so long in the derivative
+
+
+class Rig(NamedTuple):
+    """What is the same at every epoch: the hand, its markers and the cameras."""
+
+    hand: HandTables
+    mounts: Mounts
+    cameras: CameraArrays
+    caps: CapTables
+
+
+class Belief:
+    """What is believed at one epoch beside habits; filled in place.
+
+    Attributes:
+        own_w2, own: (n,) inverse variances and means of single angles, by this instant.
+        past_w2, past: (n,) the same, by the state before.
+        palm: (4, 4) the palm by the state before.
+        palm_w2: (6,) inverse variances of turn [rad] and shift [m] from there; 0: nothing is believed.
+        sight: (3,) unit vector along which depth is held, and `depth_w2` (1,) how firmly [1/m^2].
+        facing: (3,) unit vector along which the back looks, and `facing_w2` (1,).
+        turn: (3, 3) the palm's rotation by other sensors.
+        sensed: (3 + n, 3 + n) information of turn from there and free angles, `sensed_pull` (3 + n,) and
+            `sensed_constant` (1,) as of `Habits`; `sensed_known` (1,) 1: there is any.
+    """
+
+    own_w2: Float
+    own: Float
+    past_w2: Float
+    past: Float
+    palm: Float
+    palm_w2: Float
+    sight: Float
+    depth_w2: Float
+    facing: Float
+    facing_w2: Float
+    turn: Float
+    sensed: Float
+    sensed_pull: Float
+    sensed_constant: Float
+    sensed_known: Float
+
+    @classmethod
+    def none(cls, n: int) -> "Belief":
+        """Nothing is believed of a hand with n free angles."""
+        return record(
+            cls,
+            own_w2=n,
+            own=n,
+            past_w2=n,
+            past=n,
+            palm=(4, 4),
+            palm_w2=6,
+            sight=3,
+            depth_w2=1,
+            facing=3,
+            facing_w2=1,
+            turn=(3, 3),
+            sensed=(3 + n, 3 + n),
+            sensed_pull=3 + n,
+            sensed_constant=1,
+            sensed_known=1,
+        )
+
+
+class Search:
+    """Room for a search, of N = 6 + n unknowns."""
+
+    gradient: Float  # (N,)
+    normal: Float  # (N, N)
+    damped: Float  # (N, N)
+    L: Float  # (N, N)
+    step: Float  # (N,)
+    down: Float  # (N,)
+    T: Float  # (4, 4)
+    x: Float  # (n,)
+    off: Float  # (6,)
+    q: Float  # (3 + n,)
+    J: Float  # (3, 3)
+    held: Bool  # (N,)
+    surprise: Float  # (M,)
+    information: Float  # (M, 3, 3)
+    apart: Float  # (1,)
+    rows: Scratch
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Search":
+        """Allocate it."""
+        N = 6 + n
+        return record(
+            cls,
+            gradient=N,
+            normal=(N, N),
+            damped=(N, N),
+            L=(N, N),
+            step=N,
+            down=N,
+            T=(4, 4),
+            x=n,
+            off=6,
+            q=3 + n,
+            J=(3, 3),
+            held=("u1", N),
+            surprise=markers,
+            information=(markers, 3, 3),
+            apart=1,
+            rows=Scratch.empty(),
+        )
+
+
+@inlined
+def palm_off(T: Float, palm: Float, out: Float) -> None:
+    """Write turn, as sine times axis, and shift from a palm (4, 4) to T: (6,)."""
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        turned = 0.0
+        for c in range(3):
+            turned += T[k, c] * palm[j, c] - T[j, c] * palm[k, c]
+        out[i] = 0.5 * turned
+        out[3 + i] = T[i, 3] - palm[i, 3]
+
+
+@inlined
+def past_cost(belief: Belief, T: Float, x: Float, off: Float) -> float:
+    """What the state before costs at a hand; `off`: (6,) scratch."""
+    palm_off(T, belief.palm, off)
+    cost, depth = 0.0, 0.0
+    for i in range(6):
+        cost += 0.5 * belief.palm_w2[i] * off[i] * off[i]
+    for i in range(3):
+        depth += belief.sight[i] * off[3 + i]
+    cost += 0.5 * belief.depth_w2[0] * depth * depth
+    for i in range(x.shape[0]):
+        cost += 0.5 * belief.past_w2[i] * (x[i] - belief.past[i]) ** 2
+    return cost
+
+
+@inlined
+def own_cost(habits: Habits, belief: Belief, h: int, x: Float) -> float:
+    """What habits of hypothesis h and beliefs about single angles of this instant cost."""
+    cost = habits.constant[h]
+    for i in range(x.shape[0]):
+        total = 0.0
+        for j in range(x.shape[0]):
+            total += habits.normal[h, i, j] * x[j]
+        cost += (0.5 * total - habits.pull[h, i]) * x[i]
+        cost += 0.5 * belief.own_w2[i] * (x[i] - belief.own[i]) ** 2
+    return cost
+
+
+@inlined
+def _believed(
+    habits: Habits,
+    belief: Belief,
+    h: int,
+    T: Float,
+    x: Float,
+    gradient: Float,
+    normal: Float,
+    search: Search,
+) -> float:
+    """Write gradient and normal matrix of all that is believed; return its cost."""
+    n = x.shape[0]
+    for i in range(6 + n):
+        gradient[i] = 0.0
+        for j in range(6 + n):
+            normal[i, j] = 0.0
+    cost = past_cost(belief, T, x, search.off) + own_cost(habits, belief, h, x)
+    depth = 0.0
+    for i in range(3):
+        depth += belief.sight[i] * search.off[3 + i]
+    for i in range(6):
+        gradient[i] = belief.palm_w2[i] * search.off[i]
+        normal[i, i] = belief.palm_w2[i]
+    for i in range(3):
+        gradient[3 + i] += belief.depth_w2[0] * depth * belief.sight[i]
+        for j in range(3):
+            normal[3 + i, 3 + j] += belief.depth_w2[0] * belief.sight[i] * belief.sight[j]
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            normal[6 + i, 6 + j] = habits.normal[h, i, j]
+            total += habits.normal[h, i, j] * x[j]
+        gradient[6 + i] = total - habits.pull[h, i] + belief.own_w2[i] * (x[i] - belief.own[i])
+        gradient[6 + i] += belief.past_w2[i] * (x[i] - belief.past[i])
+        normal[6 + i, 6 + i] += belief.own_w2[i] + belief.past_w2[i]
+    return cost
+
+
+@inlined
+def _faced(belief: Belief, T: Float, gradient: Float, normal: Float) -> float:
+    """Add that the back (the palm's +y) looks along `facing`; return its cost."""
+    w2 = belief.facing_w2[0]
+    cost = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        off = T[i, 1] - belief.facing[i]
+        cost += 0.5 * w2 * off * off
+        off_j, off_k = T[j, 1] - belief.facing[j], T[k, 1] - belief.facing[k]
+        gradient[i] += w2 * (T[j, 1] * off_k - T[k, 1] * off_j)
+        normal[i, i] += w2 * (T[j, 1] * T[j, 1] + T[k, 1] * T[k, 1])
+        normal[i, j] -= w2 * T[i, 1] * T[j, 1]
+        normal[j, i] -= w2 * T[i, 1] * T[j, 1]
+    return cost
+
+
+@inlined
+def _turn_slope(turn: Float, J: Float) -> None:
+    """Write the derivative (3, 3) of a rotation vector (3,) by a small turn in front of it.
+
+    The inverse of the left Jacobian of SO(3) (Sola, Deray, Atchuthan 2018, "A micro Lie theory", eq. 146).
+    """
+    squared = turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2]
+    angle = max(sqrt(squared), _SMALL_RAD)
+    factor = 1.0 / (angle * angle) - 0.5 / (angle * tan(0.5 * angle))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for c in range(3):
+            J[i, c] = factor * turn[i] * turn[c]
+        J[i, i] += 1.0 - factor * squared
+        J[i, j] += 0.5 * turn[k]
+        J[i, k] -= 0.5 * turn[j]
+
+
+@inner
+def _sensed(belief: Belief, T: Float, x: Float, gradient: Float, normal: Float, search: Search) -> float:
+    """Add what other sensors say of turn and angles; return its cost."""
+    n, q, J, A = x.shape[0], search.q, search.J, belief.sensed
+    turn_between(T, belief.turn, J, q)
+    for i in range(n):
+        q[3 + i] = x[i]
+    _turn_slope(q, J)
+    cost = belief.sensed_constant[0]
+    for a in range(3 + n):
+        pull = 0.0
+        for b in range(3 + n):
+            pull += A[a, b] * q[b]
+        cost += (0.5 * pull - belief.sensed_pull[a]) * q[a]
+        pull -= belief.sensed_pull[a]
+        if a >= 3:
+            gradient[3 + a] += pull
+            for b in range(3, 3 + n):
+                normal[3 + a, 3 + b] += A[a, b]
+            continue
+        for i in range(3):
+            gradient[i] += J[a, i] * pull
+            for b in range(3, 3 + n):
+                normal[i, 3 + b] += J[a, i] * A[a, b]
+                normal[3 + b, i] += J[a, i] * A[a, b]
+            for j in range(3):
+                for b in range(3):
+                    normal[i, j] += J[a, i] * A[a, b] * J[b, j]
+    return cost
+
+
+@inner
+def linearise(
+    rig: Rig,
+    habits: Habits,
+    belief: Belief,
+    observed: Observations,
+    h: int,
+    T: Float,
+    x: Float,
+    gradient: Float,
+    normal: Float,
+    search: Search,
+) -> float:
+    """Write gradient (N,) and Gauss-Newton normal matrix (N, N) at a hand; return the cost.
+
+    To search.surprise (M,) chi square of each marker, to search.apart (1,) half of what rays that do not meet have
+    between them, and to search.information (M, 3, 3) what is known of each marker's place.
+
+    Args:
+        rig, habits, belief, observed: What is known.
+        h: Hypothesis.
+        T, x: (4, 4), (n,) the hand.
+        gradient, normal: Written.
+        search: Room.
+    """
+    work = search.rows
+    cost = _believed(habits, belief, h, T, x, gradient, normal, search)
+    if belief.facing_w2[0] > 0.0:
+        cost += _faced(belief, T, gradient, normal)
+    if belief.sensed_known[0] > 0.0:
+        cost += _sensed(belief, T, x, gradient, normal, search)
+    hand, mounts = rig.hand, rig.mounts
+    angles_of(hand, x, work.angles, work.by)
+    chains(hand, T, work.angles, work.R, work.P)
+    search.apart[0] = 0.0
+    for m in range(mounts.finger.shape[0]):
+        search.surprise[m] = 0.0
+        if not observed.seen[m]:
+            continue
+        cost += _marker(rig, observed, m, T, gradient, normal, search)
+    return cost
+
+
+@inlined
+def _marker(
+    rig: Rig, observed: Observations, m: int, T: Float, gradient: Float, normal: Float, search: Search
+) -> float:
+    """Add the rows of one marker; return their cost."""
+    work, hand, mounts = search.rows, rig.hand, rig.mounts
+    f, level = mounts.finger[m], mounts.level[m]
+    marker_point(mounts, m, T, work.R, work.P, work.point)
+    turns = f >= 0 and rig.caps.row[m] >= 0 and not observed.placed[m]
+    for i in range(3):
+        work.arm[i] = work.point[i] - T[i, 3]
+        work.ahead[i] = -work.R[f, level, i, 2] if f >= 0 else 0.0
+    cost, search.surprise[m] = marker_rows(rig.cameras, rig.caps, observed, m, work.point, work.ahead, work)
+    size, start = 6, 0
+    palm_slopes(work.arm, work.by_place)
+    if f >= 0:
+        start = hand.first[f]
+        size += hand.first[f + 1] - start
+        finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.point, False, work.by_place)
+    if turns:
+        palm_slopes(work.ahead, work.by_turn)
+        finger_slopes(hand, work.by, T, work.R, work.P, f, level, work.ahead, True, work.by_turn)
+    rows = 6 if turns else 3
+    for a in range(size):
+        shifted = 3 <= a < 6
+        for k in range(rows):
+            total = 0.0
+            for i in range(3):
+                total += work.by_place[a, i] * work.H[i, k]
+                if turns and not shifted:
+                    total += work.by_turn[a, i] * work.H[3 + i, k]
+            work.rows[a, k] = total
+        ia = a if a < 6 else start + a
+        for i in range(3):
+            gradient[ia] += work.by_place[a, i] * work.g[i]
+            if turns and not shifted:
+                gradient[ia] += work.by_turn[a, i] * work.g[3 + i]
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(3):
+                total += work.rows[a, i] * work.by_place[b, i]
+            if turns and not 3 <= b < 6:
+                for i in range(3):
+                    total += work.rows[a, 3 + i] * work.by_turn[b, i]
+            ib = b if b < 6 else start + b
+            normal[ia, ib] += total
+            if a != b:
+                normal[ib, ia] += total
+    return cost
+
+
+@inner
+def _step(rig: Rig, x: Float, damping: float, gradient: Float, normal: Float, search: Search) -> float:
+    """Write the damped step (N,), without angles that stand at a limit and are pushed outwards.
+
+    Returns:
+        By how much the cost should fall; negative: there is no step.
+    """
+    N, hand = 6 + x.shape[0], rig.hand
+    down, damped, step, held = search.down, search.damped, search.step, search.held
+    for i in range(N):
+        down[i], held[i] = -gradient[i], False
+        if i >= 6:
+            c = i - 6
+            held[i] = x[c] <= hand.low[c] if down[i] < 0.0 else x[c] >= hand.high[c]
+        if held[i]:
+            down[i] = 0.0
+        for j in range(i):
+            damped[i, j] = 0.0 if held[i] or held[j] else normal[i, j]
+        damped[i, i] = 1.0 if held[i] else normal[i, i] * (1.0 + damping)
+        step[i] = down[i]
+    if not cholesky(damped, N, search.L):
+        return -1.0
+    substitute(search.L, N, step)
+    hoped = 0.0
+    for i in range(N):
+        hoped += 0.5 * down[i] * step[i]
+    return hoped
+
+
+@inner
+def descend(
+    rig: Rig,
+    habits: Habits,
+    belief: Belief,
+    observed: Observations,
+    h: int,
+    tolerance: float,
+    share: float,
+    T: Float,
+    x: Float,
+    gradient: Float,
+    normal: Float,
+    search: Search,
+) -> tuple[float, int]:
+    """Search downhill by Levenberg-Marquardt from a hand, in place; return cost and steps.
+
+    The damping follows the gain ratio (Madsen, Nielsen, Tingleff, "Methods for Non-Linear Least Squares Problems",
+    2nd edition, 2004, eq. 2.21). The last step, of which an all but undamped model hopes for no more than the
+    tolerance, is taken without another linearisation.
+
+    Args:
+        rig, habits, belief, observed, h: What is known, and the hypothesis.
+        tolerance, share: A search ends where a step gains less than tolerance and that share of the cost.
+        T, x: (4, 4), (n,) where it begins, inside the limits, and then where it ended.
+        gradient, normal: Written: (N,), (N, N) there, or before the last step.
+        search: Room.
+    """
+    n, hand = x.shape[0], rig.hand
+    cost = linearise(rig, habits, belief, observed, h, T, x, gradient, normal, search)
+    damping, growth, iterations = _FIRST_DAMPING, 2.0, 0
+    while iterations < MAX_ITERATIONS and damping <= _MOST_DAMPING:
+        iterations += 1
+        hoped = _step(rig, x, damping, gradient, normal, search)
+        little = tolerance + share * cost
+        if hoped < 0.0:
+            damping, growth = damping * growth, 2.0 * growth
+            continue
+        rotate_by(search.step, T, search.T)
+        for i in range(n):
+            search.x[i] = min(max(x[i] + search.step[6 + i], hand.low[i]), hand.high[i])
+        if damping <= _FIRST_DAMPING and hoped < little:
+            copy(search.T, T)
+            for i in range(n):
+                x[i] = search.x[i]
+            break
+        there = linearise(
+            rig, habits, belief, observed, h, search.T, search.x, search.gradient, search.normal, search
+        )
+        gain = cost - there
+        if not gain > 0.0:
+            damping, growth = damping * growth, 2.0 * growth
+            continue
+        damping = max(damping * max(1.0 / 3.0, 1.0 - (2.0 * gain / hoped - 1.0) ** 3), 1e-9)
+        growth, cost = 2.0, there
+        copy(search.T, T)
+        copy(search.normal, normal)
+        for i in range(n):
+            x[i] = search.x[i]
+        for i in range(6 + n):
+            gradient[i] = search.gradient[i]
+        if gain < little:
+            break
+    return cost, iterations

@@ -1,0 +1,280 @@
+"""The state of a hand, the only memory of the estimator, and its prediction.
+
+A finger that is seen may be elsewhere at the next epoch by a wide random walk, so that what is seen decides. A finger
+that nobody sees moves on a little the way it was moving, and with its neighbours: fingers are moved by muscles and
+nerves that they share, so a hidden ring finger between closing neighbours closes with them (Hager-Ross, Schieber 2000,
+"Quantifying the independence of human finger movements"; Ingram, Kording, Howard, Wolpert 2008, "The statistics of
+natural hand movements"). How far it strays from there is taken as a smooth stationary process, whose steps in a time
+have the variance (the structure function of a Gaussian correlation)
+
+    strayed(t) = STRAY^2 (1 - exp(-(t / STRAY_S)^2))
+
+and the steps of two of the four fingers that are k apart correlate by ALIKE^k. So what the seen ones did since gives
+the conditional mean and variance of the hidden ones. A hand that defied habits when the marker went moves its fingers
+one by one, and so does every hand its thumb.
+"""
+
+from math import exp, sqrt
+
+from common.arrays import Bool, Float, Int
+from common.kernels import inlined, inner, record
+from master.estimator.hand_tables import HandTables
+from master.estimator.kinematics import clamp, free_of
+from master.estimator.matrices import cholesky, copy, substitute
+from master.estimator.settings import Settings
+from master.estimator.solve import Belief
+
+NEVER_NS = -(2**61)
+PALM_PART = 5  # behind the five fingers
+
+
+class HandState:
+    """A hand with n free angles as the last epoch left it.
+
+    Attributes:
+        t_ns: (1,) when.
+        known: (1,) whether there is a hand.
+        seen_ns: (1,) when anything of it was measured last.
+        placed_ns: (1,) when two cameras, or a depth law, placed a marker of it last.
+        told_ns: (6,) when each finger, and the palm, was measured last.
+        T, x, angles: (4, 4) palm, (n,) free and (20,) all angles [rad].
+        rates: (20,) [rad/s].
+        cov: (N, N) of turn [rad], shift [m], rig axes, and free angles [rad].
+        natural: (1,) probability that it obeys habits.
+        speed: (1,) [m/s] of the palm, and `lost_s` (1,) how long nothing tells where it is.
+        hidden_ns: (5,) when each hidden finger was seen last; NEVER_NS: it is seen.
+        then, then_rates: (5, 20) the angles and rates of the whole hand at that time.
+        then_alike: (5,) how neighbours correlated then.
+    """
+
+    t_ns: Int
+    known: Bool
+    seen_ns: Int
+    placed_ns: Int
+    told_ns: Int
+    T: Float
+    x: Float
+    angles: Float
+    rates: Float
+    cov: Float
+    natural: Float
+    speed: Float
+    lost_s: Float
+    hidden_ns: Int
+    then: Float
+    then_rates: Float
+    then_alike: Float
+
+    @classmethod
+    def unknown(cls, n: int) -> "HandState":
+        """Nothing is known yet."""
+        N = 6 + n
+        state = record(
+            cls,
+            t_ns=("i8", 1),
+            known=("u1", 1),
+            seen_ns=("i8", 1),
+            placed_ns=("i8", 1),
+            told_ns=("i8", 6),
+            T=(4, 4),
+            x=n,
+            angles=20,
+            rates=20,
+            cov=(N, N),
+            natural=1,
+            speed=1,
+            lost_s=1,
+            hidden_ns=("i8", 5),
+            then=(5, 20),
+            then_rates=(5, 20),
+            then_alike=5,
+        )
+        for never in (state.t_ns, state.seen_ns, state.placed_ns, state.told_ns, state.hidden_ns):
+            never[:] = NEVER_NS
+        return state
+
+
+class Hidden:
+    """What is believed of fingers that nobody sees.
+
+    Attributes:
+        angles: (20,) [rad]; those of fingers that are seen mean nothing.
+        sigma: (5,) [rad] standard deviation of that.
+        gone_s: (5,) time since they were seen last; 0: seen now.
+        own: (5,) share of the variance of a step that the fingers that are seen do not tell.
+    """
+
+    angles: Float
+    sigma: Float
+    gone_s: Float
+    own: Float
+    x: Float  # (n,) room
+    K: Float  # (4, 4) room
+    L: Float  # (4, 4) room
+    weight: Float  # (4,) room
+    ahead: Float  # (20,) room
+
+    @classmethod
+    def none(cls, n: int) -> "Hidden":
+        """Room for one hand."""
+        return record(cls, angles=20, sigma=5, gone_s=5, own=5, x=n, K=(4, 4), L=(4, 4), weight=4, ahead=20)
+
+
+@inlined
+def strayed(settings: Settings, gone_s: float) -> float:
+    """Variance [rad^2] of a finger's angle about where it was heading, a time after it was last seen."""
+    return settings.stray_rad**2 * (1.0 - exp(-((gone_s / settings.stray_s) ** 2)))
+
+
+@inner
+def _neighbours(settings: Settings, state: HandState, f: int, shown: Bool, hidden: Hidden) -> None:
+    """Move the hidden finger f as the seen ones moved since it was lost."""
+    count, alike, K, weight = 0, state.then_alike[f], hidden.K, hidden.weight
+    for g in range(1, 5):
+        if not shown[g]:
+            continue
+        row = 0
+        for other in range(1, g + 1):
+            if shown[other]:
+                K[count, row] = alike ** abs(g - other) if g != other else 1.0
+                row += 1
+        weight[count] = alike ** abs(f - g)
+        count += 1
+    if count == 0 or not cholesky(K, count, hidden.L):
+        return
+    substitute(hidden.L, count, weight)
+    count = 0
+    for g in range(1, 5):
+        if shown[g]:
+            for k in range(1, 4):
+                moved = state.angles[4 * g + k] - hidden.ahead[4 * g + k]
+                hidden.angles[4 * f + k] += weight[count] * moved
+            hidden.own[f] -= weight[count] * alike ** abs(f - g)
+            count += 1
+
+
+@inner
+def hide(
+    hand: HandTables, settings: Settings, state: HandState, t_ns: int, shown: Bool, hidden: Hidden
+) -> None:
+    """Write where fingers without a measurement are believed to be; note when each was lost."""
+    for a in range(20):
+        hidden.angles[a] = state.angles[a]
+    for f in range(5):
+        hidden.sigma[f], hidden.gone_s[f], hidden.own[f] = settings.held_rad, 0.0, 1.0
+        if shown[f]:
+            state.hidden_ns[f] = NEVER_NS
+            continue
+        if state.hidden_ns[f] == NEVER_NS:
+            state.hidden_ns[f] = state.t_ns[0]
+            state.then_alike[f] = settings.alike * state.natural[0]
+            for a in range(20):
+                state.then[f, a], state.then_rates[f, a] = state.angles[a], state.rates[a]
+        gone_s = (t_ns - state.hidden_ns[f]) * 1e-9
+        coasted_s = settings.coast_s * (1.0 - exp(-gone_s / settings.coast_s))
+        for a in range(20):
+            hidden.ahead[a] = state.then[f, a] + state.then_rates[f, a] * coasted_s
+        for a in range(4 * f, 4 * f + 4):
+            hidden.angles[a] = hidden.ahead[a]
+        hidden.gone_s[f] = gone_s
+        if f > 0:
+            _neighbours(settings, state, f, shown, hidden)
+        hidden.sigma[f] = sqrt(settings.held_rad**2 + hidden.own[f] * strayed(settings, gone_s))
+    clamp(hand, hidden.angles)
+
+
+@inner
+def predict(
+    hand: HandTables,
+    settings: Settings,
+    state: HandState,
+    t_ns: int,
+    shown: Bool,
+    palm_shown: bool,
+    hidden: Hidden,
+    belief: Belief,
+) -> None:
+    """Write what the state says of an epoch: `Belief.past`, `palm` and their weights.
+
+    What was hidden moved on for as long as nobody saw it, not since the last epoch.
+
+    Args:
+        hand, settings, state: The hand; `state.hidden_ns` and what goes with it are kept up.
+        t_ns: The epoch.
+        shown: (5,) fingers that are measured now.
+        palm_shown: Whether markers or sensors tell where the palm is.
+        hidden, belief: Written.
+    """
+    hide(hand, settings, state, t_ns, shown, hidden)
+    dt_s = (t_ns - state.t_ns[0]) * 1e-9
+    free_of(hand, hidden.angles, hidden.x)
+    for f in range(5):
+        age_s = (t_ns - state.told_ns[f]) * 1e-9 if shown[f] else dt_s
+        walked = 1.0 / (settings.walk_rad_s * max(age_s, settings.shortest_s)) ** 2
+        held = 0.0 if shown[f] else 1.0 / hidden.sigma[f] ** 2
+        for c in range(hand.first[f], hand.first[f + 1]):
+            belief.past_w2[c] = walked + held
+            belief.past[c] = (walked * state.x[c] + held * hidden.x[c]) / (walked + held)
+    age_s = (t_ns - state.told_ns[PALM_PART]) * 1e-9 if palm_shown else dt_s
+    age_s = max(age_s, settings.shortest_s)
+    for i in range(3):
+        belief.palm_w2[i] = 1.0 / (settings.palm_walk_rad_s * age_s) ** 2
+        belief.palm_w2[3 + i] = 1.0 / (settings.palm_walk_m_s * age_s) ** 2
+    copy(state.T, belief.palm)
+
+
+@inner
+def forget(belief: Belief) -> None:
+    """Let a belief hold nothing of the past."""
+    for i in range(belief.past.shape[0]):
+        belief.past_w2[i] = belief.past[i] = 0.0
+    for i in range(6):
+        belief.palm_w2[i] = 0.0
+    belief.depth_w2[0] = 0.0
+
+
+@inner
+def grow(
+    hand: HandTables,
+    settings: Settings,
+    state: HandState,
+    dt_s: float,
+    T: Float,
+    palm_shown: bool,
+    hidden: Hidden,
+) -> None:
+    """Add to the covariance what the hand may have done since.
+
+    - a palm or finger that is seen: by as much as the fit lets go of its last pose in that time,
+    - a finger that is hidden: by how far hidden fingers stray,
+    - a palm without markers: by a turn and a shift that grow with the time it is lost, the shift with its speed, too.
+    """
+    walked_s = max(dt_s, settings.shortest_s)
+    turn2, shift2 = (settings.palm_walk_rad_s * walked_s) ** 2, (settings.palm_walk_m_s * walked_s) ** 2
+    if palm_shown:
+        squared = 0.0
+        for i in range(3):
+            step = T[i, 3] - state.T[i, 3]
+            for j in range(3):
+                step += (T[i, j] - state.T[i, j]) * hand.rest_m[0, j]
+            squared += step * step
+        state.lost_s[0] = 0.0
+        share = 1.0 - exp(-dt_s / settings.speed_memory_s)  # a short step is mostly noise
+        state.speed[0] += share * (sqrt(squared) / dt_s - state.speed[0])
+    else:
+        before = state.lost_s[0]
+        state.lost_s[0] = before + dt_s
+        longer = state.lost_s[0] ** 2 - before**2
+        turn2 = settings.lost_turn_rad_s**2 * longer
+        shift2 = (settings.lost_shift_m_s + settings.lost_goes_on * state.speed[0]) ** 2 * longer
+    for i in range(3):
+        state.cov[i, i] += turn2
+        state.cov[3 + i, 3 + i] += shift2
+    for f in range(5):
+        gone_s = hidden.gone_s[f]
+        added = (settings.walk_rad_s * dt_s) ** 2
+        if gone_s > 0.0:
+            added = strayed(settings, gone_s) - strayed(settings, max(gone_s - dt_s, 0.0))
+            added *= hidden.own[f]
+        for c in range(hand.first[f], hand.first[f + 1]):
+            state.cov[6 + c, 6 + c] += added

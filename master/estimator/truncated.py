@@ -1,0 +1,117 @@
+"""The mean of a hand within its limits, where the likeliest one leans on them.
+
+A fit ends at the likeliest pose, and of a finger that is poorly known this is often the limit itself: everything
+beyond is forbidden, so what lies before it is piled up there. The mean of what is possible lies inside. Near its
+solution the posterior is a normal distribution cut by a box, whose moments are found by expectation propagation (Minka
+2001; for boxes: Cunningham, Hennig, Lacoste-Julien 2011, "Gaussian probabilities and expectation propagation"): each
+limit is stood for by a normal factor that leaves its own angle the mean and variance of the cut distribution.
+
+For hands that are free of habits only: natural ones rest at their limits, as flat ones do.
+"""
+
+from math import erfc, exp, inf, pi, sqrt
+
+from common.arrays import Float
+from common.kernels import inlined, inner, record
+from master.estimator.hand_tables import HandTables
+from master.estimator.matrices import cholesky, inverse
+
+_SWEEPS, _DAMPING = 6, 0.8
+_FIXED_RAD, _FIXED_WEIGHT = 1e-6, 1e10  # limits that leave no room, and how that is weighed
+_FAR = 30.0  # standard deviations, beyond which the normal distribution underflows
+_ON_LIMIT_RAD = 1e-9
+
+
+class Cut:
+    """Room for the mean within limits, of N = 6 + n unknowns."""
+
+    weight: Float  # (n,)
+    push: Float  # (n,)
+    pull: Float  # (N,)
+    total: Float  # (N, N)
+    L: Float  # (N, N)
+    work: Float  # (N, N)
+    cov: Float  # (N, N)
+
+    @classmethod
+    def empty(cls, n: int) -> "Cut":
+        """Allocate it."""
+        N = 6 + n
+        return record(cls, weight=n, push=n, pull=N, total=(N, N), L=(N, N), work=(N, N), cov=(N, N))
+
+
+@inlined
+def _below(value: float) -> float:
+    """The standard normal distribution function."""
+    return 0.5 * erfc(-value / sqrt(2.0))
+
+
+@inlined
+def _cut(middle: float, variance: float, low: float, high: float) -> tuple[float, float]:
+    """Mean and variance of a normal distribution cut at low and high."""
+    sigma = sqrt(variance)
+    a, b = (low - middle) / sigma, (high - middle) / sigma
+    flipped = a > 0.0  # mirrored, so that no tail is the difference of two numbers near 1
+    if flipped:
+        a, b = -b, -a
+    a, b = min(max(a, -_FAR), _FAR), min(max(b, -_FAR), _FAR)
+    at_a, at_b = exp(-0.5 * a * a), exp(-0.5 * b * b)
+    norm = max(_below(b) - _below(a), 1e-300) * sqrt(2.0 * pi)
+    shift = (at_a - at_b) / norm
+    left = 1.0 + (a * at_a - b * at_b) / norm - shift * shift
+    return middle + sigma * (-shift if flipped else shift), min(max(variance * left, 1e-12), variance)
+
+
+@inner
+def mean_within(hand: HandTables, normal: Float, gradient: Float, x: Float, cut: Cut, mean: Float) -> None:
+    """Write the step (N,) from the likeliest hand to the mean of those within the limits.
+
+    Straight fingers are no chance: they do rest at their limit, so nothing is piled up there.
+
+    Args:
+        hand: Its limits.
+        normal: (N, N) normal matrix of the cost at the likeliest hand.
+        gradient: (N,) there; counts where the angles stand at a limit, elsewhere it is 0.
+        x: (n,) its angles.
+        cut: Room.
+        mean: Written: turn [rad], shift [m] and angles [rad]; the angles stay within the limits.
+    """
+    n, N = x.shape[0], 6 + x.shape[0]
+    for i in range(N):
+        cut.pull[i] = 0.0
+    for i in range(n):
+        below, above = (-inf if hand.rests[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+        fixed = above - below < _FIXED_RAD
+        cut.weight[i], cut.push[i] = _FIXED_WEIGHT if fixed else 0.0, 0.0
+        if below > -_ON_LIMIT_RAD or above < _ON_LIMIT_RAD:
+            cut.pull[6 + i] = -gradient[6 + i]
+    for sweep in range(_SWEEPS + 1):
+        for i in range(N):
+            for j in range(i + 1):
+                cut.total[i, j] = normal[i, j]
+            if i >= 6:
+                cut.total[i, i] += cut.weight[i - 6]
+        cholesky(cut.total, N, cut.L)
+        inverse(cut.L, N, cut.work, cut.cov)
+        for i in range(N):
+            mean[i] = 0.0
+            for j in range(N):
+                pushed = cut.push[j - 6] if j >= 6 else 0.0
+                mean[i] += cut.cov[i, j] * (cut.pull[j] + pushed)
+        if sweep == _SWEEPS:
+            break
+        for i in range(n):
+            below, above = (-inf if hand.rests[i] else hand.low[i] - x[i]), hand.high[i] - x[i]
+            if above - below < _FIXED_RAD:
+                continue
+            variance = cut.cov[6 + i, 6 + i]
+            # the distribution of the angle without the factor of its own limits
+            alone = 1.0 / max(1.0 / variance - cut.weight[i], 1e-9)
+            middle = alone * (mean[6 + i] / variance - cut.push[i])
+            at, narrow = _cut(middle, alone, below, above)
+            better = max(1.0 / narrow - 1.0 / alone, 0.0)
+            cut.weight[i] += _DAMPING * (better - cut.weight[i])
+            cut.push[i] += _DAMPING * (at / narrow - middle / alone - cut.push[i])
+    for i in range(n):
+        below = -inf if hand.rests[i] else hand.low[i] - x[i]
+        mean[6 + i] = min(max(mean[6 + i], below), hand.high[i] - x[i])

@@ -1,0 +1,359 @@
+"""Kernels of one epoch: predict, fit, and take over what it says into the state."""
+
+from math import acos, cos, exp, sqrt
+from typing import NamedTuple
+
+from common.arrays import Bool, Code, Float
+from common.kernels import constant, inlined, inner, kernel, record
+from common.messages import Source
+from master.estimator.certainty import Certainty, add_arcs, linear, only_limits, surer, tilts
+from master.estimator.kinematics import angles_of, chains, clamp, joints, marker_point
+from master.estimator.matrices import copy, inverse_3
+from master.estimator.posterior import Blank, Posterior, Room, posterior
+from master.estimator.priors import Habits
+from master.estimator.residuals import Observations, marker_rows
+from master.estimator.settings import Settings
+from master.estimator.solve import Belief, Rig, Search, descend
+from master.estimator.state import NEVER_NS, PALM_PART, HandState, Hidden, forget, grow, predict
+
+_QUANTILE_95 = 7.815  # chi square of three numbers
+TRACK, BEGIN, ROUGH, TAKE_OVER = constant(0), constant(1), constant(2), constant(3)
+TRACKED_ON, LOST, MISLED = 0.0, 1.0, 2.0
+_SOLVED, _MEASURED, _HELD = int(Source.SOLVED), int(Source.MEASURED), int(Source.HELD)
+
+
+class Estimate:
+    """A hand at one epoch, as kernels write it.
+
+    Attributes:
+        T, angles: (4, 4) palm, (20,) all angles [rad].
+        position, rotation: (26, 3) [m], (26, 3, 3), rig frame.
+        cov: (26, 3, 3) [m^2] of the joints.
+        tilt: (5, 3, 3) [rad^2] of the last phalanges' directions, by this instant alone.
+        tracked: (26,), and `source` (26,) as of `HandPose`.
+    """
+
+    T: Float
+    angles: Float
+    position: Float
+    rotation: Float
+    cov: Float
+    tilt: Float
+    tracked: Bool
+    source: Code
+
+    @classmethod
+    def empty(cls) -> "Estimate":
+        """Room for one."""
+        return record(
+            cls,
+            T=(4, 4),
+            angles=20,
+            position=(26, 3),
+            rotation=(26, 3, 3),
+            cov=(26, 3, 3),
+            tilt=(5, 3, 3),
+            tracked=("u1", 26),
+            source=("u1", 26),
+        )
+
+
+class Workspace:
+    """Room for all kernels of one hand, and what is believed at the epoch."""
+
+    belief: Belief
+    hidden: Hidden
+    found: Posterior
+    room: Room
+    certainty: Certainty
+
+    @classmethod
+    def empty(cls, n: int, markers: int) -> "Workspace":
+        """Allocate it."""
+        return record(
+            cls,
+            belief=Belief.none(n),
+            hidden=Hidden.none(n),
+            found=Posterior.empty(n, markers),
+            room=Room.empty(n, markers),
+            certainty=Certainty.empty(n, markers),
+        )
+
+
+@inner
+def chi_square(
+    rig: Rig, observed: Observations, T: Float, x: Float, walked_m: float, search: Search
+) -> float:
+    """Chi square of the markers on a hand that may have walked so far, in any direction, since."""
+    work, mounts = search.rows, rig.mounts
+    angles_of(rig.hand, x, work.angles, work.by)
+    chains(rig.hand, T, work.angles, work.R, work.P)
+    total = 0.0
+    for m in range(mounts.finger.shape[0]):
+        if not observed.seen[m] or observed.placed[m]:
+            continue
+        f, own, kept = mounts.finger[m], observed.own[m], search.J
+        marker_point(mounts, m, T, work.R, work.P, work.point)
+        for i in range(3):
+            work.ahead[i] = -work.R[f, mounts.level[m], i, 2] if f >= 0 else 0.0
+            for j in range(3):
+                kept[i, j], work.K[i, j] = own[i, j], 0.0
+        if walked_m > 0.0:
+            inverse_3(own, work.K, own)
+            for i in range(3):
+                own[i, i] += walked_m * walked_m
+            inverse_3(own, work.K, own)
+        _, chi2 = marker_rows(rig.cameras, rig.caps, observed, m, work.point, work.ahead, work)
+        copy(kept, own)
+        total += chi2
+    return total
+
+
+@inlined
+def _widest(C: Float) -> float:
+    """The largest eigenvalue of a symmetric matrix (3, 3), by its characteristic polynomial."""
+    mean = (C[0, 0] + C[1, 1] + C[2, 2]) / 3.0
+    a, b, c = C[0, 0] - mean, C[1, 1] - mean, C[2, 2] - mean
+    d, e, f = C[0, 1], C[0, 2], C[1, 2]
+    p = sqrt((a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f)) / 6.0)
+    if not p > 0.0:
+        return mean
+    determinant = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+    return mean + 2.0 * p * cos(acos(min(max(0.5 * determinant / p**3, -1.0), 1.0)) / 3.0)
+
+
+@inner
+def _judge(
+    rig: Rig,
+    settings: Settings,
+    state: HandState,
+    t_ns: int,
+    shown: Bool,
+    observed: Observations,
+    out: Estimate,
+) -> None:
+    """Write which joints are tracked, and what each rests on.
+
+    Tracked is a joint whose 95 % region is smaller than `tracked_m`, and that rests on measurements of its finger that
+    are no older than `tracked_age_s`.
+    """
+    hand = rig.hand
+    for joint in range(26):
+        f = hand.finger[joint]
+        part = f if f >= 0 else PALM_PART
+        fresh = (t_ns - state.told_ns[part]) * 1e-9 <= settings.tracked_age_s
+        size_m = sqrt(_QUANTILE_95 * max(_widest(out.cov[joint]), 0.0))
+        out.tracked[joint] = fresh and size_m < settings.tracked_m
+        now = state.told_ns[part] == t_ns
+        out.source[joint] = _SOLVED if now else _HELD
+    for m in range(rig.mounts.finger.shape[0]):
+        f, rays = rig.mounts.finger[m], 0
+        for c in range(observed.uv.shape[0]):
+            rays += 1 if observed.weight[c, m] > 0.0 else 0
+        if f >= 0 and rays > 1 and rig.mounts.level[m] == 3:
+            for joint in range(26):
+                if hand.finger[joint] == f and hand.level[joint] == 3:
+                    out.source[joint] = _MEASURED
+
+
+@inner
+def _take_over(
+    rig: Rig,
+    settings: Settings,
+    state: HandState,
+    t_ns: int,
+    goes_on: bool,
+    shown: Bool,
+    palm_shown: bool,
+    observed: Observations,
+    space: Workspace,
+    out: Estimate,
+) -> None:
+    """Write the hand of an epoch, and the state behind it; `goes_on`: from the state before."""
+    found, hidden, room, work = space.found, space.hidden, space.certainty, space.room.search.rows
+    hand, n = rig.hand, found.x.shape[0]
+    angles_of(hand, found.x, work.angles, work.by)
+    clamp(hand, work.angles)
+    dt_s = (t_ns - state.t_ns[0]) * 1e-9
+    lost = not palm_shown
+    if goes_on:
+        grow(hand, settings, state, dt_s, found.T, palm_shown, hidden)
+        share = 1.0 - exp(-dt_s / settings.rate_memory_s)
+        for a in range(20):
+            rate = (work.angles[a] - state.angles[a]) / dt_s
+            state.rates[a] += share * (rate - state.rates[a])
+        for f in range(5):
+            lost = lost or hidden.gone_s[f] > 0.0
+    else:
+        state.lost_s[0] = state.speed[0] = 0.0
+        for a in range(20):
+            state.rates[a] = 0.0
+        for f in range(5):
+            state.hidden_ns[f] = NEVER_NS
+    if goes_on and lost:
+        now = space.room.cov
+        copy(found.cov, now)
+        only_limits(hand, found.x, hidden, now)
+        surer(now, state.cov, room, space.room.A)
+        copy(space.room.A, state.cov)
+    else:
+        copy(found.cov, state.cov)
+    chains(hand, found.T, work.angles, work.R, work.P)
+    joints(hand, found.T, work.R, work.P, out.position, out.rotation)
+    linear(hand, found.T, state.cov, work, room, out.cov)
+    tilts(hand, found.T, found.cov, work, room, out.tilt)
+    best = 0 if space.room.share[0] >= space.room.share[1] else 1
+    add_arcs(
+        rig,
+        settings,
+        found.T,
+        state.cov,
+        observed.seen,
+        space.room.information[best],
+        work,
+        room,
+        out.cov,
+    )
+    state.t_ns[0], state.known[0], state.natural[0] = t_ns, True, found.natural[0]
+    for f in range(5):
+        if shown[f]:
+            state.told_ns[f] = t_ns
+    if palm_shown:
+        state.told_ns[PALM_PART] = t_ns
+    copy(found.T, state.T)
+    copy(found.T, out.T)
+    for a in range(20):
+        out.angles[a] = state.angles[a] = work.angles[a]
+    for c in range(n):
+        state.x[c] = found.x[c]
+    _judge(rig, settings, state, t_ns, shown, observed, out)
+
+
+class Start(NamedTuple):
+    """Another hand of an epoch, or where a search begins.
+
+    Attributes:
+        T, x: (4, 4), (n,) inside the limits.
+        known: Whether there is any.
+        may_leave: Whether it may take the place of the state.
+    """
+
+    T: Float
+    x: Float
+    known: bool
+    may_leave: bool
+
+
+@kernel
+def epoch(
+    what: int,
+    rig: Rig,
+    settings: Settings,
+    habits: Habits,
+    state: HandState,
+    t_ns: int,
+    observed: Observations,
+    shown: Bool,
+    palm_shown: bool,
+    numbers: float,
+    turned: Float,
+    start: Start,
+    blank: Blank,
+    space: Workspace,
+    out: Estimate,
+) -> float:
+    """Do one of four things at an epoch. One kernel, for each compiles all that it calls.
+
+    TRACK       fit from the state and take it over
+    BEGIN       fit from `start`, without the state: what is found is in `space.found`
+    ROUGH       search roughly from `start`, in place, under the widest hypothesis
+    TAKE_OVER   take over what BEGIN found
+
+    Args:
+        what: Which.
+        rig, settings, habits: What is the same at every epoch.
+        state: Of the epoch before; of this one, once it is taken over.
+        t_ns: The epoch.
+        observed: What is measured.
+        shown: (5,) fingers that are measured.
+        palm_shown: Whether something tells where the palm is.
+        numbers: How many numbers are measured.
+        turned: (3, 3) by how much sensors say that the palm has turned since.
+        start: Another hand.
+        blank, space: Room; what is believed beside the past is in `space.belief`.
+        out: Written, where the epoch is taken over.
+
+    Returns:
+        Of TRACK: TRACKED_ON; LOST where no motion explains the markers, but `start` does; MISLED where it explains them
+        better than what is found. With the latter two the state is as it was. Of BEGIN: chi square of the markers. Of
+        ROUGH: the cost.
+    """
+    belief, found, room = space.belief, space.found, space.room
+    search = room.search
+    if what == TAKE_OVER:
+        _take_over(rig, settings, state, t_ns, False, shown, palm_shown, observed, space, out)
+        return TRACKED_ON
+    if what == ROUGH:
+        forget(belief)
+        widest = habits.constant.shape[0] - 1
+        cost, _ = descend(
+            rig,
+            habits,
+            belief,
+            observed,
+            widest,
+            settings.rough,
+            settings.tolerance_share,
+            start.T,
+            start.x,
+            room.gradient[0],
+            room.normal[0],
+            search,
+        )
+        return cost
+    natural, counts, other = 0.5, 0.0, 0.0
+    if what == BEGIN:
+        forget(belief)
+        copy(start.T, room.start_T)
+        for c in range(start.x.shape[0]):
+            room.start_x[c] = start.x[c]
+    else:
+        dt_s = (t_ns - state.t_ns[0]) * 1e-9
+        if start.known and start.may_leave:
+            other = chi_square(rig, observed, start.T, start.x, 0.0, search) + settings.misled
+            walked_m = settings.palm_walk_m_s * dt_s
+            if chi_square(rig, observed, state.T, state.x, walked_m, search) > other:
+                return LOST
+        predict(rig.hand, settings, state, t_ns, shown, palm_shown, space.hidden, belief)
+        for i in range(3):
+            for j in range(3):
+                belief.palm[i, j] = 0.0
+                for k in range(3):
+                    belief.palm[i, j] += turned[i, k] * state.T[k, j]
+        natural, counts = state.natural[0], exp(-dt_s / settings.habit_memory_s)
+        copy(belief.palm, room.start_T)
+        for c in range(start.x.shape[0]):
+            room.start_x[c] = state.x[c]
+    posterior(
+        rig,
+        settings,
+        habits,
+        belief,
+        observed,
+        room.start_T,
+        room.start_x,
+        natural,
+        counts,
+        numbers,
+        blank,
+        room,
+        found,
+    )
+    explained = chi_square(rig, observed, found.T, found.x, 0.0, search)
+    if what == BEGIN:
+        return explained
+    found.wrong[0] = explained
+    if start.known and start.may_leave and explained > other:
+        return MISLED
+    _take_over(rig, settings, state, t_ns, True, shown, palm_shown, observed, space, out)
+    return TRACKED_ON
