@@ -15,17 +15,21 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+from bench import oracle_recorded, oracle_scenes
 from bench.oracle_compare import compare, plain, table
-from bench.oracle_freeze import Piece
+from bench.oracle_freeze import Piece, freeze
 from bench.oracle_truth import FROZEN, sets_of
 from common.errors import PhalanxError
 
 _ROOT = Path(__file__).resolve().parents[1]
 _OUT = _ROOT / "out" / "oracle"
+
+Maker = Callable[[], Iterable[Piece]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         if options.command == "freeze":
-            return _freeze(options.out)
+            return _freeze(options.out, options.sets)
         sets = _chosen(options.out, options.sets)
         here = Runner(_ROOT, options.name if options.command == "run" else options.new, options.solver)
         if options.command == "run":
@@ -65,7 +69,7 @@ def _parser() -> argparse.ArgumentParser:
         "python -m bench oracle", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    freeze, run, both = (
+    frozen, run, both = (
         commands.add_parser(name, help=text)
         for name, text in (
             ("freeze", "make the recordings and their truth"),
@@ -78,10 +82,11 @@ def _parser() -> argparse.ArgumentParser:
     both.add_argument("new", metavar="B", help="name of the run that is judged")
     both.add_argument("--tree", type=Path, metavar="DIR", help="make both runs first, A by the code in DIR")
     both.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE as well")
+    for one in (frozen, run, both):
+        one.add_argument("--sets", metavar="SET,...", help="some alone")
     for one in (run, both):
         one.add_argument("--solver", choices=("estimator", "fabrik"), help="in place of that of the rigs")
-        one.add_argument("--sets", metavar="SET,...", help="some alone")
-    for one in (freeze, run, both):
+    for one in (frozen, run, both):
         one.add_argument("--out", type=Path, default=_OUT, metavar="DIR", help="default: out/oracle")
     return parser
 
@@ -101,25 +106,41 @@ def _chosen(out: Path, wanted: str | None) -> list[str]:
     return chosen
 
 
-def _freeze(out: Path) -> int:
-    # Imported here: they need all of the simulation, and a comparison does not.
-    from bench.oracle_freeze import freeze  # noqa: PLC0415
-    from bench.oracle_recorded import leap, rendered  # noqa: PLC0415
-    from bench.oracle_scenes import simulated  # noqa: PLC0415
+def _freeze(out: Path, wanted: str | None) -> int:
+    """Make the recordings.
 
+    Raises:
+        PhalanxError: There is no such set, or it cannot be written.
+    """
     data = Path(os.environ.get("PHALANX_DATASETS", _ROOT / "../shared/datasets")).resolve()
+    simulated, recorded = _makers(data)
     there = (data / "stereo").is_dir() and (data / "leapjs").is_dir()
-
-    def pieces() -> Iterator[Piece]:
-        yield from simulated()
-        if there:
-            yield from rendered(data)
-            yield from leap(data)
-
-    freeze(out, pieces())
+    makers = {**simulated, **recorded} if there else simulated
+    chosen = list(makers) if wanted is None else wanted.split(",")
+    if unknown := sorted(set(chosen) - makers.keys()):
+        raise PhalanxError(
+            f"set {unknown[0]!r}: there are {', '.join(makers)}{'' if there else _absent(data)}"
+        )
+    for name in chosen:
+        freeze(out, name, makers[name]())
     if not there:
-        print(f"no recordings at {data}: only the simulated sets are frozen; set PHALANX_DATASETS")
+        print(f"only the simulated sets are frozen{_absent(data)}")
     return 0
+
+
+def _absent(data: Path) -> str:
+    return f": no recordings at {data}: set PHALANX_DATASETS"
+
+
+def _makers(data: Path) -> tuple[dict[str, Maker], dict[str, Maker]]:
+    """What makes each set: those of simulation, and those of the data folder."""
+    simulated: dict[str, Maker] = {name: partial(oracle_scenes.scenes, name) for name in oracle_scenes.SCENES}
+    simulated |= {"held": oracle_scenes.held, "room": oracle_scenes.in_room}
+    recorded: dict[str, Maker] = {
+        name: partial(oracle_recorded.rendered, data, names)
+        for name, names in oracle_recorded.RENDERED.items()
+    }
+    return simulated, recorded | {"leap": partial(oracle_recorded.leap, data)}
 
 
 def solve(out: Path, runners: Sequence[Runner], sets: Sequence[str]) -> None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite, isnan, nan
+from math import inf, isfinite, isnan
 from pathlib import Path
 
 from bench.oracle_score import Samples, Solved, figures, samples_of
@@ -38,6 +38,7 @@ RULES = (
     Rule("false TRACKED %", most=2.0),
     Rule("jitter mm", most_times=1.0),
     Rule("valid %", least_times=0.98),
+    Rule("ghosts", most_times=1.0),
 )
 _ROUNDING = 1e-9
 
@@ -111,7 +112,7 @@ def _too(rule: Rule, old: Mapping[str, float]) -> str:
 def _ratio(old: float, new: float) -> float:
     if old == new:
         return 1.0
-    return new / old if old and isfinite(old) else nan
+    return new / old if old else inf
 
 
 def table(compared: Sequence[Compared]) -> str:
@@ -138,7 +139,7 @@ def _width(name: str) -> int:
 def _cell(value: float, label: str) -> str:
     if isnan(value):
         return "-"
-    if label == "ratio":
+    if label == "ratio" or not isfinite(value):
         return f"{value:.3f}"
     return f"{value:.0f}" if abs(value) >= 1000.0 or value == int(value) else f"{value:.2f}"
 

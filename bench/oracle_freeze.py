@@ -16,14 +16,13 @@ class Piece:
     """One recording of a set.
 
     Attributes:
-        set_name, name: Of the set, and of the recording in it.
+        name: Of the recording in its set.
         rig: The rig that is solved.
         files: Files of calibration, by their path in a calibration tree.
         messages: In the order in which they are solved.
         truth: Exact.
     """
 
-    set_name: str
     name: str
     rig: str
     files: dict[str, bytes]
@@ -40,21 +39,21 @@ def calibration_files(tree: Path, rig: str) -> dict[str, bytes]:
     return {name: (tree / name).read_bytes() for name in names}
 
 
-def freeze(out: Path, pieces: Iterable[Piece]) -> None:
-    """Write recordings and truths; those of an earlier call go.
+def freeze(out: Path, set_name: str, pieces: Iterable[Piece]) -> None:
+    """Write recordings and truths of one set; what it had before goes.
 
     Raises:
         RecordingError: A recording cannot be written.
         OSError: A folder or a truth cannot.
     """
-    shutil.rmtree(out / FROZEN, ignore_errors=True)
+    folder = out / FROZEN / set_name
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
     for piece in pieces:
-        folder = out / FROZEN / piece.set_name
-        folder.mkdir(parents=True, exist_ok=True)
         about = {"rigs": json.dumps([piece.rig]), "continuous": json.dumps(piece.truth.continuous)}
         writer = MessageWriter(folder / f"{piece.name}.mcap", piece.files, about)
         for message in piece.messages:
             writer.write("taken", message, message.ready_t_ns)
         writer.close()
         piece.truth.save(folder / f"{piece.name}.npz")
-        print(f"{piece.set_name}/{piece.name}: {len(piece.messages)} messages", flush=True)
+        print(f"{set_name}/{piece.name}: {len(piece.messages)} messages", flush=True)

@@ -9,16 +9,16 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
-from scipy.interpolate import CubicSpline  # pyright: ignore[reportMissingTypeStubs]
+from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares  # pyright: ignore[reportUnknownVariableType]
-from scipy.spatial.transform import Rotation, Slerp  # pyright: ignore[reportMissingTypeStubs]
+from scipy.spatial.transform import Rotation, Slerp
 
 from bench.fusion_shown import markers_shown
 from bench.oracle_freeze import Piece, calibration_files
@@ -38,7 +38,7 @@ from master.recorded import recorded_detections
 from master.rig import load_setup
 
 _ROOT = Path(__file__).resolve().parents[1]
-SETS = {
+RENDERED = {
     "stills": ("calib_colors", "lights_0_warm", "poses_left"),
     "static": ("static",),
     "translate_8ms": ("translate_8ms",),
@@ -54,20 +54,24 @@ _SEED = 21
 _UP = np.array([0.0, 0.06, 0.0])  # of the palm's origin from the middle of the view
 
 
-def rendered(data: Path) -> Iterator[Piece]:
-    """The recordings of the marker rig, through the slave's own detection; `data` is the data folder."""
+def rendered(data: Path, names: Sequence[str]) -> Iterator[Piece]:
+    """Recordings of the marker rig, through the slave's own detection.
+
+    Args:
+        data: The data folder.
+        names: Of the recordings.
+    """
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name)
         (tree / "cameras").mkdir()
         for camera in ("left", "right"):
             target = tree / "cameras" / f"{camera}.json"
             _slave("colours", data / "stereo/calib_colors", "--camera", camera, "-o", target)
-        for set_name, names in SETS.items():
-            for one in names:
-                yield _detected(set_name, data / "stereo" / one, tree, data / "hands")
+        for one in names:
+            yield _detected(data / "stereo" / one, tree, data / "hands")
 
 
-def _detected(set_name: str, folder: Path, tree: Path, hands: Path) -> Piece:
+def _detected(folder: Path, tree: Path, hands: Path) -> Piece:
     recording = open_recording(folder)
     rig = recording.manifest.marker_rig()
     files = {f"rigs/{rig.name}.json": msgspec.json.encode(rig)}
@@ -81,7 +85,7 @@ def _detected(set_name: str, folder: Path, tree: Path, hands: Path) -> Piece:
             files[f"cameras/{camera}.json"] = msgspec.json.encode(recording.manifest.cameras[camera])
     messages.sort(key=lambda one: one.t_ns)
     truth = _rendered_truth(folder, recording.manifest.continuous)
-    return Piece(set_name, folder.name, rig.name, files, messages, truth)
+    return Piece(folder.name, rig.name, files, messages, truth)
 
 
 def _rendered_truth(folder: Path, continuous: bool) -> Truth:
@@ -97,7 +101,8 @@ def _rendered_truth(folder: Path, continuous: bool) -> Truth:
     angles_rad = np.asarray(data["angles"], np.float64)[:, np.array(_FINGER_ANGLES)]
     if len(t_ns) < 4 or not continuous:
         return Truth(t_ns, joints_m, angles_rad, continuous)
-    fine = np.union1d(np.arange(t_ns[0], t_ns[-1], STEP_NS), t_ns)
+    steps: Int = int(t_ns[0]) + STEP_NS * np.arange(int(np.ptp(t_ns)) // STEP_NS)
+    fine = np.unique(np.concatenate([steps, t_ns]))
     since_s = 1e-9 * (t_ns - t_ns[0])
     found = [
         np.asarray(CubicSpline(since_s, rows)(1e-9 * (fine - t_ns[0]))) for rows in (joints_m, angles_rad)
@@ -157,7 +162,7 @@ class Replayed:
         turn = FACING @ mean.T
         middle = palms[:, :3, 3].mean(axis=0)
         origin_m = (palms[:, :3, 3] - middle) @ turn.T + centre_m + _UP
-        t_s = 1e-9 * recorded.t_ns
+        t_s = np.asarray(1e-9 * recorded.t_ns, np.float64)
         slerp = Slerp(t_s, Rotation.from_matrix(turn @ palms[:, :3, :3]))
         angles = _nearest_angles(model, recorded.fingers_m)
         return cls(t_s, slerp, origin_m, recorded.fingers_m.reshape(-1, 20, 3), angles)
@@ -170,17 +175,22 @@ def _between(t_s: Float, rows: Float, at_s: float) -> Float:
 
 
 def _nearest_angles(model: HandModel, fingers_m: Float) -> Float:
-    """Angles (T, 20) [rad] whose joints are nearest to recorded ones (T, 5, 4, 3) [m], palm frame."""
-    out: list[Float] = []
+    """Angles (T, 20) [rad] whose joints are nearest to recorded ones (T, 5, 4, 3) [m], palm frame.
+
+    Of every other sample; those between are what lies between.
+    """
+    rows, out = np.union1d(np.arange(0, len(fingers_m), 2), len(fingers_m) - 1), list[Float]()
     start = np.zeros(20)
-    for fingers in fingers_m:
+    for fingers in fingers_m[rows]:
 
         def off(x: Float, fingers: Float = fingers) -> Float:
             return (1e3 * (model.chains(x.reshape(5, 4)).position_m - fingers)).ravel()
 
         start = np.asarray(least_squares(off, start, xtol=1e-4, ftol=1e-4).x, np.float64)
         out.append(start)
-    return np.array(out)
+    found = np.array(out)
+    columns = [np.interp(np.arange(len(fingers_m)), rows, found[:, k]) for k in range(20)]
+    return np.asarray(np.stack(columns, axis=1), np.float64)
 
 
 def leap(data: Path) -> Iterator[Piece]:
@@ -200,7 +210,7 @@ def leap(data: Path) -> Iterator[Piece]:
         files[f"hands/{name}.json"] = msgspec.json.encode(profile)
         messages = [one for camera in scene.rig.cameras for one in _seen(scene, motion, camera, seed)]
         messages.sort(key=lambda one: one.t_ns)
-        yield Piece("leap", name, DESK, files, messages, _leap_truth(motion))
+        yield Piece(name, DESK, files, messages, _leap_truth(motion))
 
 
 def _seen(scene: Scene, motion: Replayed, camera: str, seed: int) -> Iterator[MarkerDetections]:

@@ -19,8 +19,9 @@ _FALSE_MM, _FALSE_DEG = 15.0, 20.0  # from there on a TRACKED joint is a false o
 _REST_MM = 0.05  # of the fastest joint from instant to instant: the hand rests
 _FOLLOWS_NS = 60_000_000  # longer apart, two instants are no step
 _SAME_NS = 4_000_000  # poses of two runs at most so far apart are of one instant
-_MOVES_M = 5e-3  # RMS of the joints' motion from which on a lag can be seen
-LAGS_NS = 1_000_000 * np.arange(-40, 101)
+_MOVES_M = 15e-3  # RMS of the joints' motion from which on a lag can be seen
+_LONG_NS = 300_000_000  # of motion in which a lag can be seen
+LAGS_NS = 1_000_000 * np.arange(-20, 61)
 _OF_FINGER = np.zeros((26, 5), np.bool_)
 for _finger, _joints in enumerate(FINGER_JOINTS):
     _OF_FINGER[list(_joints), _finger] = True
@@ -55,7 +56,16 @@ class Solved:
         """
         names = [one.name for one in fields(cls)]
         data = read_npz(path, names, "run it again")
-        return cls(**{name: data[name] for name in names})
+        return cls(
+            piece=np.asarray(data["piece"], np.str_),
+            t_ns=data["t_ns"].astype(np.int64),
+            position_m=data["position_m"],
+            angles_rad=data["angles_rad"],
+            cov_m2=data["cov_m2"],
+            valid=data["valid"].astype(np.bool_),
+            tracked=data["tracked"].astype(np.bool_),
+            spent_us=data["spent_us"],
+        )
 
     def of(self, piece: str) -> "Solved":
         """One recording alone."""
@@ -77,7 +87,8 @@ class Samples:
         false: (N,) whether it is off by 15 mm, or the PIP of its finger by 20 degrees.
         pip_deg: (P,) error of each PIP.
         rest_mm: (R,) length of a step that a joint makes while the truth rests.
-        wanted: How many joints there are in truth, at all instants; without: at so many instants there is no hand.
+        wanted: How many joints there are in truth, at all instants.
+        instants, without, ghosts: With a hand in truth, those of them without one in the run, and the reverse.
         spent_us: (T,) processor time of each pose.
         misfit: (L,) sum of squares [m^2] between motion and truth delayed by each of `LAGS_NS`.
     """
@@ -93,6 +104,7 @@ class Samples:
     wanted: int = 0
     instants: int = 0
     without: int = 0
+    ghosts: int = 0
 
     def joined(self, other: "Samples") -> "Samples":
         """Both together."""
@@ -105,6 +117,7 @@ class Samples:
             wanted=self.wanted + other.wanted,
             instants=self.instants + other.instants,
             without=self.without + other.without,
+            ghosts=self.ghosts + other.ghosts,
         )
 
 
@@ -119,8 +132,8 @@ def samples_of(run: Solved, truths: Mapping[str, Truth], other: Solved | None = 
 
 def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
     joints_m, angles_rad = truth.at(run.t_ns)
-    known = np.isfinite(joints_m).all(axis=2)
-    valid = run.valid & np.isfinite(run.position_m).all(axis=2)
+    known = np.asarray(np.isfinite(joints_m).all(axis=2), np.bool_)
+    valid = np.asarray(run.valid & np.isfinite(run.position_m).all(axis=2), np.bool_)
     off_m = run.position_m - joints_m
     scored = valid & known
     mm = 1e3 * np.linalg.norm(off_m, axis=2)
@@ -129,7 +142,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
     pip_deg = np.where(shown & (np.arange(5) > 0), pip_deg, np.nan)  # of the thumb it is another joint
     bent_wrong = ((pip_deg > _FALSE_DEG)[:, None, :] & _OF_FINGER).any(axis=2)
     missed = _missing(run.t_ns, other_ns, truth)
-    exists = known.any(axis=1)
+    exists = np.asarray(known.any(axis=1), np.bool_)
     return Samples(
         joint_mm=mm[scored],
         tracked=run.tracked[scored].astype(np.float64),
@@ -142,6 +155,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
         wanted=int(known.sum()) + missed * int(known.any(axis=0).sum()),
         instants=int(exists.sum()) + missed,
         without=int((exists & ~scored.any(axis=1)).sum()) + missed,
+        ghosts=int((~exists & run.valid.any(axis=1)).sum()),
     )
 
 
@@ -160,7 +174,7 @@ def _missing(t_ns: Int, other_ns: Int, truth: Truth) -> int:
 
 def _inside(off_m: Float, cov_m2: Float) -> Float:
     """(N,) whether errors (N, 3) are within the 95 % regions of covariances (N, 3, 3); without one: 0."""
-    known = np.isfinite(cov_m2).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(cov_m2).all(axis=(1, 2)), np.bool_)
     cov = np.where(known[:, None, None], cov_m2, np.eye(3)) + _FLOOR_M2 * np.eye(3)
     chi2 = (off_m * np.linalg.solve(cov, off_m[:, :, None])[:, :, 0]).sum(axis=1)
     return (known & (chi2 <= CHI2_95)).astype(np.float64)
@@ -172,7 +186,7 @@ def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
         return _nothing()
     exact = truth.at(run.t_ns)[0]
     moved_m = np.diff(exact, axis=0)
-    known = np.isfinite(moved_m).all(axis=2)
+    known = np.asarray(np.isfinite(moved_m).all(axis=2), np.bool_)
     length = 1e3 * np.linalg.norm(moved_m, axis=2)
     rests = known.any(axis=1) & (np.where(known, length, 0.0).max(axis=1) < _REST_MM)
     rests &= np.diff(run.t_ns) < _FOLLOWS_NS
@@ -183,16 +197,16 @@ def _rest_mm(run: Solved, truth: Truth, valid: Bool) -> Float:
 def _misfit(run: Solved, truth: Truth, scored: Bool) -> Float:
     """(L,) sum over joints of the squares of what differs in motion, each joint's mean error left out."""
     out = np.zeros(len(LAGS_NS))
-    exact = truth.at(run.t_ns)[0]
-    always = scored.any(axis=1).sum() >= 10 and truth.continuous
-    if not always:
+    if not truth.continuous:
         return out
-    motion = np.where(scored[:, :, None], exact, np.nan)
-    if np.nanmean(np.nanvar(motion, axis=0).sum(axis=1)) < _MOVES_M**2:
-        return out
-    whole = scored.any(axis=1)
+    whole = np.asarray(scored.any(axis=1), np.bool_)
     for lag in (LAGS_NS[0], LAGS_NS[-1]):  # the same instants for all lags
         whole &= np.isfinite(truth.at(run.t_ns - lag)[0]).any(axis=(1, 2))
+    if whole.sum() < 2 or np.ptp(run.t_ns[whole]) < _LONG_NS:
+        return out
+    exact = truth.at(run.t_ns[whole])[0]
+    if np.nanmean(np.var(exact, axis=0).sum(axis=1)) < _MOVES_M**2:
+        return out
     used = scored & whole[:, None]
     count = np.maximum(used.sum(axis=0), 1)[:, None]
     for k, lag in enumerate(LAGS_NS):
@@ -221,6 +235,7 @@ def figures(samples: Samples) -> dict[str, float]:
         "pose us": _percentile(samples.spent_us, 50.0),
         "poses": float(len(samples.spent_us)),
         "no hand": float(samples.without),
+        "ghosts": float(samples.ghosts),
     }
 
 

@@ -64,7 +64,8 @@ class Truth:
             RecordingError: It is not there, or broken.
         """
         data = read_npz(path, ("t_ns", "joints_m", "angles_rad", "continuous"), "freeze it again")
-        return cls(data["t_ns"], data["joints_m"], data["angles_rad"], bool(data["continuous"]))
+        t_ns = data["t_ns"].astype(np.int64)
+        return cls(t_ns, data["joints_m"], data["angles_rad"], bool(data["continuous"]))
 
 
 def sets_of(out: Path) -> list[str]:

@@ -47,6 +47,11 @@ def room(folder: Path, cameras: int, rate_hz: float) -> Path:
     return tree
 
 
+def middle_m() -> Float:
+    """Middle (3,) [m] of what the cameras of a room look at, rig frame."""
+    return np.array([0.0, 0.0, _RADIUS_M])
+
+
 def desk(folder: Path, rate_hz: float) -> Path:
     """Write a tree whose rig `desk` has cameras of that rate; return it."""
     tree = folder / "desk"
@@ -75,21 +80,17 @@ def dome(cameras: int) -> list[Float]:
     return [move @ pose for pose in out]
 
 
-def scene_of(setup: RigSetup) -> tuple[Scene, Float]:
-    """What is told of: the standard scene, and the way (3,) [m] from its frame to that of the rig."""
-    reference = load_setup(CALIBRATION, DESK)
-    profile = load(CALIBRATION / "hands" / f"{setup.rig.hand}.json", HandProfile)
-    # A dome's centre is its first camera's distance ahead, the scene's another.
-    ahead_m = _RADIUS_M - HAND_DEPTH_M if setup.rig.name == ROOM else 0.0
-    return Scene.standard(reference.rig, reference.cameras, profile), np.array([0.0, 0.0, ahead_m])
-
-
 def told(setup: RigSetup, rate_hz: float) -> dict[str, list[MarkerDetections]]:
     """Of each camera what it tells of `LOOP_S` of the standard scene; times are since its beginning.
 
     `session` is for the sender to set, `seq` counts, `t_ns` has the camera's phase.
     """
-    (scene, to_rig_m), rng = scene_of(setup), np.random.default_rng(_SEED)
+    reference = load_setup(CALIBRATION, DESK)
+    profile = load(CALIBRATION / "hands" / f"{setup.rig.hand}.json", HandProfile)
+    scene, rng = Scene.standard(reference.rig, reference.cameras, profile), np.random.default_rng(_SEED)
+    to_rig = np.eye(4)
+    if setup.rig.name == ROOM:  # the dome's centre is its first camera's distance ahead, the scene's another
+        to_rig[2, 3] = _RADIUS_M - HAND_DEPTH_M
     count = len(setup.rig.markers)
     sigma, nowhere = np.full(count, 0.1), np.full((count, 2), np.nan)
     out: dict[str, list[MarkerDetections]] = {}
@@ -98,7 +99,7 @@ def told(setup: RigSetup, rate_hz: float) -> dict[str, list[MarkerDetections]]:
         out[name] = []
         for seq in range(round(LOOP_S * rate_hz)):
             t_s = seq / rate_hz + phase_s
-            caps = scene.truth(t_s).markers_m + to_rig_m
+            caps = scene.truth(t_s).markers_m + to_rig[:3, 3]
             uv = model.project(caps) + rng.normal(size=(count, 2)) * NOISE_PX
             uv[rng.uniform(size=count) < UNSEEN] = np.nan
             away = np.linalg.norm(caps - model.centre, axis=1)
