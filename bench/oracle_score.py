@@ -90,7 +90,7 @@ class Samples:
         wanted: How many joints there are in truth, at all instants.
         instants, without, ghosts: With a hand in truth, those of them without one in the run, and the reverse.
         spent_us: (T,) processor time of each pose.
-        misfit: (L,) sum of squares [m^2] between motion and truth delayed by each of `LAGS_NS`.
+        misfit: (L,) sum of squares [m^2] between motion of TRACKED joints and truth delayed by each of `LAGS_NS`.
     """
 
     joint_mm: Float = field(default_factory=_nothing)
@@ -151,7 +151,7 @@ def _piece(run: Solved, truth: Truth, other_ns: Int) -> Samples:
         pip_deg=pip_deg[np.isfinite(pip_deg)],
         rest_mm=_rest_mm(run, truth, valid),
         spent_us=run.spent_us,
-        misfit=_misfit(run, truth, scored),
+        misfit=_misfit(run, truth, scored & run.tracked),  # others are off by more than they lag
         wanted=int(known.sum()) + missed * int(known.any(axis=0).sum()),
         instants=int(exists.sum()) + missed,
         without=int((exists & ~scored.any(axis=1)).sum()) + missed,
