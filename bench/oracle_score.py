@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.oracle_truth import Truth
+from bench.oracle_truth import STEP_NS, Truth
 from common.arrays import Bool, Float, Int
 from common.hand_model import FINGER_JOINTS
 from common.npz import read_npz
@@ -19,7 +19,7 @@ _FALSE_MM, _FALSE_DEG = 15.0, 20.0  # from there on a TRACKED joint is a false o
 _REST_MM = 0.05  # of the fastest joint from instant to instant: the hand rests
 _FOLLOWS_NS = 60_000_000  # longer apart, two instants are no step
 _SAME_NS = 4_000_000  # poses of two runs at most so far apart are of one instant
-_MOVES_M = 15e-3  # RMS of the joints' motion from which on a lag can be seen
+_FAST_M_S = 0.2  # of a joint: slower, its lag is less than its other errors
 _LONG_NS = 300_000_000  # of motion in which a lag can be seen
 LAGS_NS = 1_000_000 * np.arange(-20, 61)
 _OF_FINGER = np.zeros((26, 5), np.bool_)
@@ -90,7 +90,7 @@ class Samples:
         wanted: How many joints there are in truth, at all instants.
         instants, without, ghosts: With a hand in truth, those of them without one in the run, and the reverse.
         spent_us: (T,) processor time of each pose.
-        misfit: (L,) sum of squares [m^2] between motion of TRACKED joints and truth delayed by each of `LAGS_NS`.
+        misfit: (L,) sum of squares [m^2] between TRACKED joints that move fast and truth delayed by each of `LAGS_NS`.
     """
 
     joint_mm: Float = field(default_factory=_nothing)
@@ -204,10 +204,9 @@ def _misfit(run: Solved, truth: Truth, scored: Bool) -> Float:
         whole &= np.isfinite(truth.at(run.t_ns - lag)[0]).any(axis=(1, 2))
     if whole.sum() < 2 or np.ptp(run.t_ns[whole]) < _LONG_NS:
         return out
-    exact = truth.at(run.t_ns[whole])[0]
-    if np.nanmean(np.var(exact, axis=0).sum(axis=1)) < _MOVES_M**2:
-        return out
-    used = scored & whole[:, None]
+    step_m = truth.at(run.t_ns + STEP_NS)[0] - truth.at(run.t_ns - STEP_NS)[0]
+    fast = np.linalg.norm(step_m, axis=2) > _FAST_M_S * 2e-9 * STEP_NS
+    used = scored & whole[:, None] & fast
     count = np.maximum(used.sum(axis=0), 1)[:, None]
     for k, lag in enumerate(LAGS_NS):
         off = np.where(used[:, :, None], run.position_m - truth.at(run.t_ns - lag)[0], 0.0)

@@ -10,6 +10,7 @@ from common.npz import read_npz, write_npz
 
 FROZEN = "frozen"
 _MATCH_NS = 1_000_000
+_STILL_NS = 50_000_000  # a pose of an unrelated frame holds at its first row or at its middle one
 STEP_NS = 2_000_000
 """Between two rows of a truth that is read by linear interpolation: at 10 m/s^2 that errs by 5 um."""
 
@@ -48,7 +49,7 @@ class Truth:
 
     def _still(self, rows: Float, t_ns: Int) -> Float:
         nearest = np.abs(self.t_ns - t_ns[:, None]).argmin(axis=1)
-        near = np.abs(self.t_ns[nearest] - t_ns) <= _MATCH_NS
+        near = np.abs(self.t_ns[nearest] - t_ns) <= _STILL_NS
         return np.where(near[:, None], rows[nearest], np.nan)
 
     def save(self, path: Path) -> None:
