@@ -1,4 +1,7 @@
-"""`make bench`: prints the table of performance, section by section; `python -m bench NAME ...` runs some of them."""
+"""`make bench`: prints the table of performance, section by section; `python -m bench NAME ...` runs some of them.
+
+`python -m bench oracle --help`: two solvers on the same frozen messages.
+"""
 
 import argparse
 import importlib
@@ -61,7 +64,10 @@ SECTIONS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the sections asked for; return the exit code."""
+    """Run the sections asked for, or the oracle with its own options; return the exit code."""
+    given = sys.argv[1:] if arguments is None else arguments
+    if given[:1] == ["oracle"]:
+        return int(importlib.import_module("bench.oracle").main(given[1:]))
     sections = "\n".join(f"  {name:18s} {what}" for name, what in SECTIONS.items())
     parser = argparse.ArgumentParser(
         prog="python -m bench",
@@ -71,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("sections", nargs="*", metavar="SECTION", help="one of those below (default: all)")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the rows to FILE as well")
-    options = parser.parse_args(arguments)
+    options = parser.parse_args(given)
     wanted = cast(list[str], options.sections) or list(SECTIONS)
     if unknown := sorted(set(wanted) - SECTIONS.keys()):
         parser.error(f"unknown section {unknown[0]!r}; there are {', '.join(SECTIONS)}")

@@ -22,6 +22,7 @@ from common.arrays import Bool, Float
 from common.messages import MarkerDetections, WristDetections
 from common.sim.paint import MarkerView
 from common.sim.render import Renderer
+from common.sim.scene import Scene
 from common.sim.wrist.scene import WristTruth
 
 _LASTS_S = 0.2  # errors and misses are about the same for so long
@@ -74,7 +75,7 @@ def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     for camera in both.markers.rig.cameras:
         rate = both.markers.cameras[camera].frame_rate_hz / every
         times[camera] = times_of(both.scene, camera, seconds, rate)
-        found, paint[camera] = _markers(both, camera, times[camera], 1.0 / rate)
+        found, paint[camera] = markers_shown(both.scene, camera, times[camera], 1.0 / rate, both.seed)
         messages += found
     frame_s = 1.0 / both.wrist.cameras[both.wrist.rig.cameras[0]].frame_rate_hz
     line_t = np.arange(1.0, seconds / frame_s - 1.0, 3.0) * frame_s
@@ -82,14 +83,16 @@ def shown_of(both: Both, seconds: float, every: int = 1) -> Shown:
     return Shown(both, seconds, in_order(messages + triples), Sight(times, paint, line_t, line, tip))
 
 
-def _markers(both: Both, camera: str, times_s: Float, step_s: float) -> tuple[list[Observed], Float]:
-    """One marker camera's frames, and the paint (T, M) [px^2] in sight."""
-    place = both.markers.rig.cameras.index(camera)
-    count = len(both.markers.markers)
-    rng = np.random.default_rng([both.seed, 21, place])
+def markers_shown(
+    scene: Scene, camera: str, times_s: Float, step_s: float, seed: int
+) -> tuple[list[MarkerDetections], Float]:
+    """One marker camera's frames at scene times (T,) [s], and the paint (T, M) [px^2] in sight."""
+    place = scene.rig.cameras.index(camera)
+    count = len(scene.rig.markers)
+    rng = np.random.default_rng([seed, 21, place])
     least, lasting = _Wander(rng, (count,), step_s), _Wander(rng, (count, 2), step_s)
-    renderer = Renderer(both.scene, camera)
-    out: list[Observed] = []
+    renderer = Renderer(scene, camera)
+    out: list[MarkerDetections] = []
     paint: list[Float] = []
     for seq, t in enumerate(times_s.tolist()):
         view = renderer.markers(t)

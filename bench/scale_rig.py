@@ -47,6 +47,11 @@ def room(folder: Path, cameras: int, rate_hz: float) -> Path:
     return tree
 
 
+def middle_m() -> Float:
+    """Middle (3,) [m] of what the cameras of a room look at, rig frame."""
+    return np.array([0.0, 0.0, _RADIUS_M])
+
+
 def desk(folder: Path, rate_hz: float) -> Path:
     """Write a tree whose rig `desk` has cameras of that rate; return it."""
     tree = folder / "desk"
