@@ -1,7 +1,7 @@
 """Two cameras that nobody synchronised, and markers that cross in front of them: exact projections, row by row.
 
 The rig is the desk's: 75 mm apart, 497 px, lenses that distort. The second camera runs late by any offset; a marker is
-seen when its own row is exposed, as the mean over the exposure, with noise. What `Pairing` and `Triangulator` make of
+seen when its own row is exposed, as the mean over the exposure, with noise. What `FrameSync` and `Triangulator` make of
 the messages is held against the exact place at the moment of each instant.
 """
 
@@ -16,8 +16,8 @@ import numpy as np
 from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections
+from master.fabrik.sync import FrameSet, FrameSync
 from master.rig import load_setup
-from master.stereo.pairing import Instant, Pairing
 from master.stereo.triangulate import Triangulator
 
 CALIBRATION = Path(__file__).resolve().parents[1] / "calib_json"
@@ -164,7 +164,7 @@ def _instants(
     shooting: Shooting,
     treatment: Treatment,
     rng: np.random.Generator,
-) -> Iterator[tuple[Instant, float]]:
+) -> Iterator[tuple[FrameSet, float]]:
     """Instants of one run, and how long each waited."""
     streams = [
         list(_stream(name, c, model, motion, shooting, rng))
@@ -181,9 +181,10 @@ def _instants(
             ]
             for stream in streams
         ]
-    pairing = Pairing(
+    sync = FrameSync(
         known,
         dict.fromkeys(known, shooting.rate_hz),
+        MARKERS,
         policy="predict" if treatment == "predict" else "interpolate",
         continuous=treatment != "uncorrected",
     )
@@ -191,7 +192,7 @@ def _instants(
     for message in sorted((m for stream in streams for m in stream), key=lambda m: m.t_ns):
         model = known[message.camera]
         centre_ns = message.t_ns + 0.5 * (model.height_px - 1) * model.row_time_ns
-        for instant in pairing.push(message):
+        for instant in sync.push(message):
             count += 1
             if count > _TRACK and not instant.missing.any():
                 yield instant, max(centre_ns - instant.t_ns, 0.0) * 1e-9

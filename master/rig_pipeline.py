@@ -16,6 +16,7 @@ from master.fabrik.depth import LAW_MISFIT, depth_law, law_contradicts, law_misf
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver
+from master.fabrik.sync import FrameSync
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.fusion.pipeline import FusedPipeline, WristSide
 from master.hurry import never
@@ -25,7 +26,6 @@ from master.rig_setup import RigSetup
 from master.stereo.caps import CapModel
 from master.stereo.locate import CapLocator
 from master.stereo.misfit import RIG_PX, limits
-from master.stereo.pairing import Pairing
 from master.stereo.pipeline import MarkerPipeline, OtherSensors, SolvedPose, Stage
 from master.stereo.place import CalibrationResidual, Placement
 from master.wrist.pipeline import WristPipeline
@@ -104,7 +104,7 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
         setup.hand,
         rig.markers,
         setup.hand_markers,
-        sync=Pairing(setup.models, rates, policy=rig.pairing, continuous=continuous),
+        sync=FrameSync(setup.models, rates, len(rig.markers), policy=rig.pairing, continuous=continuous),
         triangulate=triangulate,
         one_euro=_point_filter(setup) if continuous else None,
         palm=PalmFitter(setup.hand, setup.hand_markers),

@@ -20,10 +20,10 @@ from master.fabrik.finger import Finger
 from master.fabrik.one_euro import PointFilter
 from master.fabrik.palm import Palm, PalmFitter
 from master.fabrik.palm_kernel import facing_of, targets_of
+from master.fabrik.sync import FrameSet, FrameSync
 from master.fabrik.triangulate import Triangulate
 from master.ik.hand import EXPLAINED
 from master.ik.hidden import FingerMemory, HiddenFingers
-from master.stereo.pairing import Instant, Pairing
 
 Stage = Callable[[str], AbstractContextManager[None]]
 FORGET_S = 0.5  # after this long without markers nothing is known of the hand any more
@@ -48,7 +48,7 @@ class FabrikSolver:
         markers: tuple[str, ...],
         hand_markers: tuple[str, ...],
         *,
-        sync: Pairing,
+        sync: FrameSync,
         triangulate: Triangulate,
         one_euro: PointFilter | None,
         palm: PalmFitter,
@@ -95,40 +95,40 @@ class FabrikSolver:
 
     def push(self, message: MarkerDetections) -> list[HandEstimate]:
         """Take one camera's centroids; return the hands they complete, oldest first."""
-        return [self.solve(instant) for instant in self.sync.push(message)]
+        return [self.solve(frames) for frames in self.sync.push(message)]
 
     def flush(self) -> list[HandEstimate]:
         """At the end of a recording: the hands that still wait for a camera."""
-        return [self.solve(instant) for instant in self.sync.flush()]
+        return [self.solve(frames) for frames in self.sync.flush()]
 
     def solve(
-        self, instant: Instant, near: SolvedHand | None = None, near_age_s: float = 0.0
+        self, frames: FrameSet, near: SolvedHand | None = None, near_age_s: float = 0.0
     ) -> HandEstimate:
         """Solve one instant.
 
         Args:
-            instant: What the cameras see of it.
+            frames: What the cameras see of it.
             near: A hand that is surer than this line's last one, for the side of the caps that the cameras see.
             near_age_s: How long ago that held [s].
         """
-        last, age_s = self._recent(instant.t_ns)
+        last, age_s = self._recent(frames.t_ns)
         seen_as, seen_age_s = (last, age_s) if near is None else (near, near_age_s)
-        pixels = instant.uv, instant.sigma_px, instant.area
+        pixels = frames.uv, frames.sigma_px, frames.area
         if last is None:
             self._memory = FingerMemory(self._model)
         with self._stage("triangulate"):
             markers = self.triangulate(*pixels, seen_as, seen_age_s)
             if seen_as is None:
-                first = self.solve_once(markers.points_m, markers.cov_m2, instant.area)
+                first = self.solve_once(markers.points_m, markers.cov_m2, frames.area)
                 markers = self.triangulate(*pixels, first, 0.0, as_seen=first is None)
         with self._stage("filter"):
             smooth = markers.points_m
             if self._one_euro is not None:
-                smooth = self._one_euro.push(instant.t_ns, smooth, markers.noise_m2)
+                smooth = self._one_euro.push(frames.t_ns, smooth, markers.noise_m2)
         with self._stage("fabrik"):
             points, cov = smooth[self.on_hand], markers.cov_m2[self.on_hand]
-            out = HandEstimate.unseen(instant.t_ns, markers, smooth, self.towards(points, instant.area))
-            palm = self._fit(instant.t_ns, points, cov, out.facing, last, age_s)
+            out = HandEstimate.unseen(frames.t_ns, markers, smooth, self.towards(points, frames.area))
+            palm = self._fit(frames.t_ns, points, cov, out.facing, last, age_s)
             return self._estimate(out, points, cov, palm)
 
     def solve_once(self, points: Float, cov: Float, area_px2: Float) -> SolvedHand | None:
@@ -150,6 +150,7 @@ class FabrikSolver:
 
     def rehearse(self) -> None:
         """Call every kernel once, so that none is compiled while a hand is tracked."""
+        self.sync.at(0)
         bent = np.full((5, 4), 0.2)
         _, places = self._palm.pose(_AWAY, self._model.clamp(bent))
         points, cov = np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan)

@@ -15,7 +15,7 @@ import numpy as np
 from common.arrays import Bool, Float, Int
 from master.stereo.misfit import RIG_PX
 
-_FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.stereo.tracks`
+_FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.fabrik.carry`
 _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter
 
 

@@ -1,7 +1,7 @@
 """What the cameras of a rig saw of one object around an instant, and when an instant has all it will get.
 
 An instant is the centre row of a frame of the leading camera: the first of the rig that is not silent, as in
-`master.stereo.pairing`. It is complete when every other camera has delivered a frame at or after it, its tags included
+`master.fabrik.sync`. It is complete when every other camera has delivered a frame at or after it, its tags included
 where the object has tags: those of a frame have come, or never will, when the markers of the next are there. It is due
 when the message time has passed its deadline. Message time is the newest capture time: no clock is read.
 
@@ -18,11 +18,10 @@ from common.arrays import Float, Int
 from common.camera_model import CameraModel
 from common.messages import MarkerDetections, TagDetections
 from master.fabrik.blob_bias import LensShift
+from master.fabrik.carry import HISTORY, SIGHTINGS
+from master.fabrik.sync import SILENT_FRAMES
 from master.objects.features import Features
-from master.stereo.tracks import SIGHTINGS
 
-HISTORY = 8
-SILENT_FRAMES = 12
 _PERIOD_NS = 16_666_667  # until frames have told
 _DEADLINE, _TAG_DEADLINE = 1.25, 2.25  # periods
 

@@ -21,6 +21,7 @@ from common.messages import HandPose, MarkerDetections, restamped
 from master.fabrik.blob_bias import LensShift
 from master.fabrik.estimate import HandEstimate, MarkerPositions
 from master.fabrik.solver import FabrikSolver
+from master.fabrik.sync import FrameSet
 from master.fusion.sensed_hand import SensedHand
 from master.ik.hand import HandSolution
 from master.ik.hand_one_euro import HandOneEuro
@@ -29,7 +30,6 @@ from master.ik.tracker import HandTracker, TrackedHand, pose_of
 from master.stereo.caps import CapModel
 from master.stereo.drift import DepthDrift
 from master.stereo.locate import CapLocator, Located
-from master.stereo.pairing import Instant
 from master.stereo.place import EXACT, CalibrationResidual, Placement, ray_covariance
 from master.stereo.rivals import RivalChooser
 from master.stereo.whereabouts import HandBelief, Past
@@ -62,7 +62,7 @@ class SolvedPose:
 
 
 class MarkerPipeline:
-    """Push machine. Holds pairing, line, tracker and filter, each with its own state."""
+    """Push machine. Holds line, tracker and filter, each with its own state."""
 
     def __init__(
         self,
@@ -136,7 +136,7 @@ class MarkerPipeline:
         shape = (len(self._cameras), len(self.markers))
         unseen = np.full(shape, np.nan)
         nothing = np.full((*shape, 2), np.nan)
-        instant = Instant(t_ns, nothing, unseen, unseen, ready_t_ns, np.ones(len(self._cameras), np.bool_))
+        instant = FrameSet(t_ns, nothing, unseen, unseen, ready_t_ns, np.ones(len(self._cameras), np.bool_))
         poses = self._solved([instant])
         return poses[0] if poses else None
 
@@ -151,7 +151,7 @@ class MarkerPipeline:
         """At the end of a recording: the poses that still wait for a camera."""
         return self._solved(self._line.sync.flush())
 
-    def _solved(self, instants: list[Instant]) -> list[SolvedPose]:
+    def _solved(self, instants: list[FrameSet]) -> list[SolvedPose]:
         """Poses of instants later than the last one; others are counted: cameras came back with old frames."""
         poses: list[SolvedPose] = []
         for instant in instants:
@@ -165,7 +165,7 @@ class MarkerPipeline:
             poses.append(self._solve(instant))
         return poses
 
-    def _solve(self, instant: Instant) -> SolvedPose:
+    def _solve(self, instant: FrameSet) -> SolvedPose:
         last, age_s = (None, 0.0) if self._tracker is None else self._tracker.recent(instant.t_ns)
         with self._stage("triangulate"):
             if self._lens_shift.any:
@@ -189,7 +189,7 @@ class MarkerPipeline:
         return SolvedPose(pose, instant.ready_t_ns)
 
     def _located_of(
-        self, instant: Instant, line: HandEstimate, last: HandSolution | None, age_s: float
+        self, instant: FrameSet, line: HandEstimate, last: HandSolution | None, age_s: float
     ) -> Located:
         """The markers by the rays of all cameras: the line's own, unless that goes by a law of disparity."""
         if isinstance(line.markers, Located):
@@ -203,7 +203,7 @@ class MarkerPipeline:
     def _refined(
         self,
         tracker: HandTracker,
-        instant: Instant,
+        instant: FrameSet,
         line: HandEstimate,
         found: Located,
         last: HandSolution | None,
@@ -245,7 +245,7 @@ class MarkerPipeline:
                 sight=self._sight(hand, on_hand),
             )
 
-    def _without_rivals(self, instant: Instant) -> Instant:
+    def _without_rivals(self, instant: FrameSet) -> FrameSet:
         """The instant with one place for each marker; the usual one has no rival and is passed on."""
         if instant.rival_uv is None or instant.rival_sigma_px is None:
             return instant
@@ -274,14 +274,14 @@ class MarkerPipeline:
         for m in np.flatnonzero(markers):
             self.counts[f"{event}.{self.markers[m]}"[:_NAME]] += 1
 
-    def _count_odd(self, found: MarkerPositions, instant: Instant) -> None:
+    def _count_odd(self, found: MarkerPositions, instant: FrameSet) -> None:
         """Count markers whose rays do not meet, and cameras that were left out."""
         self._count("apart", found.apart)
         self.counts["epipolar_misfits"] += int(found.apart.sum())
         if isinstance(found, Located) and found.left_out.any():
             self._count_left_out(found, instant)
 
-    def _count_left_out(self, found: Located, instant: Instant) -> None:
+    def _count_left_out(self, found: Located, instant: FrameSet) -> None:
         """Count what was left out of each camera, and instants at which that is most of what it sees."""
         sees = np.isfinite(instant.uv[..., 0]) & np.isfinite(found.points_m[:, 0])
         mostly = found.left_out.sum(axis=1) > 0.5 * sees.sum(axis=1)
@@ -291,7 +291,7 @@ class MarkerPipeline:
                 self.counts[f"mostly_left_out.{self._names[c]}"[:_NAME]] += 1
 
     def _with_rays(
-        self, instant: Instant, points: Float, cov: Float, last: HandSolution | None, age_s: float
+        self, instant: FrameSet, points: Float, cov: Float, last: HandSolution | None, age_s: float
     ) -> tuple[Float, Float]:
         """Points and covariances of the hand's markers, with those added that only one camera sees.
 

@@ -12,7 +12,7 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
 from master.fabrik.blob_bias import LensShift
-from master.stereo.pairing import Instant, Pairing
+from master.fabrik.sync import FrameSet, FrameSync
 from master.stereo.place import CalibrationResidual, Placement
 
 
@@ -78,18 +78,18 @@ def seen_by(
     """
     rows = rows_of(rig, names)
     cameras = tuple(models.values())
-    pairing, shift = Pairing(dict(models), dict(frame_rate_hz)), LensShift(cameras)
-    place = Placement(cameras, CalibrationResidual.of(rig))
+    sync = FrameSync(dict(models), dict(frame_rate_hz), len(rig.markers))
+    shift, place = LensShift(cameras), Placement(cameras, CalibrationResidual.of(rig))
     late_ns = {camera: round(1e3 * us) for camera, us in rig.stamp_offset_us.items()}
     moved = (replace(one, t_ns=one.t_ns + late_ns.get(one.camera, 0)) for one in messages)
-    instants = [instant for one in moved for instant in pairing.push(one)] + pairing.flush()
+    sets = [frames for one in moved for frames in sync.push(one)] + sync.flush()
     times, points, covs = list[int](), list[Float](), list[Float]()
-    for instant in instants:
-        uv = shift.centres(instant.uv, instant.area) if shift.any else instant.uv
-        uv, sigma = _clear(instant, uv)[:, rows], instant.sigma_px[:, rows]
+    for frames in sets:
+        uv = shift.centres(frames.uv, frames.area) if shift.any else frames.uv
+        uv, sigma = _clear(frames, uv)[:, rows], frames.sigma_px[:, rows]
         placed = place(uv, sigma)
         wrong = placed.apart(uv)
-        times.append(instant.t_ns)
+        times.append(frames.t_ns)
         points.append(np.where(wrong[:, None], np.nan, placed.points))
         covs.append(placed.cov)
     return _seen(tuple(names), times, points, covs)
@@ -117,11 +117,11 @@ def seen_in(poses: Sequence[HandPose], rig: RigCalibration, names: Sequence[str]
     )
 
 
-def _clear(instant: Instant, uv: Float) -> Float:
+def _clear(frames: FrameSet, uv: Float) -> Float:
     """Pixels (C, M, 2) without those that have a rival."""
-    if instant.rival_uv is None:
+    if frames.rival_uv is None:
         return uv
-    return np.where(np.isfinite(instant.rival_uv[..., :1]), np.nan, uv)
+    return np.where(np.isfinite(frames.rival_uv[..., :1]), np.nan, uv)
 
 
 def _seen(names: tuple[str, ...], times: list[int], points: list[Float], covs: list[Float]) -> Seen:

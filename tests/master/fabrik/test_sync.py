@@ -1,4 +1,4 @@
-"""Tests of pairing: which instants come out, when, in any order of messages, and where each marker was then."""
+"""Frame synchronisation: which instants come out, when, in any order of messages, and where each marker was."""
 
 import msgspec
 import numpy as np
@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from common.arrays import Float
 from common.messages import MarkerDetections
-from master.stereo.pairing import SILENT_FRAMES, Instant, Pairing
+from master.fabrik.carry import HISTORY
+from master.fabrik.sync import SILENT_FRAMES, FrameSet, FrameSync
 from tests.hand_helpers import camera_models, detections, rig_file
 
 MS = 1_000_000
@@ -16,11 +17,11 @@ PERIOD = 16 * MS
 RATES = {"left": 62.5, "right": 62.5, "top": 62.5}
 
 
-def pairing(
+def sync(
     row_time_us: float = 0.0, cameras: tuple[str, ...] = ("left", "right"), **options: object
-) -> Pairing:
+) -> FrameSync:
     models = camera_models(rig_file(cameras), row_time_us)
-    return Pairing(models, {name: RATES[name] for name in cameras}, **options)  # pyright: ignore[reportArgumentType]
+    return FrameSync(models, {name: RATES[name] for name in cameras}, 2, **options)  # pyright: ignore[reportArgumentType]
 
 
 def path(t_s: Float) -> Float:
@@ -46,7 +47,7 @@ def frame(
     return detections(camera, seq, t_ns, uv if shift is None else uv + shift)
 
 
-def push_all(machine: Pairing, messages: list[MarkerDetections]) -> list[Instant]:
+def push_all(machine: FrameSync, messages: list[MarkerDetections]) -> list[FrameSet]:
     out = [instant for message in messages for instant in machine.push(message)]
     return out + machine.flush()
 
@@ -63,7 +64,7 @@ def stream(camera: str, count: int, late_ns: int = 0, row_time_us: float = 0.0) 
 
 
 def test_an_instant_waits_for_the_other_camera_and_no_longer() -> None:
-    machine = pairing()
+    machine = sync()
     for k in range(2):
         machine.push(frame("left", k, k * PERIOD))
         machine.push(frame("right", k, k * PERIOD + 5 * MS))
@@ -75,7 +76,7 @@ def test_an_instant_waits_for_the_other_camera_and_no_longer() -> None:
 
 
 def test_the_deadline_emits_what_there_is() -> None:
-    machine = pairing()
+    machine = sync()
     push_early = [frame("left", 0, 0), frame("right", 0, 5 * MS), frame("right", 1, PERIOD + 5 * MS)]
     for message in push_early:
         machine.push(message)
@@ -89,7 +90,7 @@ def test_the_deadline_emits_what_there_is() -> None:
 
 
 def test_flush_emits_the_rest_once() -> None:
-    machine = pairing()
+    machine = sync()
     machine.push(frame("left", 0, 0))
     assert [i.t_ns for i in machine.flush()] == [0]
     assert machine.flush() == []
@@ -97,7 +98,7 @@ def test_flush_emits_the_rest_once() -> None:
 
 @pytest.mark.parametrize(("late_ms", "waits"), [(5, True), (7, True), (9, False), (15, False)])
 def test_predict_waits_only_for_a_frame_that_is_nearer_than_the_last(late_ms: int, waits: bool) -> None:
-    machine = pairing(policy="predict")
+    machine = sync(policy="predict")
     messages = interleaved(stream("left", 6), stream("right", 6, late_ms * MS))
     emitted = {i.t_ns: m.t_ns for m in messages for i in machine.push(m)}
     # From the third frame on: with the leader's own message, or with the other's that comes within half a period.
@@ -105,11 +106,11 @@ def test_predict_waits_only_for_a_frame_that_is_nearer_than_the_last(late_ms: in
 
 
 def test_predicted_tracks_follow_the_motion() -> None:
-    machine = pairing(policy="predict")
+    machine = sync(policy="predict")
     instants = push_all(machine, interleaved(stream("left", 8), stream("right", 8, 12 * MS)))
     last = instants[-1]
     np.testing.assert_allclose(last.uv[1], path(np.array(last.t_ns * 1e-9)), atol=0.1)
-    waited = push_all(pairing(), interleaved(stream("left", 8), stream("right", 8, 12 * MS)))[-1]
+    waited = push_all(sync(), interleaved(stream("left", 8), stream("right", 8, 12 * MS)))[-1]
     assert (last.sigma_px[1] > waited.sigma_px[1]).all()  # and is less sure than an interpolated one
 
 
@@ -120,7 +121,7 @@ def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(
     policy: str, late_ms: int, choices: list[bool]
 ) -> None:
     streams = stream("left", 20, row_time_us=20.0), stream("right", 20, late_ms * MS, row_time_us=20.0)
-    expected = push_all(pairing(20.0, policy=policy), interleaved(*streams))
+    expected = push_all(sync(20.0, policy=policy), interleaved(*streams))
     sent, order = [0, 0], [streams[0][0]]
     sent[0] = 1
     for left in choices:
@@ -131,7 +132,7 @@ def test_any_order_of_the_two_cameras_messages_gives_the_same_instants(
         if sent[c] < 20:
             order.append(streams[c][sent[c]])
             sent[c] += 1
-    found = push_all(pairing(20.0, policy=policy), order)
+    found = push_all(sync(20.0, policy=policy), order)
     complete = min(sent[0], sent[1] - 1)
     assert [i.t_ns for i in found[:complete]] == [i.t_ns for i in expected[:complete]]
     # The very first may be due before its cameras have tracks.
@@ -152,7 +153,7 @@ def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, ro
         stream(c, 10, late, row_time_us=row_time_us)
         for c, late in (("left", 0), ("right", int(late_ms * MS)))
     ]
-    instants = push_all(pairing(row_time_us), interleaved(*streams))
+    instants = push_all(sync(row_time_us), interleaved(*streams))
     assert len(instants) == 10
     for k, instant in enumerate(instants):
         assert instant.t_ns == k * PERIOD + round(239.5 * row_time_us * 1e3)  # the centre row of the leader
@@ -162,8 +163,8 @@ def test_a_parabola_is_met_exactly_whatever_the_capture_times(late_ms: float, ro
         np.testing.assert_allclose(instant.uv, [truth, truth], atol=0.05)  # half of a centroid's noise
 
 
-def test_a_single_sighting_is_held_and_its_doubt_is_a_hand_speed_times_the_time() -> None:
-    machine = pairing()
+def test_a_single_sighting_is_held_and_its_sigma_is_a_hand_speed_times_the_time() -> None:
+    machine = sync()
     machine.push(frame("left", 0, 0))
     machine.push(frame("right", 0, 4 * MS))
     [instant] = machine.flush()
@@ -174,7 +175,7 @@ def test_a_single_sighting_is_held_and_its_doubt_is_a_hand_speed_times_the_time(
 
 
 def test_a_marker_is_as_sure_as_its_slave_says() -> None:
-    machine = pairing()
+    machine = sync()
     machine.push(msgspec.structs.replace(frame("left", 0, 0), sigma_px=np.array([0.04, 0.7])))
     np.testing.assert_allclose(machine.flush()[0].sigma_px[0], [0.04, 0.7])
 
@@ -182,9 +183,9 @@ def test_a_marker_is_as_sure_as_its_slave_says() -> None:
 def test_a_lost_marker_stays_lost_and_leaves_the_other_alone() -> None:
     lost = np.array([[np.nan, np.nan], [0.0, 0.0]])
     left, right = stream("left", 10), stream("right", 10, 5 * MS)
-    whole = push_all(pairing(), interleaved(left, right))
+    whole = push_all(sync(), interleaved(left, right))
     right = [frame("right", k, k * PERIOD + 5 * MS, lost if 4 <= k < 7 else None) for k in range(10)]
-    found = push_all(pairing(), interleaved(left, right))
+    found = push_all(sync(), interleaved(left, right))
     for k in range(10):
         np.testing.assert_array_equal(found[k].uv[:, 1], whole[k].uv[:, 1])
         np.testing.assert_array_equal(found[k].uv[0], whole[k].uv[0])
@@ -211,7 +212,7 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
                 for m, rival, cross in zip(frames, rivals, crossed, strict=True)
             ]
         )
-    instants = push_all(pairing(20.6), interleaved(*streams))
+    instants = push_all(sync(20.6), interleaved(*streams))
     for instant in instants[3:]:
         assert instant.rival_uv is not None
         truth = path(np.array(instant.t_ns * 1e-9))
@@ -224,7 +225,7 @@ def test_a_rival_is_carried_at_the_time_of_its_own_row() -> None:
 
 
 def test_no_rival_costs_nothing_and_makes_none() -> None:
-    instants = push_all(pairing(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
+    instants = push_all(sync(), interleaved(stream("left", 4), stream("right", 4, 5 * MS)))
     assert all(instant.rival_uv is None and instant.rival_sigma_px is None for instant in instants)
 
 
@@ -232,7 +233,7 @@ def test_no_rival_costs_nothing_and_makes_none() -> None:
 
 
 def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
-    machine = pairing()
+    machine = sync()
     left, right = stream("left", 10), stream("right", 80, 5 * MS)
     instants = push_all(machine, interleaved(left, right))
     times = np.array([i.t_ns for i in instants])
@@ -244,21 +245,21 @@ def test_when_the_leader_falls_silent_the_next_camera_leads() -> None:
 
 
 def test_when_the_other_camera_falls_silent_poses_go_on() -> None:
-    machine = pairing()
+    machine = sync()
     instants = push_all(machine, interleaved(stream("left", 60), stream("right", 10, 5 * MS)))
     assert [i.t_ns for i in instants] == [k * PERIOD for k in range(60)]
     assert all(i.missing[1] for i in instants[13:])
 
 
 def test_after_the_silence_an_instant_no_longer_waits_for_the_deadline() -> None:
-    machine = pairing()
+    machine = sync()
     for message in interleaved(stream("left", 60), stream("right", 2, 5 * MS)):
         machine.push(message)
     assert [i.t_ns for i in machine.push(frame("left", 60, 60 * PERIOD))] == [60 * PERIOD]
 
 
 def test_a_leader_that_returns_leads_again_and_time_never_steps_back() -> None:
-    machine = pairing()
+    machine = sync()
     left = stream("left", 10) + [frame("left", k, k * PERIOD) for k in range(60, 80)]
     messages = interleaved(left, stream("right", 80, 5 * MS))
     # Its first frame comes behind one of the other camera that was exposed later.
@@ -272,7 +273,7 @@ def test_a_leader_that_returns_leads_again_and_time_never_steps_back() -> None:
 
 
 def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
-    machine = pairing()
+    machine = sync()
     for message in interleaved(stream("left", 5), stream("right", 5, 5 * MS)):
         machine.push(message)
     assert machine.push(frame("left", 5, 2 * PERIOD)) == []
@@ -287,7 +288,7 @@ def test_a_clock_that_steps_back_is_ignored_until_time_goes_on() -> None:
 )
 def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, kept: bool, first: str) -> None:
     """A cable is out between the leader's frame and its partner's: the pose would be as old as the cut."""
-    machine = pairing()
+    machine = sync()
     for message in interleaved(stream("left", 6), stream("right", 5, 5 * MS)):
         machine.push(message)
     back = 5 + pause
@@ -302,7 +303,7 @@ def test_what_waited_for_a_partner_while_nothing_came_is_left_out(pause: int, ke
 
 
 def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
-    machine = pairing()
+    machine = sync()
     times = [0, 1, 400, 401, 800]
     found = push_all(
         machine, [frame(c, k, t * PERIOD) for k, t in enumerate(times) for c in ("left", "right")]
@@ -314,7 +315,7 @@ def test_a_whole_pair_before_a_pause_is_told_whenever_it_is_complete() -> None:
 def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
     cameras = ("left", "right", "top")
     streams = [stream(camera, 10, late * MS) for camera, late in zip(cameras, (0, 5, 11), strict=True)]
-    instants = push_all(pairing(cameras=cameras), interleaved(*streams))
+    instants = push_all(sync(cameras=cameras), interleaved(*streams))
     assert len(instants) == 10
     for instant in instants[2:]:
         assert instant.uv.shape == (3, 2, 2)
@@ -322,7 +323,7 @@ def test_three_cameras_meet_at_the_instant_of_the_first() -> None:
 
 
 def test_unrelated_frames_are_never_mixed() -> None:
-    machine = pairing(continuous=False)
+    machine = sync(continuous=False)
     messages = [
         detections(camera, k, k * 1_000 * MS + late, np.full((2, 2), 100.0 * k))
         for k in range(3)
@@ -332,19 +333,45 @@ def test_unrelated_frames_are_never_mixed() -> None:
     assert len(instants) == 3
     for k, instant in enumerate(instants):
         np.testing.assert_array_equal(instant.uv, np.full((2, 2, 2), 100.0 * k))
-    lonely = push_all(pairing(continuous=False), [messages[0], messages[3]])
+    lonely = push_all(sync(continuous=False), [messages[0], messages[3]])
     assert list(lonely[0].missing) == [False, True]
 
 
 def test_a_stranger_is_a_mistake_of_the_caller() -> None:
     with pytest.raises(ValueError, match="stranger"):
-        pairing().push(frame("stranger", 0, 0))
+        sync().push(frame("stranger", 0, 0))
+    with pytest.raises(ValueError, match="'left': 1 markers, not 2"):
+        sync().push(detections("left", 0, 0, np.full((1, 2), 100.0)))
+
+
+def test_what_was_emitted_stays_as_it_was() -> None:
+    machine = sync()
+    messages = interleaved(stream("left", 4), stream("right", 4, 5 * MS))
+    kept = push_all(machine, messages)
+    before = [(one.uv.copy(), one.sigma_px.copy(), one.area.copy(), one.missing.copy()) for one in kept]
+    push_all(
+        machine, interleaved(*([frame(c, k, k * PERIOD) for k in range(9, 30)] for c in ("left", "right")))
+    )
+    for one, was in zip(kept, before, strict=True):
+        for array, copy in zip((one.uv, one.sigma_px, one.area, one.missing), was, strict=True):
+            np.testing.assert_array_equal(array, copy)
+
+
+def test_an_instant_older_than_all_that_is_held_has_no_frame() -> None:
+    machine = sync()
+    for k in range(2 * HISTORY):
+        machine.push(frame("left", k, k * PERIOD))
+    found = machine.at(0)
+    assert found.missing.all()
+    assert np.isnan(found.uv).all()
+    assert found.ready_t_ns == 0
+    assert sync().at(0).missing.all()
 
 
 @pytest.mark.parametrize("what", ["seldom", "old"])
 def test_a_leader_that_hardly_delivers_or_only_what_is_old_leads_no_more(what: str) -> None:
     """One frame in fifteen, or stamps nearly a second old: the hand is as often there as the other camera's frames."""
-    machine, found = pairing(), list[int]()
+    machine, found = sync(), list[int]()
     for k in range(300):
         left_ns = k * PERIOD - (59 * PERIOD if what == "old" and k > 60 else 0)
         if what == "old" or k < 60 or k % 15 == 0:
