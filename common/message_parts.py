@@ -194,19 +194,26 @@ def refuse_parts(message: Message, field: str) -> None:
         missing = row[0] != row[0]
         for value in row:
             if (value != value) is not missing:
-                raise ValueError(f"{field}: NaN in a part of a row, must be in all of it or nowhere")
+                raise _in_part(field)
 
 
 def refuse_sigma(message: Message, sigma: str, uv: str) -> None:
-    """Refuse standard deviations (N,) that are not there where points (N, 2) are seen, or elsewhere.
+    """Refuse points (N, 2) seen in part, and standard deviations (N,) that are not just where points are seen.
 
     Raises:
         ValueError: One is.
     """
     points: Float = getattr(message, uv)
-    for u, value in zip(points[:, 0].tolist(), getattr(message, sigma).tolist(), strict=True):
-        if (u != u) is not (value != value):
+    for (u, v), value in zip(points.tolist(), getattr(message, sigma).tolist(), strict=True):
+        missing = u != u
+        if (v != v) is not missing:
+            raise _in_part(uv)
+        if (value != value) is not missing:
             raise ValueError(f"{sigma}: must be positive where {uv} is seen and NaN elsewhere")
+
+
+def _in_part(field: str) -> ValueError:
+    return ValueError(f"{field}: NaN in a part of a row, must be in all of it or nowhere")
 
 
 def refuse_beyond(message: Message, field: str) -> None:

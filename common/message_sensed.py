@@ -73,7 +73,6 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         if self.rival_uv.size == 0:
             force_setattr(self, "rival_uv", nowhere(m))
         _marker_arrays(m).freeze(self)
-        refuse_parts(self, "uv")
         refuse_sigma(self, "sigma_px", "uv")
         if self.rival_uv is nowhere(m):
             return
@@ -126,7 +125,6 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     def __post_init__(self) -> None:
         _TRIPLE_ARRAYS.freeze(self)
         for uv, sigma in (("laser_uv", "laser_sigma_px"), ("tip_uv", "tip_sigma_px")):
-            refuse_parts(self, uv)
             refuse_sigma(self, sigma, uv)
 
 
