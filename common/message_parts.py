@@ -9,16 +9,26 @@ docs/schema/messages.json list the bounds from here.
 """
 
 import re
+from collections.abc import Mapping
 from functools import cache
-from math import nan
-from typing import Annotated, Any, NamedTuple
+from math import prod
+from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
+from msgspec.structs import force_setattr
 
-from common.arrays import Float
+from common.arrays import Bool, Code, Float, Ids
 
+_FLOAT = np.dtype(np.float64)
+# Elements of each type of array; on the wire the same, little-endian, as all machines of ours are.
+DTYPES: dict[object, np.dtype[Any]] = {
+    Float: _FLOAT,
+    Bool: np.dtype(np.bool_),
+    Code: np.dtype(np.uint8),
+    Ids: np.dtype(np.uint16),
+}
 MAX_MARKERS = 48
 MAX_TAGS = 16  # in one frame: their corners fit one Ethernet packet
 JOINT_COUNT = 26
@@ -27,7 +37,6 @@ MAX_PICTURE = 16_384  # width and height of a picture [px]
 MAX_COUNT = 2**63 - 1
 MAX_TIME_NS = 2**61  # 73 years; sums and differences of two stay within 63 bits
 MAX_NUMBER = 1e18
-_LOOPED = 32  # so few elements are compared faster one by one than by numpy
 _TURN = 1.001  # an element of a unit quaternion, rounded
 _LENGTH = 0.1  # by how much the squared length of a quaternion may miss 1
 
@@ -90,40 +99,121 @@ def bounds_of(kind: type) -> dict[str, Bounds]:
     return {name: extra[0]["bounds"] for name, extra in extras.items() if extra}
 
 
+def array_type(of: object) -> object:
+    """The type of a field without its bounds."""
+    return get_args(of)[0] if get_origin(of) is Annotated else of
+
+
 def printable(text: str) -> str:
     """Return the text with a question mark for each character that `Text` refuses."""
     return _NOT_PRINTABLE.sub("?", text)
 
 
-def freeze(
-    message: Message, field: str, dtype: type[np.generic], shape: tuple[int, ...], *, whole: bool = False
-) -> None:
-    """Check the shape and bounds of an array field, and make it read-only.
+_NOTHING = None, None
 
-    The array is given its shape, and copied if it was writable.
 
-    With `whole`, each of its rows is NaN in all or in no element: a point is seen or not.
+class Layout:
+    """The array fields of one kind of message: type, shape, and bounds of each element.
+
+    The bounds stand one after the other in two vectors, so that all numbers of a message are compared at once.
+    """
+
+    def __init__(self, kind: type[Message], **shapes: tuple[int, ...]) -> None:
+        """Fields of `kind` with these shapes, in this order."""
+        types = {field.name: field.type for field in msgspec.structs.fields(kind)}
+        self.arrays = tuple((name, DTYPES[array_type(types[name])], shape) for name, shape in shapes.items())
+        self._expected = {name: (dtype, shape) for name, dtype, shape in self.arrays}
+        bounds = bounds_of(kind)
+        self._numbers = [
+            (name, prod(shape), bounds[name]) for name, shape in shapes.items() if name in bounds
+        ]
+        each = [of for _, size, of in self._numbers for _ in range(size)]
+        self._low, self._high = np.array(each).reshape(-1, 2).T.copy()
+
+    def freeze(self, message: Message) -> None:
+        """Check all arrays of a new message, and make them read-only.
+
+        Each is given its shape, and copied if it was writable.
+
+        Raises:
+            ValueError: Another shape.
+            OutOfBoundsError: An element is beyond the bounds of its field.
+        """
+        numbers: list[np.ndarray] = []
+        for name, dtype, shape in self.arrays:
+            given = getattr(message, name)
+            array = np.asarray(given, dtype)
+            if array.shape != shape:
+                try:
+                    array = array.reshape(shape)
+                except ValueError as error:
+                    raise ValueError(f"{name}: shape {array.shape}, expected {shape}") from error
+            if array.flags.writeable:
+                array = array.copy()
+                array.setflags(write=False)
+            if array is not given:
+                force_setattr(message, name, array)
+            if dtype is _FLOAT:
+                numbers.append(array.ravel())
+        every = np.concatenate(numbers)
+        # NaN, which is "not observed", is neither less nor greater.
+        if np.count_nonzero(every < self._low) or np.count_nonzero(every > self._high):
+            self._refuse(every.tolist())
+
+    def adopt(self, message: Message, arrays: Mapping[str, np.ndarray]) -> None:
+        """Give a message arrays that their maker knows to be good: read-only from here on, their numbers not looked at.
+
+        Raises:
+            ValueError: Another name, shape or type: the maker is wrong.
+        """
+        for name, array in arrays.items():
+            dtype, shape = self._expected.get(name, _NOTHING)
+            if array.shape != shape or (array.dtype is not dtype and array.dtype != dtype):
+                raise ValueError(f"{name}: {array.dtype} {array.shape}, expected {dtype} {shape}")
+            array.setflags(write=False)
+            force_setattr(message, name, array)
+
+    def _refuse(self, every: list[float]) -> None:
+        """Name the first number that is beyond its bounds."""
+        begin = 0
+        for name, size, (low, high) in self._numbers:
+            for value in every[begin : begin + size]:
+                if value < low or value > high:
+                    raise _beyond(name, value, low, high)
+            begin += size
+
+
+def refuse_parts(message: Message, field: str) -> None:
+    """Refuse points (..., D) of which one is seen in part: a row is NaN in all or in no element.
 
     Raises:
-        ValueError: Another shape, or a row that is NaN in part.
-        OutOfBoundsError: An element is beyond the bounds of the field.
+        ValueError: One is.
     """
-    given = getattr(message, field)
-    array = np.asarray(given, dtype=dtype)
-    if array.shape != shape:
-        try:
-            array = array.reshape(shape)
-        except ValueError as error:
-            raise ValueError(f"{field}: shape {array.shape}, expected {shape}") from error
-    if dtype is np.float64:
-        _refuse_beyond(field, array, bounds_of(type(message))[field])
-        if whole:
-            _refuse_parts(field, array)
-    if array.flags.writeable:
-        array = array.copy()
-        array.flags.writeable = False
-    if array is not given:
-        msgspec.structs.force_setattr(message, field, array)
+    points: Float = getattr(message, field)
+    for row in points.reshape(-1, points.shape[-1]).tolist():
+        missing = row[0] != row[0]
+        for value in row:
+            if (value != value) is not missing:
+                raise _in_part(field)
+
+
+def refuse_sigma(message: Message, sigma: str, uv: str) -> None:
+    """Refuse points (N, 2) seen in part, and standard deviations (N,) that are not just where points are seen.
+
+    Raises:
+        ValueError: One is.
+    """
+    points: Float = getattr(message, uv)
+    for (u, v), value in zip(points.tolist(), getattr(message, sigma).tolist(), strict=True):
+        missing = u != u
+        if (v != v) is not missing:
+            raise _in_part(uv)
+        if (value != value) is not missing:
+            raise ValueError(f"{sigma}: must be positive where {uv} is seen and NaN elsewhere")
+
+
+def _in_part(field: str) -> ValueError:
+    return ValueError(f"{field}: NaN in a part of a row, must be in all of it or nowhere")
 
 
 def refuse_beyond(message: Message, field: str) -> None:
@@ -148,22 +238,5 @@ def refuse_no_turn(message: Message, field: str) -> None:
         raise OutOfBoundsError(f"{field}: a quaternion of squared length {w * w + x * x + y * y + z * z:g}")
 
 
-def _refuse_beyond(field: str, array: np.ndarray, bounds: Bounds) -> None:
-    low, high = bounds
-    if array.size <= _LOOPED:
-        for value in array.ravel().tolist():
-            if value < low or value > high:
-                raise _beyond(field, value, low, high)
-    elif ((array < low) | (array > high)).any():
-        raise _beyond(field, nan, low, high)
-
-
-def _refuse_parts(field: str, array: np.ndarray) -> None:
-    missing = np.isnan(array) if array.ndim > 1 else np.isnan(array)[None]
-    if (missing.any(axis=-1) != missing.all(axis=-1)).any():
-        raise ValueError(f"{field}: NaN in a part of a row, must be in all of it or nowhere")
-
-
 def _beyond(field: str, value: float, low: float, high: float) -> OutOfBoundsError:
-    shown = "an element" if value != value else f"{value:g}"
-    return OutOfBoundsError(f"{field}: {shown} is not within {low:g} ... {high:g}")
+    return OutOfBoundsError(f"{field}: {value:g} is not within {low:g} ... {high:g}")

@@ -10,13 +10,13 @@ in an array or a number is "not known", and within all bounds.
 import inspect
 from collections.abc import Sequence
 from math import isnan
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
 
 from common.arrays import Bool, Code, Float, Ids
-from common.message_parts import MAX_COUNT, MAX_NUMBER, MAX_PICTURE, MAX_TIME_NS, bounds_of
+from common.message_parts import MAX_COUNT, MAX_NUMBER, MAX_PICTURE, MAX_TIME_NS, array_type, bounds_of
 from common.messages import WIRE_VERSION, AnyMessage, Backlog, Message
 from common.session import Handshake
 from common.streams import ALIVE_KEY, STREAMS, Path
@@ -74,7 +74,7 @@ def _parts(kinds: Sequence[type[Message]]) -> dict[str, Any]:
     for kind in kinds:
         fields = parts[kind.__name__]["properties"]
         for field in msgspec.structs.fields(kind):
-            array = get_args(field.type)[0] if get_origin(field.type) is Annotated else field.type
+            array = array_type(field.type)
             if array in _DTYPES:
                 limits = _limits(kind, field.name)
                 fields[field.encode_name] = {"x-msgpack": "bin", "x-dtype": _DTYPES[array]} | limits

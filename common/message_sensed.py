@@ -5,9 +5,9 @@ from functools import cache
 from math import nan
 from typing import Annotated, TypeAlias
 
-import msgspec
 import numpy as np
 from msgspec import Meta
+from msgspec.structs import force_setattr
 
 from common.arrays import Float, Ids
 from common.message_parts import (
@@ -16,6 +16,7 @@ from common.message_parts import (
     MAX_PICTURE,
     MAX_TAGS,
     Count,
+    Layout,
     Message,
     Name,
     Pixels,
@@ -24,9 +25,10 @@ from common.message_parts import (
     TimeNs,
     TimeSigmaNs,
     Turn,
-    freeze,
     refuse_beyond,
     refuse_no_turn,
+    refuse_parts,
+    refuse_sigma,
     within,
 )
 
@@ -68,18 +70,13 @@ class MarkerDetections(Message, frozen=True, eq=False, tag=True):
         m = len(self.area)
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
-        freeze(self, "uv", np.float64, (m, 2), whole=True)
-        freeze(self, "area", np.float64, (m,))
-        freeze(self, "quality", np.float64, (m,))
-        freeze(self, "sigma_px", np.float64, (m,))
-        # A list is faster than numpy for so few.
-        for u, sigma in zip(self.uv[:, 0].tolist(), self.sigma_px.tolist(), strict=True):
-            if (u != u) != (sigma != sigma):
-                raise ValueError("sigma_px: must be positive where uv is seen and NaN elsewhere")
         if self.rival_uv.size == 0:
-            msgspec.structs.force_setattr(self, "rival_uv", nowhere(m))
+            force_setattr(self, "rival_uv", nowhere(m))
+        _marker_arrays(m).freeze(self)
+        refuse_sigma(self, "sigma_px", "uv")
+        if self.rival_uv is nowhere(m):
             return
-        freeze(self, "rival_uv", np.float64, (m, 2), whole=True)
+        refuse_parts(self, "rival_uv")
         if not np.isnan(self.rival_uv[np.isnan(self.uv[:, 0])]).all():
             raise ValueError("rival_uv: a rival of a marker that is not seen")
 
@@ -126,18 +123,9 @@ class WristDetections(Message, frozen=True, eq=False, tag=True):
     exposure_us: Annotated[float, Meta(ge=0.0, le=1e7)] = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("laser_uv", "tip_uv"):
-            freeze(self, name, np.float64, (FINGER_COUNT, 2), whole=True)
-        for name in ("laser_sigma_px", "laser_px", "tip_sigma_px", "tip_depth"):
-            freeze(self, name, np.float64, (FINGER_COUNT,))
-        for what, uv, sigma in (
-            ("laser", self.laser_uv, self.laser_sigma_px),
-            ("tip", self.tip_uv, self.tip_sigma_px),
-        ):
-            if (np.isnan(sigma) != np.isnan(uv[:, 0])).any():
-                raise ValueError(
-                    f"{what}_sigma_px: must be positive where {what}_uv is seen and NaN elsewhere"
-                )
+        _TRIPLE_ARRAYS.freeze(self)
+        for uv, sigma in (("laser_uv", "laser_sigma_px"), ("tip_uv", "tip_sigma_px")):
+            refuse_sigma(self, sigma, uv)
 
 
 class TagDetections(Message, frozen=True, eq=False, tag=True):
@@ -170,9 +158,7 @@ class TagDetections(Message, frozen=True, eq=False, tag=True):
         n = len(self.ids)
         if n > MAX_TAGS:
             raise ValueError(f"{n} tags, at most {MAX_TAGS}")
-        freeze(self, "ids", np.uint16, (n,))
-        freeze(self, "uv", np.float64, (n, 4, 2))
-        freeze(self, "sigma_px", np.float64, (n,))
+        _tag_arrays(n).freeze(self)
         if (self.ids[1:] <= self.ids[:-1]).any():
             raise ValueError("ids: must rise, each once")
         if np.isnan(self.uv).any() or np.isnan(self.sigma_px).any():
@@ -199,8 +185,8 @@ class TrackerPose(Message, frozen=True, eq=False, tag=True):
     orientation_wxyz: Turn
 
     def __post_init__(self) -> None:
-        freeze(self, "position_m", np.float64, (3,), whole=True)
-        freeze(self, "orientation_wxyz", np.float64, (4,))
+        _TRACKER_ARRAYS.freeze(self)
+        refuse_parts(self, "position_m")
         refuse_no_turn(self, "orientation_wxyz")
 
 
@@ -231,8 +217,7 @@ class ImuSample(Message, frozen=True, eq=False, tag=True):
     heading_sigma_rad: Annotated[float, within(0.0, 1e3)] = nan
 
     def __post_init__(self) -> None:
-        for field, size in (("gyro_rad_s", 3), ("accel_m_s2", 3), ("mag_ut", 3), ("orientation_wxyz", 4)):
-            freeze(self, field, np.float64, (size,))
+        _IMU_ARRAYS.freeze(self)
         refuse_no_turn(self, "orientation_wxyz")
         refuse_beyond(self, "heading_sigma_rad")
 
@@ -246,3 +231,26 @@ def nowhere(markers: int) -> Float:
     nowhere = np.full((markers, 2), np.nan)
     nowhere.flags.writeable = False
     return nowhere
+
+
+@cache
+def _marker_arrays(m: int) -> Layout:
+    return Layout(MarkerDetections, uv=(m, 2), area=(m,), quality=(m,), sigma_px=(m,), rival_uv=(m, 2))
+
+
+@cache
+def _tag_arrays(n: int) -> Layout:
+    return Layout(TagDetections, ids=(n,), uv=(n, 4, 2), sigma_px=(n,))
+
+
+_TRIPLE_ARRAYS = Layout(
+    WristDetections,
+    laser_uv=(FINGER_COUNT, 2),
+    laser_sigma_px=(FINGER_COUNT,),
+    laser_px=(FINGER_COUNT,),
+    tip_uv=(FINGER_COUNT, 2),
+    tip_sigma_px=(FINGER_COUNT,),
+    tip_depth=(FINGER_COUNT,),
+)
+_TRACKER_ARRAYS = Layout(TrackerPose, position_m=(3,), orientation_wxyz=(4,))
+_IMU_ARRAYS = Layout(ImuSample, gyro_rad_s=(3,), accel_m_s2=(3,), mag_ut=(3,), orientation_wxyz=(4,))

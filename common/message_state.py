@@ -138,7 +138,7 @@ class Backlog(Message, frozen=True, eq=False, tag=True):
     Attributes:
         source: Process name: "master".
         t_ns: When that message was there [ns], master's clock.
-        leave_out: How many instants of each hand are left out between two that are solved; 0: it is not behind.
+        leave_out: How many instants of each hand are left out, at most, between two that are solved; 0: none.
     """
 
     source: Name

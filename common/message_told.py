@@ -1,24 +1,27 @@
 """What a master makes of it: poses of hands and objects, contact of both, gestures."""
 
+from copy import copy
 from enum import IntEnum
+from functools import cache
 from math import nan
-from typing import Annotated, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from msgspec import Meta, field
+from msgspec.structs import fields, force_setattr
 
 from common.arrays import Bool, Code, Float
 from common.message_parts import (
     FINGER_COUNT,
     JOINT_COUNT,
     MAX_MARKERS,
+    Layout,
     Message,
     Metres,
     Name,
     Numbers,
     TimeNs,
     Turn,
-    freeze,
     refuse_beyond,
     within,
 )
@@ -121,33 +124,31 @@ class HandPose(Message, frozen=True, eq=False, tag=True):
     wrist_bend_sigma_rad: Numbers = field(default_factory=lambda: _NO_SIGMA)
 
     def __post_init__(self) -> None:
-        j = JOINT_COUNT
         m = self.markers_m.size // 3
         if m > MAX_MARKERS:
             raise ValueError(f"{m} markers, at most {MAX_MARKERS}")
-        freeze(self, "position_m", np.float64, (j, 3))
-        freeze(self, "orientation_wxyz", np.float64, (j, 4))
-        freeze(self, "radius_m", np.float64, (j,))
-        freeze(self, "valid", np.bool_, (j,))
-        freeze(self, "tracked", np.bool_, (j,))
-        freeze(self, "cov_m2", np.float64, (j, 3, 3))
-        freeze(self, "source", np.uint8, (j,))
-        if self.source.max() > max(Source):
-            raise ValueError(f"source: {self.source.max()} is no Source code")
-        freeze(self, "angles_rad", np.float64, (FINGER_COUNT, 4))
-        freeze(self, "markers_m", np.float64, (m, 3))
-        freeze(self, "markers_raw_m", np.float64, (m, 3))
-        freeze(self, "markers_cov_m2", np.float64, (m, 3, 3))
-        freeze(self, "inside_volume", np.bool_, (j,))
-        freeze(self, "laser_m", np.float64, (FINGER_COUNT, 3))
-        freeze(self, "level", np.uint8, (FINGER_COUNT,))
-        if self.level.max() > max(Level):
-            raise ValueError(f"level: {self.level.max()} is no Level code")
-        freeze(self, "ambiguous", np.bool_, (FINGER_COUNT,))
-        freeze(self, "palm_world_wxyz", np.float64, (4,))
-        freeze(self, "palm_world_sigma_rad", np.float64, (2,))
-        freeze(self, "wrist_bend_rad", np.float64, (2,))
-        freeze(self, "wrist_bend_sigma_rad", np.float64, (2,))
+        _hand_arrays(m).freeze(self)
+        for name, kind, most in (("source", Source, _MOST_SOURCE), ("level", Level, _MOST_LEVEL)):
+            if (code := max(getattr(self, name).tolist())) > most:
+                raise ValueError(f"{name}: {code} is no {kind.__name__} code")
+
+    @classmethod
+    def known_good(cls, hand: str, t_ns: int, **arrays: Float | Bool | Code) -> "HandPose":
+        """A pose of arrays that its maker knows to be good: their numbers are not checked.
+
+        They become read-only, and are the pose's: nobody writes into them later. Those of a wrist device may be
+        missing.
+
+        Raises:
+            ValueError: An array has another shape or type, or is missing.
+        """
+        if missing := _NEEDED - arrays.keys():
+            raise ValueError(f"missing: {', '.join(sorted(missing))}")
+        pose = copy(_NO_HAND)
+        force_setattr(pose, "hand", hand)
+        force_setattr(pose, "t_ns", t_ns)
+        _hand_arrays(len(arrays["markers_m"])).adopt(pose, arrays)
+        return pose
 
 
 class ObjectPose(Message, frozen=True, eq=False, tag=True):
@@ -183,9 +184,7 @@ class ObjectPose(Message, frozen=True, eq=False, tag=True):
     latency_ns: TimeNs = 0
 
     def __post_init__(self) -> None:
-        freeze(self, "position_m", np.float64, (3,))
-        freeze(self, "orientation_wxyz", np.float64, (4,))
-        freeze(self, "cov", np.float64, (6, 6))
+        _OBJECT_ARRAYS.freeze(self)
         refuse_beyond(self, "residual_m")
 
 
@@ -216,10 +215,7 @@ class Contact(Message, frozen=True, eq=False, tag=True):
     held: bool
 
     def __post_init__(self) -> None:
-        freeze(self, "distance_m", np.float64, (FINGER_COUNT,))
-        freeze(self, "sigma_m", np.float64, (FINGER_COUNT,))
-        freeze(self, "point_m", np.float64, (FINGER_COUNT, 3))
-        freeze(self, "touching", np.bool_, (FINGER_COUNT,))
+        _CONTACT_ARRAYS.freeze(self)
         refuse_beyond(self, "palm_distance_m")
 
 
@@ -257,10 +253,53 @@ class Gesture(Message, frozen=True, eq=False, tag=True):
     direction: Turn = field(default_factory=lambda: _NO_POINT)
 
     def __post_init__(self) -> None:
-        freeze(self, "origin_m", np.float64, (3,))
-        freeze(self, "direction", np.float64, (3,))
+        _GESTURE_ARRAYS.freeze(self)
         for name in ("distance_m", "strength", "angle_rad"):
             refuse_beyond(self, name)
 
 
 Told: TypeAlias = HandPose | ObjectPose | Contact | Gesture  # what a master makes of it
+
+
+@cache
+def _hand_arrays(m: int) -> Layout:
+    j = JOINT_COUNT
+    return Layout(
+        HandPose,
+        position_m=(j, 3),
+        orientation_wxyz=(j, 4),
+        radius_m=(j,),
+        valid=(j,),
+        tracked=(j,),
+        cov_m2=(j, 3, 3),
+        source=(j,),
+        angles_rad=(FINGER_COUNT, 4),
+        markers_m=(m, 3),
+        markers_raw_m=(m, 3),
+        markers_cov_m2=(m, 3, 3),
+        inside_volume=(j,),
+        laser_m=(FINGER_COUNT, 3),
+        level=(FINGER_COUNT,),
+        ambiguous=(FINGER_COUNT,),
+        palm_world_wxyz=(4,),
+        palm_world_sigma_rad=(2,),
+        wrist_bend_rad=(2,),
+        wrist_bend_sigma_rad=(2,),
+    )
+
+
+_OBJECT_ARRAYS = Layout(ObjectPose, position_m=(3,), orientation_wxyz=(4,), cov=(6, 6))
+_CONTACT_ARRAYS = Layout(
+    Contact,
+    distance_m=(FINGER_COUNT,),
+    sigma_m=(FINGER_COUNT,),
+    point_m=(FINGER_COUNT, 3),
+    touching=(FINGER_COUNT,),
+)
+_GESTURE_ARRAYS = Layout(Gesture, origin_m=(3,), direction=(3,))
+_MOST_SOURCE, _MOST_LEVEL = int(max(Source)), int(max(Level))
+_NEEDED = frozenset(field.name for field in fields(HandPose) if field.required) - {"hand", "t_ns"}
+_nothing_needed: dict[str, Any] = {
+    name: np.zeros(shape, of) for name, of, shape in _hand_arrays(0).arrays if name in _NEEDED
+}
+_NO_HAND = HandPose(hand="none", t_ns=0, **_nothing_needed)

@@ -13,9 +13,9 @@ from typing import TypeAlias, TypeVar, cast
 import msgspec
 import numpy as np
 
-from common.arrays import Bool, Code, Float, Ids
 from common.errors import BoundsError, MessageError
 from common.message_parts import (
+    DTYPES,
     FINGER_COUNT,
     JOINT_COUNT,
     MAX_MARKERS,
@@ -133,8 +133,27 @@ MessageT = TypeVar("MessageT", bound=Message)
 # How msgspec begins to say that a number is beyond the `ge` or `le` of its field.
 _BEYOND = tuple(f"Expected `{kind}` {sign}=" for kind in ("int", "float") for sign in "<>")
 _NONE = np.empty((0, 2))
-_ENCODER = msgspec.msgpack.Encoder(enc_hook=lambda array: _to_bytes(array))
-_DECODER = msgspec.msgpack.Decoder(AnyMessage, dec_hook=lambda kind, raw: _from_bytes(kind, raw))
+
+
+def _to_bytes(array: object) -> bytes:
+    if not isinstance(array, np.ndarray):
+        raise NotImplementedError(f"cannot encode {type(array)}")
+    return array.tobytes()  # row by row, however it lies
+
+
+def _from_bytes(kind: type, raw: object) -> object:
+    if not isinstance(raw, bytes):
+        raise ValueError("array is not bytes")
+    dtype = DTYPES[kind]
+    if len(raw) % dtype.itemsize:
+        raise ValueError("array is cut")
+    if dtype.kind == "b" and raw.translate(None, b"\0\1"):
+        raise ValueError("truth value is neither 0 nor 1")
+    return np.frombuffer(raw, dtype)
+
+
+_ENCODER = msgspec.msgpack.Encoder(enc_hook=_to_bytes)
+_DECODER = msgspec.msgpack.Decoder(AnyMessage, dec_hook=_from_bytes)
 
 
 def encode(message: Message) -> bytes:
@@ -171,23 +190,3 @@ def restamped(message: MessageT, **numbers: float) -> MessageT:
     for name, number in numbers.items():
         msgspec.structs.force_setattr(message, name, number)
     return message
-
-
-def _to_bytes(array: object) -> bytes:
-    if not isinstance(array, np.ndarray):
-        raise NotImplementedError(f"cannot encode {type(array)}")
-    return np.ascontiguousarray(cast(Float | Bool | Code | Ids, array)).tobytes()
-
-
-_WIRE_DTYPE = {Float: np.dtype("<f8"), Bool: np.dtype("?"), Code: np.dtype("u1"), Ids: np.dtype("<u2")}
-
-
-def _from_bytes(kind: type, raw: object) -> object:
-    if not isinstance(raw, bytes):
-        raise ValueError("array is not bytes")
-    dtype = _WIRE_DTYPE[kind]
-    if len(raw) % dtype.itemsize:
-        raise ValueError("array is cut")
-    if dtype.kind == "b" and raw.translate(None, b"\0\1"):
-        raise ValueError("truth value is neither 0 nor 1")
-    return np.frombuffer(raw, dtype)

@@ -1,10 +1,13 @@
 """The one table of streams: what travels, by which path, under which key, recorded or not."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import cast
+from operator import attrgetter
+from typing import Any, get_args
 
 from common.messages import (
+    AnyMessage,
     Checklist,
     Command,
     Contact,
@@ -86,12 +89,13 @@ def key_of(stream: str, name: str) -> str:
     return key.format(name=name)
 
 
+_NAMED_BY = ("hand", "object", "target", "camera", "source")
+_SENDER: dict[type[Message], Callable[[Any], str]] = {
+    kind: attrgetter(next(field for field in _NAMED_BY if field in kind.__struct_fields__))
+    for kind in get_args(AnyMessage)
+}
+
+
 def sender_of(message: Message) -> str:
     """The name under which a message travels: its camera, sensor, hand, object or process."""
-    if isinstance(message, HandPose | Contact | Gesture):
-        return message.hand
-    if isinstance(message, ObjectPose):
-        return message.object
-    if isinstance(message, Command):
-        return message.target
-    return cast(str, getattr(message, "camera", None) or getattr(message, "source", ""))
+    return _SENDER[type(message)](message)

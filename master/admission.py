@@ -8,8 +8,6 @@ with the clock.
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-
 from common.arrays import Float
 from common.datagram import Refusal
 from common.messages import (
@@ -66,7 +64,7 @@ def bucket_of(rate_hz: float | None) -> TokenBucket:
 
 def refused(message: Sensed, limits: SenderLimits) -> Refusal | None:
     """Why a message cannot be of a sender with these files; None: it can."""
-    if isinstance(message, ImuSample | TrackerPose):
+    if isinstance(message, (ImuSample, TrackerPose)):  # a tuple: a union would be made anew for each message
         return None
     if abs(message.ready_t_ns - message.t_ns) > READY_NS:
         return Refusal.READY_TIME
@@ -108,5 +106,6 @@ def _outside(uv: Float, size: tuple[int, int]) -> bool:
 
     Far: further out than one picture's size. NaN is not.
     """
-    far = np.abs(uv - (0.5 * size[0], 0.5 * size[1])) > (1.5 * size[0], 1.5 * size[1])
-    return bool(far.any())
+    width, height = size
+    points: list[list[float]] = uv.reshape(-1, 2).tolist()
+    return any(u < -width or u > 2 * width or v < -height or v > 2 * height for u, v in points)

@@ -1,49 +1,103 @@
 """What a master that falls behind leaves out: it solves the newest instant, and no message is lost for it.
 
-Solving a hand takes about the same time whether two cameras saw it or sixteen; messages must be taken whatever comes of
-them, for a camera's past tells where its markers are at every instant. So at overload instants are left out (*shed*),
-evenly, and counted (`instants_shed`): first every other one, then three of four, until what waits is worked off.
+An instant is left out (*shed*, counted as `instants_shed`) when what waits already completes a newer one of the same
+hand: where the hand was then interests nobody any more. All messages are taken, for a camera's past tells where its
+markers are at every instant. A newer instant waits when the leading camera, the first of the rig, has a frame in the
+queue, and every other camera has one there that is not older. So what is left out is a period of the cameras older than
+what is solved in its place: datagrams that come together, and jitter of less than half a period, leave nothing out
+while the solver takes less than a period (waiting is then never longer than the jitter: Lindley's recursion).
 
 How much waits is looked at once for each message that is taken, and nothing but `Hurry.leave_out` comes of it: with the
 messages and that number, what is solved can be solved again bit for bit (`master.recording`).
-
-A machine that is fast enough works off a short pause by itself, and every pose is told; so it begins where the lag is
-longer than such pauses last.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
-BEGIN_S = 0.125  # of lag
-BEGIN_FRAMES, HARD_FRAMES, END_FRAMES = (
-    4,
-    8,
-    1,
-)  # of each camera that wait; the first, where it is longer than that lag
-_SOME, _MOST = 1, 3  # instants that are left out between two that are solved
+from common.messages import Detections, Message
+from master.message_queue import QUEUE_PER_CAMERA, Span
+from master.rig_setup import RigSetup
+
+MOST = QUEUE_PER_CAMERA  # instants in a row: as many as can wait; a master that has no time but for messages tells some
+_SILENT_PERIODS = (
+    12  # of the slowest camera: so long nothing waits for one that says nothing, as in `Pairing`
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Cameras:
+    """The cameras whose frames make the instants of one hand, the leading one first.
+
+    Attributes:
+        centre_ns: Camera -> middle of its frames after their stamps [ns].
+        silent_ns: A camera that said nothing for so long is not waited for.
+    """
+
+    centre_ns: Mapping[str, int]
+    silent_ns: int
+
+    @classmethod
+    def of(cls, setup: RigSetup, names: Sequence[str]) -> "Cameras":
+        """Those of these names."""
+        models = {name: setup.models[name] for name in names if name in setup.models}
+        late_us = setup.rig.stamp_offset_us
+        centre_ns = {
+            name: round(1e3 * late_us.get(name, 0.0) + 0.5 * (model.height_px - 1) * model.row_time_ns)
+            for name, model in models.items()
+        }
+        slowest_hz = min(setup.cameras[name].frame_rate_hz for name in names)
+        return cls(dict.fromkeys(names, 0) | centre_ns, round(_SILENT_PERIODS * 1e9 / slowest_hz))
+
+    def newer_waits(self, waiting: Mapping[str, Span], newest_ns: Mapping[str, int], t_ns: int) -> bool:
+        """Whether what waits completes an instant.
+
+        Args:
+            waiting: Camera -> when its frames are that wait [ns].
+            newest_ns: Camera -> when its last frame is that was taken [ns].
+            t_ns: When the frame is that is taken now [ns].
+        """
+        heard = [
+            name
+            for name in self.centre_ns
+            if name in waiting or t_ns - newest_ns.get(name, t_ns - self.silent_ns) < self.silent_ns
+        ]
+        if not all(name in waiting for name in heard):
+            return False
+        next_ns = waiting[heard[0]].oldest_ns + self.centre_ns[heard[0]]
+        return all(waiting[name].newest_ns + self.centre_ns[name] >= next_ns for name in heard)
 
 
 class Hurry:
-    """How far a master is behind.
+    """Whether a master is behind. Holds the time of the last frame of each camera.
 
     Attributes:
-        waiting: How many frames, of all cameras, have come and were not taken yet.
+        waiting: Camera -> when its frames are that have come and were not taken yet [ns].
         leave_out: How many instants are left out between two that are solved, of each hand; 0: none.
     """
 
-    def __init__(self, cameras: int = 1, frame_rate_hz: float = 60.0) -> None:
-        """Of a master of so many cameras, at the rate of the fastest, that is not behind."""
-        self.waiting: Callable[[], int] = lambda: 0
+    def __init__(self, setups: Sequence[RigSetup] = ()) -> None:
+        """Of a master of these hands that is not behind; without hands it is as far behind as it is told."""
+        self.waiting: Callable[[], Mapping[str, Span]] = dict[str, Span]
         self.leave_out = 0
-        self._cameras = max(cameras, 1)
-        self._begin = max(BEGIN_S * frame_rate_hz, BEGIN_FRAMES)
+        self._newest_ns: dict[str, int] = {}
+        self._cameras: dict[str, list[Cameras]] = {}
+        for setup in setups:
+            worn = setup.wrist_cameras
+            marked = [name for name in setup.models if name not in worn]
+            for names in (marked, *([name] for name in worn)):
+                for name in names:
+                    self._cameras.setdefault(name, []).append(Cameras.of(setup, names))
 
-    def look(self) -> None:
-        """A message was taken: see what waits behind it."""
-        frames = self.waiting() / self._cameras
-        if frames <= (END_FRAMES if self.leave_out else self._begin):
-            self.leave_out = 0
-        else:
-            self.leave_out = _MOST if frames > HARD_FRAMES else _SOME
+    def look(self, message: Message) -> None:
+        """A message was taken: see what waits behind it. Only with a frame it changes what is left out."""
+        if not isinstance(message, Detections):
+            return
+        waiting, watched = self.waiting(), self._cameras.get(message.camera)
+        self._newest_ns[message.camera] = message.t_ns
+        behind = bool(waiting and watched) and all(
+            cameras.newer_waits(waiting, self._newest_ns, message.t_ns) for cameras in watched or ()
+        )
+        self.leave_out = MOST if behind else 0
 
 
 class Shedding:

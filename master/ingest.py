@@ -1,15 +1,12 @@
 """Where datagrams become detections and IMU samples on the master's clock: decoded, checked, counted.
 
-A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the
-pipeline takes messages from a queue that drops the oldest, so a slow pipeline sees what is new. Frames, tags, samples
-of IMUs and poses of trackers have each their own room in it: none drives another out, and at overload all that is
-taken is of the same stretch of time.
+A socket around `master.link`: one thread reads, answers and repeats what has to be repeated; the live loop takes
+messages from a queue (`master.message_queue`).
 """
 
 import os
 import threading
-from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from ipaddress import AddressValueError, IPv4Address
 from types import MappingProxyType
@@ -19,42 +16,28 @@ from common.clock_offset import ClockEstimate
 from common.datagram import Address
 from common.errors import BusError
 from common.link_key import LinkKey
-from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose, WristDetections
 from common.session import Random
-from common.streams import sender_of
 from common.supervisor import until
 from common.udp import UdpSocket
 from master.admission import SenderLimits
 from master.link import MasterLink
 from master.link_senders import Taken
+from master.message_queue import MessageQueue
 from master.quarantine import Quarantine
 from master.sequence import CameraCounts
 from master.turned_away import Away, MarkerCounts
 
 AT_ONCE = 64  # datagrams between two looks at what is due: less than a millisecond
 DUE_NS = 1_000_000  # nor is it looked at more often while nothing but data comes
-QUEUE = 64  # frames, or triples, that may wait, of one or two cameras
-QUEUE_PER_CAMERA = 32  # of more: a third of a second at 90 Hz
-ROOM = {
-    "frame": QUEUE,
-    "tags": QUEUE,
-    "imu": 16 * QUEUE,
-    "tracker": 16 * QUEUE,
-}  # what comes while so many frames do
-# Whose room in the queue a message takes.
-_KIND: dict[type[Taken], str] = {
-    MarkerDetections: "frame",
-    WristDetections: "frame",
-    TagDetections: "tags",
-    ImuSample: "imu",
-    TrackerPose: "tracker",
-}
 
 
 class Ingest:
     """All slaves of one rig, heard on one UDP port.
 
-    Holds the socket, its thread, the queue, and the link's state behind a lock.
+    Holds the socket, its thread, and the link's state behind a lock.
+
+    Attributes:
+        queue: What came and was not taken yet.
     """
 
     def __init__(
@@ -102,12 +85,7 @@ class Ingest:
         self._cameras, self._senders = cameras, (*cameras, *imus, *trackers)
         self._socket = UdpSocket(bind, broadcast=True)
         self._lock = threading.Lock()
-        self._queue: deque[Taken] = deque()
-        self._room = room(len(cameras))
-        self._waiting = dict.fromkeys(ROOM, 0)
-        self._waiting_of: Counter[tuple[str, str]] = Counter()  # kind and sender
-        self._changed = threading.Condition()
-        self._overflowed = 0
+        self.queue = MessageQueue(len(cameras))
         self._closing = threading.Event()
         self._thread = threading.Thread(
             target=until(self._closing.is_set, self._run), name="ingest", daemon=True
@@ -147,11 +125,6 @@ class Ingest:
         return sum(self.counts_of(camera).skipped for camera in self._cameras)
 
     @property
-    def waiting(self) -> int:
-        """Frames, or triples, of all cameras that have come and were not taken yet."""
-        return self._waiting["frame"]
-
-    @property
     def refused(self) -> dict[str, int]:
         """Reason (docs/wire.md) -> datagrams refused for it."""
         with self._lock:
@@ -165,7 +138,7 @@ class Ingest:
         <camera>.tags_late, once there were any.
         """
         counts = {
-            "queue.dropped": self._overflowed,
+            "queue.dropped": self.queue.overflowed,
             "would_block": self._socket.would_block,
             "send_failed": self._socket.failed,
             "unsynchronised": self._link.unsynchronised,
@@ -225,21 +198,13 @@ class Ingest:
 
     def get(self, timeout_s: float) -> Taken | None:
         """Return the oldest waiting message, times on the master's clock; None after `timeout_s`."""
-        with self._changed:
-            if not self._queue:
-                self._changed.wait_for(lambda: self._queue or self._closing.is_set(), timeout_s)
-                if not self._queue:
-                    return None
-            message = self._queue.popleft()
-            self._left(message)
-            return message
+        return self.queue.get(timeout_s)
 
     def close(self) -> None:
         """End the thread and give the port back. Safe to call twice."""
         self._closing.set()
         self._thread.join()
-        with self._changed:
-            self._changed.notify_all()
+        self.queue.close()
         self._socket.close()
 
     def _run(self) -> None:
@@ -261,7 +226,7 @@ class Ingest:
             for datagram, address in outbox:
                 self._socket.send(datagram, address)
             if taken:
-                self._put(taken)
+                self.queue.put(taken)
 
     def _come(self, first: tuple[bytes, Address] | None) -> Iterator[tuple[bytes, Address]]:
         """What has come, at most `AT_ONCE`: under a flood it is not for each that all that is due is seen to."""
@@ -272,43 +237,6 @@ class Ingest:
             if (arrived := self._socket.receive_waiting()) is None:
                 return
             yield arrived
-
-    def _put(self, messages: Sequence[Taken]) -> None:
-        """Let them wait, and wake who waits for them: once for all that came together.
-
-        Where there is no more room for a kind, the oldest of the sender goes of which most wait: who sends too much
-        loses his own.
-        """
-        with self._changed:
-            for message in messages:
-                kind = _KIND[type(message)]
-                self._queue.append(message)
-                self._waiting[kind] += 1
-                self._waiting_of[kind, sender_of(message)] += 1
-                if self._waiting[kind] > self._room[kind]:
-                    self._overflowed += 1
-                    self._drop_oldest(kind)
-            self._changed.notify()
-
-    def _drop_oldest(self, kind: str) -> None:
-        _, most = max((n, sender) for (of, sender), n in self._waiting_of.items() if of == kind)
-        for k, message in enumerate(self._queue):
-            if _KIND[type(message)] == kind and sender_of(message) == most:
-                del self._queue[k]
-                self._left(message)
-                return
-
-    def _left(self, message: Taken) -> None:
-        """It waits no more."""
-        kind = _KIND[type(message)]
-        self._waiting[kind] -= 1
-        self._waiting_of[kind, sender_of(message)] -= 1
-
-
-def room(cameras: int) -> dict[str, int]:
-    """How many messages of each kind may wait."""
-    frames = max(QUEUE, QUEUE_PER_CAMERA * cameras)
-    return ROOM | {"frame": frames, "tags": frames}
 
 
 def _check_address(host: str) -> None:

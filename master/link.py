@@ -55,6 +55,7 @@ from common.session import (
     read,
     seal,
 )
+from common.streams import sender_of
 from master.admission import SenderLimits
 from master.link_senders import ASKED, Sender, Session, Taken, not_admitted, on_master_clock
 from master.quarantine import Quarantine
@@ -351,7 +352,7 @@ class MasterLink:
             return Refusal.UNDECODABLE
         if not isinstance(message, Taken):
             return Refusal.UNDECODABLE
-        name = message.source if isinstance(message, ImuSample | TrackerPose) else message.camera
+        name = sender_of(message)
         kind = sender.kinds.get(type(message))
         if name != session.name or kind is None:
             return Refusal.IMPOSTOR

@@ -123,7 +123,7 @@ def on_master_clock(message: Taken, clock: ClockEstimate | None, kind: Counted, 
     ):
         return None
     kind.newest_ns = t_ns
-    if isinstance(message, ImuSample | TrackerPose):
+    if isinstance(message, (ImuSample, TrackerPose)):
         return restamped(message, t_ns=t_ns)
     return restamped(
         message,

@@ -98,8 +98,7 @@ def run_live(
     """
     clock: Clock = SystemClock()
     stages, figures = StageTimes(), RunFigures()
-    rates_hz = [camera.frame_rate_hz for setup in setups for camera in setup.cameras.values()]
-    hurry = Hurry(len(cameras_of(setups)), max(rates_hz))
+    hurry = Hurry(setups)
     pipelines = [LivePipeline(setup, stages, Shedding(hurry)) for setup in setups]
     world = World(setups, pipelines, stages)
     tuning = None if settings.files is None else RigTuning(settings.files, setups, pipelines, say, world)
@@ -114,7 +113,7 @@ def run_live(
             recorder.wait_ready(bus)
         ingest = ingest_of(setups, key, clock, settings)
         stack.callback(ingest.close)
-        hurry.waiting = lambda: ingest.waiting
+        hurry.waiting = ingest.queue.frame_spans
         sinks = _sinks(setups, settings, bus)
         for sink in sinks:
             stack.callback(sink.close)
@@ -162,7 +161,7 @@ def run_live(
         say(f"listening on {ingest.address[0]}:{ingest.address[1]}, bus on {settings.bus}")
         gc.collect()
         gc.freeze()  # what lives until the end is never walked again: no pause in the loop
-        source = Tapped(DevicePoses(ingest, bus), tap, hurry)
+        source = Tapped(DevicePoses(ingest.queue, bus), tap, hurry)
         run(WatchedLoop(source, ServiceManager(os.environ)), guard, sinks, clock, figures, stop)
         source.flush()
         tap.drain()

@@ -10,11 +10,15 @@ each of those and every object. A wrist device alone has a frame of its own: its
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from math import nan
+from typing import Protocol
 
 import msgspec
 
+from common.arrays import Float
 from common.messages import (
     Contact,
+    Detections,
     Gesture,
     HandPose,
     ImuSample,
@@ -25,7 +29,6 @@ from common.messages import (
 )
 from master.app import Solved
 from master.gestures.recogniser import GestureRecogniser
-from master.hands import Hands, Line
 from master.link_senders import Taken
 from master.objects.contact import ContactWatch
 from master.objects.line import SolvedObject
@@ -35,6 +38,7 @@ from master.stereo.pipeline import SolvedPose, Stage
 from master.tracked_object import TrackedObject
 
 _NAME = 64  # characters of a name in `Health`
+_FRAMES = MarkerDetections, WristDetections
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +88,32 @@ class _Beside:
         )
 
 
+class Line(Protocol):
+    """What makes poses of one hand: the pipeline of its setup, or a `LivePipeline`."""
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Events since the start."""
+        ...
+
+    def push(self, message: Detections) -> list[SolvedPose]:
+        """Take one camera's detections; return the poses they complete, oldest first."""
+        ...
+
+    def push_orientation(self, t_ns: int, orientation_wxyz: Float, heading_sigma_rad: float = nan) -> None:
+        """Take what the hand's IMU says of its own orientation (4,)."""
+        ...
+
+    def flush(self) -> list[SolvedPose]:
+        """At the end of a recording: the poses that still wait for something."""
+        ...
+
+
 class World:
-    """Push machine over all that comes. Holds the hands, what is beside them, and the gestures that have not ended."""
+    """Push machine over all that comes.
+
+    Holds the line of each hand, what is beside them, and the gestures that have not ended.
+    """
 
     def __init__(
         self, setups: Sequence[RigSetup], lines: Sequence[Line], stage: Stage, *, gestures: bool = True
@@ -101,7 +129,14 @@ class World:
         Raises:
             CalibrationError: An object does not fit its rig.
         """
-        self._hands, self._stage, self._say_gestures = Hands(setups, lines), stage, gestures
+        self._stage, self._say_gestures = stage, gestures
+        self._hands = tuple(zip(setups, lines, strict=True))
+        self._watching = {
+            name: [hand for hand in self._hands if name in hand[0].cameras]
+            for setup in setups
+            for name in setup.camera_names
+        }
+        self._worn_by = {name: line for setup, line in self._hands for name in setup.imus}
         self._counts: Counter[str] = Counter()
         self._now = _Beside.of(setups, self._counts, gestures=gestures)
         self._begun: dict[tuple[str, str, str], Gesture] = {}
@@ -115,7 +150,11 @@ class World:
         Of objects object.NAME.poses, .tracked, .occluded; of gestures gesture.KIND, how many began; of trackers
         tracker.NAME.lost, .leap, .late, .broken, and .unplaced where it is not registered.
         """
-        return Counter(dict(self._hands.counts) | dict(self._counts))
+        # The loop may add a count meanwhile: a copy is made at once.
+        each = [(setup.hand.profile.name, dict(line.counts)) for setup, line in self._hands]
+        if len(each) > 1:
+            each = [(hand, {f"{hand}.{event}"[:_NAME]: n for event, n in own.items()}) for hand, own in each]
+        return Counter({event: n for _, own in each for event, n in own.items()} | dict(self._counts))
 
     @property
     def counts_beside(self) -> dict[str, int]:
@@ -132,11 +171,13 @@ class World:
         if self._next:
             yield from self._take_over(self._next.popleft())
         if isinstance(message, ImuSample):
-            self._hands.push_sample(message)
+            if (line := self._worn_by.get(message.source)) is not None:
+                line.push_orientation(message.t_ns, message.orientation_wxyz, message.heading_sigma_rad)
             return
         poses: list[SolvedPose] = []
-        if isinstance(message, MarkerDetections | WristDetections):
-            poses = self._hands.push(message)
+        if isinstance(message, _FRAMES):
+            for setup, line in self._watching.get(message.camera, ()):
+                poses += line.push(setup.own(message))
             yield from poses
         yield from self._seen(message)
         for one in poses:
@@ -144,7 +185,7 @@ class World:
 
     def flush(self) -> Iterator[Solved]:
         """At the end of a recording: what still waits for something."""
-        poses = self._hands.flush()
+        poses = [solved for _, line in self._hands for solved in line.flush()]
         yield from poses
         for one in self._now.objects:
             yield from self._known(one.flush())

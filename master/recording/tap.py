@@ -151,7 +151,7 @@ class Tapped(Generic[TakenT]):
         self.flush()
         self._last = self._source.get(timeout_s)
         if self._last is not None:
-            self._hurry.look()
+            self._hurry.look(self._last)
         return self._last
 
     def flush(self) -> None:

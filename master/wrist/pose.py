@@ -61,7 +61,7 @@ class PoseMaker:
         position, orientation = joints.position_m, matrix_to_quaternion(joints.rotation)
         lost = CHAINS[~known].ravel()
         position[lost], orientation[lost], cov[lost] = np.nan, np.nan, np.nan
-        return HandPose(
+        return HandPose.known_good(
             hand=model.profile.name,
             t_ns=t_ns,
             position_m=position,

@@ -1,7 +1,7 @@
 """Messages come back as they went, and bytes that are no message raise `MessageError` and nothing else."""
 
 import random
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 import numpy as np
@@ -364,6 +364,49 @@ def test_a_message_does_not_follow_the_array_it_was_made_of() -> None:
     message = msgspec.structs.replace(sample_detections(), uv=uv, sigma_px=np.ones(6))
     uv[0] = 7.0
     assert not message.uv.any()
+
+
+NEEDED = [
+    of.name for of in msgspec.structs.fields(HandPose) if of.required and of.name not in ("hand", "t_ns")
+]
+
+
+def parts_of(pose: HandPose, *more: str) -> dict[str, Any]:
+    return {name: np.array(getattr(pose, name)) for name in (*NEEDED, *more)}
+
+
+@pytest.mark.parametrize("markers", [0, 6, MAX_MARKERS])
+def test_a_pose_of_good_arrays_is_the_one_that_is_checked_and_holds_them(markers: int) -> None:
+    parts = parts_of(sample_pose(markers), "laser_m", "level")
+    pose = HandPose.known_good("right", 5, **parts)
+    assert_same(pose, HandPose(hand="right", t_ns=5, **parts))
+    assert encode(decode(encode(pose))) == encode(pose)
+    for name, array in parts.items():
+        assert getattr(pose, name) is array, "nothing is copied"
+        assert not array.flags.writeable, "nor written any more"
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("position_m", np.zeros((3, JOINT_COUNT))),
+        ("position_m", np.zeros((JOINT_COUNT, 3), np.float32)),
+        ("valid", np.ones(JOINT_COUNT, np.uint8)),
+        ("markers_raw_m", np.zeros((5, 3))),
+        ("level", np.zeros(5)),
+        ("latency", np.zeros(5)),
+    ],
+)
+def test_a_maker_whose_arrays_have_another_shape_or_type_is_stopped(name: str, wrong: Float) -> None:
+    with pytest.raises(ValueError, match=f"{name}: .* expected"):
+        HandPose.known_good("right", 5, **(parts_of(sample_pose()) | {name: wrong}))
+
+
+def test_a_maker_who_leaves_an_array_out_is_stopped() -> None:
+    parts = parts_of(sample_pose())
+    del parts["valid"], parts["cov_m2"]
+    with pytest.raises(ValueError, match="missing: cov_m2, valid"):
+        HandPose.known_good("right", 5, **parts)
 
 
 def test_a_marker_frame_fits_one_datagram_and_its_size_is_known() -> None:

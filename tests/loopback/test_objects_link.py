@@ -12,8 +12,9 @@ from common.clock import SkewedClock, SystemClock
 from common.datagram import Kind, Refusal, Sealer
 from common.messages import MarkerDetections, TagDetections, TrackerPose, WristDetections, encode
 from common.session import RigKeys
-from master.ingest import ROOM, Ingest
+from master.ingest import Ingest
 from master.link import MasterLink
+from master.message_queue import ROOM
 from slave.link import SlaveLink
 from slave.uplink import Uplink
 from tests.loopback.test_handshake import BROADCAST, KEY, MASTER, S, Wires
@@ -306,7 +307,7 @@ def test_at_overload_each_kind_of_message_keeps_its_newest(stack: ExitStack) -> 
     count = ROOM["tracker"] + 5
     for seq in range(count):
         for message in (detections("left", 1, seq), tags("left", 1, seq), tracker("puck", 1, seq)):
-            ingest._put([message])
+            ingest.queue.put([message])
     taken = [ingest.get(0.0) for _ in range(sum(ROOM[kind] for kind in ("frame", "tags", "tracker")))]
     for kind, room in ((MarkerDetections, "frame"), (TagDetections, "tags"), (TrackerPose, "tracker")):
         newest = list(range(count - ROOM[room], count))

@@ -13,7 +13,6 @@ from common.arrays import Float
 from common.calibration import ImuCalibration, RigCalibration, load, save
 from common.errors import CalibrationError
 from common.messages import Detections, ImuSample, MarkerDetections
-from master.hands import Hands
 from master.needs_restart import refuse_restart
 from master.outputs.files import RunFiles, load_poses
 from master.rig import load_setup, pipeline_of
@@ -21,6 +20,7 @@ from master.stages import StageTimes
 from master.stereo.pipeline import SolvedPose
 from master.time_watch import TimeWatch
 from master.tuning import LivePipeline, RigFiles, RigTuning
+from master.world import World
 from tests.hand_helpers import MARKERS
 from tests.master.test_outputs_files import random_pose
 from tests.master.test_rig_merge import setups, two_hands
@@ -73,8 +73,9 @@ def test_cameras_that_watch_two_hands_solve_both(short_run: SyntheticRun) -> Non
         short_run.setup.rig, markers=markers, other_hands=("made-left",), stamp_offset_us={}
     )
     both = setups(rig)
-    hands = Hands(both, [pipeline_of(setup, StageTimes()) for setup in both])
-    poses = [one.pose for message in short_run.messages for one in hands.push(with_left_markers(message))]
+    hands = World(both, [pipeline_of(setup, StageTimes()) for setup in both], StageTimes(), gestures=False)
+    told = [one for message in short_run.messages for one in hands.push(with_left_markers(message))]
+    poses = [one.pose for one in told if isinstance(one, SolvedPose)]
     of = {name: [pose for pose in poses if pose.hand == name] for name in ("made-right", "made-left")}
     assert len(of["made-right"]) == len(of["made-left"]) >= 6
     assert hands.counts["made-left.poses"] == len(of["made-left"])
@@ -90,12 +91,11 @@ def test_messages_and_samples_go_to_their_own_hand(short_run: SyntheticRun, root
     right = setup_of(msgspec.structs.replace(short_run.setup.rig, imu=imu))
     left = load_setup(root / "calib_json", "wrist-left")
     lines = Told(), Told()
-    hands = Hands((right, left), lines)
+    hands = World((right, left), lines, StageTimes())
     seen = exact_triple(left, wrist_scene(left).truth(0.5), 0)
-    for message in (short_run.messages[0], seen):
-        hands.push(message)
-    for source, t_ns in (("palm", 1), (left.imus[0], 2), ("another", 3)):
-        hands.push_sample(sample(source, t_ns))
+    samples = [sample(source, t_ns) for source, t_ns in (("palm", 1), (left.imus[0], 2), ("another", 3))]
+    for message in (short_run.messages[0], seen, *samples):
+        assert not list(hands.push(message))
     assert [line.messages for line in lines] == [[short_run.messages[0]], [seen]]
     assert [line.samples for line in lines] == [[1], [2]]
     assert hands.counts == {"made-right.pushed": 1, "default-left.pushed": 1}

@@ -10,8 +10,9 @@ from common.clock import SystemClock
 from common.datagram import MAX_DATAGRAM
 from common.errors import BusError
 from common.messages import ImuSample, MarkerDetections, TagDetections, TrackerPose
-from master.ingest import QUEUE, Ingest
+from master.ingest import Ingest
 from master.link_senders import Taken
+from master.message_queue import QUEUE
 from tests.network_helpers import detections, free_udp_port, until
 
 KEY = bytes(range(32))
@@ -50,7 +51,7 @@ def test_rubbish_is_counted_by_reason(ingest: Ingest) -> None:
 
 def test_a_slow_reader_gets_the_newest_and_a_count(ingest: Ingest) -> None:
     for seq in range(QUEUE + 5):
-        ingest._put([detections("left", 1, seq)])
+        ingest.queue.put([detections("left", 1, seq)])
     first = ingest.get(0.0)
     assert first is not None
     assert first.seq == 5
@@ -60,9 +61,9 @@ def test_a_slow_reader_gets_the_newest_and_a_count(ingest: Ingest) -> None:
 def test_samples_of_an_imu_drive_no_frame_out(ingest: Ingest) -> None:
     nan = np.full(3, np.nan)
     for seq in range(QUEUE):
-        ingest._put([detections("left", 1, seq)])
+        ingest.queue.put([detections("left", 1, seq)])
         for k in range(10):
-            ingest._put([ImuSample("palm-imu", 1, 10 * seq + k, 0, nan, nan, nan, np.full(4, np.nan))])
+            ingest.queue.put([ImuSample("palm-imu", 1, 10 * seq + k, 0, nan, nan, nan, np.full(4, np.nan))])
     taken = [ingest.get(0.0) for _ in range(11 * QUEUE)]
     assert [one.seq for one in taken if isinstance(one, MarkerDetections)] == list(range(QUEUE))
     assert ingest.get(0.0) is None
@@ -75,7 +76,7 @@ def test_frames_that_pile_up_starve_nothing_else(ingest: Ingest, kind: str) -> N
     taken: list[Taken] = []
     for k in range(6 * QUEUE):
         for message in (detections("left", 1, 2 * k), detections("left", 1, 2 * k + 1), cheap(kind, k)):
-            ingest._put([message])
+            ingest.queue.put([message])
         while (one := ingest.get(0.0)) is not None:
             taken.append(one)
             if isinstance(one, MarkerDetections):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ from common.bus import LoopbackBus
 from common.messages import Contact, Gesture, HandPose, Health, MarkerDetections
 from common.recording import MessageWriter
 from master.hurry import Hurry
+from master.link_senders import Taken
+from master.message_queue import MessageQueue
 from master.recording.digest import ToldDigest
 from master.recording.files import carried_files, rigs_text
 from master.recording.player import world_of
@@ -62,31 +65,28 @@ def recorded_run(
     return RecordedRun(path, live)
 
 
-class Ingested:
-    """The queue of a master: what comes next, while so many frames wait behind each."""
+class Bursts:
+    """What a master takes of messages that come in bursts of so many: a burst is in its queue when that is empty."""
 
-    def __init__(self, waiting: Sequence[int]) -> None:
-        self._waiting, self._number = waiting, 0
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self.queue, self._sizes, self._come = MessageQueue(2), list(sizes), iter(scene())
 
-    def get(self, timeout_s: float) -> MarkerDetections | None:
-        del timeout_s
-        self._number += 1
-        return scene()[self._number - 1] if self._number <= len(self._waiting) else None
-
-    def waiting(self) -> int:
-        return self._waiting[self._number - 1]
+    def get(self, timeout_s: float) -> Taken | None:
+        if not self.queue.frames and self._sizes:
+            self.queue.put(list(islice(self._come, self._sizes.pop(0))))
+        return self.queue.get(timeout_s)
 
 
-def overloaded_run(path: Path, calibration: Path, waiting: Sequence[int]) -> tuple[RecordedRun, int]:
-    """Of a master that has so many frames behind each message, as its tap shows it; and how many instants it shed."""
+def overloaded_run(path: Path, calibration: Path, bursts: Sequence[int]) -> tuple[RecordedRun, int]:
+    """Of a master to which frames come in bursts of so many, as its tap shows it; and how many instants it shed."""
     files = RigFiles(calibration, ("desk",))
     setups = files.load()
     writer = MessageWriter(path, carried_files(files, setups), {"rigs": rigs_text(files.rigs)})
-    bus, hurry, queue, live = LoopbackBus(), Hurry(2), Ingested(waiting), ToldDigest()
-    hurry.waiting, world = queue.waiting, world_of(setups, hurry)
+    bus, hurry, come, live = LoopbackBus(), Hurry(setups), Bursts(bursts), ToldDigest()
+    hurry.waiting, world = come.queue.frame_spans, world_of(setups, hurry)
     shown = bus.subscribe("taken", depth=1000)
     tap = Tap(bus, ManualClock(), always=True)
-    source = Tapped(queue, tap, hurry)
+    source = Tapped(come, tap, hurry)
     while (message := source.get(0.0)) is not None:
         for solved in world.push(message):
             live.take(solved if isinstance(solved, Contact | Gesture) else solved.pose)

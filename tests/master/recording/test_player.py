@@ -12,6 +12,7 @@ from common.errors import BusError, PhalanxError, RecordingError
 from common.messages import Backlog, Command, HandPose, Told
 from common.recording import open_messages
 from common.streams import MASTER
+from master.hurry import MOST
 from master.outputs.files import load_poses
 from master.recording.clock import ReplayClock
 from master.recording.files import recorded_setups
@@ -71,12 +72,12 @@ def test_every_speed_tells_what_was_told_live(run: RecordedRun, whole: tuple[Pas
 
 
 def test_what_a_master_that_fell_behind_left_out_is_left_out_again(tmp_path: Path, root: Path) -> None:
-    waiting = [0] * 12 + [18] * 16 + [6] * 8 + [2] * 12
-    (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", waiting)
+    bursts = [*[2] * 6, 16, 4, 4, 4, *[2] * 4]
+    (path, live), shed = overloaded_run(tmp_path / "run.mcap", root / "calib_json", bursts)
     recording = open_messages(path)
     said = [one.message for one in recording.read(["taken"]) if isinstance(one.message, Backlog)]
-    assert [one.leave_out for one in said] == [3, 1, 0]
-    assert (shed, live.counts["poses"]) == (8, FRAMES - 8)
+    assert [one.leave_out for one in said] == 4 * [MOST, 0]
+    assert (shed, live.counts["poses"]) == (10, FRAMES - 10)
     setups = recorded_setups(recording)
     for passed in (Player(recording, setups, []).run(), Player(recording, setups, [], speed=2.0).run()):
         assert passed.digest.counts == live.counts
