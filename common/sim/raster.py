@@ -5,6 +5,8 @@ Pixel (0, 0) is the centre of the top-left pixel, in OpenCV's drawing as everywh
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from math import ceil, floor, hypot
 
 import cv2
 import numpy as np
@@ -14,6 +16,7 @@ from common.arrays import Bool, Float, Image
 
 Int32 = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
+Complex = npt.NDArray[np.complex128]
 
 FIXED_BITS = 4
 SUPER = 6
@@ -21,6 +24,9 @@ HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the 
 ARC_POINTS = 8
 BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
+ROOM_PX = 2.0  # around what a marker covers
+# Middles of 1 ... MAX_STEPS equal parts of an exposure of length 1, from its middle.
+_MOMENTS = tuple((np.arange(n) + 0.5) / n - 0.5 for n in range(1, MAX_STEPS + 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,26 +54,31 @@ class Coverage:
 
 
 def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
-    """Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2) joined by their outer tangents."""
-    between = b - a
-    distance = np.hypot(between[..., 0], between[..., 1])
+    """Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2) joined by their outer tangents.
+
+    Complex numbers are points of the plane: e^(i angle) turns by an angle, its powers walk along an arc.
+    """
+    start, stop = _complex(a), _complex(b)
+    between = stop - start
+    distance = np.abs(between)
     swallowed = distance <= np.abs(radius_a - radius_b)
-    b_wins = (swallowed & (radius_b > radius_a))[..., None]
-    a_wins = (swallowed & (radius_b <= radius_a))[..., None]
-    a, b = np.where(b_wins, b, a), np.where(a_wins, a, b)
-    radius_a, radius_b = (
-        np.where(b_wins[..., 0], radius_b, radius_a),
-        np.where(a_wins[..., 0], radius_a, radius_b),
-    )
-    heading = np.arctan2(between[..., 1], between[..., 0])
-    ratio = np.where(swallowed, 0.0, (radius_a - radius_b) / np.maximum(distance, 1e-9))
-    tangent = np.arccos(np.clip(ratio, -1.0, 1.0))
-    step = np.linspace(0.0, 1.0, ARC_POINTS)
-    arc_a = (heading + tangent)[..., None] + (2.0 * (np.pi - tangent))[..., None] * step
-    arc_b = (heading - tangent)[..., None] + (2.0 * tangent)[..., None] * step
-    side_a = a[..., None, :] + radius_a[..., None, None] * np.stack([np.cos(arc_a), np.sin(arc_a)], axis=-1)
-    side_b = b[..., None, :] + radius_b[..., None, None] * np.stack([np.cos(arc_b), np.sin(arc_b)], axis=-1)
-    return np.concatenate([side_a, side_b], axis=-2)
+    if swallowed.any():  # the larger disc is the whole outline
+        b_wins = radius_b > radius_a
+        start, stop = np.where(swallowed & b_wins, stop, start), np.where(swallowed & ~b_wins, start, stop)
+        larger = np.maximum(radius_a, radius_b)
+        radius_a, radius_b = np.where(swallowed, larger, radius_a), np.where(swallowed, larger, radius_b)
+    heading = np.where(distance > 0.0, between, 1.0) / np.where(distance > 0.0, distance, 1.0)
+    cosine = (radius_a - radius_b) / np.maximum(distance, 1e-9)
+    tangent = np.arccos(cosine)
+    sine = np.sqrt(1.0 - cosine * cosine)
+    arcs = np.empty((*distance.shape, 2, ARC_POINTS), dtype=np.complex128)
+    arcs[..., 0, 0] = radius_a * heading * (cosine + 1j * sine)
+    arcs[..., 1, 0] = radius_b * heading * (cosine - 1j * sine)
+    step = np.stack([np.pi - tangent, tangent], axis=-1) * (2.0j / (ARC_POINTS - 1))
+    arcs[..., 1:] = np.exp(step)[..., None]
+    arcs = arcs.cumprod(axis=-1)
+    arcs += np.stack([start, stop], axis=-1)[..., None]
+    return arcs.view(np.float64).reshape(*distance.shape, 2 * ARC_POINTS, 2)
 
 
 def hull(points: Float) -> Float:
@@ -97,38 +108,38 @@ def cover(
         offsets_s: Moments (n,) of the exposure, relative to its middle [s], at most 8.
         size: Width and height of the image [px]; what falls outside is not visible.
     """
-    reach = float(np.abs(offsets_s).max()) * np.abs(outline.velocity) + 2.0
-    low = np.floor(outline.corners.min(axis=0) - reach).astype(int)
-    high = np.ceil(outline.corners.max(axis=0) + reach).astype(int) + 1
-    origin = low - 0.5 + 0.5 / SUPER
-    shape = tuple((high - low)[::-1] * SUPER)
-    drawn = _inset(outline.corners)
-    others = [Shape(_inset(other.corners), other.velocity) for other in nearer]
-    own_cut = None if cut is None else Shape(_inset(cut.corners), cut.velocity)
+    (left, top), (right, bottom) = outline.corners.min(axis=0).tolist(), outline.corners.max(axis=0).tolist()
+    ways = np.abs(float(offsets_s[-1]) * outline.velocity).tolist()
+    x0, y0 = (floor(edge - way - ROOM_PX) for edge, way in zip((left, top), ways, strict=True))
+    x1, y1 = (ceil(edge + way + ROOM_PX) + 1 for edge, way in zip((right, bottom), ways, strict=True))
+    shapes = (outline, *nearer) if cut is None else (outline, cut, *nearer)
+    drawn = _fine_corners(shapes, offsets_s, np.array([x0, y0]) - 0.5 + 0.5 / SUPER)
+    own_parts = len(shapes) - len(nearer)
     level = 255 // len(offsets_s)
     total: Image | None = None
     own = 0
-    for offset in offsets_s:
-        mask = np.zeros(shape, dtype=np.uint8)
-        _fill_fine(mask, drawn + offset * outline.velocity - origin, level)
-        if own_cut is not None:
-            _fill_fine(mask, own_cut.corners + offset * own_cut.velocity - origin, 0)
-        own += cv2.countNonZero(mask)
-        for other in others:
-            _fill_fine(mask, other.corners + offset * other.velocity - origin, 0)
-        total = mask if total is None else np.asarray(cv2.add(total, mask), dtype=np.uint8)
+    for moment in drawn:
+        mask = np.zeros(((y1 - y0) * SUPER, (x1 - x0) * SUPER), dtype=np.uint8)
+        for k, corners in enumerate(moment):
+            if k == own_parts:
+                own += cv2.countNonZero(mask)
+            cv2.fillConvexPoly(mask, corners, 0 if k else level, lineType=cv2.LINE_8, shift=FIXED_BITS)
+        if not nearer:
+            own += cv2.countNonZero(mask)
+        total = mask if total is None else cv2.add(total, mask, dst=total)
     assert total is not None
-    _blank_outside(total, low, high, size)
-    seen = float(cv2.sumElems(total)[0]) / level
-    fine = cv2.resize(total, tuple(high - low), interpolation=cv2.INTER_AREA)
-    alpha = fine.astype(np.float32) * np.float32(1.0 / (level * len(offsets_s)))
-    return Coverage(int(low[0]), int(low[1]), alpha, seen / own if own else 0.0)
+    _blank_outside(total, (x0, y0), (x1, y1), size)
+    seen = cv2.sumElems(total)[0] / level
+    fine = cv2.resize(total, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    alpha = fine * np.float32(1.0 / (level * len(offsets_s)))
+    return Coverage(x0, y0, alpha, seen / own if own else 0.0)
 
 
 def moments(shape: Shape, exposure_s: float) -> Float:
     """Moments (n,) of an exposure, from its middle [s], at which a shape is drawn: about one per pixel of way."""
-    n = int(np.clip(np.ceil(np.hypot(*shape.velocity) * exposure_s / BLUR_STEP_PX), 1, MAX_STEPS))
-    return ((np.arange(n) + 0.5) / n - 0.5) * exposure_s
+    way = hypot(*shape.velocity.tolist()) * exposure_s
+    n = min(max(ceil(way / BLUR_STEP_PX), 1), MAX_STEPS)
+    return _MOMENTS[n - 1] * exposure_s
 
 
 def centroid(coverage: Coverage) -> Float:
@@ -142,19 +153,31 @@ def centroid(coverage: Coverage) -> Float:
     return np.array([u, v])
 
 
-def _inset(corners: Float) -> Float:
-    """Corners moved inwards by what the fill adds."""
-    spread = corners - corners.mean(axis=0)
+def _complex(points: Float) -> Complex:
+    """Points (..., 2) of the plane as complex numbers (...)."""
+    return np.ascontiguousarray(points).view(np.complex128)[..., 0]
+
+
+def _fine_corners(shapes: Sequence[Shape], offsets_s: Float, origin: Float) -> list[list[Int32]]:
+    """Corners of all shapes at each moment, on the fine grid from `origin` (2,) [px], in OpenCV's numbers.
+
+    They are moved inwards by what the fill adds.
+    """
+    counts = [len(shape.corners) for shape in shapes]
+    corners = np.concatenate([shape.corners for shape in shapes])
+    starts = [0, *accumulate(counts)]
+    owner = np.repeat(np.arange(len(shapes)), counts)
+    middle = np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None]
+    spread = corners - middle[owner]
     reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
-    return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
-
-
-def _fill_fine(mask: Image, points: Float, level: int) -> None:
-    cv2.fillConvexPoly(mask, fixed(points * SUPER), level, lineType=cv2.LINE_8, shift=FIXED_BITS)
+    inset = corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
+    velocity = np.array([shape.velocity for shape in shapes])[owner]
+    moved = fixed((inset + offsets_s[:, None, None] * velocity - origin) * SUPER)
+    return [[at[a:b] for a, b in pairwise(starts)] for at in moved]
 
 
 def _blank_outside(
-    mask: Image, low: npt.NDArray[np.int_], high: npt.NDArray[np.int_], size: tuple[int, int]
+    mask: Image, low: tuple[int, int], high: tuple[int, int], size: tuple[int, int]
 ) -> None:
     width, height = size
     if low[0] < 0:

@@ -33,6 +33,8 @@ SPHERE_COUNT = 29
 PALM_HULL = (0, 4, 8, 12, 16, *WRIST_SPHERES, *METACARPAL_SPHERES)
 WEB_HULL = (0, 1, WEB_SPHERE)
 CAPSULES = np.array([[4 * f + k, 4 * f + k + 1] for f in range(5) for k in range(3)])
+SLEEVE_M = 0.45
+FRAME_ROWS = 26 + 26 * 3 + 3 + 1 + 1
 ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
 
 
@@ -60,20 +62,20 @@ class HandSurface:
     """Which points a hand has, and how they move with its joints.
 
     Attributes:
-        model: The hand.
-        markers: Of the rig; free: those of them that sit on no hand.
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
-        count: Number of key points.
+        weights: (K, FRAME_ROWS) key points as sums of the rows of `_frame_rows`; of the sleeve's far end the way there.
     """
 
-    model: HandModel
-    markers: tuple[str, ...]
-    free: tuple[str, ...]
     radius_m: Float
     caps: tuple[Cap, ...]
     boxes: tuple[Box, ...]
-    count: int
+    weights: Float
+
+    @property
+    def count(self) -> int:
+        """Number of key points."""
+        return len(self.weights)
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
@@ -82,75 +84,84 @@ class HandSurface:
         Raises:
             CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
         """
-        radius = np.zeros(SPHERE_COUNT)
-        radius[:20] = model.radius_m[CHAINS].ravel()
-        radius[0] *= 0.85
-        wrist = model.radius_m[1]
-        radius[list(WRIST_SPHERES)] = 0.76 * wrist
-        radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
-        radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
-        radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
-        count = SPHERE_COUNT
+        radius = _sphere_radii(model)
+        rows = _spheres(model)
         caps: list[Cap] = []
         boxes: list[Box] = []
         for m, name in enumerate(markers):
             if name in free:
                 continue
-            mount = model.mount(name)
+            mount, count = model.mount(name), len(rows)
             finger = mount.finger
             if mount.joint is None:
                 boxes.append(Box(m, slice(count, count + 8)))
-                count += 8
+                rows += [_in_palm(mount.offset_m + corner) for corner in box_corners()]
             elif finger is not None and mount.joint == CHAINS[finger, 3]:
-                caps.append(Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1))
+                cap = Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1)
+                caps.append(cap)
                 radius[4 * finger + 3] *= SKIN_UNDER_PAINT
-                count += 2
+                ahead = -cap.radius_m * _AXES[mount.joint, 2]
+                centroid = _JOINTS[mount.joint] + mount.offset_m @ _AXES[mount.joint]
+                centre = centroid - cap_centroid_ahead(1.0) * ahead
+                rows += [centre, centre - CYLINDER_SHARE * ahead]
+                rows[4 * finger + 3] = centre - SKIN_BACK_SHARE * ahead
             else:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
                 )
-        return cls(model, markers, free, radius, tuple(caps), tuple(boxes), count)
+        return cls(radius, tuple(caps), tuple(boxes), np.array(rows))
 
     def key_points(self, joints: HandJoints) -> Float:
         """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
-        lead = joints.position_m.shape[:-2]
-        points = np.empty((*lead, self.count, 3))
-        points[..., :20, :] = joints.position_m[..., CHAINS.ravel(), :]
-        wrist = 0.45 * self.model.radius_m[1]
-        T = joints.T_rig_palm
-        z = T[..., :3, 2]
-        for sphere, x in zip(WRIST_SPHERES, (wrist, -wrist), strict=True):
-            points[..., sphere, :] = _apply(T, np.array([x, -0.003, -0.012]))
-        points[..., METACARPAL_SPHERES, :] = joints.position_m[..., METACARPALS, :]
-        knuckle, base = joints.position_m[..., 7, :], joints.position_m[..., 6, :]
-        points[..., WEB_SPHERE, :] = base + 0.62 * (knuckle - base) - 0.004 * T[..., :3, 1]
-        cuff = T[..., :3, 3] - 0.018 * z
-        arm = -0.55 * z + 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
-        points[..., SLEEVE_SPHERES[0], :] = cuff
-        points[..., SLEEVE_SPHERES[1], :] = cuff + 0.45 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
-        centroid = self._centroids(joints)
-        for cap in self.caps:
-            ahead = -joints.rotation[..., CHAINS[cap.finger, 3], :, 2]
-            points[..., cap.centre, :] = (
-                centroid[..., cap.marker, :] - cap_centroid_ahead(cap.radius_m) * ahead
-            )
-            points[..., cap.base, :] = points[..., cap.centre, :] - CYLINDER_SHARE * cap.radius_m * ahead
-            back = SKIN_BACK_SHARE * cap.radius_m * ahead
-            points[..., 4 * cap.finger + 3, :] = points[..., cap.centre, :] - back
-        for box in self.boxes:
-            corners = box_corners()
-            turned = np.einsum("...ij,kj->...ki", T[..., :3, :3], corners)
-            points[..., box.corners, :] = centroid[..., box.marker, None, :] + turned
+        points = self.weights @ _frame_rows(joints)
+        cuff, end = SLEEVE_SPHERES
+        points[..., end, :] = points[..., cuff, :] + SLEEVE_M * unit(points[..., end, :])
         return points
 
-    def _centroids(self, joints: HandJoints) -> Float:
-        """Centroids (..., M, 3) [m] of the painted surfaces; NaN for those on no hand."""
-        if not self.free:
-            return self.model.marker_points(joints, self.markers)
-        own = [m for m, name in enumerate(self.markers) if name not in self.free]
-        points = np.full((*joints.position_m.shape[:-2], len(self.markers), 3), np.nan)
-        points[..., own, :] = self.model.marker_points(joints, tuple(self.markers[m] for m in own))
-        return points
+
+# Key points are linear in joints and axes. Of `_frame_rows`, as unit vectors:
+_UNIT_ROWS = np.eye(FRAME_ROWS)
+_JOINTS, _AXES = _UNIT_ROWS[:26], _UNIT_ROWS[26:104].reshape(26, 3, FRAME_ROWS)
+_PALM_AXES, _PALM_ORIGIN, _TO_ELBOW = _UNIT_ROWS[104:107], _UNIT_ROWS[107], _UNIT_ROWS[108]
+
+
+def _frame_rows(joints: HandJoints) -> Float:
+    """Rows (..., FRAME_ROWS, 3): positions [m] and axes of the joints, palm axes and origin, direction to the elbow."""
+    T, lead = joints.T_rig_palm, joints.position_m.shape[:-2]
+    axes = np.swapaxes(joints.rotation, -1, -2).reshape(*lead, 78, 3)
+    elbow = np.broadcast_to(ELBOW_RIG / np.linalg.norm(ELBOW_RIG), (*lead, 1, 3))
+    return np.concatenate([joints.position_m, axes, np.swapaxes(T[..., :3, :], -1, -2), elbow], axis=-2)
+
+
+def _in_palm(point_m: Float) -> Float:
+    """A point (3,) [m] of the palm's frame as a sum of frame rows (FRAME_ROWS,)."""
+    return point_m @ _PALM_AXES + _PALM_ORIGIN
+
+
+def _spheres(model: HandModel) -> list[Float]:
+    """The middles of all spheres as sums of frame rows."""
+    wrist = 0.45 * float(model.radius_m[1])
+    return [
+        *_JOINTS[CHAINS.ravel()],
+        *(_in_palm(np.array([x, -0.003, -0.012])) for x in (wrist, -wrist)),
+        *_JOINTS[list(METACARPALS)],
+        0.38 * _JOINTS[6] + 0.62 * _JOINTS[7] - 0.004 * _PALM_AXES[1],
+        _in_palm(np.array([0.0, 0.0, -0.018])),
+        0.45 * _TO_ELBOW - 0.55 * _PALM_AXES[2],
+    ]
+
+
+def _sphere_radii(model: HandModel) -> Float:
+    """Radii (SPHERE_COUNT,) [m] of bare skin and sleeve."""
+    radius = np.zeros(SPHERE_COUNT)
+    radius[:20] = model.radius_m[CHAINS].ravel()
+    radius[0] *= 0.85
+    wrist = model.radius_m[1]
+    radius[list(WRIST_SPHERES)] = 0.76 * wrist
+    radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
+    radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
+    radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
+    return radius
 
 
 def cap_centroid_ahead(radius_m: float) -> float:
@@ -182,9 +193,11 @@ def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> F
     d2 = (centre * centre).sum(axis=-1)
     shrink = 1.0 - radius_m**2 / d2
     towards = centre / np.sqrt(d2)[:, None]
-    contact = (centre * shrink[:, None])[:, None] + rim(towards, radius_m * np.sqrt(shrink), circle)
-    edge = base[:, None] + rim(axis, radius_m, circle)
-    ahead = ((contact - centre[:, None]) * axis[:, None]).sum(axis=-1, keepdims=True) >= 0.0
+    both = np.stack([towards, axis]), np.stack([radius_m * np.sqrt(shrink), radius_m])
+    around, across = rim(*both, circle)
+    contact = (centre * shrink[:, None])[:, None] + around
+    edge = base[:, None] + across
+    ahead = ((contact - centre[:, None]) @ axis[:, :, None]) >= 0.0
     return np.concatenate([np.where(ahead, contact, edge), edge], axis=1)
 
 
@@ -211,7 +224,3 @@ def unit_circle(n: int) -> Float:
     angle = 2.0 * np.pi * np.arange(n) / n
     scale = np.sqrt((2.0 * np.pi / n) / np.sin(2.0 * np.pi / n))
     return scale * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def _apply(T: Float, point: Float) -> Float:
-    return T[..., :3, :3] @ point + T[..., :3, 3]
