@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image
+from common.arrays import Bool, Float, Image, Int
 
 Int32 = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
@@ -35,6 +35,26 @@ class Shape:
 
     corners: Float
     velocity: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """A marker's outline and what hides it.
+
+    Attributes:
+        outline: The marker.
+        nearer: Everything that lies before it.
+        cut: What it hides of itself (the finger before its cap); not part of its own outline.
+    """
+
+    outline: Shape
+    nearer: Sequence[Shape] = ()
+    cut: Shape | None = None
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The outline, the cut if there is one, and what lies before them."""
+        return (self.outline, *(() if self.cut is None else (self.cut,)), *self.nearer)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,42 +116,73 @@ def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
     cv2.fillConvexPoly(image, corners, colour, lineType=cv2.LINE_AA, shift=FIXED_BITS)
 
 
-def cover(
-    outline: Shape, cut: Shape | None, nearer: Sequence[Shape], offsets_s: Float, size: tuple[int, int]
-) -> Coverage:
-    """Measure what an outline covers, by drawing at six times the resolution at each moment of the exposure.
+def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -> list[Coverage]:
+    """Measure what each marker covers, by drawing at six times the resolution at each moment of the exposure.
 
     Args:
-        outline: The marker.
-        cut: What the marker hides of itself (the finger before its cap); not part of its own outline.
-        nearer: Everything that lies before it.
-        offsets_s: Moments (n,) of the exposure, relative to its middle [s], at most 8.
+        markers: Markers, each with what hides it.
+        exposure_s: Exposure [s].
         size: Width and height of the image [px]; what falls outside is not visible.
     """
-    (left, top), (right, bottom) = outline.corners.min(axis=0).tolist(), outline.corners.max(axis=0).tolist()
-    ways = np.abs(float(offsets_s[-1]) * outline.velocity).tolist()
-    x0, y0 = (floor(edge - way - ROOM_PX) for edge, way in zip((left, top), ways, strict=True))
-    x1, y1 = (ceil(edge + way + ROOM_PX) + 1 for edge, way in zip((right, bottom), ways, strict=True))
-    shapes = (outline, *nearer) if cut is None else (outline, cut, *nearer)
-    drawn = _fine_corners(shapes, offsets_s, np.array([x0, y0]) - 0.5 + 0.5 / SUPER)
-    own_parts = len(shapes) - len(nearer)
-    level = 255 // len(offsets_s)
+    if not markers:
+        return []
+    shapes = [shape for marker in markers for shape in marker.shapes]
+    counts = [len(shape.corners) for shape in shapes]
+    starts = [0, *accumulate(counts)]
+    owner = np.repeat(np.arange(len(shapes)), counts)
+    corners = np.concatenate([shape.corners for shape in shapes])
+    inset = _inset(corners, np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None], owner)
+    velocity = np.array([shape.velocity for shape in shapes])[owner]
+    low, high = (f.reduceat(corners, starts[:-1]) for f in (np.minimum, np.maximum))
+    found: list[Coverage] = []
+    first = 0
+    for marker in markers:
+        stop = first + len(marker.shapes)
+        offsets_s = moments(marker.outline, exposure_s)
+        reach = offsets_s[-1] * np.abs(marker.outline.velocity) + ROOM_PX
+        x0, y0 = map(floor, (low[first] - reach).tolist())
+        x1, y1 = (ceil(edge) + 1 for edge in (high[first] + reach).tolist())
+        own = slice(starts[first], starts[stop])
+        moved = inset[own] + offsets_s[:, None, None] * velocity[own] + (0.5 - 0.5 / SUPER)
+        fine = fixed((moved - np.array([x0, y0])) * SUPER)
+        parts = [(a - own.start, b - own.start) for a, b in pairwise(starts[first : stop + 1])]
+        found.append(_covered(fine, parts, 1 if marker.cut is None else 2, (x0, y0, x1, y1), size))
+        first = stop
+    return found
+
+
+def _covered(
+    corners: Int32,
+    parts: Sequence[tuple[int, int]],
+    own_parts: int,
+    window: tuple[int, int, int, int],
+    size: tuple[int, int],
+) -> Coverage:
+    """What one marker covers.
+
+    Args:
+        corners: (n, N, 2) of all shapes at each moment, on the fine grid of the window.
+        parts: Where the corners of each shape begin and end: the marker, what it hides of itself, what hides it.
+        own_parts: How many of them are the marker's own.
+        window: Pixels x0, y0, x1, y1.
+        size: Of the image.
+    """
+    x0, y0, x1, y1 = window
+    level = 255 // len(corners)
     total: Image | None = None
     own = 0
-    for moment in drawn:
+    for moment in corners:
         mask = np.zeros(((y1 - y0) * SUPER, (x1 - x0) * SUPER), dtype=np.uint8)
-        for k, corners in enumerate(moment):
-            if k == own_parts:
+        for k, (a, b) in enumerate(parts):
+            cv2.fillConvexPoly(mask, moment[a:b], 0 if k else level, lineType=cv2.LINE_8, shift=FIXED_BITS)
+            if k == own_parts - 1:
                 own += cv2.countNonZero(mask)
-            cv2.fillConvexPoly(mask, corners, 0 if k else level, lineType=cv2.LINE_8, shift=FIXED_BITS)
-        if not nearer:
-            own += cv2.countNonZero(mask)
-        total = mask if total is None else cv2.add(total, mask, dst=total)
+        total = mask if total is None else np.asarray(cv2.add(total, mask, dst=total), dtype=np.uint8)
     assert total is not None
-    _blank_outside(total, (x0, y0), (x1, y1), size)
+    _blank_outside(total, window, size)
     seen = cv2.sumElems(total)[0] / level
     fine = cv2.resize(total, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
-    alpha = fine * np.float32(1.0 / (level * len(offsets_s)))
+    alpha = fine * np.float32(1.0 / (level * len(corners)))
     return Coverage(x0, y0, alpha, seen / own if own else 0.0)
 
 
@@ -158,36 +209,23 @@ def _complex(points: Float) -> Complex:
     return np.ascontiguousarray(points).view(np.complex128)[..., 0]
 
 
-def _fine_corners(shapes: Sequence[Shape], offsets_s: Float, origin: Float) -> list[list[Int32]]:
-    """Corners of all shapes at each moment, on the fine grid from `origin` (2,) [px], in OpenCV's numbers.
-
-    They are moved inwards by what the fill adds.
-    """
-    counts = [len(shape.corners) for shape in shapes]
-    corners = np.concatenate([shape.corners for shape in shapes])
-    starts = [0, *accumulate(counts)]
-    owner = np.repeat(np.arange(len(shapes)), counts)
-    middle = np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None]
+def _inset(corners: Float, middle: Float, owner: Int) -> Float:
+    """Corners (N, 2) moved towards the middle of their shape `owner` (N,) by what the fill adds."""
     spread = corners - middle[owner]
     reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
-    inset = corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
-    velocity = np.array([shape.velocity for shape in shapes])[owner]
-    moved = fixed((inset + offsets_s[:, None, None] * velocity - origin) * SUPER)
-    return [[at[a:b] for a, b in pairwise(starts)] for at in moved]
+    return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
 
 
-def _blank_outside(
-    mask: Image, low: tuple[int, int], high: tuple[int, int], size: tuple[int, int]
-) -> None:
-    width, height = size
-    if low[0] < 0:
-        mask[:, : -low[0] * SUPER] = 0
-    if low[1] < 0:
-        mask[: -low[1] * SUPER] = 0
-    if high[0] > width:
-        mask[:, max(width - low[0], 0) * SUPER :] = 0
-    if high[1] > height:
-        mask[max(height - low[1], 0) * SUPER :] = 0
+def _blank_outside(mask: Image, window: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    (x0, y0, x1, y1), (width, height) = window, size
+    if x0 < 0:
+        mask[:, : -x0 * SUPER] = 0
+    if y0 < 0:
+        mask[: -y0 * SUPER] = 0
+    if x1 > width:
+        mask[:, max(width - x0, 0) * SUPER :] = 0
+    if y1 > height:
+        mask[max(height - y0, 0) * SUPER :] = 0
 
 
 def overlaps(low_a: Float, high_a: Float, low_b: Float, high_b: Float) -> Bool:

@@ -21,7 +21,7 @@ from common.sim.objects_seen import SeenPart
 from common.sim.paint import MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.sim.surface import CAPSULES, PALM_HULL, WEB_HULL
+from common.sim.surface import CAPSULES, PALM_HULL
 from common.sim.things import SeenThing
 from common.sim.view import LAYERS, PHALANGES, Snapshot, View
 from common.srgb import relit_bytes
@@ -120,8 +120,8 @@ class Renderer:
             grown = part[0] in ROOTS
             far = float(depth[CAPSULES[list(part)]].mean())
             parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
-        palm = [[raster.fixed(h) for h in self._view.hulls(snapshot, hull)] for hull in (WEB_HULL, PALM_HULL)]
-        behind = self._view.looks_into_sleeve(snapshot)
+        palm = [[raster.fixed(hull) for hull in layers] for layers in (snapshot.web, snapshot.palm)]
+        behind = snapshot.into_sleeve
         if behind:
             self._draw_sleeve(image, snapshot)
         raster.fill(image, raster.fixed(snapshot.cuff_uv[0]), self._card)  # the dark inside of the sleeve
@@ -174,8 +174,8 @@ class Renderer:
         under[:] = np.rint(total / len(moments))
 
     def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
-        for layer in range(LAYERS):
-            raster.fill(image, raster.fixed(self._view.sleeve(snapshot, layer)), self._sleeve[layer])
+        for outline, colour in zip(snapshot.sleeve, self._sleeve, strict=True):
+            raster.fill(image, raster.fixed(outline), colour)
 
     def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Box:
         """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""
@@ -208,7 +208,7 @@ class Renderer:
 
     def _way(self, snapshot: Snapshot) -> Float:
         """How far (2,) [px] the palm moves during the exposure."""
-        return snapshot.speed_uv[list(PALM_HULL)].mean(axis=0) * self._view.exposure_s
+        return snapshot.palm_speed * self._view.exposure_s
 
     def _smear(self, image: Image, box: Box, snapshot: Snapshot) -> None:
         """Motion blur of the skin: halves of the palm's way averaged, twice."""

@@ -37,6 +37,11 @@ SLEEVE_M = 0.45
 FRAME_ROWS = 26 + 26 * 3 + 3 + 1 + 1
 ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
 
+# Key points are linear in joints and axes. Of `_frame_rows`, as unit vectors:
+_UNIT_ROWS = np.eye(FRAME_ROWS)
+_JOINTS, _AXES = _UNIT_ROWS[:26], _UNIT_ROWS[26:104].reshape(26, 3, FRAME_ROWS)
+_PALM_AXES, _PALM_ORIGIN, _TO_ELBOW = _UNIT_ROWS[104:107], _UNIT_ROWS[107], _UNIT_ROWS[108]
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cap:
@@ -117,12 +122,6 @@ class HandSurface:
         cuff, end = SLEEVE_SPHERES
         points[..., end, :] = points[..., cuff, :] + SLEEVE_M * unit(points[..., end, :])
         return points
-
-
-# Key points are linear in joints and axes. Of `_frame_rows`, as unit vectors:
-_UNIT_ROWS = np.eye(FRAME_ROWS)
-_JOINTS, _AXES = _UNIT_ROWS[:26], _UNIT_ROWS[26:104].reshape(26, 3, FRAME_ROWS)
-_PALM_AXES, _PALM_ORIGIN, _TO_ELBOW = _UNIT_ROWS[104:107], _UNIT_ROWS[107], _UNIT_ROWS[108]
 
 
 def _frame_rows(joints: HandJoints) -> Float:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
@@ -30,6 +30,7 @@ from common.sim.surface import (
     PALM_HULL,
     SLEEVE_SPHERES,
     SPHERE_COUNT,
+    WEB_HULL,
     HandSurface,
     cap_centroid_ahead,
     cap_outline,
@@ -44,6 +45,7 @@ FURTHEST_PX = 4000.0
 INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
 PHALANGES = len(CAPSULES)
+_PALM, _WEB, _CUFF, _ELBOW = list(PALM_HULL), list(WEB_HULL), *SLEEVE_SPHERES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +63,8 @@ class Snapshot:
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
         shine_uv: (C, 2) [px] where the paint mirrors the lamp.
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
+        palm, web, sleeve: Hulls (N, 2) [px] of each layer, the first the outline.
+        into_sleeve: The camera looks into the sleeve rather than at its side: the hand then lies before it.
         things: What the hand takes, before it is drawn or hides anything.
         tracked: The tracked objects, likewise.
     """
@@ -77,8 +81,17 @@ class Snapshot:
     from_behind: Bool
     shine_uv: Float
     cuff_uv: Float
+    palm: tuple[Float, ...]
+    web: tuple[Float, ...]
+    sleeve: tuple[Float, ...]
+    into_sleeve: bool
     things: tuple[SeenThing, ...]
     tracked: SeenObjects
+
+    @property
+    def palm_speed(self) -> Float:
+        """How fast (2,) [px/s] the palm moves."""
+        return self.speed_uv[_PALM].mean(axis=0)
 
 
 class View:
@@ -146,17 +159,17 @@ class View:
         discs_px = size[:, None] * LAYER_SINES
         centre, base = points[self.cap_centre], points[self.cap_base]
         axis, joint = unit(centre - base), points[self._cap_joint]
-        behind = joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle)
-        edge = np.concatenate([base[:, None] + rim(axis, self.cap_radius, self._fine_circle), behind], axis=1)
         half = unit(self.to_light - unit(centre))
         parts = (
             lit,
             cap_outline(centre, base, self.cap_radius, self._fine_circle),
-            edge,
+            joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle),
             centre + self.cap_radius[:, None] * half,
             self._cuff(points),
         )
-        discs_uv, cap_uv, rim_uv, shine_uv, cuff_uv = self._project_all(parts)
+        discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = self._project_all(parts)
+        discs = discs_uv[:SPHERE_COUNT, :, None] + discs_px[:SPHERE_COUNT, :, None, None] * self.circle
+        sleeve = np.concatenate([cuff_uv, discs[_ELBOW]], axis=1)
         a, b, own = self._from, self._to, slice(self.surface.count, None)
         return Snapshot(
             points=points,
@@ -167,30 +180,23 @@ class View:
             discs_px=discs_px,
             outlines=raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b]),
             cap_uv=cap_uv,
-            rim_uv=rim_uv,
+            rim_uv=np.concatenate([cap_uv[:, len(self._fine_circle) :], joint_uv], axis=1),
             from_behind=((centre - base) * base).sum(axis=1) > 0.0,
             shine_uv=shine_uv,
             cuff_uv=cuff_uv,
+            palm=_hulls(discs[_PALM]),
+            web=_hulls(discs[_WEB]),
+            sleeve=tuple(raster.hull(layer) for layer in sleeve),
+            into_sleeve=_looks_into(*points[[_CUFF, _ELBOW]]),
             things=self._things(t_s, things),
             tracked=self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own])),
         )
-
-    def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
-        """Hull of some spheres in the first `layers` layers [px]."""
-        chosen = list(spheres)
-        centre, radius = snapshot.discs_uv[chosen, :layers], snapshot.discs_px[chosen, :layers]
-        points = centre[:, :, None] + radius[:, :, None, None] * self.circle
-        return [raster.hull(points[:, layer].reshape(-1, 2)) for layer in range(layers)]
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
         """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
         if not snapshot.from_behind[cap]:
             return None
         return Shape(raster.hull(snapshot.rim_uv[cap]), snapshot.speed_uv[self.cap_base[cap]])
-
-    def phalanx_depth(self, snapshot: Snapshot, uv: Float) -> Float:
-        """Depth (..., PHALANGES) [m] of every phalanx where it passes nearest to the pixels `uv` (..., 2)."""
-        return _depth_along(snapshot, uv[..., None, :], CAPSULES[:, 0], CAPSULES[:, 1])
 
     def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
         """Whether the plane of the palm passes between the camera and points (..., 3) [m], camera frame."""
@@ -203,23 +209,6 @@ class View:
         """Whether the back of the hand is turned to the camera."""
         _, offset = _palm_plane(snapshot)
         return offset * self.scene.model.side_sign > 0.0
-
-    def looks_into_sleeve(self, snapshot: Snapshot) -> bool:
-        """Whether the camera looks into the sleeve rather than at its side: the hand then lies before it."""
-        cuff, end = snapshot.points[list(SLEEVE_SPHERES)]
-        return float((end - cuff) @ cuff) > INTO_COSINE * float(
-            np.linalg.norm(end - cuff) * np.linalg.norm(cuff)
-        )
-
-    def sleeve(self, snapshot: Snapshot, layer: int = 0) -> Float:
-        """Outline of one layer of the sleeve [px]; the first is the sleeve's own."""
-        end = SLEEVE_SPHERES[1]
-        disc = snapshot.discs_uv[end, layer] + snapshot.discs_px[end, layer] * self.circle
-        return raster.hull(np.vstack([snapshot.cuff_uv[layer], disc]))
-
-    def sleeve_depth(self, snapshot: Snapshot, uv: Float) -> Float:
-        """Depth (...) [m] of the sleeve where it passes nearest to the pixels `uv` (..., 2)."""
-        return _depth_along(snapshot, uv, *SLEEVE_SPHERES)
 
     def cards(self, snapshot: Snapshot) -> tuple[Shape, ...]:
         """Outlines of the cards near the view, at the moment of the hand's middle row."""
@@ -283,12 +272,15 @@ class View:
         ]
 
 
-def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
-    """Depth (...) [m] of the lines from key points `a` to `b` where they pass nearest to `uv` (..., 2) [px]."""
-    start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
-    share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
-    share = np.minimum(np.maximum(share, 0.0), 1.0)
-    return np.asarray(snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share)
+def _hulls(discs: Float) -> tuple[Float, ...]:
+    """Hulls (N, 2) [px] of the discs (B, LAYERS, n, 2) of each layer."""
+    return tuple(raster.hull(layer) for layer in discs.swapaxes(0, 1).reshape(LAYERS, -1, 2))
+
+
+def _looks_into(cuff: Float, end: Float) -> bool:
+    """Whether a camera sees the opening of a sleeve from `cuff` to `end` (3,) [m], camera frame, not its side."""
+    along = end - cuff
+    return float(along @ cuff) > INTO_COSINE * float(np.linalg.norm(along) * np.linalg.norm(cuff))
 
 
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:
