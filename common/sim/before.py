@@ -71,7 +71,7 @@ def things_before(
 
 def _phalanges_before(snapshot: Snapshot, places: Places) -> Bool:
     """Which phalanges (N, PHALANGES) reach into the box of a marker before it."""
-    skin = snapshot.outlines[:PHALANGES, 0]
+    skin = snapshot.outlines[:, 0]
     found = raster.overlaps(places.low[:, None], places.high[:, None], skin.min(axis=1), skin.max(axis=1)) & (
         _depth_along(snapshot, places.uv[:, None], CAPSULES[:, 0], CAPSULES[:, 1]) < places.depth[:, None]
     )

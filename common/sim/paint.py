@@ -19,10 +19,9 @@ from common.sim.desk import LENS_SIGMA_PX
 from common.sim.object_paint import ObjectPainter, ObjectView, PaintedFeature
 from common.sim.objects_seen import SeenBead
 from common.sim.raster import Coverage, Shape
-from common.sim.surface import SPHERE_COUNT, unit
-from common.sim.view import LAYERS, PHALANGES, Snapshot, View
+from common.sim.surface import unit
+from common.sim.view import Snapshot, View
 
-SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 MARGIN_PX = 2
 
 
@@ -81,8 +80,13 @@ class Painter:
         self._tables = light.SrgbTables.make()
         rig = view.scene.rig
         self._paint = {m: light.paint(n) for m, n in enumerate(rig.markers) if n not in rig.free_markers}
-        self._shades = {m: light.shades(paint, gloss=0.02) for m, paint in self._paint.items()}
-        self._shine = {m: light.bgr_bytes(np.array(paint) + 0.10) for m, paint in self._paint.items()}
+        self._shades = {
+            m: (*light.shades(paint, gloss=0.02), light.bgr_bytes(np.array(paint) + 0.10))
+            for m, paint in self._paint.items()
+        }
+        self._sides = {m: light.face_shade(paint, 0.25) for m, paint in self._paint.items()}
+        self._caps = {cap.marker: c for c, cap in enumerate(view.surface.caps)}
+        self._boxes = {box.marker: box.corners for box in view.surface.boxes}
         self._objects = ObjectPainter(view, self._tables)
 
     def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Covered:
@@ -175,24 +179,21 @@ class Painter:
         """Colours of one marker's surface over a pixel box, as if it filled it."""
         x0, y0, x1, y1 = box
         look = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
-        view, corner, shades = self._view, np.array([x0, y0]), self._shades[item.marker]
-        look[:] = shades[0]
-        for c, cap in enumerate(view.surface.caps):
-            if cap.marker == item.marker:
-                bands = raster.fixed(snapshot.outlines[PHALANGES + c] - corner)
-                for layer in range(1, LAYERS):
-                    raster.fill(look, bands[layer], shades[layer])
-                size = SHINE_SHARE * snapshot.discs_px[SPHERE_COUNT + 2 * c, 0]
-                spot = snapshot.shine_uv[c] - corner + size * view.circle
-                raster.fill(look, raster.fixed(spot), self._shine[item.marker])
-        for side in view.surface.boxes:
-            if side.marker == item.marker:
-                uv = snapshot.uv[side.corners] - corner
-                look[:] = light.face_shade(self._paint[item.marker], 0.25)
-                top = snapshot.points[side.corners][:4]
-                normal = unit(cross(top[1] - top[0], top[3] - top[0]))
-                facing = float(normal @ view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
-                raster.fill(look, raster.fixed(uv[:4]), light.face_shade(self._paint[item.marker], facing))
+        cap = self._caps.get(item.marker)
+        if cap is not None:
+            base, *bands = self._shades[item.marker]
+            cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), base, cv2.FILLED)
+            corners = snapshot.bands[cap] - raster.fixed(np.array([x0, y0]))
+            for outline, colour in zip(corners, bands, strict=True):
+                raster.fill(look, outline, colour)
+            return look
+        side = self._boxes[item.marker]
+        cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), self._sides[item.marker], cv2.FILLED)
+        top = snapshot.points[side][:4]
+        normal = unit(cross(top[1] - top[0], top[3] - top[0]))
+        facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
+        corners = raster.fixed(snapshot.uv[side][:4] - (x0, y0))
+        raster.fill(look, corners, light.face_shade(self._paint[item.marker], facing))
         return look
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:

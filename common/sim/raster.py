@@ -20,8 +20,8 @@ Complex = npt.NDArray[np.complex128]
 
 FIXED_BITS = 4
 SUPER = 6
-HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 ARC_POINTS = 8
+HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
 ROOM_PX = 2.0  # around what a marker covers
@@ -101,6 +101,12 @@ def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
     return arcs.view(np.float64).reshape(*distance.shape, 2 * ARC_POINTS, 2)
 
 
+def discs(centre: Float, radius: Float, circle: Float) -> Float:
+    """Outlines (..., n, 2) [px] of discs about `centre` (..., 2), each a `circle` (n, 2) of that radius (...)."""
+    points = _complex(centre)[..., None] + radius[..., None] * _complex(circle)
+    return points.view(np.float64).reshape(*points.shape, 2)
+
+
 def hull(points: Float) -> Float:
     """Convex hull (N, 2) [px] of points."""
     return np.asarray(cv2.convexHull(points.astype(np.float32)), dtype=np.float64).reshape(-1, 2)
@@ -132,7 +138,9 @@ def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -
     owner = np.repeat(np.arange(len(shapes)), counts)
     corners = np.concatenate([shape.corners for shape in shapes])
     inset = _inset(corners, np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None], owner)
-    velocity = np.array([shape.velocity for shape in shapes])[owner]
+    scale = SUPER << FIXED_BITS
+    middle = (inset + (0.5 - 0.5 / SUPER)) * scale
+    speed = np.array([shape.velocity for shape in shapes])[owner] * scale
     low, high = (f.reduceat(corners, starts[:-1]) for f in (np.minimum, np.maximum))
     found: list[Coverage] = []
     first = 0
@@ -143,9 +151,10 @@ def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -
         x0, y0 = map(floor, (low[first] - reach).tolist())
         x1, y1 = (ceil(edge) + 1 for edge in (high[first] + reach).tolist())
         own = slice(starts[first], starts[stop])
-        moved = inset[own] + offsets_s[:, None, None] * velocity[own] + (0.5 - 0.5 / SUPER)
-        fine = fixed((moved - np.array([x0, y0])) * SUPER)
+        moved = middle[own] + offsets_s[:, None, None] * speed[own]
+        moved -= (x0 * scale, y0 * scale)
         parts = [(a - own.start, b - own.start) for a, b in pairwise(starts[first : stop + 1])]
+        fine = np.rint(moved).astype(np.int32)
         found.append(_covered(fine, parts, 1 if marker.cut is None else 2, (x0, y0, x1, y1), size))
         first = stop
     return found

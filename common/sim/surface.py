@@ -16,7 +16,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
+from common.hand_model import CHAINS, METACARPALS, Chains, HandModel
 
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
@@ -34,13 +34,13 @@ PALM_HULL = (0, 4, 8, 12, 16, *WRIST_SPHERES, *METACARPAL_SPHERES)
 WEB_HULL = (0, 1, WEB_SPHERE)
 CAPSULES = np.array([[4 * f + k, 4 * f + k + 1] for f in range(5) for k in range(3)])
 SLEEVE_M = 0.45
-FRAME_ROWS = 26 + 26 * 3 + 3 + 1 + 1
 ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
+TO_ELBOW = 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
 
-# Key points are linear in joints and axes. Of `_frame_rows`, as unit vectors:
-_UNIT_ROWS = np.eye(FRAME_ROWS)
-_JOINTS, _AXES = _UNIT_ROWS[:26], _UNIT_ROWS[26:104].reshape(26, 3, FRAME_ROWS)
-_PALM_AXES, _PALM_ORIGIN, _TO_ELBOW = _UNIT_ROWS[104:107], _UNIT_ROWS[107], _UNIT_ROWS[108]
+# Key points are linear in positions and axes of the chains' joints (`_chain_rows`); these and the axes of the palm,
+# in which all else stands still, are the unit vectors of:
+_UNIT_ROWS = np.eye(20 + 20 * 3 + 3)
+_JOINTS, _AXES, _PALM = _UNIT_ROWS[:20], _UNIT_ROWS[20:80].reshape(20, 3, 83), _UNIT_ROWS[80:]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,13 +69,15 @@ class HandSurface:
     Attributes:
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
-        weights: (K, FRAME_ROWS) key points as sums of the rows of `_frame_rows`; of the sleeve's far end the way there.
+        weights: (K, 80) and still: (K, 3) [m]: key points, palm frame, as sums of `_chain_rows`, and of what stands
+            still; of the sleeve's far end, the way there that the palm asks for.
     """
 
     radius_m: Float
     caps: tuple[Cap, ...]
     boxes: tuple[Box, ...]
     weights: Float
+    still: Float
 
     @property
     def count(self) -> int:
@@ -100,13 +102,13 @@ class HandSurface:
             finger = mount.finger
             if mount.joint is None:
                 boxes.append(Box(m, slice(count, count + 8)))
-                rows += [_in_palm(mount.offset_m + corner) for corner in box_corners()]
+                rows += [(mount.offset_m + corner) @ _PALM for corner in box_corners()]
             elif finger is not None and mount.joint == CHAINS[finger, 3]:
                 cap = Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1)
                 caps.append(cap)
                 radius[4 * finger + 3] *= SKIN_UNDER_PAINT
-                ahead = -cap.radius_m * _AXES[mount.joint, 2]
-                centroid = _JOINTS[mount.joint] + mount.offset_m @ _AXES[mount.joint]
+                ahead = -cap.radius_m * _AXES[4 * finger + 3, 2]
+                centroid = _JOINTS[4 * finger + 3] + mount.offset_m @ _AXES[4 * finger + 3]
                 centre = centroid - cap_centroid_ahead(1.0) * ahead
                 rows += [centre, centre - CYLINDER_SHARE * ahead]
                 rows[4 * finger + 3] = centre - SKIN_BACK_SHARE * ahead
@@ -114,39 +116,40 @@ class HandSurface:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
                 )
-        return cls(radius, tuple(caps), tuple(boxes), np.array(rows))
+        table = np.array(rows)
+        return cls(radius, tuple(caps), tuple(boxes), table[:, :80].copy(), table[:, 80:].copy())
 
-    def key_points(self, joints: HandJoints) -> Float:
-        """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
-        points = self.weights @ _frame_rows(joints)
-        cuff, end = SLEEVE_SPHERES
-        points[..., end, :] = points[..., cuff, :] + SLEEVE_M * unit(points[..., end, :])
+    def key_points(self, T_rig_palm: Float, chains: Chains) -> Float:
+        """Key points (..., K, 3) [m], rig frame, of palm poses (..., 4, 4) and bent fingers."""
+        R, (cuff, end) = np.swapaxes(T_rig_palm[..., :3, :3], -1, -2), SLEEVE_SPHERES
+        points = (self.weights @ _chain_rows(chains) + self.still) @ R
+        way = unit(points[..., end, :] + TO_ELBOW)
+        points += T_rig_palm[..., None, :3, 3]
+        points[..., end, :] = points[..., cuff, :] + SLEEVE_M * way
         return points
 
 
-def _frame_rows(joints: HandJoints) -> Float:
-    """Rows (..., FRAME_ROWS, 3): positions [m] and axes of the joints, palm axes and origin, direction to the elbow."""
-    T, lead = joints.T_rig_palm, joints.position_m.shape[:-2]
-    axes = np.swapaxes(joints.rotation, -1, -2).reshape(*lead, 78, 3)
-    elbow = np.broadcast_to(ELBOW_RIG / np.linalg.norm(ELBOW_RIG), (*lead, 1, 3))
-    return np.concatenate([joints.position_m, axes, np.swapaxes(T[..., :3, :], -1, -2), elbow], axis=-2)
-
-
-def _in_palm(point_m: Float) -> Float:
-    """A point (3,) [m] of the palm's frame as a sum of frame rows (FRAME_ROWS,)."""
-    return point_m @ _PALM_AXES + _PALM_ORIGIN
+def _chain_rows(chains: Chains) -> Float:
+    """Positions [m], then axes, of the joints of all chains, finger by finger (..., 80, 3), palm frame."""
+    lead = chains.position_m.shape[:-3]
+    axes = np.swapaxes(chains.rotation, -1, -2)
+    return np.concatenate([chains.position_m.reshape(*lead, 20, 3), axes.reshape(*lead, 60, 3)], axis=-2)
 
 
 def _spheres(model: HandModel) -> list[Float]:
-    """The middles of all spheres as sums of frame rows."""
+    """The middles of all spheres as sums of unit rows."""
     wrist = 0.45 * float(model.radius_m[1])
+    still = [
+        (wrist, -0.003, -0.012),
+        (-wrist, -0.003, -0.012),
+        *model.rest_position_m[list(METACARPALS)],
+    ]
     return [
-        *_JOINTS[CHAINS.ravel()],
-        *(_in_palm(np.array([x, -0.003, -0.012])) for x in (wrist, -wrist)),
-        *_JOINTS[list(METACARPALS)],
-        0.38 * _JOINTS[6] + 0.62 * _JOINTS[7] - 0.004 * _PALM_AXES[1],
-        _in_palm(np.array([0.0, 0.0, -0.018])),
-        0.45 * _TO_ELBOW - 0.55 * _PALM_AXES[2],
+        *_JOINTS,
+        *(np.array(point) @ _PALM for point in still),
+        0.38 * model.rest_position_m[6] @ _PALM + 0.62 * _JOINTS[4] - 0.004 * _PALM[1],
+        -0.018 * _PALM[2],
+        -0.55 * _PALM[2],
     ]
 
 

@@ -14,7 +14,6 @@ from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
-from common.hand_model import HandJoints
 from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
@@ -22,7 +21,7 @@ from common.sim.motion import HandState
 from common.sim.object_looks import Looks, Points
 from common.sim.object_surface import ObjectSurface
 from common.sim.objects_seen import SeenObjects
-from common.sim.raster import Shape
+from common.sim.raster import Int32, Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
     CAPSULES,
@@ -42,6 +41,7 @@ from common.sim.things import LAYER_SINES, SeenThing, seen, tube_rims
 
 NEAREST_M = 0.05
 FURTHEST_PX = 4000.0
+SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
 PHALANGES = len(CAPSULES)
@@ -57,11 +57,12 @@ class Snapshot:
         uv: (K, 2) [px] of the points; speed_uv: (K, 2) [px/s].
         t_s: (K,) the moments [s], scene time.
         discs_uv: (B, LAYERS, 2) [px], discs_px: (B, LAYERS): shading of the spheres, then of the caps' two ends each.
-        outlines: (PHALANGES + C, LAYERS, N, 2) [px] phalanges, then the shading of the caps.
+        outlines: (PHALANGES, LAYERS, N, 2) [px] phalanges.
         cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
         rim_uv: (C, n, 2) [px] the cap's edge towards the finger, and the finger's girth at its last joint.
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
-        shine_uv: (C, 2) [px] where the paint mirrors the lamp.
+        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the paint mirrors
+            the lamp, in OpenCV's numbers (`raster.fixed`).
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
         palm, web, sleeve: Hulls (N, 2) [px] of each layer, the first the outline.
         into_sleeve: The camera looks into the sleeve rather than at its side: the hand then lies before it.
@@ -79,7 +80,7 @@ class Snapshot:
     cap_uv: Float
     rim_uv: Float
     from_behind: Bool
-    shine_uv: Float
+    bands: Int32
     cuff_uv: Float
     palm: tuple[Float, ...]
     web: tuple[Float, ...]
@@ -125,6 +126,7 @@ class View:
         first = SPHERE_COUNT + 2 * np.arange(len(caps))
         self._from = np.concatenate([CAPSULES[:, 0], first])
         self._to = np.concatenate([CAPSULES[:, 1], first + 1])
+        self._to_lit = (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
         self._fine_circle = unit_circle(32)
         self.objects = ObjectSurface.of(scene.tracked, scene.rig.markers)
         self._looks = Looks(self.to_light, self.circle, self.focal_px, self.project)
@@ -154,7 +156,7 @@ class View:
         """Geometry of the frame whose row 0 is exposed around `t_s` [s]."""
         points, uv, speed_uv, when, things = self._moments(t_s)
         body = points[self._bodies]
-        lit = body[:, None] + (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
+        lit = body[:, None] + self._to_lit
         size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
         discs_px = size[:, None] * LAYER_SINES
         centre, base = points[self.cap_centre], points[self.cap_base]
@@ -168,9 +170,12 @@ class View:
             self._cuff(points),
         )
         discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = self._project_all(parts)
-        discs = discs_uv[:SPHERE_COUNT, :, None] + discs_px[:SPHERE_COUNT, :, None, None] * self.circle
-        sleeve = np.concatenate([cuff_uv, discs[_ELBOW]], axis=1)
         a, b, own = self._from, self._to, slice(self.surface.count, None)
+        outlines = raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b])
+        spots = raster.discs(shine_uv, SHINE_SHARE * discs_px[SPHERE_COUNT::2, 0], self.circle)
+        bands = np.concatenate([outlines[PHALANGES:, 1:], spots[:, None]], axis=1)
+        discs = raster.discs(discs_uv, discs_px, self.circle)
+        sleeve = np.concatenate([cuff_uv, discs[_ELBOW]], axis=1)
         return Snapshot(
             points=points,
             uv=uv,
@@ -178,11 +183,11 @@ class View:
             t_s=when,
             discs_uv=discs_uv,
             discs_px=discs_px,
-            outlines=raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b]),
+            outlines=outlines[:PHALANGES],
             cap_uv=cap_uv,
             rim_uv=np.concatenate([cap_uv[:, len(self._fine_circle) :], joint_uv], axis=1),
             from_behind=((centre - base) * base).sum(axis=1) > 0.0,
-            shine_uv=shine_uv,
+            bands=raster.fixed(bands),
             cuff_uv=cuff_uv,
             palm=_hulls(discs[_PALM]),
             web=_hulls(discs[_WEB]),
@@ -225,8 +230,7 @@ class View:
         t_middle = t_s + 0.5 * readout_s
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
-        joints = self.scene.joints_of(states)
-        before, now, after = transform(self.T_camera_rig, self._key_points(joints, states))
+        before, now, after = transform(self.T_camera_rig, self._key_points(states))
         slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
         points = now
@@ -239,9 +243,10 @@ class View:
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
         return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])
 
-    def _key_points(self, joints: HandJoints, states: tuple[HandState, ...]) -> Float:
+    def _key_points(self, states: tuple[HandState, ...]) -> Float:
         """Key points (S, K, 3) [m], rig frame, of the hand, then of the tracked objects."""
-        hand = self.surface.key_points(joints)
+        chains = self.scene.model.chains(np.array([state.angles_rad for state in states]))
+        hand = self.surface.key_points(np.array([state.T_rig_palm for state in states]), chains)
         if not self.objects.local.size:
             return hand
         poses = np.array([self.scene.object_poses(state) for state in states])
