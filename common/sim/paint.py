@@ -4,7 +4,7 @@ Coverage is measured with everything nearer cut out, and the same coverage blend
 image and truth come from one drawing.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -93,10 +93,12 @@ class Painter:
         """Every marker, bead and tag with what it covers, everything nearer cut out."""
         view, speed = self._view, snapshot.speed_uv
         caps, boxes = view.surface.caps, view.surface.boxes
-        corners = [*snapshot.cap_uv, *(snapshot.uv[box.corners] for box in boxes)]
+        box_uv = np.array([snapshot.uv[box.corners] for box in boxes]).reshape(-1, 8, 2)
         ways = [*speed[view.cap_centre], *(speed[box.corners].mean(axis=0) for box in boxes)]
-        outlines = [Shape(raster.hull(uv), way) for uv, way in zip(corners, ways, strict=True)]
-        places = self._places(snapshot, corners)
+        outlines = [
+            Shape(raster.hull(uv), way) for uv, way in zip((*snapshot.cap_uv, *box_uv), ways, strict=True)
+        ]
+        places = self._places(snapshot, box_uv)
         # Caps hide each other; boxes lie flat on the palm.
         touching = raster.overlaps(places.low[:, None], places.high[:, None], places.low, places.high)
         touching &= places.depth[:, None] > places.depth
@@ -125,18 +127,17 @@ class Painter:
         features = self._objects.cover(snapshot, cards, hand) if view.objects.local.size else ()
         return Covered(tuple(sorted(painted, key=lambda item: item.marker)), tuple(features), snapshot)
 
-    def _places(self, snapshot: Snapshot, corners: Sequence[Float]) -> Places:
-        """Where the markers of the hand are, caps first, of the corners (N, 2) [px] of each."""
+    def _places(self, snapshot: Snapshot, box_uv: Float) -> Places:
+        """Where the markers of the hand are, caps first, then boxes with these corners (B, 8, 2) [px]."""
         view = self._view
         boxes = [box.corners for box in view.surface.boxes]
+        corners = snapshot.cap_uv, box_uv
         centre = snapshot.points[view.cap_centre]
         return Places(
-            uv=np.concatenate(
-                [snapshot.uv[view.cap_centre], *(snapshot.uv[b].mean(axis=0)[None] for b in boxes)]
-            ),
+            uv=np.concatenate([snapshot.uv[view.cap_centre], box_uv.mean(axis=1)]),
             depth=np.append(centre[:, 2], [snapshot.points[b, 2].mean() for b in boxes]),
-            low=np.array([uv.min(axis=0) for uv in corners]) - REACH_PX,
-            high=np.array([uv.max(axis=0) for uv in corners]) + REACH_PX,
+            low=np.concatenate([uv.min(axis=1) for uv in corners]) - REACH_PX,
+            high=np.concatenate([uv.max(axis=1) for uv in corners]) + REACH_PX,
             behind_palm=np.append(
                 view.behind_palm(snapshot, centre), [not view.shows_back(snapshot)] * len(boxes)
             ),

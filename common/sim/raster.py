@@ -94,10 +94,11 @@ def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
     arcs = np.empty((*distance.shape, 2, ARC_POINTS), dtype=np.complex128)
     arcs[..., 0, 0] = radius_a * heading * (cosine + 1j * sine)
     arcs[..., 1, 0] = radius_b * heading * (cosine - 1j * sine)
-    step = np.stack([np.pi - tangent, tangent], axis=-1) * (2.0j / (ARC_POINTS - 1))
-    arcs[..., 1:] = np.exp(step)[..., None]
+    step = np.array([np.pi - tangent, tangent]) * (2.0j / (ARC_POINTS - 1))
+    arcs[..., 1:] = np.moveaxis(np.exp(step), 0, -1)[..., None]
     arcs = arcs.cumprod(axis=-1)
-    arcs += np.stack([start, stop], axis=-1)[..., None]
+    arcs[..., 0, :] += start[..., None]
+    arcs[..., 1, :] += stop[..., None]
     return arcs.view(np.float64).reshape(*distance.shape, 2 * ARC_POINTS, 2)
 
 
@@ -115,6 +116,12 @@ def hull(points: Float) -> Float:
 def fixed(points: Float) -> Int32:
     """Corners as OpenCV's fixed-point numbers."""
     return np.rint(points * (1 << FIXED_BITS)).astype(np.int32)
+
+
+def fixed_each(outlines: Sequence[Float]) -> list[Int32]:
+    """Each of some outlines (N, 2) as OpenCV's fixed-point numbers."""
+    corners = fixed(np.concatenate(outlines))
+    return [corners[a:b] for a, b in pairwise([0, *accumulate(map(len, outlines))])]
 
 
 def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:

@@ -128,7 +128,7 @@ class Renderer:
             grown = part[0] in ROOTS
             far = sum(phalanges[k] for k in part) / len(part)
             parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
-        palm = [[raster.fixed(hull) for hull in layers] for layers in (snapshot.web, snapshot.palm)]
+        palm = list(zip(raster.fixed_each(snapshot.web), raster.fixed_each(snapshot.palm), strict=True))
         behind = snapshot.into_sleeve
         if behind:
             self._draw_sleeve(image, snapshot)
@@ -141,7 +141,7 @@ class Renderer:
                 self._draw_part(image, part, snapshot)
                 continue
             for layer in range(LAYERS):
-                shapes = [corners[k, layer] for k in part] if part else [hull[layer] for hull in palm]
+                shapes = [corners[k, layer] for k in part] if part else [*palm[layer]]
                 if not part and layer >= ROUND_LAYER:
                     shapes += [corners[k, layer] for k in ROOTS]  # knuckles and thumb flow out of the palm
                 for shape in shapes:
@@ -182,8 +182,8 @@ class Renderer:
         under[:] = np.rint(total / len(moments))
 
     def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
-        for outline, colour in zip(snapshot.sleeve, self._sleeve, strict=True):
-            raster.fill(image, raster.fixed(outline), colour)
+        for outline, colour in zip(raster.fixed_each(snapshot.sleeve), self._sleeve, strict=True):
+            raster.fill(image, outline, colour)
 
     def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Box:
         """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""

@@ -195,7 +195,7 @@ def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> F
     d2 = (centre * centre).sum(axis=-1)
     shrink = 1.0 - radius_m**2 / d2
     towards = centre / np.sqrt(d2)[:, None]
-    both = np.stack([towards, axis]), np.stack([radius_m * np.sqrt(shrink), radius_m])
+    both = np.array([towards, axis]), np.array([radius_m * np.sqrt(shrink), radius_m])
     around, across = rim(*both, circle)
     contact = (centre * shrink[:, None])[:, None] + around
     edge = base[:, None] + across

@@ -64,6 +64,7 @@ class Snapshot:
         bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the paint mirrors
             the lamp, in OpenCV's numbers (`raster.fixed`).
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
+        palm_speed: (2,) [px/s] of the palm.
         palm, web, sleeve: Hulls (N, 2) [px] of each layer, the first the outline.
         into_sleeve: The camera looks into the sleeve rather than at its side: the hand then lies before it.
         things: What the hand takes, before it is drawn or hides anything.
@@ -82,17 +83,13 @@ class Snapshot:
     from_behind: Bool
     bands: Int32
     cuff_uv: Float
+    palm_speed: Float
     palm: tuple[Float, ...]
     web: tuple[Float, ...]
     sleeve: tuple[Float, ...]
     into_sleeve: bool
     things: tuple[SeenThing, ...]
     tracked: SeenObjects
-
-    @property
-    def palm_speed(self) -> Float:
-        """How fast (2,) [px/s] the palm moves."""
-        return self.speed_uv[_PALM].mean(axis=0)
 
 
 class View:
@@ -189,6 +186,7 @@ class View:
             from_behind=((centre - base) * base).sum(axis=1) > 0.0,
             bands=raster.fixed(bands),
             cuff_uv=cuff_uv,
+            palm_speed=speed_uv[_PALM].sum(axis=0) / len(_PALM),
             palm=_hulls(discs[_PALM]),
             web=_hulls(discs[_WEB]),
             sleeve=tuple(raster.hull(layer) for layer in sleeve),
