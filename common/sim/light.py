@@ -64,7 +64,7 @@ class SrgbTables:
 
     def decode(self, image: Image) -> Float32:
         """Linear light (H, W, 3) of sRGB bytes."""
-        return np.asarray(cv2.LUT(image, self.linear), dtype=np.float32)
+        return np.asarray(cv2.LUT(image, self.linear), dtype=np.float32).reshape(image.shape)
 
     def encode(self, light: Float32) -> Image:
         """sRGB bytes of linear light (H, W, 3), clipped to 0..1."""

@@ -207,11 +207,12 @@ class Painter:
             x1, y1 = cover.x + width + MARGIN_PX, cover.y + height + MARGIN_PX
             if x1 <= 0 or y1 <= 0 or x0 >= self._size[0] or y0 >= self._size[1] or not cover.alpha.any():
                 continue
-            box, members = (x0, y0, x1, y1), [item]
+            box: Window = (x0, y0, x1, y1)
+            members: list[AnyPainted] = [item]
             while touching := [group for group in groups if _touch(box, group[0])]:
                 for other, others in touching:
-                    box = (*map(min, box[:2], other[:2]), *map(max, box[2:], other[2:]))
-                    members = members + others
+                    box = _around(box, other)
+                    members += others
                 groups = [group for group in groups if group not in touching]
             groups.append((box, members))
         return [members for _, members in groups]
@@ -235,6 +236,10 @@ def _of_markers(painted: Covered) -> Iterator[tuple[int, Coverage, float]]:
     for item in painted.features:
         if isinstance(item.feature, SeenBead) and item.feature.bead.marker is not None:
             yield item.feature.bead.marker, item.coverage, item.feature.t_s
+
+
+def _around(a: Window, b: Window) -> Window:
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
 
 
 def _touch(a: Window, b: Window) -> bool:

@@ -197,8 +197,8 @@ def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> F
     towards = centre / np.sqrt(d2)[:, None]
     both = np.array([towards, axis]), np.array([radius_m * np.sqrt(shrink), radius_m])
     around, across = rim(*both, circle)
-    contact = (centre * shrink[:, None])[:, None] + around
-    edge = base[:, None] + across
+    contact: Float = (centre * shrink[:, None])[:, None] + around
+    edge: Float = base[:, None] + across
     ahead = ((contact - centre[:, None]) @ axis[:, :, None]) >= 0.0
     return np.concatenate([np.where(ahead, contact, edge), edge], axis=1)
 
