@@ -6,6 +6,7 @@ colours learnt here and there agree.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -63,12 +64,14 @@ class SrgbTables:
 
     def decode(self, image: Image) -> Float32:
         """Linear light (H, W, 3) of sRGB bytes."""
-        return self.linear[image]
+        return np.asarray(cv2.LUT(image, self.linear), dtype=np.float32).reshape(image.shape)
 
     def encode(self, light: Float32) -> Image:
         """sRGB bytes of linear light (H, W, 3), clipped to 0..1."""
-        steps = np.clip(light * np.float32(_ENCODE_STEPS - 1) + np.float32(0.5), 0, _ENCODE_STEPS - 1)
-        return self.byte[steps.astype(np.uint16)]
+        steps = light * np.float32(_ENCODE_STEPS - 1)
+        steps += np.float32(0.5)
+        np.clip(steps, 0, _ENCODE_STEPS - 1, out=steps)
+        return self.byte.take(steps.astype(np.intp))
 
 
 def bgr_bytes(linear_rgb: Float) -> tuple[int, int, int]:

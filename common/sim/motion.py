@@ -10,10 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
+import cv2
 import numpy as np
 
 from common.arrays import Float
-from common.geometry import axis_rotation, rigid, rotation_vector_to_matrix
+from common.geometry import axis_rotation, rigid
 from common.hand_model import HandModel
 from common.sim.held import Cylinder
 from common.wrist_bend import STRAIGHT
@@ -36,6 +37,11 @@ POSES = {
     "pinch": ((14, 28, 20), (2, 44, 46), (0, 20, 26), (-5, 16, 22), (-10, 14, 20)),
 }
 FIST = ((4, 32, 34), (1, 66, 88), (0, 68, 92), (-2, 68, 92), (-4, 68, 88))
+_WOBBLE_DEG = np.array([1.0, 3.0, 3.0])
+_TILT_DEG = 12.0  # of the fingers towards the cameras
+_SEEN_FROM_BEHIND = axis_rotation(0, np.radians(_TILT_DEG)) @ np.array(
+    [[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]]
+)
 WAVE_CREST = ((12, 8, 12), (5, 34, 30), (0, 34, 30), (-5, 34, 30), (-10, 34, 30))
 
 
@@ -150,11 +156,9 @@ def angles_of(model: HandModel, posture_deg: Float, wobble: Float) -> Float:
     The wobble moves MCP and PIP by up to 3 degrees and abduction by 1, and spoils the DIP coupling by up to 12 %.
     """
     angles = np.empty((*posture_deg.shape[:-1], 4))
-    angles[..., :3] = posture_deg
-    angles[..., 0] += wobble[:, 0]
-    angles[..., 1:3] += 3.0 * wobble[:, 1:3]
-    coupling = 2.0 / 3.0 if model.dip_per_pip is None else model.dip_per_pip
-    ratio = np.array([0.9, coupling, coupling, coupling, coupling])
+    angles[..., :3] = posture_deg + _WOBBLE_DEG * wobble[:, :3]
+    ratio = np.full(5, 2.0 / 3.0 if model.dip_per_pip is None else model.dip_per_pip)
+    ratio[0] = 0.9
     angles[..., 3] = ratio * angles[..., 2] * (1.0 + 0.12 * wobble[:, 3])
     return model.clamp(np.radians(angles))
 
@@ -165,11 +169,9 @@ def base_pose(model: HandModel, centre_m: Float, shift_m: Float, turn_rad: Float
     The wrist is placed so that the flat hand's middle is at `centre_m` + `shift_m`; `turn_rad` (3,) turns the
     palm about the rig's axes through that middle. Fingers point a little towards the cameras.
     """
-    flat = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0]])
-    tilt = axis_rotation(0, np.radians(12.0))
-    rotation = rotation_vector_to_matrix(turn_rad) @ tilt @ flat
-    middle = np.array([0.0, 0.0, 0.5 * float(model.rest_position_m[:, 2].max())])
-    return rigid(rotation, centre_m + shift_m - rotation @ middle)
+    rotation = np.asarray(cv2.Rodrigues(turn_rad)[0], np.float64) @ _SEEN_FROM_BEHIND
+    middle = 0.5 * float(model.rest_position_m[:, 2].max())
+    return rigid(rotation, centre_m + shift_m - middle * rotation[:, 2])
 
 
 class Waves:

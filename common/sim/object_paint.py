@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from common.arrays import Float
 from common.sim import light, raster
-from common.sim.before import REACH_PX, phalanges, skin_before, sleeve_before, things_before
+from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.objects_seen import SeenBead, SeenPart, SeenSheet
 from common.sim.raster import Coverage, Shape
 from common.sim.tag_paint import sheet_look
@@ -65,7 +65,7 @@ class ObjectPainter:
         self._shine = {marker: light.bgr_bytes(np.array(paint) + 0.10) for marker, paint in paints.items()}
 
     def cover(
-        self, snapshot: Snapshot, cards: tuple[Shape, ...], hand: Sequence[tuple[Shape, float]], palm: Shape
+        self, snapshot: Snapshot, cards: tuple[Shape, ...], hand: Sequence[tuple[Shape, float]]
     ) -> list[PaintedFeature]:
         """Every bead and every tag that shows its front, everything nearer cut out.
 
@@ -73,7 +73,6 @@ class ObjectPainter:
             snapshot: The image.
             cards: Occluders before all else.
             hand: Outlines of the hand's markers and their depths [m].
-            palm: Outline of the palm.
         """
         tracked = snapshot.tracked
         features: list[tuple[SeenBead | SeenSheet, SeenPart | None]] = [(b, b.part) for b in tracked.beads]
@@ -82,22 +81,30 @@ class ObjectPainter:
             for sheet in tracked.sheets
             if sheet.shows
         ]
+        if not features:
+            return []
+        at = np.array([feature.at for feature, _ in features])
+        shapes = [feature.shape for feature, _ in features]
+        places = Places(
+            uv=np.array([feature.uv for feature, _ in features]),
+            depth=at[:, 2],
+            low=np.array([shape.corners.min(axis=0) for shape in shapes]) - REACH_PX,
+            high=np.array([shape.corners.max(axis=0) for shape in shapes]) + REACH_PX,
+            behind_palm=self._view.behind_palm(snapshot, at),
+            phalanx=np.full(len(features), NO_PHALANX),
+        )
         boxes = np.array([(one.corners.min(axis=0), one.corners.max(axis=0)) for one, _ in hand])
         boxes = boxes.reshape(-1, 2, 2)
         away = np.array([depth for _, depth in hand])
-        found: list[PaintedFeature] = []
-        for feature, own in features:
-            shape, depth = feature.shape, float(feature.at[2])
-            low, high = shape.corners.min(axis=0) - REACH_PX, shape.corners.max(axis=0) + REACH_PX
-            nearer = things_before(snapshot, (low, high), feature.uv, depth - TOUCHING_M, own)
-            nearer += self._skin_before(snapshot, feature, (low, high), palm)
-            markers = (away < depth) & raster.overlaps(boxes[:, 0], boxes[:, 1], low, high)
-            nearer += [*(hand[int(k)][0] for k in np.flatnonzero(markers)), *cards]
-            cover = raster.cover(
-                shape, None, nearer, raster.moments(shape, self._view.exposure_s), self._size
-            )
-            found.append(PaintedFeature(feature, cover))
-        return found
+        markers: list[raster.Marker] = []
+        for k, skin in enumerate(hand_before(snapshot, places)):
+            depth = float(places.depth[k])
+            over = (away < depth) & raster.overlaps(boxes[:, 0], boxes[:, 1], places.low[k], places.high[k])
+            things = things_before(snapshot, places, k, depth - TOUCHING_M, features[k][1])
+            nearer = (*things, *skin, *(hand[int(n)][0] for n in np.flatnonzero(over)), *cards)
+            markers.append(raster.Marker(shapes[k], nearer))
+        covers = raster.cover(markers, self._view.exposure_s, self._size)
+        return [PaintedFeature(feature, cover) for (feature, _), cover in zip(features, covers, strict=True)]
 
     def look(self, item: PaintedFeature, box: Box) -> Float32:
         """Linear light (h, w, 3) of its surface over pixels x0, y0, x1, y1, as if it filled them."""
@@ -130,15 +137,3 @@ class ObjectPainter:
                 np.array([feature.t_s for feature in (*beads, *sheets)]),
             )
         return views
-
-    def _skin_before(
-        self, snapshot: Snapshot, feature: SeenBead | SeenSheet, box: tuple[Float, Float], palm: Shape
-    ) -> list[Shape]:
-        """What of skin and sleeve may lie before a feature, whose box `low`, `high` (2,) [px] is given."""
-        view, depth, uv = self._view, feature.at[2:], feature.uv[None]
-        skin = skin_before(view, snapshot, uv, depth, box[0][None], box[1][None])[0]
-        before = [
-            *phalanges(snapshot, skin),
-            *sleeve_before(view, snapshot, feature.shape, float(depth[0])),
-        ]
-        return [*before, *([palm] if bool(view.behind_palm(snapshot, feature.at)) else [])]

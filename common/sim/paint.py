@@ -14,15 +14,14 @@ import numpy as np
 from common.arrays import Float, Image
 from common.geometry import cross
 from common.sim import light, raster
-from common.sim.before import REACH_PX, phalanges, skin_before, sleeve_before, things_before
+from common.sim.before import NO_PHALANX, REACH_PX, Places, hand_before, things_before
 from common.sim.desk import LENS_SIGMA_PX
 from common.sim.object_paint import ObjectPainter, ObjectView, PaintedFeature
 from common.sim.objects_seen import SeenBead
 from common.sim.raster import Coverage, Shape
-from common.sim.surface import PALM_HULL, SPHERE_COUNT, unit
-from common.sim.view import LAYERS, PHALANGES, Snapshot, View
+from common.sim.surface import unit
+from common.sim.view import Snapshot, View
 
-SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 MARGIN_PX = 2
 
 
@@ -47,15 +46,15 @@ class MarkerView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Painted:
-    """One marker of the hand in one frame: its coverage and its outline."""
+    """One marker of the hand in one frame: what it covers, and the moment of its row [s], scene time."""
 
     marker: int
     coverage: Coverage
-    outline: Shape
     t_s: float
 
 
 AnyPainted: TypeAlias = Painted | PaintedFeature
+Window: TypeAlias = tuple[int, int, int, int]  # x0, y0, x1, y1 [px]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,52 +80,69 @@ class Painter:
         self._tables = light.SrgbTables.make()
         rig = view.scene.rig
         self._paint = {m: light.paint(n) for m, n in enumerate(rig.markers) if n not in rig.free_markers}
-        self._shades = {m: light.shades(paint, gloss=0.02) for m, paint in self._paint.items()}
-        self._shine = {m: light.bgr_bytes(np.array(paint) + 0.10) for m, paint in self._paint.items()}
+        self._shades = {
+            m: (*light.shades(paint, gloss=0.02), light.bgr_bytes(np.array(paint) + 0.10))
+            for m, paint in self._paint.items()
+        }
+        self._sides = {m: light.face_shade(paint, 0.25) for m, paint in self._paint.items()}
+        self._caps = {cap.marker: c for c, cap in enumerate(view.surface.caps)}
+        self._boxes = {box.marker: box.corners for box in view.surface.boxes}
         self._objects = ObjectPainter(view, self._tables)
 
     def cover(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Covered:
         """Every marker, bead and tag with what it covers, everything nearer cut out."""
-        surface, view = self._view.surface, self._view
-        palm = Shape(view.hulls(snapshot, PALM_HULL, 1)[0], snapshot.speed_uv[list(PALM_HULL)].mean(axis=0))
-        caps = [
-            Shape(raster.hull(uv), snapshot.speed_uv[k])
-            for uv, k in zip(snapshot.cap_uv, view.cap_centre, strict=True)
+        view, speed = self._view, snapshot.speed_uv
+        caps, boxes = view.surface.caps, view.surface.boxes
+        box_uv = np.array([snapshot.uv[box.corners] for box in boxes]).reshape(-1, 8, 2)
+        ways = [*speed[view.cap_centre], *(speed[box.corners].mean(axis=0) for box in boxes)]
+        outlines = [
+            Shape(raster.hull(uv), way) for uv, way in zip((*snapshot.cap_uv, *box_uv), ways, strict=True)
         ]
-        low, high = snapshot.cap_uv.min(axis=1) - REACH_PX, snapshot.cap_uv.max(axis=1) + REACH_PX
-        centre = snapshot.points[view.cap_centre]
-        hidden = view.behind_palm(snapshot, centre)
-        skin = skin_before(view, snapshot, snapshot.uv[view.cap_centre], centre[:, 2], low, high)
-        touching = raster.overlaps(low[:, None], high[:, None], low, high)
-        touching &= centre[:, None, 2] > centre[None, :, 2]
-        hand = list(zip(caps, centre[:, 2].tolist(), strict=True))
-        painted: list[Painted] = []
-        for c, cap in enumerate(surface.caps):
-            skin[c, 3 * cap.finger + 2] = False  # that one is the cap's own, see `own_finger`
-            nearer = [*phalanges(snapshot, skin[c]), *(caps[n] for n in np.flatnonzero(touching[c]))]
-            nearer += [
-                *([palm] if hidden[c] else []),
-                *sleeve_before(view, snapshot, caps[c], float(centre[c, 2])),
-                *things_before(snapshot, (low[c], high[c]), snapshot.uv[cap.centre], float(centre[c, 2])),
-                *cards,
-            ]
-            cut = view.own_finger(snapshot, c)
-            cover = raster.cover(caps[c], cut, nearer, raster.moments(caps[c], view.exposure_s), self._size)
-            painted.append(Painted(cap.marker, cover, caps[c], float(snapshot.t_s[cap.centre])))
-        for box in surface.boxes:
-            uv = snapshot.uv[box.corners]
-            shape = Shape(raster.hull(uv), snapshot.speed_uv[box.corners].mean(axis=0))
-            depth = snapshot.points[box.corners, 2].mean(keepdims=True)
-            at = uv.min(axis=0)[None] - REACH_PX, uv.max(axis=0)[None] + REACH_PX
-            before = skin_before(view, snapshot, uv.mean(axis=0)[None], depth, *at)[0]
-            nearer = [*phalanges(snapshot, before), *([] if view.shows_back(snapshot) else [palm]), *cards]
-            nearer += sleeve_before(view, snapshot, shape, float(depth[0]))
-            nearer += things_before(snapshot, (at[0][0], at[1][0]), uv.mean(axis=0), float(depth[0]))
-            cover = raster.cover(shape, None, nearer, raster.moments(shape, view.exposure_s), self._size)
-            painted.append(Painted(box.marker, cover, shape, float(snapshot.t_s[box.corners.start])))
-            hand.append((shape, float(depth[0])))
-        features = self._objects.cover(snapshot, cards, hand, palm) if view.objects.local.size else ()
+        places = self._places(snapshot, box_uv)
+        # Caps hide each other; boxes lie flat on the palm.
+        touching = raster.overlaps(places.low[:, None], places.high[:, None], places.low, places.high)
+        touching &= places.depth[:, None] > places.depth
+        touching[:, len(caps) :] = touching[len(caps) :] = False
+        markers = [
+            raster.Marker(
+                outlines[k],
+                (
+                    *skin,
+                    *(outlines[n] for n in np.flatnonzero(touching[k])),
+                    *things_before(snapshot, places, k, float(places.depth[k])),
+                    *cards,
+                ),
+                view.own_finger(snapshot, k) if k < len(caps) else None,
+            )
+            for k, skin in enumerate(hand_before(snapshot, places))
+        ]
+        numbers = [marker.marker for marker in (*caps, *boxes)]
+        points = [*view.cap_centre.tolist(), *(box.corners.start for box in boxes)]
+        covers = raster.cover(markers, view.exposure_s, self._size)
+        painted = [
+            Painted(number, cover, float(snapshot.t_s[point]))
+            for number, cover, point in zip(numbers, covers, points, strict=True)
+        ]
+        hand = list(zip(outlines, places.depth.tolist(), strict=True))
+        features = self._objects.cover(snapshot, cards, hand) if view.objects.local.size else ()
         return Covered(tuple(sorted(painted, key=lambda item: item.marker)), tuple(features), snapshot)
+
+    def _places(self, snapshot: Snapshot, box_uv: Float) -> Places:
+        """Where the markers of the hand are, caps first, then boxes with these corners (B, 8, 2) [px]."""
+        view = self._view
+        boxes = [box.corners for box in view.surface.boxes]
+        corners = snapshot.cap_uv, box_uv
+        centre = snapshot.points[view.cap_centre]
+        return Places(
+            uv=np.concatenate([snapshot.uv[view.cap_centre], box_uv.mean(axis=1)]),
+            depth=np.append(centre[:, 2], [snapshot.points[b, 2].mean() for b in boxes]),
+            low=np.concatenate([uv.min(axis=1) for uv in corners]) - REACH_PX,
+            high=np.concatenate([uv.max(axis=1) for uv in corners]) + REACH_PX,
+            behind_palm=np.append(
+                view.behind_palm(snapshot, centre), [not view.shows_back(snapshot)] * len(boxes)
+            ),
+            phalanx=np.array([3 * cap.finger + 2 for cap in view.surface.caps] + [NO_PHALANX] * len(boxes)),
+        )
 
     def window(self, image: Image, group: list[AnyPainted], snapshot: Snapshot) -> tuple[int, int, Image]:
         """Paint a group of markers and blur its window, all in linear light; where it goes, and its pixels."""
@@ -160,49 +176,46 @@ class Painter:
         inner = window[top : -1 if y1 < height else None, left : -1 if x1 < width else None]
         return x0 + left, y0 + top, self._tables.encode(np.asarray(inner, dtype=np.float32))
 
-    def _look(self, item: Painted, snapshot: Snapshot, box: tuple[int, int, int, int]) -> Image:
+    def _look(self, item: Painted, snapshot: Snapshot, box: Window) -> Image:
         """Colours of one marker's surface over a pixel box, as if it filled it."""
         x0, y0, x1, y1 = box
         look = np.empty((y1 - y0, x1 - x0, 3), dtype=np.uint8)
-        view, corner, shades = self._view, np.array([x0, y0]), self._shades[item.marker]
-        look[:] = shades[0]
-        for c, cap in enumerate(view.surface.caps):
-            if cap.marker == item.marker:
-                bands = raster.fixed(snapshot.outlines[PHALANGES + c] - corner)
-                for layer in range(1, LAYERS):
-                    raster.fill(look, bands[layer], shades[layer])
-                size = SHINE_SHARE * snapshot.discs_px[SPHERE_COUNT + 2 * c, 0]
-                spot = snapshot.shine_uv[c] - corner + size * view.circle
-                raster.fill(look, raster.fixed(spot), self._shine[item.marker])
-        for side in view.surface.boxes:
-            if side.marker == item.marker:
-                uv = snapshot.uv[side.corners] - corner
-                look[:] = light.face_shade(self._paint[item.marker], 0.25)
-                top = snapshot.points[side.corners][:4]
-                normal = unit(cross(top[1] - top[0], top[3] - top[0]))
-                facing = float(normal @ view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
-                raster.fill(look, raster.fixed(uv[:4]), light.face_shade(self._paint[item.marker], facing))
+        cap = self._caps.get(item.marker)
+        if cap is not None:
+            base, *bands = self._shades[item.marker]
+            cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), base, cv2.FILLED)
+            corners = snapshot.bands[cap] - raster.fixed(np.array([x0, y0]))
+            for outline, colour in zip(corners, bands, strict=True):
+                raster.fill(look, outline, colour)
+            return look
+        side = self._boxes[item.marker]
+        cv2.rectangle(look, (0, 0), (x1 - x0, y1 - y0), self._sides[item.marker], cv2.FILLED)
+        top = snapshot.points[side][:4]
+        normal = unit(cross(top[1] - top[0], top[3] - top[0]))
+        facing = float(normal @ self._view.to_light) * (-1.0 if float(normal @ top[0]) > 0.0 else 1.0)
+        corners = raster.fixed(snapshot.uv[side][:4] - (x0, y0))
+        raster.fill(look, corners, light.face_shade(self._paint[item.marker], facing))
         return look
 
     def clusters(self, painted: Covered) -> list[list[AnyPainted]]:
         """Markers whose windows touch, together; markers outside the image or hidden left out."""
-        groups: list[tuple[Float, Float, list[AnyPainted]]] = []
+        groups: list[tuple[Window, list[AnyPainted]]] = []
         for item in (*painted.markers, *painted.features):
             cover = item.coverage
-            low = np.array([cover.x, cover.y], dtype=np.float64) - MARGIN_PX
-            high = low + np.array(cover.alpha.shape[::-1]) + 2.0 * MARGIN_PX
-            if (high <= 0).any() or (low >= np.array(self._size)).any() or not cover.alpha.any():
+            height, width = cover.alpha.shape
+            x0, y0 = cover.x - MARGIN_PX, cover.y - MARGIN_PX
+            x1, y1 = cover.x + width + MARGIN_PX, cover.y + height + MARGIN_PX
+            if x1 <= 0 or y1 <= 0 or x0 >= self._size[0] or y0 >= self._size[1] or not cover.alpha.any():
                 continue
+            box: Window = (x0, y0, x1, y1)
             members: list[AnyPainted] = [item]
-            touching = [group for group in groups if bool(raster.overlaps(low, high, group[0], group[1]))]
-            while touching:
-                for group in touching:
-                    low, high = np.minimum(low, group[0]), np.maximum(high, group[1])
-                    members += group[2]
-                groups = [group for group in groups if not any(group is taken for taken in touching)]
-                touching = [group for group in groups if bool(raster.overlaps(low, high, group[0], group[1]))]
-            groups.append((low, high, members))
-        return [members for _, _, members in groups]
+            while touching := [group for group in groups if _touch(box, group[0])]:
+                for other, others in touching:
+                    box = _around(box, other)
+                    members += others
+                groups = [group for group in groups if group not in touching]
+            groups.append((box, members))
+        return [members for _, members in groups]
 
     def truth(self, painted: Covered) -> MarkerView:
         """What is visible of all markers, in the order of the rig, and of the objects."""
@@ -223,3 +236,11 @@ def _of_markers(painted: Covered) -> Iterator[tuple[int, Coverage, float]]:
     for item in painted.features:
         if isinstance(item.feature, SeenBead) and item.feature.bead.marker is not None:
             yield item.feature.bead.marker, item.coverage, item.feature.t_s
+
+
+def _around(a: Window, b: Window) -> Window:
+    return min(a[0], b[0]), min(a[1], b[1]), max(a[2], b[2]), max(a[3], b[3])
+
+
+def _touch(a: Window, b: Window) -> bool:
+    return a[0] <= b[2] and b[0] <= a[2] and a[1] <= b[3] and b[1] <= a[3]

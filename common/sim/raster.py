@@ -5,22 +5,28 @@ Pixel (0, 0) is the centre of the top-left pixel, in OpenCV's drawing as everywh
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from math import ceil, floor, hypot
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 
-from common.arrays import Bool, Float, Image
+from common.arrays import Bool, Float, Image, Int
 
 Int32 = npt.NDArray[np.int32]
 Float32 = npt.NDArray[np.float32]
+Complex = npt.NDArray[np.complex128]
 
 FIXED_BITS = 4
 SUPER = 6
-HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 ARC_POINTS = 8
+HALF_SUBPIXEL_PX = 0.5 / SUPER  # OpenCV's fill reaches half a pixel beyond the true edge
 BLUR_STEP_PX = 1.2
 MAX_STEPS = 6
+ROOM_PX = 2.0  # around what a marker covers
+# Middles of 1 ... MAX_STEPS equal parts of an exposure of length 1, from its middle.
+_MOMENTS = tuple((np.arange(n) + 0.5) / n - 0.5 for n in range(1, MAX_STEPS + 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,6 +35,26 @@ class Shape:
 
     corners: Float
     velocity: Float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Marker:
+    """A marker's outline and what hides it.
+
+    Attributes:
+        outline: The marker.
+        nearer: Everything that lies before it.
+        cut: What it hides of itself (the finger before its cap); not part of its own outline.
+    """
+
+    outline: Shape
+    nearer: Sequence[Shape] = ()
+    cut: Shape | None = None
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The outline, the cut if there is one, and what lies before them."""
+        return (self.outline, *(() if self.cut is None else (self.cut,)), *self.nearer)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,26 +74,38 @@ class Coverage:
 
 
 def capsules(a: Float, radius_a: Float, b: Float, radius_b: Float) -> Float:
-    """Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2) joined by their outer tangents."""
-    between = b - a
-    distance = np.hypot(between[..., 0], between[..., 1])
+    """Outlines (..., 2 n, 2) [px] of discs at `a` and `b` (..., 2) joined by their outer tangents.
+
+    Complex numbers are points of the plane: e^(i angle) turns by an angle, its powers walk along an arc.
+    """
+    start, stop = _complex(a), _complex(b)
+    between = stop - start
+    distance = np.abs(between)
     swallowed = distance <= np.abs(radius_a - radius_b)
-    b_wins = (swallowed & (radius_b > radius_a))[..., None]
-    a_wins = (swallowed & (radius_b <= radius_a))[..., None]
-    a, b = np.where(b_wins, b, a), np.where(a_wins, a, b)
-    radius_a, radius_b = (
-        np.where(b_wins[..., 0], radius_b, radius_a),
-        np.where(a_wins[..., 0], radius_a, radius_b),
-    )
-    heading = np.arctan2(between[..., 1], between[..., 0])
-    ratio = np.where(swallowed, 0.0, (radius_a - radius_b) / np.maximum(distance, 1e-9))
-    tangent = np.arccos(np.clip(ratio, -1.0, 1.0))
-    step = np.linspace(0.0, 1.0, ARC_POINTS)
-    arc_a = (heading + tangent)[..., None] + (2.0 * (np.pi - tangent))[..., None] * step
-    arc_b = (heading - tangent)[..., None] + (2.0 * tangent)[..., None] * step
-    side_a = a[..., None, :] + radius_a[..., None, None] * np.stack([np.cos(arc_a), np.sin(arc_a)], axis=-1)
-    side_b = b[..., None, :] + radius_b[..., None, None] * np.stack([np.cos(arc_b), np.sin(arc_b)], axis=-1)
-    return np.concatenate([side_a, side_b], axis=-2)
+    if swallowed.any():  # the larger disc is the whole outline
+        b_wins = radius_b > radius_a
+        start, stop = np.where(swallowed & b_wins, stop, start), np.where(swallowed & ~b_wins, start, stop)
+        larger = np.maximum(radius_a, radius_b)
+        radius_a, radius_b = np.where(swallowed, larger, radius_a), np.where(swallowed, larger, radius_b)
+    heading = np.where(distance > 0.0, between, 1.0) / np.where(distance > 0.0, distance, 1.0)
+    cosine = (radius_a - radius_b) / np.maximum(distance, 1e-9)
+    tangent = np.arccos(cosine)
+    sine = np.sqrt(1.0 - cosine * cosine)
+    arcs = np.empty((*distance.shape, 2, ARC_POINTS), dtype=np.complex128)
+    arcs[..., 0, 0] = radius_a * heading * (cosine + 1j * sine)
+    arcs[..., 1, 0] = radius_b * heading * (cosine - 1j * sine)
+    step = np.array([np.pi - tangent, tangent]) * (2.0j / (ARC_POINTS - 1))
+    arcs[..., 1:] = np.moveaxis(np.exp(step), 0, -1)[..., None]
+    arcs = arcs.cumprod(axis=-1)
+    arcs[..., 0, :] += start[..., None]
+    arcs[..., 1, :] += stop[..., None]
+    return arcs.view(np.float64).reshape(*distance.shape, 2 * ARC_POINTS, 2)
+
+
+def discs(centre: Float, radius: Float, circle: Float) -> Float:
+    """Outlines (..., n, 2) [px] of discs about `centre` (..., 2), each a `circle` (n, 2) of that radius (...)."""
+    points = _complex(centre)[..., None] + radius[..., None] * _complex(circle)
+    return points.view(np.float64).reshape(*points.shape, 2)
 
 
 def hull(points: Float) -> Float:
@@ -80,55 +118,95 @@ def fixed(points: Float) -> Int32:
     return np.rint(points * (1 << FIXED_BITS)).astype(np.int32)
 
 
+def fixed_each(outlines: Sequence[Float]) -> list[Int32]:
+    """Each of some outlines (N, 2) as OpenCV's fixed-point numbers."""
+    corners = fixed(np.concatenate(outlines))
+    return [corners[a:b] for a, b in pairwise([0, *accumulate(map(len, outlines))])]
+
+
 def fill(image: Image, corners: Int32, colour: tuple[int, int, int]) -> None:
     """Fill a convex outline, smooth edges."""
     cv2.fillConvexPoly(image, corners, colour, lineType=cv2.LINE_AA, shift=FIXED_BITS)
 
 
-def cover(
-    outline: Shape, cut: Shape | None, nearer: Sequence[Shape], offsets_s: Float, size: tuple[int, int]
-) -> Coverage:
-    """Measure what an outline covers, by drawing at six times the resolution at each moment of the exposure.
+def cover(markers: Sequence[Marker], exposure_s: float, size: tuple[int, int]) -> list[Coverage]:
+    """Measure what each marker covers, by drawing at six times the resolution at each moment of the exposure.
 
     Args:
-        outline: The marker.
-        cut: What the marker hides of itself (the finger before its cap); not part of its own outline.
-        nearer: Everything that lies before it.
-        offsets_s: Moments (n,) of the exposure, relative to its middle [s], at most 8.
+        markers: Markers, each with what hides it.
+        exposure_s: Exposure [s].
         size: Width and height of the image [px]; what falls outside is not visible.
     """
-    reach = float(np.abs(offsets_s).max()) * np.abs(outline.velocity) + 2.0
-    low = np.floor(outline.corners.min(axis=0) - reach).astype(int)
-    high = np.ceil(outline.corners.max(axis=0) + reach).astype(int) + 1
-    origin = low - 0.5 + 0.5 / SUPER
-    shape = tuple((high - low)[::-1] * SUPER)
-    drawn = _inset(outline.corners)
-    others = [Shape(_inset(other.corners), other.velocity) for other in nearer]
-    own_cut = None if cut is None else Shape(_inset(cut.corners), cut.velocity)
-    level = 255 // len(offsets_s)
+    if not markers:
+        return []
+    shapes = [shape for marker in markers for shape in marker.shapes]
+    counts = [len(shape.corners) for shape in shapes]
+    starts = [0, *accumulate(counts)]
+    owner = np.repeat(np.arange(len(shapes)), counts)
+    corners = np.concatenate([shape.corners for shape in shapes])
+    inset = _inset(corners, np.add.reduceat(corners, starts[:-1]) / np.array(counts)[:, None], owner)
+    scale = SUPER << FIXED_BITS
+    middle = (inset + (0.5 - 0.5 / SUPER)) * scale
+    speed = np.array([shape.velocity for shape in shapes])[owner] * scale
+    low, high = (f.reduceat(corners, starts[:-1]) for f in (np.minimum, np.maximum))
+    found: list[Coverage] = []
+    first = 0
+    for marker in markers:
+        stop = first + len(marker.shapes)
+        offsets_s = moments(marker.outline, exposure_s)
+        reach = offsets_s[-1] * np.abs(marker.outline.velocity) + ROOM_PX
+        x0, y0 = map(floor, (low[first] - reach).tolist())
+        x1, y1 = (ceil(edge) + 1 for edge in (high[first] + reach).tolist())
+        own = slice(starts[first], starts[stop])
+        moved = middle[own] + offsets_s[:, None, None] * speed[own]
+        moved -= (x0 * scale, y0 * scale)
+        parts = [(a - own.start, b - own.start) for a, b in pairwise(starts[first : stop + 1])]
+        fine = np.rint(moved).astype(np.int32)
+        found.append(_covered(fine, parts, 1 if marker.cut is None else 2, (x0, y0, x1, y1), size))
+        first = stop
+    return found
+
+
+def _covered(
+    corners: Int32,
+    parts: Sequence[tuple[int, int]],
+    own_parts: int,
+    window: tuple[int, int, int, int],
+    size: tuple[int, int],
+) -> Coverage:
+    """What one marker covers.
+
+    Args:
+        corners: (n, N, 2) of all shapes at each moment, on the fine grid of the window.
+        parts: Where the corners of each shape begin and end: the marker, what it hides of itself, what hides it.
+        own_parts: How many of them are the marker's own.
+        window: Pixels x0, y0, x1, y1.
+        size: Of the image.
+    """
+    x0, y0, x1, y1 = window
+    level = 255 // len(corners)
     total: Image | None = None
     own = 0
-    for offset in offsets_s:
-        mask = np.zeros(shape, dtype=np.uint8)
-        _fill_fine(mask, drawn + offset * outline.velocity - origin, level)
-        if own_cut is not None:
-            _fill_fine(mask, own_cut.corners + offset * own_cut.velocity - origin, 0)
-        own += cv2.countNonZero(mask)
-        for other in others:
-            _fill_fine(mask, other.corners + offset * other.velocity - origin, 0)
-        total = mask if total is None else np.asarray(cv2.add(total, mask), dtype=np.uint8)
+    for moment in corners:
+        mask = np.zeros(((y1 - y0) * SUPER, (x1 - x0) * SUPER), dtype=np.uint8)
+        for k, (a, b) in enumerate(parts):
+            cv2.fillConvexPoly(mask, moment[a:b], 0 if k else level, lineType=cv2.LINE_8, shift=FIXED_BITS)
+            if k == own_parts - 1:
+                own += cv2.countNonZero(mask)
+        total = mask if total is None else np.asarray(cv2.add(total, mask, dst=total), dtype=np.uint8)
     assert total is not None
-    _blank_outside(total, low, high, size)
-    seen = float(cv2.sumElems(total)[0]) / level
-    fine = cv2.resize(total, tuple(high - low), interpolation=cv2.INTER_AREA)
-    alpha = fine.astype(np.float32) * np.float32(1.0 / (level * len(offsets_s)))
-    return Coverage(int(low[0]), int(low[1]), alpha, seen / own if own else 0.0)
+    _blank_outside(total, window, size)
+    seen = cv2.sumElems(total)[0] / level
+    fine = cv2.resize(total, (x1 - x0, y1 - y0), interpolation=cv2.INTER_AREA)
+    alpha = fine * np.float32(1.0 / (level * len(corners)))
+    return Coverage(x0, y0, alpha, seen / own if own else 0.0)
 
 
 def moments(shape: Shape, exposure_s: float) -> Float:
     """Moments (n,) of an exposure, from its middle [s], at which a shape is drawn: about one per pixel of way."""
-    n = int(np.clip(np.ceil(np.hypot(*shape.velocity) * exposure_s / BLUR_STEP_PX), 1, MAX_STEPS))
-    return ((np.arange(n) + 0.5) / n - 0.5) * exposure_s
+    way = hypot(*shape.velocity.tolist()) * exposure_s
+    n = min(max(ceil(way / BLUR_STEP_PX), 1), MAX_STEPS)
+    return _MOMENTS[n - 1] * exposure_s
 
 
 def centroid(coverage: Coverage) -> Float:
@@ -142,29 +220,28 @@ def centroid(coverage: Coverage) -> Float:
     return np.array([u, v])
 
 
-def _inset(corners: Float) -> Float:
-    """Corners moved inwards by what the fill adds."""
-    spread = corners - corners.mean(axis=0)
+def _complex(points: Float) -> Complex:
+    """Points (..., 2) of the plane as complex numbers (...)."""
+    return np.ascontiguousarray(points).view(np.complex128)[..., 0]
+
+
+def _inset(corners: Float, middle: Float, owner: Int) -> Float:
+    """Corners (N, 2) moved towards the middle of their shape `owner` (N,) by what the fill adds."""
+    spread = corners - middle[owner]
     reach = np.hypot(spread[:, 0], spread[:, 1])[:, None]
     return corners - spread * np.minimum(HALF_SUBPIXEL_PX / np.maximum(reach, 1e-6), 1.0)
 
 
-def _fill_fine(mask: Image, points: Float, level: int) -> None:
-    cv2.fillConvexPoly(mask, fixed(points * SUPER), level, lineType=cv2.LINE_8, shift=FIXED_BITS)
-
-
-def _blank_outside(
-    mask: Image, low: npt.NDArray[np.int_], high: npt.NDArray[np.int_], size: tuple[int, int]
-) -> None:
-    width, height = size
-    if low[0] < 0:
-        mask[:, : -low[0] * SUPER] = 0
-    if low[1] < 0:
-        mask[: -low[1] * SUPER] = 0
-    if high[0] > width:
-        mask[:, max(width - low[0], 0) * SUPER :] = 0
-    if high[1] > height:
-        mask[max(height - low[1], 0) * SUPER :] = 0
+def _blank_outside(mask: Image, window: tuple[int, int, int, int], size: tuple[int, int]) -> None:
+    (x0, y0, x1, y1), (width, height) = window, size
+    if x0 < 0:
+        mask[:, : -x0 * SUPER] = 0
+    if y0 < 0:
+        mask[: -y0 * SUPER] = 0
+    if x1 > width:
+        mask[:, max(width - x0, 0) * SUPER :] = 0
+    if y1 > height:
+        mask[max(height - y0, 0) * SUPER :] = 0
 
 
 def overlaps(low_a: Float, high_a: Float, low_b: Float, high_b: Float) -> Bool:

@@ -10,6 +10,7 @@ gain of the camera does the same (`Renderer.exposed`), and a longer exposure sme
 """
 
 from copy import copy
+from math import ceil, floor
 
 import cv2
 import numpy as np
@@ -18,16 +19,17 @@ from common.arrays import Float, Image
 from common.sim import light, raster
 from common.sim.desk import LENS_SIGMA_PX, NoiseTiles, desk_image
 from common.sim.objects_seen import SeenPart
-from common.sim.paint import MarkerView, Painter
+from common.sim.paint import Covered, MarkerView, Painter
 from common.sim.raster import Shape
 from common.sim.scene import DESK_DEPTH_M, Scene
-from common.sim.surface import CAPSULES, PALM_HULL, WEB_HULL
+from common.sim.surface import CAPSULES, PALM_HULL
 from common.sim.things import SeenThing
-from common.sim.view import LAYERS, PHALANGES, Snapshot, View
+from common.sim.view import LAYERS, Snapshot, View
 from common.srgb import relit_bytes
 
 Box = tuple[int, int, int, int]
 
+_PALM = list(PALM_HULL)
 ROOTS = (0, 3, 6, 9, 12)  # capsules that begin at the palm
 ROUND_LAYER = 2
 BEND_COSINE = 0.6  # a finger bent more than this is drawn in two parts, each at its own depth
@@ -72,7 +74,7 @@ class Renderer:
 
     def render(self, t_s: float) -> Image:
         """Image (H, W, 3) BGR of the frame whose row 0 is at mid-exposure at scene time `t_s` [s]."""
-        return self.observe(t_s)[0]
+        return self._draw(t_s)[0]
 
     def visible_fraction(self, t_s: float) -> Float:
         """Visible share (M,) of every marker in that frame."""
@@ -85,6 +87,11 @@ class Renderer:
 
     def observe(self, t_s: float) -> tuple[Image, MarkerView]:
         """Image and truth of one frame."""
+        image, painted = self._draw(t_s)
+        return image, self._painter.truth(painted)
+
+    def _draw(self, t_s: float) -> tuple[Image, Covered]:
+        """Image of one frame, and what is painted in it."""
         snapshot = self._view.snapshot(t_s)
         cards = self._view.cards(snapshot)
         painted = self._painter.cover(snapshot, cards)
@@ -106,22 +113,23 @@ class Renderer:
         if (gains_bgr != 1.0).any():
             image = np.asarray(cv2.LUT(image, relit_bytes(gains_bgr).T[None]), dtype=np.uint8)
         self._noise.add_to(image, round(t_s * 1e6))
-        return image, self._painter.truth(painted)
+        return image, painted
 
     def _draw_hand(self, image: Image, snapshot: Snapshot) -> None:
-        corners = raster.fixed(snapshot.outlines[:PHALANGES])
+        corners = raster.fixed(snapshot.outlines)
         depth = snapshot.points[:, 2]
-        palm_depth = float(depth[list(PALM_HULL)].mean())
+        palm_depth = float(depth[_PALM].mean())
         parts: list[tuple[float, tuple[int, ...] | SeenThing | SeenPart]] = [(palm_depth, ())]
         parts += [(float(thing.ends_depth.mean()), thing) for thing in snapshot.things]
         parts += [(float(part.ends_depth.mean()), part) for part in snapshot.tracked.parts]
+        phalanges = depth[CAPSULES].mean(axis=1).tolist()
         for part in _finger_parts(snapshot):
             # A part that grows out of the palm goes under its edge, wherever the rest of it is.
             grown = part[0] in ROOTS
-            far = float(depth[CAPSULES[list(part)]].mean())
+            far = sum(phalanges[k] for k in part) / len(part)
             parts.append((max(far, palm_depth + 1e-6) if grown else far, part))
-        palm = [[raster.fixed(h) for h in self._view.hulls(snapshot, hull)] for hull in (WEB_HULL, PALM_HULL)]
-        behind = self._view.looks_into_sleeve(snapshot)
+        palm = list(zip(raster.fixed_each(snapshot.web), raster.fixed_each(snapshot.palm), strict=True))
+        behind = snapshot.into_sleeve
         if behind:
             self._draw_sleeve(image, snapshot)
         raster.fill(image, raster.fixed(snapshot.cuff_uv[0]), self._card)  # the dark inside of the sleeve
@@ -133,7 +141,7 @@ class Renderer:
                 self._draw_part(image, part, snapshot)
                 continue
             for layer in range(LAYERS):
-                shapes = [corners[k, layer] for k in part] if part else [hull[layer] for hull in palm]
+                shapes = [corners[k, layer] for k in part] if part else [*palm[layer]]
                 if not part and layer >= ROUND_LAYER:
                     shapes += [corners[k, layer] for k in ROOTS]  # knuckles and thumb flow out of the palm
                 for shape in shapes:
@@ -174,22 +182,21 @@ class Renderer:
         under[:] = np.rint(total / len(moments))
 
     def _draw_sleeve(self, image: Image, snapshot: Snapshot) -> None:
-        for layer in range(LAYERS):
-            raster.fill(image, raster.fixed(self._view.sleeve(snapshot, layer)), self._sleeve[layer])
+        for outline, colour in zip(raster.fixed_each(snapshot.sleeve), self._sleeve, strict=True):
+            raster.fill(image, outline, colour)
 
     def _hand_box(self, snapshot: Snapshot, cards: tuple[Shape, ...]) -> Box:
         """Box x0, y0, x1, y1 [px] of all that is drawn, inside the image."""
         spread = snapshot.discs_px[:, 0, None] + 6.0
-        corners = [
-            snapshot.discs_uv[:, 0] - spread,
-            snapshot.discs_uv[:, 0] + spread,
-            *(c.corners for c in cards),
-            *(thing.layers[0] for thing in snapshot.things),
-        ]
-        points = np.vstack(corners)
-        x0, y0 = np.clip(np.floor(points.min(axis=0)), 0, np.array(self._size) - 1).astype(int)
-        x1, y1 = np.clip(np.ceil(points.max(axis=0)), 1, self._size).astype(int)
-        return int(x0), int(y0), max(int(x1), int(x0) + 1), max(int(y1), int(y0) + 1)
+        low, high = (
+            (snapshot.discs_uv[:, 0] - spread).min(axis=0),
+            (snapshot.discs_uv[:, 0] + spread).max(axis=0),
+        )
+        for outline in (*(c.corners for c in cards), *(thing.layers[0] for thing in snapshot.things)):
+            low, high = np.minimum(low, outline.min(axis=0)), np.maximum(high, outline.max(axis=0))
+        (x0, y0), (x1, y1), (width, height) = low.tolist(), high.tolist(), self._size
+        x0, y0 = min(max(floor(x0), 0), width - 1), min(max(floor(y0), 0), height - 1)
+        return x0, y0, max(min(ceil(x1), width), x0 + 1), max(min(ceil(y1), height), y0 + 1)
 
     def _with_objects(self, box: Box, snapshot: Snapshot) -> Box:
         """The box and all that is drawn of tracked objects."""
@@ -208,7 +215,7 @@ class Renderer:
 
     def _way(self, snapshot: Snapshot) -> Float:
         """How far (2,) [px] the palm moves during the exposure."""
-        return snapshot.speed_uv[list(PALM_HULL)].mean(axis=0) * self._view.exposure_s
+        return snapshot.palm_speed * self._view.exposure_s
 
     def _smear(self, image: Image, box: Box, snapshot: Snapshot) -> None:
         """Motion blur of the skin: halves of the palm's way averaged, twice."""
@@ -237,13 +244,15 @@ def _finger_parts(snapshot: Snapshot) -> list[tuple[int, ...]]:
     """Capsules of every finger, cut where it is strongly bent."""
     way = snapshot.points[CAPSULES[:, 1]] - snapshot.points[CAPSULES[:, 0]]
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+    straight = (way[1:] * way[:-1]).sum(axis=1) >= BEND_COSINE
     parts: list[tuple[int, ...]] = []
     for f in range(5):
-        part = [3 * f]
-        for k in (1, 2):
-            if float(way[3 * f + k] @ way[3 * f + k - 1]) < BEND_COSINE:
-                parts.append(tuple(part))
-                part = []
-            part.append(3 * f + k)
-        parts.append(tuple(part))
+        part = (3 * f,)
+        for k in (3 * f + 1, 3 * f + 2):
+            if straight[k - 1]:
+                part = (*part, k)
+            else:
+                parts.append(part)
+                part = (k,)
+        parts.append(part)
     return parts

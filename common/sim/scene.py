@@ -218,10 +218,7 @@ class Scene:
 
     def joints(self, times_s: tuple[float, ...]) -> HandJoints:
         """Joints at several instants at once, stacked along the first axis."""
-        return self.joints_of(tuple(self.motion.at(t) for t in times_s))
-
-    def joints_of(self, states: tuple[HandState, ...]) -> HandJoints:
-        """Joints of several states at once, stacked along the first axis."""
+        states = [self.motion.at(t) for t in times_s]
         return self.model.forward(
             np.stack([state.T_rig_palm for state in states]), np.stack([state.angles_rad for state in states])
         )

@@ -16,7 +16,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.errors import CalibrationError
-from common.hand_model import CHAINS, METACARPALS, HandJoints, HandModel
+from common.hand_model import CHAINS, METACARPALS, Chains, HandModel
 
 CYLINDER_SHARE = 0.7
 BOX_M = (0.025, 0.003, 0.020)  # along the palm's x, y (thickness), z
@@ -33,7 +33,14 @@ SPHERE_COUNT = 29
 PALM_HULL = (0, 4, 8, 12, 16, *WRIST_SPHERES, *METACARPAL_SPHERES)
 WEB_HULL = (0, 1, WEB_SPHERE)
 CAPSULES = np.array([[4 * f + k, 4 * f + k + 1] for f in range(5) for k in range(3)])
+SLEEVE_M = 0.45
 ELBOW_RIG = np.array([0.06, 1.0, 0.25])  # where the forearm would like to go
+TO_ELBOW = 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
+
+# Key points are linear in positions and axes of the chains' joints (`_chain_rows`); these and the axes of the palm,
+# in which all else stands still, are the unit vectors of:
+_UNIT_ROWS = np.eye(20 + 20 * 3 + 3)
+_JOINTS, _AXES, _PALM = _UNIT_ROWS[:20], _UNIT_ROWS[20:80].reshape(20, 3, 83), _UNIT_ROWS[80:]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,20 +67,22 @@ class HandSurface:
     """Which points a hand has, and how they move with its joints.
 
     Attributes:
-        model: The hand.
-        markers: Of the rig; free: those of them that sit on no hand.
         radius_m: (SPHERE_COUNT,) sphere radii [m]; spheres are key points 0 ... SPHERE_COUNT - 1.
         caps, boxes: The painted markers.
-        count: Number of key points.
+        weights: (K, 80) and still: (K, 3) [m]: key points, palm frame, as sums of `_chain_rows`, and of what stands
+            still; of the sleeve's far end, the way there that the palm asks for.
     """
 
-    model: HandModel
-    markers: tuple[str, ...]
-    free: tuple[str, ...]
     radius_m: Float
     caps: tuple[Cap, ...]
     boxes: tuple[Box, ...]
-    count: int
+    weights: Float
+    still: Float
+
+    @property
+    def count(self) -> int:
+        """Number of key points."""
+        return len(self.weights)
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...], free: tuple[str, ...] = ()) -> "HandSurface":
@@ -82,75 +91,79 @@ class HandSurface:
         Raises:
             CalibrationError: A marker of the list is unknown to the profile, or on no finger end nor the palm.
         """
-        radius = np.zeros(SPHERE_COUNT)
-        radius[:20] = model.radius_m[CHAINS].ravel()
-        radius[0] *= 0.85
-        wrist = model.radius_m[1]
-        radius[list(WRIST_SPHERES)] = 0.76 * wrist
-        radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
-        radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
-        radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
-        count = SPHERE_COUNT
+        radius = _sphere_radii(model)
+        rows = _spheres(model)
         caps: list[Cap] = []
         boxes: list[Box] = []
         for m, name in enumerate(markers):
             if name in free:
                 continue
-            mount = model.mount(name)
+            mount, count = model.mount(name), len(rows)
             finger = mount.finger
             if mount.joint is None:
                 boxes.append(Box(m, slice(count, count + 8)))
-                count += 8
+                rows += [(mount.offset_m + corner) @ _PALM for corner in box_corners()]
             elif finger is not None and mount.joint == CHAINS[finger, 3]:
-                caps.append(Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1))
+                cap = Cap(m, finger, float(model.radius_m[mount.joint]), count, count + 1)
+                caps.append(cap)
                 radius[4 * finger + 3] *= SKIN_UNDER_PAINT
-                count += 2
+                ahead = -cap.radius_m * _AXES[4 * finger + 3, 2]
+                centroid = _JOINTS[4 * finger + 3] + mount.offset_m @ _AXES[4 * finger + 3]
+                centre = centroid - cap_centroid_ahead(1.0) * ahead
+                rows += [centre, centre - CYLINDER_SHARE * ahead]
+                rows[4 * finger + 3] = centre - SKIN_BACK_SHARE * ahead
             else:
                 raise CalibrationError(
                     f"hand {model.profile.name!r}: markers.{name}.joint: the simulator paints finger ends and the palm"
                 )
-        return cls(model, markers, free, radius, tuple(caps), tuple(boxes), count)
+        table = np.array(rows)
+        return cls(radius, tuple(caps), tuple(boxes), table[:, :80].copy(), table[:, 80:].copy())
 
-    def key_points(self, joints: HandJoints) -> Float:
-        """Key points (..., K, 3) [m] of joints with any leading axes, rig frame."""
-        lead = joints.position_m.shape[:-2]
-        points = np.empty((*lead, self.count, 3))
-        points[..., :20, :] = joints.position_m[..., CHAINS.ravel(), :]
-        wrist = 0.45 * self.model.radius_m[1]
-        T = joints.T_rig_palm
-        z = T[..., :3, 2]
-        for sphere, x in zip(WRIST_SPHERES, (wrist, -wrist), strict=True):
-            points[..., sphere, :] = _apply(T, np.array([x, -0.003, -0.012]))
-        points[..., METACARPAL_SPHERES, :] = joints.position_m[..., METACARPALS, :]
-        knuckle, base = joints.position_m[..., 7, :], joints.position_m[..., 6, :]
-        points[..., WEB_SPHERE, :] = base + 0.62 * (knuckle - base) - 0.004 * T[..., :3, 1]
-        cuff = T[..., :3, 3] - 0.018 * z
-        arm = -0.55 * z + 0.45 * ELBOW_RIG / np.linalg.norm(ELBOW_RIG)
-        points[..., SLEEVE_SPHERES[0], :] = cuff
-        points[..., SLEEVE_SPHERES[1], :] = cuff + 0.45 * arm / np.linalg.norm(arm, axis=-1, keepdims=True)
-        centroid = self._centroids(joints)
-        for cap in self.caps:
-            ahead = -joints.rotation[..., CHAINS[cap.finger, 3], :, 2]
-            points[..., cap.centre, :] = (
-                centroid[..., cap.marker, :] - cap_centroid_ahead(cap.radius_m) * ahead
-            )
-            points[..., cap.base, :] = points[..., cap.centre, :] - CYLINDER_SHARE * cap.radius_m * ahead
-            back = SKIN_BACK_SHARE * cap.radius_m * ahead
-            points[..., 4 * cap.finger + 3, :] = points[..., cap.centre, :] - back
-        for box in self.boxes:
-            corners = box_corners()
-            turned = np.einsum("...ij,kj->...ki", T[..., :3, :3], corners)
-            points[..., box.corners, :] = centroid[..., box.marker, None, :] + turned
+    def key_points(self, T_rig_palm: Float, chains: Chains) -> Float:
+        """Key points (..., K, 3) [m], rig frame, of palm poses (..., 4, 4) and bent fingers."""
+        R, (cuff, end) = np.swapaxes(T_rig_palm[..., :3, :3], -1, -2), SLEEVE_SPHERES
+        points = (self.weights @ _chain_rows(chains) + self.still) @ R
+        way = unit(points[..., end, :] + TO_ELBOW)
+        points += T_rig_palm[..., None, :3, 3]
+        points[..., end, :] = points[..., cuff, :] + SLEEVE_M * way
         return points
 
-    def _centroids(self, joints: HandJoints) -> Float:
-        """Centroids (..., M, 3) [m] of the painted surfaces; NaN for those on no hand."""
-        if not self.free:
-            return self.model.marker_points(joints, self.markers)
-        own = [m for m, name in enumerate(self.markers) if name not in self.free]
-        points = np.full((*joints.position_m.shape[:-2], len(self.markers), 3), np.nan)
-        points[..., own, :] = self.model.marker_points(joints, tuple(self.markers[m] for m in own))
-        return points
+
+def _chain_rows(chains: Chains) -> Float:
+    """Positions [m], then axes, of the joints of all chains, finger by finger (..., 80, 3), palm frame."""
+    lead = chains.position_m.shape[:-3]
+    axes = np.swapaxes(chains.rotation, -1, -2)
+    return np.concatenate([chains.position_m.reshape(*lead, 20, 3), axes.reshape(*lead, 60, 3)], axis=-2)
+
+
+def _spheres(model: HandModel) -> list[Float]:
+    """The middles of all spheres as sums of unit rows."""
+    wrist = 0.45 * float(model.radius_m[1])
+    still = [
+        (wrist, -0.003, -0.012),
+        (-wrist, -0.003, -0.012),
+        *model.rest_position_m[list(METACARPALS)],
+    ]
+    return [
+        *_JOINTS,
+        *(np.array(point) @ _PALM for point in still),
+        0.38 * model.rest_position_m[6] @ _PALM + 0.62 * _JOINTS[4] - 0.004 * _PALM[1],
+        -0.018 * _PALM[2],
+        -0.55 * _PALM[2],
+    ]
+
+
+def _sphere_radii(model: HandModel) -> Float:
+    """Radii (SPHERE_COUNT,) [m] of bare skin and sleeve."""
+    radius = np.zeros(SPHERE_COUNT)
+    radius[:20] = model.radius_m[CHAINS].ravel()
+    radius[0] *= 0.85
+    wrist = model.radius_m[1]
+    radius[list(WRIST_SPHERES)] = 0.76 * wrist
+    radius[list(METACARPAL_SPHERES)] = 0.9 * model.radius_m[list(METACARPALS)]
+    radius[WEB_SPHERE] = 0.8 * model.radius_m[7]
+    radius[list(SLEEVE_SPHERES)] = 1.3 * wrist, 2.2 * wrist
+    return radius
 
 
 def cap_centroid_ahead(radius_m: float) -> float:
@@ -182,9 +195,11 @@ def cap_outline(centre: Float, base: Float, radius_m: Float, circle: Float) -> F
     d2 = (centre * centre).sum(axis=-1)
     shrink = 1.0 - radius_m**2 / d2
     towards = centre / np.sqrt(d2)[:, None]
-    contact = (centre * shrink[:, None])[:, None] + rim(towards, radius_m * np.sqrt(shrink), circle)
-    edge = base[:, None] + rim(axis, radius_m, circle)
-    ahead = ((contact - centre[:, None]) * axis[:, None]).sum(axis=-1, keepdims=True) >= 0.0
+    both = np.array([towards, axis]), np.array([radius_m * np.sqrt(shrink), radius_m])
+    around, across = rim(*both, circle)
+    contact: Float = (centre * shrink[:, None])[:, None] + around
+    edge: Float = base[:, None] + across
+    ahead = ((contact - centre[:, None]) @ axis[:, :, None]) >= 0.0
     return np.concatenate([np.where(ahead, contact, edge), edge], axis=1)
 
 
@@ -211,7 +226,3 @@ def unit_circle(n: int) -> Float:
     angle = 2.0 * np.pi * np.arange(n) / n
     scale = np.sqrt((2.0 * np.pi / n) / np.sin(2.0 * np.pi / n))
     return scale * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-
-def _apply(T: Float, point: Float) -> Float:
-    return T[..., :3, :3] @ point + T[..., :3, 3]

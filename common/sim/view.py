@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.arrays import Bool, Float, Int
+from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.geometry import invert, transform
-from common.hand_model import HandJoints
 from common.sim import raster
 from common.sim.held import Cylinder
 from common.sim.light import LAYER_COSINES, TO_LIGHT_RIG
@@ -22,7 +21,7 @@ from common.sim.motion import HandState
 from common.sim.object_looks import Looks, Points
 from common.sim.object_surface import ObjectSurface
 from common.sim.objects_seen import SeenObjects
-from common.sim.raster import Shape
+from common.sim.raster import Int32, Shape
 from common.sim.scene import Scene
 from common.sim.surface import (
     CAPSULES,
@@ -30,6 +29,7 @@ from common.sim.surface import (
     PALM_HULL,
     SLEEVE_SPHERES,
     SPHERE_COUNT,
+    WEB_HULL,
     HandSurface,
     cap_centroid_ahead,
     cap_outline,
@@ -41,9 +41,11 @@ from common.sim.things import LAYER_SINES, SeenThing, seen, tube_rims
 
 NEAREST_M = 0.05
 FURTHEST_PX = 4000.0
+SHINE_SHARE = 0.17  # radius of the glossy spot, share of the cap's
 INTO_COSINE = np.sqrt(0.5)  # to the sleeve's axis: from there on its opening is seen rather than its side
 LAYERS = len(LAYER_COSINES)
 PHALANGES = len(CAPSULES)
+_PALM, _WEB, _CUFF, _ELBOW = list(PALM_HULL), list(WEB_HULL), *SLEEVE_SPHERES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,12 +57,16 @@ class Snapshot:
         uv: (K, 2) [px] of the points; speed_uv: (K, 2) [px/s].
         t_s: (K,) the moments [s], scene time.
         discs_uv: (B, LAYERS, 2) [px], discs_px: (B, LAYERS): shading of the spheres, then of the caps' two ends each.
-        outlines: (PHALANGES + C, LAYERS, N, 2) [px] phalanges, then the shading of the caps.
+        outlines: (PHALANGES, LAYERS, N, 2) [px] phalanges.
         cap_uv: (C, N, 2) [px] points whose hull is the cap's outline.
         rim_uv: (C, n, 2) [px] the cap's edge towards the finger, and the finger's girth at its last joint.
         from_behind: (C,) the finger points away from the camera, so that its own skin hides part of the cap.
-        shine_uv: (C, 2) [px] where the paint mirrors the lamp.
+        bands: (C, LAYERS, N, 2) shading of the caps from their second layer on, then the spot where the paint mirrors
+            the lamp, in OpenCV's numbers (`raster.fixed`).
         cuff_uv: (LAYERS, n, 2) [px] front edge of the sleeve.
+        palm_speed: (2,) [px/s] of the palm.
+        palm, web, sleeve: Hulls (N, 2) [px] of each layer, the first the outline.
+        into_sleeve: The camera looks into the sleeve rather than at its side: the hand then lies before it.
         things: What the hand takes, before it is drawn or hides anything.
         tracked: The tracked objects, likewise.
     """
@@ -75,8 +81,13 @@ class Snapshot:
     cap_uv: Float
     rim_uv: Float
     from_behind: Bool
-    shine_uv: Float
+    bands: Int32
     cuff_uv: Float
+    palm_speed: Float
+    palm: tuple[Float, ...]
+    web: tuple[Float, ...]
+    sleeve: tuple[Float, ...]
+    into_sleeve: bool
     things: tuple[SeenThing, ...]
     tracked: SeenObjects
 
@@ -112,6 +123,7 @@ class View:
         first = SPHERE_COUNT + 2 * np.arange(len(caps))
         self._from = np.concatenate([CAPSULES[:, 0], first])
         self._to = np.concatenate([CAPSULES[:, 1], first + 1])
+        self._to_lit = (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
         self._fine_circle = unit_circle(32)
         self.objects = ObjectSurface.of(scene.tracked, scene.rig.markers)
         self._looks = Looks(self.to_light, self.circle, self.focal_px, self.project)
@@ -141,23 +153,26 @@ class View:
         """Geometry of the frame whose row 0 is exposed around `t_s` [s]."""
         points, uv, speed_uv, when, things = self._moments(t_s)
         body = points[self._bodies]
-        lit = body[:, None] + (self._radius[:, None] * LAYER_COSINES)[..., None] * self.to_light
+        lit = body[:, None] + self._to_lit
         size = self.focal_px * self._radius / np.maximum(body[:, 2], NEAREST_M)
         discs_px = size[:, None] * LAYER_SINES
         centre, base = points[self.cap_centre], points[self.cap_base]
         axis, joint = unit(centre - base), points[self._cap_joint]
-        behind = joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle)
-        edge = np.concatenate([base[:, None] + rim(axis, self.cap_radius, self._fine_circle), behind], axis=1)
         half = unit(self.to_light - unit(centre))
         parts = (
             lit,
             cap_outline(centre, base, self.cap_radius, self._fine_circle),
-            edge,
+            joint[:, None] + rim(axis, self.surface.radius_m[self._cap_joint], self.circle),
             centre + self.cap_radius[:, None] * half,
             self._cuff(points),
         )
-        discs_uv, cap_uv, rim_uv, shine_uv, cuff_uv = self._project_all(parts)
+        discs_uv, cap_uv, joint_uv, shine_uv, cuff_uv = self._project_all(parts)
         a, b, own = self._from, self._to, slice(self.surface.count, None)
+        outlines = raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b])
+        spots = raster.discs(shine_uv, SHINE_SHARE * discs_px[SPHERE_COUNT::2, 0], self.circle)
+        bands = np.concatenate([outlines[PHALANGES:, 1:], spots[:, None]], axis=1)
+        discs = raster.discs(discs_uv, discs_px, self.circle)
+        sleeve = np.concatenate([cuff_uv, discs[_ELBOW]], axis=1)
         return Snapshot(
             points=points,
             uv=uv,
@@ -165,32 +180,26 @@ class View:
             t_s=when,
             discs_uv=discs_uv,
             discs_px=discs_px,
-            outlines=raster.capsules(discs_uv[a], discs_px[a], discs_uv[b], discs_px[b]),
+            outlines=outlines[:PHALANGES],
             cap_uv=cap_uv,
-            rim_uv=rim_uv,
+            rim_uv=np.concatenate([cap_uv[:, len(self._fine_circle) :], joint_uv], axis=1),
             from_behind=((centre - base) * base).sum(axis=1) > 0.0,
-            shine_uv=shine_uv,
+            bands=raster.fixed(bands),
             cuff_uv=cuff_uv,
+            palm_speed=speed_uv[_PALM].sum(axis=0) / len(_PALM),
+            palm=_hulls(discs[_PALM]),
+            web=_hulls(discs[_WEB]),
+            sleeve=tuple(raster.hull(layer) for layer in sleeve),
+            into_sleeve=_looks_into(*points[[_CUFF, _ELBOW]]),
             things=self._things(t_s, things),
             tracked=self._looks.seen(self.objects, Points(points[own], uv[own], speed_uv[own], when[own])),
         )
-
-    def hulls(self, snapshot: Snapshot, spheres: tuple[int, ...], layers: int = LAYERS) -> list[Float]:
-        """Hull of some spheres in the first `layers` layers [px]."""
-        chosen = list(spheres)
-        centre, radius = snapshot.discs_uv[chosen, :layers], snapshot.discs_px[chosen, :layers]
-        points = centre[:, :, None] + radius[:, :, None, None] * self.circle
-        return [raster.hull(points[:, layer].reshape(-1, 2)) for layer in range(layers)]
 
     def own_finger(self, snapshot: Snapshot, cap: int) -> Shape | None:
         """The last phalanx behind cap number `cap`, where it lies before it: the finger points away."""
         if not snapshot.from_behind[cap]:
             return None
         return Shape(raster.hull(snapshot.rim_uv[cap]), snapshot.speed_uv[self.cap_base[cap]])
-
-    def phalanx_depth(self, snapshot: Snapshot, uv: Float) -> Float:
-        """Depth (..., PHALANGES) [m] of every phalanx where it passes nearest to the pixels `uv` (..., 2)."""
-        return _depth_along(snapshot, uv[..., None, :], CAPSULES[:, 0], CAPSULES[:, 1])
 
     def behind_palm(self, snapshot: Snapshot, points: Float) -> Bool:
         """Whether the plane of the palm passes between the camera and points (..., 3) [m], camera frame."""
@@ -203,23 +212,6 @@ class View:
         """Whether the back of the hand is turned to the camera."""
         _, offset = _palm_plane(snapshot)
         return offset * self.scene.model.side_sign > 0.0
-
-    def looks_into_sleeve(self, snapshot: Snapshot) -> bool:
-        """Whether the camera looks into the sleeve rather than at its side: the hand then lies before it."""
-        cuff, end = snapshot.points[list(SLEEVE_SPHERES)]
-        return float((end - cuff) @ cuff) > INTO_COSINE * float(
-            np.linalg.norm(end - cuff) * np.linalg.norm(cuff)
-        )
-
-    def sleeve(self, snapshot: Snapshot, layer: int = 0) -> Float:
-        """Outline of one layer of the sleeve [px]; the first is the sleeve's own."""
-        end = SLEEVE_SPHERES[1]
-        disc = snapshot.discs_uv[end, layer] + snapshot.discs_px[end, layer] * self.circle
-        return raster.hull(np.vstack([snapshot.cuff_uv[layer], disc]))
-
-    def sleeve_depth(self, snapshot: Snapshot, uv: Float) -> Float:
-        """Depth (...) [m] of the sleeve where it passes nearest to the pixels `uv` (..., 2)."""
-        return _depth_along(snapshot, uv, *SLEEVE_SPHERES)
 
     def cards(self, snapshot: Snapshot) -> tuple[Shape, ...]:
         """Outlines of the cards near the view, at the moment of the hand's middle row."""
@@ -236,8 +228,7 @@ class View:
         t_middle = t_s + 0.5 * readout_s
         h = max(0.5 * readout_s, 0.5 * self.exposure_s, 1e-4)
         states = tuple(self.scene.motion.at(t) for t in (t_middle - h, t_middle, t_middle + h))
-        joints = self.scene.joints_of(states)
-        before, now, after = transform(self.T_camera_rig, self._key_points(joints, states))
+        before, now, after = transform(self.T_camera_rig, self._key_points(states))
         slope, bend = (after - before) / (2.0 * h), (after - 2.0 * now + before) / (h * h)
         when = np.full(len(now), t_middle)
         points = now
@@ -250,9 +241,10 @@ class View:
         speed_uv = self.focal_px * (speed[:, :2] / z - points[:, :2] * speed[:, 2:] / z**2)
         return points, self.project(points), speed_uv, when, self.scene.untracked(states[1])
 
-    def _key_points(self, joints: HandJoints, states: tuple[HandState, ...]) -> Float:
+    def _key_points(self, states: tuple[HandState, ...]) -> Float:
         """Key points (S, K, 3) [m], rig frame, of the hand, then of the tracked objects."""
-        hand = self.surface.key_points(joints)
+        chains = self.scene.model.chains(np.array([state.angles_rad for state in states]))
+        hand = self.surface.key_points(np.array([state.T_rig_palm for state in states]), chains)
         if not self.objects.local.size:
             return hand
         poses = np.array([self.scene.object_poses(state) for state in states])
@@ -283,12 +275,15 @@ class View:
         ]
 
 
-def _depth_along(snapshot: Snapshot, uv: Float, a: Int | int, b: Int | int) -> Float:
-    """Depth (...) [m] of the lines from key points `a` to `b` where they pass nearest to `uv` (..., 2) [px]."""
-    start, along = snapshot.uv[a], snapshot.uv[b] - snapshot.uv[a]
-    share = ((uv - start) * along).sum(axis=-1) / np.maximum((along * along).sum(axis=-1), 1e-9)
-    share = np.minimum(np.maximum(share, 0.0), 1.0)
-    return np.asarray(snapshot.points[a, 2] * (1.0 - share) + snapshot.points[b, 2] * share)
+def _hulls(discs: Float) -> tuple[Float, ...]:
+    """Hulls (N, 2) [px] of the discs (B, LAYERS, n, 2) of each layer."""
+    return tuple(raster.hull(layer) for layer in discs.swapaxes(0, 1).reshape(LAYERS, -1, 2))
+
+
+def _looks_into(cuff: Float, end: Float) -> bool:
+    """Whether a camera sees the opening of a sleeve from `cuff` to `end` (3,) [m], camera frame, not its side."""
+    along = end - cuff
+    return float(along @ cuff) > INTO_COSINE * float(np.linalg.norm(along) * np.linalg.norm(cuff))
 
 
 def _palm_plane(snapshot: Snapshot) -> tuple[Float, float]:

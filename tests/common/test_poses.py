@@ -146,7 +146,7 @@ def test_from_behind_the_forearm_the_sleeve_hides_the_tips() -> None:
     behind: list[float] = []
     for t in TIMES[::60]:
         snapshot = view.snapshot(float(t))
-        assert not view.looks_into_sleeve(snapshot)
+        assert not snapshot.into_sleeve
         sleeve, shown = snapshot.points[list(SLEEVE_SPHERES)], renderer.visible_fraction(float(t))
         for tip in range(5):
             apart, along = nearest_to_ray(snapshot.points[view.cap_centre[tip]], sleeve)

@@ -94,10 +94,17 @@ def test_lone_caps_are_where_their_visible_surface_projects(name: str) -> None:
     assert abs(np.mean(shares) - 1.0) < 0.01
 
 
+def covered(outline: Float, *nearer: Float) -> raster.Coverage:
+    """What resting outlines (N, 2) [px] leave of the first, in an image of 200 x 200 pixels."""
+    shape, *hiding = (Shape(corners, np.zeros(2)) for corners in (outline, *nearer))
+    (cover,) = raster.cover([raster.Marker(shape, hiding)], 1e-3, (200, 200))
+    return cover
+
+
 def test_disc_coverage_equals_its_area_and_centre() -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
     disc = np.array([50.3, 40.8]) + 7.25 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    cover = raster.cover(Shape(disc, np.zeros(2)), None, (), np.zeros(1), (200, 200))
+    cover = covered(disc)
     np.testing.assert_allclose(raster.centroid(cover), [50.3, 40.8], atol=0.02)
     assert abs(float(cover.alpha.sum()) / (np.pi * 7.25**2) - 1.0) < 0.02
     assert cover.share == 1.0
@@ -105,16 +112,47 @@ def test_disc_coverage_equals_its_area_and_centre() -> None:
 
 def test_coverage_counts_what_hides_and_what_leaves_the_image() -> None:
     square = np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]) - 0.5
-    still = np.zeros(2)
-    half = Shape(square + np.array([10.0, 0.0]), still)
-    cover = raster.cover(Shape(square, still), None, (half,), np.zeros(1), (200, 200))
+    cover = covered(square, square + np.array([10.0, 0.0]))
     assert abs(cover.share - 0.5) < 0.02
     np.testing.assert_allclose(raster.centroid(cover), [14.5, 19.5], atol=0.1)
-    out = raster.cover(Shape(square - np.array([20.0, 0.0]), still), None, (), np.zeros(1), (200, 200))
+    out = covered(square - np.array([20.0, 0.0]))
     assert abs(out.share - 0.5) < 0.03
-    gone = raster.cover(Shape(square - np.array([60.0, 0.0]), still), None, (), np.zeros(1), (200, 200))
+    gone = covered(square - np.array([60.0, 0.0]))
     assert gone.share == 0.0
     assert np.isnan(raster.centroid(gone)).all()
+
+
+def test_markers_measured_together_are_as_if_measured_alone() -> None:
+    square = np.array([[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]) - 0.25
+    triangle = np.array([[20.0, 5.0], [45.0, 25.0], [22.0, 60.0]])
+    moving, still = Shape(square, np.array([900.0, -300.0])), Shape(triangle, np.zeros(2))
+    markers = [raster.Marker(moving, (still,)), raster.Marker(still, (), moving), raster.Marker(still)]
+    together = raster.cover(markers, 5e-3, (200, 200))
+    for marker, cover in zip(markers, together, strict=True):
+        (alone,) = raster.cover([marker], 5e-3, (200, 200))
+        np.testing.assert_array_equal(cover.alpha, alone.alpha)
+        assert (cover.x, cover.y, cover.share) == (alone.x, alone.y, alone.share)
+    assert together[0].share < 0.9  # what lies before it counts
+    assert together[1].share == 1.0  # what it hides of itself does not
+    assert raster.cover([], 5e-3, (200, 200)) == []
+
+
+def test_exposure_smears_coverage_about_its_middle() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
+    disc = np.array([50.3, 40.8]) + 7.25 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    (cover,) = raster.cover([raster.Marker(Shape(disc, np.array([1000.0, 0.0])))], 6e-3, (200, 200))
+    np.testing.assert_allclose(raster.centroid(cover), [50.3, 40.8], atol=0.03)
+    assert (cover.alpha > 0.0).any(axis=0).sum() >= 19  # 14.5 px wide, and 5 px of way between first and last
+
+
+@pytest.mark.parametrize("radii", [(5.0, 2.0), (2.0, 5.0), (4.0, 4.0)])
+def test_capsule_lies_about_both_discs_and_touches_them(radii: tuple[float, float]) -> None:
+    ends = np.array([[10.0, 20.0], [31.0, 7.0]])
+    size = np.array(radii)
+    outline = raster.capsules(ends[:1], size[:1], ends[1:], size[1:])[0]
+    reach = np.hypot(*(outline[:, None] - ends).transpose(2, 0, 1))
+    assert (reach >= size - 1e-9).all()
+    np.testing.assert_allclose((reach - size).min(axis=1), 0.0, atol=1e-9)
 
 
 def test_swallowed_disc_leaves_the_larger_one() -> None:
@@ -271,7 +309,7 @@ def test_surface_moves_rigidly_with_the_palm() -> None:
     surface = HandSurface.of(SCENE.model, RIG.markers)
     angles = SCENE.truth(3.0).angles_rad
     T = SCENE.truth(24.0).T_rig_palm
-    moved = surface.key_points(SCENE.model.forward(T, angles))
-    still = surface.key_points(SCENE.model.forward(np.eye(4), angles))
+    chains = SCENE.model.chains(angles)
+    moved, still = surface.key_points(T, chains), surface.key_points(np.eye(4), chains)
     hand = [k for k in range(surface.count) if k != 28]  # the far end of the sleeve follows the elbow
     np.testing.assert_allclose(moved[hand], still[hand] @ T[:3, :3].T + T[:3, 3], atol=1e-12)

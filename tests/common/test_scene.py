@@ -74,7 +74,7 @@ def sampled_cap(centre: Float, base: Float, radius: float, n: int = 200_000) -> 
 def test_painted_surface_has_its_centroid_at_the_profiles_point(t: float) -> None:
     truth = SCENE.truth(t)
     surface = HandSurface.of(SCENE.model, RIG.markers)
-    points = surface.key_points(truth.joints)
+    points = surface.key_points(truth.T_rig_palm, SCENE.model.chains(truth.angles_rad))
     assert len(surface.caps) == 5
     for cap in surface.caps:
         sample = sampled_cap(points[cap.centre], points[cap.base], cap.radius_m)
