@@ -5,20 +5,19 @@ the gap of two is the least, over s and t in 0..1, of
 
     |(a + s u) - (b + t v)| - (r_a + s d_a) - (r_b + t d_b),
 
-which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` are of numbers
-as well as of arrays, and have no others under them, so that kernels may have them too.
+which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` take numbers
+as well as arrays and call nothing of their own, so that kernels may compile them.
 """
 
 from dataclasses import dataclass
-from typing import TypeAlias, TypeVar
+from typing import TypeAlias
 
 import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS
 
-Number = TypeVar("Number", float, Float)
-Foot: TypeAlias = tuple[Number, Number, Number, Number, Number, Number]
+Foot: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
 
 ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
 
@@ -96,8 +95,8 @@ def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
 
 
 def foot_of(
-    foot: Number, foot_by: Number, c0: Number, c1: Number, c2: Number, growth_m: Number, square: Number
-) -> Foot[Number]:
+    foot: Float, foot_by: Float, c0: Float, c1: Float, c2: Float, growth_m: Float, square: Float
+) -> Foot:
     """Return where along a cone the foot of a point on the other's bone is.
 
     The foot is linear in the point's share, and the square of its distance from the bone, in units of the bone's
@@ -116,7 +115,7 @@ def foot_of(
     return foot, foot_by, c0 - foot * foot, c1 - 2.0 * foot * foot_by, c2 - foot_by * foot_by, lean
 
 
-def nearest(on: Foot[Number], share: Number) -> Number:
+def nearest(on: Foot, share: Float) -> Float:
     """Return where along a cone, 0..1, its skin is nearest to the point at a share of the other's bone."""
     foot, foot_by, off_2, off_by, off_by_2, lean = on
     beyond = lean * np.sqrt(np.maximum(off_2 + share * (off_by + share * off_by_2), 0.0))

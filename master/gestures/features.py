@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from common.hand_model import CHAINS, FINGERS, MIDDLE_PROXIMAL, TIPS, WRIST, HandModel
+from common.hand_model import CHAINS, FINGERS, TIPS, WRIST, HandModel
 from common.kernels import inner, kernel
 from common.messages import HandPose
 from master.estimator.small_matrices import spread
@@ -51,7 +51,6 @@ class HandFeatures(NamedTuple):
         joints_m: (26, 3) [m], rig frame.
         joints_cov_m2: (26, 3, 3) [m^2], rig frame; where nothing is known, a metre each way.
         T_rig_palm: (4, 4) palm -> rig frame.
-        size_m: From the wrist to the middle knuckle [m].
         side_sign: +1 right, -1 left.
         palm_world_wxyz: (4,) as in the pose.
     """
@@ -71,7 +70,6 @@ class HandFeatures(NamedTuple):
     joints_m: Float
     joints_cov_m2: Float
     T_rig_palm: Float
-    size_m: float
     side_sign: float
     palm_world_wxyz: Float
 
@@ -129,7 +127,26 @@ class FeatureExtractor:
         wrist: list[float] = pose.position_m[WRIST].tolist() + pose.orientation_wxyz[WRIST].tolist()
         if not isfinite(sum(wrist)):
             return None
-        found = _measure(
+        out = HandFeatures(
+            hand=pose.hand,
+            t_ns=pose.t_ns,
+            known=np.empty(5, np.bool_),
+            seen=pose.tracked[TIPS],
+            sigma_m=np.empty(5),
+            shape_sigma_m=np.empty(5),
+            bend_rad=np.empty((5, 3)),
+            curl=np.empty(5),
+            caps_m=np.empty((5, 3)),
+            tips_m=np.empty((5, 3)),
+            pads_m=np.empty((5, 3)),
+            radius_m=np.empty(5),
+            joints_m=np.empty((26, 3)),
+            joints_cov_m2=np.empty((26, 3, 3)),
+            T_rig_palm=np.empty((4, 4)),
+            side_sign=self._side_sign,
+            palm_world_wxyz=pose.palm_world_wxyz,
+        )
+        _measure(
             _plain(pose.position_m),
             _plain(pose.orientation_wxyz),
             _plain(pose.radius_m),
@@ -137,10 +154,20 @@ class FeatureExtractor:
             _plain(pose.valid),
             _plain(pose.markers_m),
             self._hand,
+            out.known,
+            out.sigma_m,
+            out.shape_sigma_m,
+            out.bend_rad,
+            out.curl,
+            out.caps_m,
+            out.tips_m,
+            out.pads_m,
+            out.radius_m,
+            out.joints_m,
+            out.joints_cov_m2,
+            out.T_rig_palm,
         )
-        return HandFeatures(
-            pose.hand, pose.t_ns, found[0], pose.tracked[TIPS], *found[1:], self._side_sign, pose.palm_world_wxyz
-        )
+        return out
 
 
 def _plain(array: Any) -> Any:
@@ -154,13 +181,29 @@ def _plain(array: Any) -> Any:
 
 @kernel
 def _measure(
-    position: Float, wxyz: Float, radius: Float, cov: Float, valid: Bool, markers: Float, hand: _Hand
-) -> tuple[
-    Bool, Float, Float, Float, Float, Float, Float, Float, Float, Float, Float, Float, float
-]:
-    """Return `HandFeatures` from `known` to `size_m` without `seen`, of the arrays of a pose with a hand."""
-    joints, rotation, lacking = np.empty((26, 3)), np.empty((26, 3, 3)), np.zeros(26, np.bool_)
-    T = _joints(position, wxyz, hand, joints, rotation, lacking)
+    position: Float,
+    wxyz: Float,
+    radius: Float,
+    cov: Float,
+    valid: Bool,
+    markers: Float,
+    hand: _Hand,
+    known: Bool,
+    sigma: Float,
+    shape_sigma: Float,
+    bend: Float,
+    curl: Float,
+    caps: Float,
+    tips: Float,
+    pads: Float,
+    tip_radius: Float,
+    joints: Float,
+    joints_cov: Float,
+    T: Float,
+) -> None:
+    """Write `HandFeatures` from `known` on, of the arrays of a pose with a hand."""
+    rotation, lacking = np.empty((26, 3, 3)), np.empty(26, np.bool_)
+    _joints(position, wxyz, hand, joints, rotation, lacking, T)
     finite = np.empty(26, np.bool_)
     for j in range(26):
         total = 0.0
@@ -168,9 +211,6 @@ def _measure(
             for b in range(3):
                 total += cov[j, a, b]
         finite[j] = isfinite(total)
-    known, sigma, shape_sigma = np.empty(5, np.bool_), np.empty(5), np.empty(5)
-    bend, curl, tip_radius = np.empty((5, 3)), np.empty(5), np.empty(5)
-    tips, pads, caps = np.empty((5, 3)), np.empty((5, 3)), np.empty((5, 3))
     wrist = spread(cov[WRIST])[0] if finite[WRIST] else 0.0
     for f in range(5):
         last, tip = CHAINS[f, 2], CHAINS[f, 3]
@@ -193,23 +233,18 @@ def _measure(
                 cap += rotation[joint, i, k] * hand.cap_offset_m[f, k]
             caps[f, i] = joints[joint, i] + cap
     _take_seen(markers, caps)
-    joints_cov = np.empty((26, 3, 3))
     for j in range(26):
         for a in range(3):
             for b in range(3):
                 nothing = 1.0 if a == b else 0.0
                 joints_cov[j, a, b] = cov[j, a, b] if finite[j] and not lacking[j] else nothing
-    size = 0.0
-    for i in range(3):
-        size += (joints[MIDDLE_PROXIMAL, i] - joints[WRIST, i]) ** 2
-    return known, sigma, shape_sigma, bend, curl, caps, tips, pads, tip_radius, joints, joints_cov, T, sqrt(size)
 
 
 @inner
 def _joints(
-    position: Float, wxyz: Float, hand: _Hand, joints: Float, rotation: Float, lacking: Bool
-) -> Float:
-    """Write joints, rotations, and which the pose lacks, there as likely; return the palm's transform."""
+    position: Float, wxyz: Float, hand: _Hand, joints: Float, rotation: Float, lacking: Bool, T: Float
+) -> None:
+    """Write joints and rotations, which the pose lacks, these as likely, and the palm's transform."""
     for j in range(26):
         w, x, y, z = wxyz[j, 0], wxyz[j, 1], wxyz[j, 2], wxyz[j, 3]
         lacking[j] = isnan(position[j, 0] + position[j, 1] + position[j, 2] + w + x + y + z)
@@ -221,11 +256,11 @@ def _joints(
         R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
         for i in range(3):
             joints[j, i] = position[j, i]
-    T = np.zeros((4, 4))
-    T[3, 3] = 1.0
+    T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
     for i in range(3):
         T[i, 3] = joints[WRIST, i]
         for k in range(3):
+            T[i, k] = 0.0
             for m in range(3):
                 T[i, k] += rotation[WRIST, i, m] * hand.wrist_rotation[k, m]
             T[i, 3] -= T[i, k] * hand.wrist_m[k]
@@ -238,7 +273,6 @@ def _joints(
                     rotation[j, i, k] = 0.0
                     for m in range(3):
                         rotation[j, i, k] += T[i, m] * hand.likely_rotation[j, m, k]
-    return T
 
 
 @inner

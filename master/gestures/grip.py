@@ -301,3 +301,13 @@ def _spread(place: Float, known: Bool, before: Float, known_before: Bool) -> flo
                 away_before += (before[f, i] - then[i] / count) ** 2
             most = max(most, abs(sqrt(away) - sqrt(away_before)))
     return most
+
+
+def rehearse(seen: HandFeatures) -> None:
+    """Call the kernels once, so that none is compiled while a hand is about a knob."""
+    tips = Tips.of(seen, inf, worn_only=False)
+    is_grip(seen, tips, DialSettings())
+    axis_of(tips.palmar, 1.0, turned_by(tips, tips))
+    spread_m(tips, tips)
+    widened_m(tips, tips)
+    tips.axis()

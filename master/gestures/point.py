@@ -51,7 +51,8 @@ class PointWatch:
         """What is to be told at the instant of the features; it begins only where it may."""
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
-        self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= own.ray_sigma_rad * (1.0 if point is None else _LASTING)
+        most_rad = own.ray_sigma_rad * (1.0 if point is None else _LASTING)
+        self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= most_rad
         if point is None:
             if not (shape and may_begin):
                 self._since_ns = None

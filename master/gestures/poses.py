@@ -97,9 +97,7 @@ class PoseTable:
 
     def misfit(self, quantities: Quantities) -> Float:
         """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
-        out = np.zeros(self._table.low.shape)
-        _fit(self._table, quantities.value, quantities.sigma, np.ones(len(FINGERS), np.bool_), out)
-        return out
+        return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
 
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
         """How well each pose fits.
@@ -108,17 +106,29 @@ class PoseTable:
             quantities: Of the hand.
             known: (5,) which fingers are.
         """
-        misfit = np.zeros(self._table.low.shape)
-        return Fit(*_fit(self._table, quantities.value, quantities.sigma, known, misfit))
+        return self._fit(quantities, known)[0]
+
+    def _fit(self, quantities: Quantities, known: Bool) -> tuple[Fit, Float]:
+        """The fit, and the misfits (P, Q)."""
+        poses, misfit = len(self.names), np.zeros(self._table.low.shape)
+        score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
+        best = _fit(self._table, quantities.value, quantities.sigma, known, misfit, score, confidence, enough)
+        return Fit(score, confidence, enough, best), misfit
 
 
 @kernel
 def _fit(
-    table: _Table, value: Float, sigma: Float, known: Bool, misfit: Float
-) -> tuple[Float, Float, Bool, int]:
-    """Write misfits (P, Q), zero before, and return the fields of `Fit`; arguments as of `PoseTable.fit`."""
+    table: _Table,
+    value: Float,
+    sigma: Float,
+    known: Bool,
+    misfit: Float,
+    score: Float,
+    confidence: Float,
+    enough: Bool,
+) -> int:
+    """Return the best pose; write the fields of `Fit`, and misfits (P, Q), which are zero before."""
     poses, count = table.low.shape
-    score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
     total = 0.0
     for p in range(poses):
         squares, share, asked = 0.0, 0.0, 0
@@ -145,7 +155,7 @@ def _fit(
             confidence[p] = score[p] * table.weight[p] * score[p] / total
         if enough[p] and (best < 0 or confidence[p] > confidence[best]):
             best = p
-    return score, confidence, enough, best
+    return best
 
 
 class FingerSpeed:

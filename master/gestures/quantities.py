@@ -14,7 +14,7 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.gesture_settings import Quantity
-from common.hand_model import CHAINS
+from common.hand_model import CHAINS, MIDDLE_PROXIMAL, WRIST
 from common.kernels import inner, kernel
 from master.gestures.features import HandFeatures
 
@@ -50,7 +50,6 @@ class Quantities:
             features.bend_rad,
             features.seen,
             features.T_rig_palm,
-            features.size_m,
             features.side_sign,
             value,
             sigma,
@@ -67,7 +66,6 @@ def _write(
     bend: Float,
     seen: Bool,
     T: Float,
-    size: float,
     side: float,
     value: Float,
     sigma: Float,
@@ -77,6 +75,7 @@ def _write(
     for f in range(5):
         lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
         turned[f] = degrees(doubt[f] / lever)
+    size = _length(joints, WRIST, MIDDLE_PROXIMAL)
     value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), turned[0]
     for i in range(3):
         place = 0.0
@@ -95,7 +94,9 @@ def _write(
         value[column + 2] = both
         for k in range(3):
             sigma[column + k] = turned[f]
-        off = sqrt((tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2)
+        off = sqrt(
+            (tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2
+        )
         value[_GAPS + f - 1] = 1e3 * (off - radius[f] - radius[0])
         sigma[_GAPS + f - 1] = 1e3 * hypot(doubt[f], doubt[0])
         every += both / 4.0

@@ -1,7 +1,8 @@
 """Where the thumb is to the fingers, skin to skin, and which sides face each other: what pinches and taps are."""
 
+from collections.abc import Callable
 from math import acos, hypot, sqrt
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from master.estimator.small_matrices import spread
 from master.fabrik.rotations import Vector, cross, dot, length, minus
 from master.gestures.features import PAD_SHARE, HandFeatures
 
-_foot_of, _nearest = inner(foot_of), inner(nearest)
+_Foot = tuple[float, float, float, float, float, float]
+_foot_of = cast(Callable[[float, float, float, float, float, float, float], _Foot], inner(foot_of))
+_nearest = cast(Callable[[_Foot, float], float], inner(nearest))
 
 
 class ThumbTouch(NamedTuple):
@@ -45,16 +48,22 @@ class ThumbTouch(NamedTuple):
 
 def thumb_touch(features: HandFeatures, radius_m: Float) -> ThumbTouch:
     """The gaps of a hand whose joints have the radii (26,) [m]."""
-    return ThumbTouch(*_touch(features.joints_m, features.joints_cov_m2, features.pads_m, radius_m))
+    out = ThumbTouch(
+        gap_m=np.empty(4),
+        middle_m=np.empty((4, 3)),
+        apart_rad=np.empty(4),
+        apart_sigma_rad=np.empty(4),
+        key_gap_m=np.empty((4, 3)),
+        key_palmar=np.empty((4, 3)),
+        key_sigma_m=np.empty((4, 3)),
+    )
+    _write(features.joints_m, features.joints_cov_m2, features.pads_m, radius_m, out)
+    return out
 
 
 @kernel
-def _touch(
-    joints: Float, cov: Float, pads: Float, radius: Float
-) -> tuple[Float, Float, Float, Float, Float, Float, Float]:
-    """Return the fields of `ThumbTouch`."""
-    gap, middle, apart, turned = np.empty(4), np.empty((4, 3)), np.empty(4), np.empty(4)
-    key_gap, key_palmar, key_sigma = np.empty((4, 3)), np.empty((4, 3)), np.empty((4, 3))
+def _write(joints: Float, cov: Float, pads: Float, radius: Float, out: ThumbTouch) -> None:
+    """Write a touch; arguments as of `HandFeatures`."""
     thumb, tip = CHAINS[0, 2], CHAINS[0, 3]
     thumb_side = _palmar(0, 2, joints, pads)
     thumb_turned = _turned_rad(0, joints, cov)
@@ -68,18 +77,17 @@ def _touch(
             over = max(apart_m, 1e-9)
             way = off[0] / over, off[1] / over, off[2] / over
             radius_a = radius[thumb] + on_a * (radius[tip] - radius[thumb])
-            key_gap[k, s] = apart_m - radius_a - (radius[a] + on_b * (radius[b] - radius[a]))
+            out.key_gap_m[k, s] = apart_m - radius_a - (radius[a] + on_b * (radius[b] - radius[a]))
             side = _palmar(k + 1, s, joints, pads)
-            key_palmar[k, s] = -dot(way, side)
-            key_sigma[k, s] = _sigma_m(cov, thumb, tip, on_a, a, b, on_b, way)
+            out.key_palmar[k, s] = -dot(way, side)
+            out.key_sigma_m[k, s] = _sigma_m(cov, thumb, tip, on_a, a, b, on_b, way)
             if s == 2:
-                gap[k] = key_gap[k, s]
+                out.gap_m[k] = out.key_gap_m[k, s]
                 for i in range(3):
-                    middle[k, i] = start[i] + (radius_a + 0.5 * gap[k]) * way[i]
+                    out.middle_m[k, i] = start[i] + (radius_a + 0.5 * out.gap_m[k]) * way[i]
                 face = min(dot(way, thumb_side), -dot(way, side))
-                apart[k] = acos(min(max(face, -1.0), 1.0))
-        turned[k] = hypot(thumb_turned, _turned_rad(k + 1, joints, cov))
-    return gap, middle, apart, turned, key_gap, key_palmar, key_sigma
+                out.apart_rad[k] = acos(min(max(face, -1.0), 1.0))
+        out.apart_sigma_rad[k] = hypot(thumb_turned, _turned_rad(k + 1, joints, cov))
 
 
 @inner
@@ -99,7 +107,14 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
     """Return where along two segments their skins are nearest, as `common.skin_gaps`."""
     u, v = minus(_at(joints, a_end), _at(joints, a)), minus(_at(joints, b_end), _at(joints, b))
     apart = minus(_at(joints, b), _at(joints, a))
-    uu, vv, uv, au, bv, square = dot(u, u), dot(v, v), dot(u, v), dot(apart, u), dot(apart, v), dot(apart, apart)
+    uu, vv, uv, au, bv, square = (
+        dot(u, u),
+        dot(v, v),
+        dot(u, v),
+        dot(apart, u),
+        dot(apart, v),
+        dot(apart, apart),
+    )
     on_a = _foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, radius[a_end] - radius[a], uu)
     on_b = _foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, radius[b_end] - radius[b], vv)
     s, t = 0.5, 0.5
