@@ -124,7 +124,7 @@ class DialWatch:
         return [told]
 
     def _held(self, t_ns: int, tips: Tips, hold_s: float, *, grips: bool) -> Float | None:
-        """The axis of the tips, if they have been for so long as they are now, and mostly a grip."""
+        """The axis of the tips, if they are still, and mostly a grip, so long."""
         while self._maybe and spread_m(tips, self._maybe[0][1]) > self._settings.still_m:
             self._maybe.popleft()
         if not grips and not self._maybe:
@@ -144,7 +144,7 @@ class DialWatch:
         self._maybe.clear()
 
     def _again(self, tips: Tips) -> bool:
-        """Whether a hand that had let go grips as wide as before, for the knob is the same."""
+        """Whether a hand that let go grips as wide as before: the same knob."""
         before = self._before
         return before is not None and abs(widened_m(tips, before)) <= self._settings.still_m
 

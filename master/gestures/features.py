@@ -1,4 +1,6 @@
-"""What gestures are read from: bends, tips and pads of the fingers, and how well they are known.
+"""Extract features of a hand: bends, tips and pads of the fingers.
+
+And how well they are known.
 
 All of it is geometry of the solved joints, not of the profile's angles: those are zero in the rest pose of a profile,
 and rest poses differ from hand to hand. A bend is the signed angle between two bones about the hinge between them,
@@ -171,7 +173,10 @@ class FeatureExtractor:
 
 
 def _plain(array: Any) -> Any:
-    """The array as kernels are compiled for: contiguous and read-only, as messages nearly always are."""
+    """Return the array contiguous and read-only, as kernels are compiled for.
+
+    Those of messages nearly always are.
+    """
     if array.flags.c_contiguous:
         return array
     out = np.ascontiguousarray(array)
@@ -244,7 +249,10 @@ def _measure(
 def _joints(
     position: Float, wxyz: Float, hand: _Hand, joints: Float, rotation: Float, lacking: Bool, T: Float
 ) -> None:
-    """Write joints and rotations, which the pose lacks, these as likely, and the palm's transform."""
+    """Write joints, rotations and the palm's transform.
+
+    Also which joints the pose lacks; these are written as likely.
+    """
     for j in range(26):
         w, x, y, z = wxyz[j, 0], wxyz[j, 1], wxyz[j, 2], wxyz[j, 3]
         lacking[j] = isnan(position[j, 0] + position[j, 1] + position[j, 2] + w + x + y + z)
@@ -298,7 +306,10 @@ def _bends(f: int, joints: Float, rotation: Float, T: Float, bend: Float) -> Non
 
 @inner
 def _take_seen(markers: Float, caps: Float) -> None:
-    """Put each cap where its marker is, the nearest to it of those that it is the nearest cap to."""
+    """Put each cap where its marker is.
+
+    That is the nearest one to it, if the cap is the nearest to the marker as well.
+    """
     own = np.empty(5, np.int64)
     for f in range(5):
         own[f], least = -1, inf

@@ -1,4 +1,4 @@
-"""Is the hand about a knob? The circle through its tips, and how they are turned against how they were.
+"""Find a grip about a knob: the circle of the tips, and how they turned.
 
 The thumb's tip and those of the fingers lie about one circle, in one plane, pads inwards, the thumb across from the
 fingers. Nothing here remembers anything.
@@ -23,7 +23,7 @@ _EYE = np.eye(3)
 
 
 class Tips(NamedTuple):
-    """Tips of thumb ... little in a frame that stands still in the room: the caps' middles.
+    """Tips of thumb ... little: the caps' middles in a frame still in the room.
 
     Attributes:
         place_m: (5, 3) [m].
@@ -41,7 +41,10 @@ class Tips(NamedTuple):
 
     @classmethod
     def of(cls, seen: HandFeatures, sigma_most_m: float, *, worn_only: bool) -> "Tips":
-        """Those of a hand; where all that sees it is worn on its arm, the rig frame goes with it."""
+        """Those of a hand.
+
+        `worn_only`: all that sees it is worn on its arm, and the rig frame goes with it.
+        """
         turn = _EYE
         if worn_only and not np.isnan(seen.palm_world_wxyz).any():
             turn = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
@@ -49,7 +52,10 @@ class Tips(NamedTuple):
         return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, turn @ seen.palmar, turn)
 
     def axis(self) -> Float | None:
-        """Axis (3,) of the circle through the tips that are known, out of the palm; None: they are fewer than three."""
+        """Axis (3,) of the circle of the known tips, out of the palm.
+
+        None: they are fewer than three.
+        """
         if self.known.sum() < 3:
             return None
         centre, axis = np.empty(3), np.empty(3)
@@ -97,7 +103,10 @@ def _about(
     low: float,
     high: float,
 ) -> bool:
-    """Return whether tips are about a knob; pads (5, 3) from the tip's middle, the rest of `Tips` and settings."""
+    """Return whether tips are about a knob.
+
+    Pads (5, 3) are from the tip's middle; the rest as of `Tips` and the settings.
+    """
     centre, axis = np.empty(3), np.empty(3)
     radius = _circle(place, known, palmar, centre, axis)
     if axis[0] * palmar[0] + axis[1] * palmar[1] + axis[2] * palmar[2] < aslant or not low <= radius <= high:
@@ -128,7 +137,9 @@ def _about(
 
 @kernel
 def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float) -> float:
-    """Return the radius of the circle of known places (5, 3); write its centre and axis, out of the palm.
+    """Return the radius of the circle of known places (5, 3).
+
+    Write its centre, and its axis out of the palm.
 
     The circle of least algebraic error (Kasa, 1976) in the plane of least squares. Along the principal axes of the
     places about their mean, its normal equations fall apart.
@@ -183,13 +194,16 @@ def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
 
 
 def turned_by(now: Tips, then: Tips) -> Float:
-    """Rotation vector (3,) [rad] by which the tips have turned as one since `then`; surer ones count more."""
+    """Rotation vector (3,) [rad] of the tips as one since `then`.
+
+    Surer ones count more.
+    """
     return _turned(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
 
 
 @kernel
 def _turned(place: Float, sigma: Float, before: Float, sigma_before: Float) -> Float:
-    """Return the rotation vector (3,) of the best turn from `before` to `place` (Horn, 1987)."""
+    """Return the rotation vector (3,) from `before` to `place` (Horn, 1987)."""
     weight, total = np.empty(5), 0.0
     middle, middle_before = np.zeros(3), np.zeros(3)
     for f in range(5):
@@ -228,7 +242,9 @@ def _turned(place: Float, sigma: Float, before: Float, sigma_before: Float) -> F
 
 @kernel
 def axis_of(prior: Float, weight: float, turn: Float) -> Float:
-    """Return the axis (3,) of most weight of a unit vector (3,) and a turn, as its rotation vector (3,).
+    """Return the axis (3,) of most weight of a unit vector and a turn.
+
+    The turn is a rotation vector (3,).
 
     It is the first axis of the sum of both, as a tensor.
     """
@@ -248,7 +264,9 @@ def axis_of(prior: Float, weight: float, turn: Float) -> Float:
 
 
 def widened_m(tips: Tips, then: Tips) -> float:
-    """By how much the grip is wider than `then` [m]: half of what the thumb's tip has gone from those of the fingers.
+    """By how much the grip is wider than `then` [m].
+
+    Half of what the thumb's tip has gone from those of the fingers.
 
     NaN: the thumb or the fingers are not known.
     """
@@ -274,7 +292,9 @@ def _widened(place: Float, known: Bool, before: Float, known_before: Bool) -> fl
 
 
 def spread_m(tips: Tips, then: Tips) -> float:
-    """By how much more or less a tip is away from the middle of the known ones than `then` [m], at most.
+    """The greatest change of a tip's distance from the middle since `then` [m].
+
+    The middle is that of the known tips.
 
     inf: fewer than three are known.
     """

@@ -123,7 +123,7 @@ def _bends(seen: HandFeatures) -> list[float]:
 
 @kernel
 def _ray_sigma_rad(joints: Float, cov: Float) -> float:
-    """Return the standard deviation [rad] of the ray, about the axis where it is worst.
+    """Return the standard deviation [rad] of the ray, about its worst axis.
 
     Arguments as of `HandFeatures`. What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
     """
@@ -134,10 +134,10 @@ def _ray_sigma_rad(joints: Float, cov: Float) -> float:
     )
     length = sqrt(x * x + y * y + z * z)
     w = x / length, y / length, z / length
-    both, along = cov[_TIP] + cov[_KNUCKLE], np.zeros(3)
-    total = 0.0
+    both, along, total = np.empty((3, 3)), np.zeros(3), 0.0
     for i in range(3):
         for k in range(3):
+            both[i, k] = cov[_TIP, i, k] + cov[_KNUCKLE, i, k]
             along[i] += both[i, k] * w[k]
         total += w[i] * along[i]
     for i in range(3):

@@ -127,7 +127,10 @@ def _fit(
     confidence: Float,
     enough: Bool,
 ) -> int:
-    """Return the best pose; write the fields of `Fit`, and misfits (P, Q), which are zero before."""
+    """Return the best pose; write the fields of `Fit`, and misfits (P, Q).
+
+    The misfits are zero before.
+    """
     poses, count = table.low.shape
     total = 0.0
     for p in range(poses):

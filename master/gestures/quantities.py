@@ -124,7 +124,7 @@ def _length(joints: Float, a: int, b: int) -> float:
 
 @inner
 def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
-    """Return how far a finger is taken for one that hides, 0..1, and the standard deviation [deg] of what results.
+    """Return how far a finger is taken for hidden, 0..1, and its sigma [deg].
 
     A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies behind the
     hand or before the palm. That an unseen finger hides is joined with what is believed of it, as one more witness.
@@ -137,7 +137,9 @@ def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
 
 @inner
 def _heading(f: int, joints: Float, T: Float, side: float) -> float:
-    """Return where a finger's first bone heads [deg] in the palm's plane, to the thumb is positive.
+    """Return where a finger's first bone heads [deg] in the palm's plane.
+
+    To the thumb is positive.
 
     Fingers that stand up from that plane have no heading in it: their angle fades with what is left.
     """

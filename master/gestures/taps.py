@@ -173,7 +173,9 @@ def _worst_m(seen: HandFeatures, joint: int) -> float:
 
 
 def _beyond_m(joints_m: Float, finger: int) -> Float:
-    """How far (N, 2) [m] the thumb's tip is beyond the planes that halve a finger's bends, at PIP and DIP.
+    """How far (N, 2) [m] the thumb's tip is beyond PIP and DIP of a finger.
+
+    Beyond the planes that halve its bends there.
 
     Of hands (N, 26, 3) [m] and a finger 0 ... 3.
     """

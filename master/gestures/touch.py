@@ -129,9 +129,15 @@ def _shares(joints: Float, radius: Float, a: int, a_end: int, b: int, b_end: int
 
 @inner
 def _turned_rad(f: int, joints: Float, cov: Float) -> float:
-    """Return the standard deviation [rad] of the direction of a last bone: of its ends, over its length."""
-    a, b = CHAINS[f, 2], CHAINS[f, 3]
-    return spread(cov[a] + cov[b])[1] / length(minus(_at(joints, b), _at(joints, a)))
+    """Return the standard deviation [rad] of the direction of a last bone.
+
+    That of its ends, over its length.
+    """
+    a, b, ends = CHAINS[f, 2], CHAINS[f, 3], np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            ends[i, j] = cov[a, i, j] + cov[b, i, j]
+    return spread(ends)[1] / length(minus(_at(joints, b), _at(joints, a)))
 
 
 @inner
@@ -154,7 +160,9 @@ def _sigma_m(
 
 @inner
 def _palmar(f: int, s: int, joints: Float, pads: Float) -> Vector:
-    """Return the unit vector out of the palmar side of a segment, rig frame: across it, in the plane of its bend.
+    """Return the unit vector out of the palmar side of a segment, rig frame.
+
+    It is across the segment, in the plane of its bend.
 
     The pad says it for the last one; the others are turned back by the bends between.
     """
