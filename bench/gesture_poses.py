@@ -30,7 +30,7 @@ from common.hand_model import HandModel
 from common.messages import HandPose
 from common.sim.poses import StudyPoses
 from master.fabrik.one_euro import OneEuroParameters
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.poses import PoseRecogniser
 from master.ik.hand_one_euro import HandOneEuro
 from master.ik.tracker import HandTracker
@@ -127,13 +127,13 @@ def _cost() -> Row:
     model = HandModel.of(_hand("right"))
     joints = model.forward(np.eye(4), np.zeros((5, 4)))
     pose = pose_of(model, 0, joints.position_m, matrix_to_quaternion(joints.rotation), np.zeros((5, 4)))
-    recogniser = PoseRecogniser(default_gestures())
+    extractor, recogniser = FeatureExtractor(model), PoseRecogniser(default_gestures())
     t_ns = 0
 
     def step() -> None:
         nonlocal t_ns
         t_ns += _PERIOD_NS
-        features = features_of(msgspec.structs.replace(pose, t_ns=t_ns), model)
+        features = extractor.of(msgspec.structs.replace(pose, t_ns=t_ns))
         assert features is not None
         recogniser.push(features)
 

@@ -12,7 +12,7 @@ from common.gesture_settings import default_gestures
 from common.hand_model import HandModel
 from common.messages import JOINT_COUNT, HandPose, Source
 from common.sim.motion import POSES
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.poses import PoseRecogniser
 
 FORMED = 2  # frames in which a formed pose may not be told yet
@@ -103,10 +103,10 @@ def pose_of(model: HandModel, t_ns: int, place_m: Float, turned_wxyz: Float, ang
 
 def told_of(poses: Sequence[HandPose], model: HandModel) -> list[str | None]:
     """The pose that is held after each."""
-    recogniser = PoseRecogniser(default_gestures())
+    extractor, recogniser = FeatureExtractor(model), PoseRecogniser(default_gestures())
     out: list[str | None] = []
     for pose in poses:
-        features = features_of(pose, model)
+        features = extractor.of(pose)
         if features is None:
             recogniser.lose(pose.hand, pose.t_ns)
         else:

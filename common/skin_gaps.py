@@ -5,17 +5,21 @@ the gap of two is the least, over s and t in 0..1, of
 
     |(a + s u) - (b + t v)| - (r_a + s d_a) - (r_b + t d_b),
 
-which is convex in (s, t): descending in each in turn, in closed form, leads to it.
+which is convex in (s, t): descending in each in turn, in closed form, leads to it. `foot_of` and `nearest` take numbers
+as well as arrays and call nothing of their own, so that kernels may compile them.
 """
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS
 
-_ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
+Foot: TypeAlias = tuple[Float, Float, Float, Float, Float, Float]
+
+ROUNDS = 12  # what is left then is below 0.1 mm, at worst where fingers are parallel
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,12 +76,12 @@ def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
         np.vecdot(one, two) for one, two in ((a.along_m, b.along_m), (apart, a.along_m), (apart, b.along_m))
     )
     square = np.vecdot(apart, apart)
-    on_a = _Foot.of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, _lean(a.growth_m, uu))
-    on_b = _Foot.of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, _lean(b.growth_m, vv))
+    on_a = foot_of(au / uu, uv / uu, square / uu, 2.0 * bv / uu, vv / uu, a.growth_m, uu)
+    on_b = foot_of(-bv / vv, uv / vv, square / vv, -2.0 * au / vv, uu / vv, b.growth_m, vv)
     s = t = np.full(apart.shape[:-1], 0.5)
-    for _ in range(_ROUNDS):
-        s, before = on_a.nearest(t), t
-        t = on_b.nearest(s)
+    for _ in range(ROUNDS):
+        s, before = nearest(on_a, t), t
+        t = nearest(on_b, s)
         if (t == before).all():  # as where the nearest are ends of bones: more rounds change nothing
             break
     from_a = a.start_m + s[..., None] * a.along_m
@@ -90,39 +94,29 @@ def gaps_between(a: RoundCones, b: RoundCones) -> Gaps:
     return Gaps(gap, s, t, middle, way)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Foot:
-    """Where along a cone its skin is nearest to a point that goes along the other's bone, both by their shares 0..1.
+def foot_of(
+    foot: Float, foot_by: Float, c0: Float, c1: Float, c2: Float, growth_m: Float, square: Float
+) -> Foot:
+    """Return where along a cone the foot of a point on the other's bone is.
 
-    The foot of the point is linear in its share, and the square of its distance from the bone, in units of the bone's
+    The foot is linear in the point's share, and the square of its distance from the bone, in units of the bone's
     length, is a quadratic: so a round needs no vectors.
 
-    Attributes:
-        foot, foot_by: (...) the foot of the other's start, and by how much it goes on.
-        off_2, off_by, off_by_2: (...) coefficients of that square.
-        lean: (...) by how much the nearest place is beyond the foot, to where the cone is thicker, per distance.
+    Args:
+        foot, foot_by: The foot of the other's start, and by how much it goes on; shares of this bone.
+        c0, c1, c2: The square of the distance from this cone's start is c0 + c1 x + c2 x^2 of a share x.
+        growth_m, square: Of this cone: growth [m], and the square of its bone's length [m^2].
+
+    Returns:
+        `foot` and `foot_by`, the three coefficients of the square of the distance from the bone, and by how much the
+        nearest place is beyond the foot, to where the cone is thicker, per distance: the tangent of half its angle.
     """
-
-    foot: Float
-    foot_by: Float
-    off_2: Float
-    off_by: Float
-    off_by_2: Float
-    lean: Float
-
-    @classmethod
-    def of(cls, foot: Float, foot_by: Float, c0: Float, c1: Float, c2: Float, lean: Float) -> "_Foot":
-        """By the feet, and the square of the distance from this cone's start, c0 + c1 x + c2 x^2 of a share x."""
-        off = c0 - foot * foot, c1 - 2.0 * foot * foot_by, c2 - foot_by * foot_by
-        return cls(foot, foot_by, *off, lean)
-
-    def nearest(self, share: Float) -> Float:
-        """Where (...) along the cone, for shares (...) of the other."""
-        off_2 = self.off_2 + share * (self.off_by + share * self.off_by_2)
-        beyond = self.lean * np.sqrt(np.maximum(off_2, 0.0))
-        return np.minimum(np.maximum(self.foot + share * self.foot_by + beyond, 0.0), 1.0)
+    lean = growth_m / np.sqrt(np.maximum(square - growth_m * growth_m, 1e-12))
+    return foot, foot_by, c0 - foot * foot, c1 - 2.0 * foot * foot_by, c2 - foot_by * foot_by, lean
 
 
-def _lean(growth_m: Float, square: Float) -> Float:
-    """Of cones by their growth and the squares of their lengths: the tangent of half their angle, outwards."""
-    return growth_m / np.sqrt(np.maximum(square - growth_m * growth_m, 1e-12))
+def nearest(on: Foot, share: Float) -> Float:
+    """Return where along a cone, 0..1, its skin is nearest to the point at a share of the other's bone."""
+    foot, foot_by, off_2, off_by, off_by_2, lean = on
+    beyond = lean * np.sqrt(np.maximum(off_2 + share * (off_by + share * off_by_2), 0.0))
+    return np.minimum(np.maximum(foot + share * foot_by + beyond, 0.0), 1.0)

@@ -34,7 +34,13 @@ LIVE = (
     "tests/master/export/test_export_gltf.py",
 )
 
-_KERNELS = ("common/kernels.py", "master/fabrik/*.py", "master/estimator/*.py")
+_KERNELS = (
+    "common/kernels.py",
+    "common/skin_gaps.py",
+    "master/fabrik/*.py",
+    "master/estimator/*.py",
+    "master/gestures/*.py",
+)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -47,8 +53,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if known.is_file() and known.read_text() == now:
         return
     if known.is_file():
-        for code in (ROOT / "master").glob("[ef]*/__pycache__/*.nb[ci]"):
-            code.unlink(missing_ok=True)
+        for pattern in ("master/[efg]*", "common"):
+            for code in ROOT.glob(f"{pattern}/__pycache__/*.nb[ci]"):
+                code.unlink(missing_ok=True)
     known.parent.mkdir(exist_ok=True)
     known.write_text(now)
 

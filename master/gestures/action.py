@@ -12,7 +12,7 @@ finger has come to meet the thumb; and a finger that is stretched while a dial t
 from common.arrays import Float
 from common.gesture_settings import GestureSettings
 from common.messages import Gesture
-from master.gestures.dial import DialWatch, still_frame
+from master.gestures.dial import DialWatch
 from master.gestures.features import HandFeatures
 from master.gestures.pinch import PinchWatch
 from master.gestures.point import PointWatch
@@ -29,13 +29,10 @@ class ActionWatch:
         self.pinch, self.dial = PinchWatch(settings.pinch), DialWatch(settings.dial)
         self.tap, self.point = TapWatch(settings.tap), PointWatch(settings.point)
 
-    def push(self, seen: HandFeatures, caps_m: Float, *, worn_only: bool = False) -> list[Gesture]:
+    def push(self, seen: HandFeatures, *, worn_only: bool = False) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
-        Args:
-            seen: The hand.
-            caps_m: (5, 3) of the fingertips [m], rig frame.
-            worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
+        `worn_only`: all that sees the hand is worn on its arm, and the rig frame goes with it.
         """
         pinch, dial, tap, point = self.pinch, self.dial, self.tap, self.point
         touch = thumb_touch(seen, self._radius_m)
@@ -46,8 +43,8 @@ class ActionWatch:
         else:
             told += tap.push(seen, touch, may_begin=True)
         others = pinch.active or tap.active
-        still, across_m = still_frame(seen, worn_only=worn_only), float(touch.gap_m.min())
-        told += dial.push(seen, caps_m, still, across_m, may_begin=not others and not point.active)
+        dial_may = not others and not point.active
+        told += dial.push(seen, float(touch.gap_m.min()), may_begin=dial_may, worn_only=worn_only)
         return told + point.push(seen, may_begin=not others and not dial.active)
 
     def lost(self, t_ns: int) -> list[Gesture]:

@@ -7,10 +7,8 @@ before it lets go stands still, and a bad instant in a quick turn is led over.
 """
 
 from collections import deque
-
-import numpy as np
-
-from common.arrays import Float
+from math import exp
+from statistics import median
 
 _LATE_S = 0.1  # what counts as of late
 _FIRM = 0.3  # of what is quick: from there on the last instants before it may be of it
@@ -40,7 +38,7 @@ class Course:
         if not self._late:
             good = abs(wide_m) <= most_m
         else:
-            usual = float(np.median([wide for _, wide, _ in self._late]))
+            usual = median(wide for _, wide, _ in self._late)
             lasts = self._since_ns is not None and (t_ns - self._since_ns) * 1e-9 > _LASTS_S
             good = abs(wide_m) <= most_m and (lasts or abs(wide_m - usual) <= self._quick_m)
             if good and lasts:
@@ -62,14 +60,15 @@ class Course:
         there was none."""
         if not self._late:
             return None
-        usual = float(np.median([wide for _, wide, _ in self._late]))
+        usual = median(wide for _, wide, _ in self._late)
         firm = len(self._late)
         while firm > 1 and abs(self._late[firm - 1][1] - usual) > _FIRM * self._quick_m:
             firm -= 1
         kept = list(self._late)[:firm]
-        times: Float = np.array([(t - kept[-1][0]) * 1e-9 for t, _, _ in kept])
-        angles: Float = np.array([angle for _, _, angle in kept])
-        off = times - times.mean()
-        rate = float(off @ angles) / max(float(off @ off), 1e-12) if len(times) > 2 else 0.0
+        times = [(t - kept[-1][0]) * 1e-9 for t, _, _ in kept]
+        middle = sum(times) / len(times)
+        off = [t - middle for t in times]
+        rate = sum(t * angle for t, (_, _, angle) in zip(off, kept, strict=True))
+        rate = rate / max(sum(t * t for t in off), 1e-12) if len(times) > 2 else 0.0
         gone = (t_ns - kept[-1][0]) * 1e-9
-        return float(angles[-1]) + rate * _FADE_S * (1.0 - float(np.exp(-gone / _FADE_S)))
+        return kept[-1][2] + rate * _FADE_S * (1.0 - exp(-gone / _FADE_S))

@@ -10,49 +10,48 @@ Tips that stand still to each other are a grip where most instants of the hold h
 decides some of that, and cameras that see no more than fingertips doubt it from instant to instant.
 
 The axis begins as that of the circle through the tips; a turn tells its own axis the better the farther it goes, and
-what is known of it is the mean of both (`_axis_of`).
+what is known of it is the mean of both (`_turn`).
 
 Where all that sees is worn on the arm (no markers, and the palm stands still in the camera's frame) it is the palm in
 the world of the IMU that turns.
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
+from math import atan2, cos, pi, radians, sin, sqrt
 
 from common.arrays import Float
-from common.geometry import quaternion_to_matrix
 from common.gesture_actions import DialSettings
 from common.messages import Gesture, Phase
 from master.gestures.course import Course
 from master.gestures.features import HandFeatures
-from master.gestures.grip import Circle, Tips, circle_through, grip_of, spread_m, turned_by, widened_m
+from master.gestures.grip import Tips, axis_of, is_grip, may_grip, spread_m, turned_by, widened_m
 from master.gestures.lasting import Lasting
 
-_AXIS_RAD = np.radians(15.0)  # how well the circle of the tips tells the axis of the knob
-_SWAY_RAD = np.radians(4.0)  # about other axes, by which a hand sways while it turns a knob
+_AXIS_RAD = radians(15.0)  # how well the circle of the tips tells the axis of the knob
+_SWAY_RAD = radians(4.0)  # about other axes, by which a hand sways while it turns a knob
 _MOST = 0.6  # of the instants of a hold have the shape of a grip
-_EYE = np.eye(3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Grip:
     """One grip of the dial.
 
     Attributes:
         tips: As they were when it closed.
-        axis: (3,) of the circle of the tips.
+        circle_axis: (3,) of the circle of the tips.
         base_rad: By how much the dial had been turned then.
         course: How it has gone of late.
-        farthest: (3,) rotation vector [rad] of its largest turn so far.
+        farthest_rad: Of its largest turn so far.
+        axis: (3,) of the knob, by both.
     """
 
     tips: Tips
-    axis: Float
+    circle_axis: Float
     base_rad: float
     course: Course
-    farthest: Float
+    farthest_rad: float
+    axis: Float
 
 
 class DialWatch:
@@ -74,35 +73,39 @@ class DialWatch:
         return self._dial is not None
 
     def push(
-        self, seen: HandFeatures, caps_m: Float, turn: Float, across_m: float, *, may_begin: bool
+        self, seen: HandFeatures, across_m: float, *, may_begin: bool, worn_only: bool = False
     ) -> list[Gesture]:
         """What is to be told at the instant of the features.
 
         Args:
             seen: The hand.
-            caps_m: (5, 3) of the fingertips [m], rig frame.
-            turn: (3, 3) from the rig frame to one that stands still in the room.
             across_m: Between the skins of the thumb and the finger next to it [m].
             may_begin: Whether a dial may begin.
+            worn_only: All that sees the hand is worn on its arm: the rig frame goes with it.
         """
-        tips = _tips_of(seen, caps_m, turn, across_m, self._settings.sigma_most_m)
+        if self._dial is None and not may_begin:
+            self._maybe.clear()
+            return []
+        grips = self._dial is None and may_grip(seen, across_m, self._settings)
+        if self._dial is None and not grips and not self._maybe:
+            return []
+        tips = Tips.of(seen, self._settings.sigma_most_m, worn_only=worn_only)
         if self._dial is None:
-            circle = self._held(seen.t_ns, tips, self._settings.hold_s) if may_begin else None
-            if circle is None:
-                if not may_begin:
-                    self._maybe.clear()
+            grips = grips and is_grip(seen, tips, self._settings)
+            axis = self._held(seen.t_ns, tips, self._settings.hold_s, grips=grips)
+            if axis is None:
                 return []
             self._dial = Lasting(seen.hand, "dial", "dial", seen.t_ns)
             self._angle = 0.0
-            self._take(tips, circle)
+            self._take(tips, axis)
             self._closed_ns = self._known_ns = seen.t_ns
-            return [self._tell(self._dial, "begin", seen, turn, tips)]
+            return [self._tell(self._dial, "begin", seen, tips)]
         self._follow(seen.t_ns, tips)
         own = self._settings
         opened = self._grip is None and (seen.t_ns - self._closed_ns) * 1e-9 > own.regrip_s
         if opened or (seen.t_ns - self._known_ns) * 1e-9 > own.lost_s:
-            return self._end(self._tell(self._dial, "end", seen, turn, tips))
-        return [self._tell(self._dial, "update", seen, turn, tips)]
+            return self._end(self._tell(self._dial, "end", seen, tips))
+        return [self._tell(self._dial, "update", seen, tips)]
 
     def lost(self, t_ns: int) -> list[Gesture]:
         """What is to be told at an instant at which there is no hand."""
@@ -120,37 +123,30 @@ class DialWatch:
         self._maybe.clear()
         return [told]
 
-    def _held(self, t_ns: int, tips: Tips, hold_s: float) -> Circle | None:
-        """The grip, if it has been as it is now for so long."""
-        own = self._settings
-        circle = self._again(tips) if self._dial is not None else grip_of(tips, own)
-        while self._maybe and _most(spread_m(tips, self._maybe[0][1])) > own.still_m:
+    def _held(self, t_ns: int, tips: Tips, hold_s: float, *, grips: bool) -> Float | None:
+        """The axis of the tips, if they are still, and mostly a grip, so long."""
+        while self._maybe and spread_m(tips, self._maybe[0][1]) > self._settings.still_m:
             self._maybe.popleft()
-        if circle is None and not self._maybe:
+        if not grips and not self._maybe:
             return None
-        self._maybe.append((t_ns, tips, circle is not None))
+        self._maybe.append((t_ns, tips, grips))
         while len(self._maybe) > 1 and (t_ns - self._maybe[1][0]) * 1e-9 >= hold_s:
             self._maybe.popleft()
         if (t_ns - self._maybe[0][0]) * 1e-9 < hold_s:
             return None
         if sum(shape for _, _, shape in self._maybe) < _MOST * len(self._maybe):
             return None
-        known = np.flatnonzero(tips.known)
-        return circle_through(tips.place_m[known], tips.palmar) if len(known) >= 3 else None
+        return tips.axis()
 
-    def _take(self, tips: Tips, circle: Circle) -> None:
+    def _take(self, tips: Tips, axis: Float) -> None:
         """A grip closes."""
-        course = Course(self._settings.quick_m)
-        self._grip = _Grip(tips, circle.axis, self._angle, course, np.zeros(3))
+        self._grip = _Grip(tips, axis, self._angle, Course(self._settings.quick_m), 0.0, axis)
         self._maybe.clear()
 
-    def _again(self, tips: Tips) -> Circle | None:
-        """The grip of a hand that had let go: as wide again as that before, for the knob is the same."""
+    def _again(self, tips: Tips) -> bool:
+        """Whether a hand that let go grips as wide as before: the same knob."""
         before = self._before
-        if before is None or not abs(widened_m(tips, before)) <= self._settings.still_m:
-            return None
-        known = np.flatnonzero(tips.known)
-        return circle_through(tips.place_m[known], tips.palmar)
+        return before is not None and abs(widened_m(tips, before)) <= self._settings.still_m
 
     def _follow(self, t_ns: int, tips: Tips) -> None:
         """Turn the dial, let it go, or grip it again."""
@@ -158,9 +154,9 @@ class DialWatch:
         if tips.known.sum() >= 3:
             self._known_ns = t_ns
         if grip is None:
-            circle = self._held(t_ns, tips, own.again_s)
-            if circle is not None:
-                self._take(tips, circle)
+            axis = self._held(t_ns, tips, own.again_s, grips=self._again(tips))
+            if axis is not None:
+                self._take(tips, axis)
                 self._closed_ns = t_ns
             return
         wide = widened_m(tips, grip.tips)
@@ -175,65 +171,28 @@ class DialWatch:
             self._grip, self._before = None, grip.tips
 
     def _turn(self, t_ns: int, tips: Tips, grip: _Grip, wide_m: float) -> None:
-        """The angle of tips that turn the knob."""
+        """The angle of tips that turn the knob.
+
+        Its axis is that of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is
+        far. A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of
+        the two directions go with one over the square. The angle is the twist about it (Dobrowolski, 2015).
+        """
         turn = turned_by(tips, grip.tips)
-        if float(turn @ turn) > float(grip.farthest @ grip.farthest):
-            self._grip = grip = replace(grip, farthest=turn)
-        twist = _twist(turn, _axis_of(grip)) + grip.base_rad
-        self._angle = twist + 2.0 * np.pi * round((self._angle - twist) / (2.0 * np.pi))
+        far = sqrt(turn @ turn)
+        if far > grip.farthest_rad:
+            grip.farthest_rad = far
+            grip.axis = axis_of(grip.circle_axis, (_SWAY_RAD / _AXIS_RAD) ** 2, turn)
+        along = float(turn @ grip.axis) / max(far, 1e-12)
+        twist = 2.0 * atan2(along * sin(0.5 * far), cos(0.5 * far)) + grip.base_rad
+        self._angle = twist + 2.0 * pi * round((self._angle - twist) / (2.0 * pi))
         grip.course.push(t_ns, wide_m, self._angle)
 
-    def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, turn: Float, tips: Tips) -> Gesture:
+    def _tell(self, dial: Lasting, phase: Phase, seen: HandFeatures, tips: Tips) -> Gesture:
         grip = self._grip
         origin = 0.5 * seen.tips_m[0] + 0.5 * seen.tips_m[1:].mean(axis=0)
-        way = seen.palmar if grip is None else turn.T @ _axis_of(grip)
+        way = seen.palmar if grip is None else tips.T_still_rig.T @ grip.axis
         confidence = float(tips.known.mean()) * (0.5 if grip is None else 1.0)
         self._last = dial.told(
             phase, seen.t_ns, confidence, angle_rad=self._angle, origin_m=origin, direction=way
         )
         return self._last
-
-
-def _most(lengths: Float) -> float:
-    """The largest of those that are known, inf where none is."""
-    known = np.abs(lengths[np.isfinite(lengths)])
-    return float(known.max()) if len(known) else np.inf
-
-
-def still_frame(seen: HandFeatures, *, worn_only: bool) -> Float:
-    """(3, 3) from the rig frame to one that stands still in the room: another one where all that sees is worn."""
-    if not worn_only or np.isnan(seen.palm_world_wxyz).any():
-        return _EYE
-    return quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
-
-
-def _tips_of(seen: HandFeatures, caps_m: Float, turn: Float, across_m: float, sigma_most_m: float) -> Tips:
-    pads = seen.pads_m - seen.tips_m
-    return Tips(
-        place_m=caps_m @ turn.T,
-        sigma_m=seen.sigma_m,
-        inwards=(pads / np.sqrt(np.vecdot(pads, pads))[:, None]) @ turn.T,
-        palmar=turn @ seen.palmar,
-        across_m=across_m,
-        curl=float(seen.curl[1:].mean()),
-        known=seen.sigma_m <= sigma_most_m,
-    )
-
-
-def _axis_of(grip: _Grip) -> Float:
-    """The axis (3,) of most weight: that of the tips' circle as sure as it is, that of the turn as sure as it is far.
-
-    A turn r sways by `_SWAY_RAD` about other axes, so it tells its axis to `_SWAY_RAD` / |r|: the weights of the two
-    directions go with one over the square, and the best axis is the first of the sum of both, as a tensor.
-    """
-    prior = (_SWAY_RAD / _AXIS_RAD) ** 2
-    both = prior * np.outer(grip.axis, grip.axis) + np.outer(grip.farthest, grip.farthest)
-    axis: Float = np.linalg.eigh(both)[1][:, 2]
-    return axis if float(axis @ grip.axis) > 0.0 else -axis
-
-
-def _twist(turn: Float, axis: Float) -> float:
-    """The part about an axis (3,) of a turn, a rotation vector (3,) [rad]: its twist (Dobrowolski, 2015)."""
-    angle = float(np.linalg.norm(turn))
-    along = float(turn @ axis) / max(angle, 1e-12)
-    return 2.0 * float(np.arctan2(along * np.sin(0.5 * angle), np.cos(0.5 * angle)))

@@ -1,31 +1,38 @@
-"""What gestures are read from: how far each finger is bent, where its tip and pad are, and how sure that is.
+"""Extract features of a hand: bends, tips and pads of the fingers.
+
+And how well they are known.
 
 All of it is geometry of the solved joints, not of the profile's angles: those are zero in the rest pose of a profile,
 and rest poses differ from hand to hand. A bend is the signed angle between two bones about the hinge between them,
 that of the MCP between the palm's plane and the first bone; positive is towards the palm, for both hands alike.
+
+A painted cap's centroid is measured to a fraction of a millimetre, however the palm lies. The tip's joint is inferred
+from it by way of the hand, and is some millimetres off where the palm is known from the tips alone. So caps are
+features of their own.
 """
 
-from dataclasses import dataclass
-from math import isfinite
+from math import atan2, hypot, inf, isfinite, isnan, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.arrays import Bool, Float
-from common.geometry import cross, quaternion_to_matrix, rigid
-from common.hand_model import CHAINS, MIDDLE_PROXIMAL, TIPS, WRIST, HandModel
+from common.arrays import Bool, Float, Int
+from common.hand_model import CHAINS, FINGERS, TIPS, WRIST, HandModel
+from common.kernels import inner, kernel
 from common.messages import HandPose
+from master.estimator.small_matrices import spread
+from master.fabrik.rotations import cross, dot
 
 KNOWN_SIGMA_M = 0.015  # a tip that may be farther off is anywhere between straight and half bent
+PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad is thickest
 # Sum of a finger's bends [rad], MCP, PIP and DIP, where it is as curled as it goes; of the thumb MCP and IP.
 _CURLED_RAD = np.radians([90.0, 230.0, 230.0, 230.0, 230.0])
 # Of fingers that nothing is known of [rad]: a thumb at rest, fingers half bent.
-LIKELY_RAD = np.radians([[8.0, 15.0, 15.0, 15.0], *([[0.0, 55.0, 75.0, 50.0]] * 4)])
-_TIPS_AND_WRIST = np.append(TIPS, WRIST)
-_PAD_SHARE = 0.75  # of the last bone, from the joint: where the ball of the pad is thickest
+_LIKELY_RAD = np.radians([[8.0, 15.0, 15.0, 15.0], *([[0.0, 55.0, 75.0, 50.0]] * 4)])
+_OWN_M = 0.012  # a marker farther from where the hand has the cap is not this finger's
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class HandFeatures:
+class HandFeatures(NamedTuple):
     """One hand at one instant; fingers thumb ... little.
 
     Attributes:
@@ -35,20 +42,17 @@ class HandFeatures:
         seen: (5,) a sensor observes the finger's tip now.
         sigma_m: (5,) standard deviation [m] of the tip along the axis where it is worst; inf: nothing is known.
         shape_sigma_m: (5,) the same without what the wrist's place has of it, which moves the whole hand.
-        angles_rad: (5, 4) of the pose, zero in the profile's rest pose.
         bend_rad: (5, 3) bends of MCP, PIP and DIP, zero where the bones lie in the palm's plane in one line; of the
             thumb the first is how far its metacarpal stands out of the palm's plane, then MCP and IP.
         curl: (5,) 0 straight ... 1 curled.
+        caps_m: (5, 3) centroids of the tips' painted caps [m], rig frame: measured where seen, else where the hand has
+            them; of a finger without a cap its tip.
         tips_m: (5, 3) middle of the tip's round end [m], rig frame.
         pads_m: (5, 3) middle of the pad's skin [m], rig frame.
         radius_m: (5,) of the round end [m].
         joints_m: (26, 3) [m], rig frame.
-        rotation: (26, 3, 3) joint frame -> rig frame.
         joints_cov_m2: (26, 3, 3) [m^2], rig frame; where nothing is known, a metre each way.
         T_rig_palm: (4, 4) palm -> rig frame.
-        dorsal, palmar, forward: (3,) unit vectors, rig frame: out of the back of the hand, out of the palm, along the
-            palm to the fingers.
-        size_m: From the wrist to the middle knuckle [m].
         side_sign: +1 right, -1 left.
         palm_world_wxyz: (4,) as in the pose.
     """
@@ -59,98 +63,272 @@ class HandFeatures:
     seen: Bool
     sigma_m: Float
     shape_sigma_m: Float
-    angles_rad: Float
     bend_rad: Float
     curl: Float
+    caps_m: Float
     tips_m: Float
     pads_m: Float
     radius_m: Float
     joints_m: Float
-    rotation: Float
     joints_cov_m2: Float
     T_rig_palm: Float
-    dorsal: Float
-    palmar: Float
-    forward: Float
-    size_m: float
     side_sign: float
     palm_world_wxyz: Float
 
+    @property
+    def palmar(self) -> Float:
+        """Unit vector (3,) out of the palm, rig frame."""
+        return -self.T_rig_palm[:3, 1]
 
-def features_of(pose: HandPose, model: HandModel) -> HandFeatures | None:
-    """The features of a pose of `model`'s hand; None where the pose has no hand.
 
-    A finger of which the pose has nothing is not known, its doubt is infinite, and it stands where fingers that hide
-    are likely to be.
+class _Hand(NamedTuple):
+    """A profile for the kernel.
+
+    Attributes:
+        wrist_m, wrist_rotation: (3,) [m], (3, 3) the wrist joint at rest, palm frame.
+        likely_m, likely_rotation: (26, 3) [m], (26, 3, 3) a hand of which nothing is known, palm frame.
+        cap_joint, cap_offset_m: (5,), (5, 3) joint that carries the finger's cap, and where, in its frame [m].
     """
-    joints, wxyz = pose.position_m, pose.orientation_wxyz
-    there: Float = joints.sum(axis=1) + wxyz.sum(axis=1)
-    if not (pose.valid[WRIST] and isfinite(there[WRIST])):
-        return None
-    rotation, lacking = quaternion_to_matrix(wxyz), np.isnan(there)
-    palm = rotation[WRIST] @ model.rest_rotation[WRIST].T
-    T_rig_palm = rigid(palm, joints[WRIST] - palm @ model.rest_position_m[WRIST])
-    if lacking.any():
-        likely = model.forward(T_rig_palm, LIKELY_RAD)
-        joints = np.where(lacking[:, None], likely.position_m, joints)
-        rotation = np.where(lacking[:, None, None], likely.rotation, rotation)
-    bend = _bends(joints[CHAINS], rotation[CHAINS], palm)
-    total = bend.sum(axis=1)
-    total[0] -= bend[0, 0]
-    told: Bool = np.asarray(np.isfinite(pose.cov_m2.sum(axis=(1, 2))), np.bool_)
-    sigma, wrist = _sigma_m(pose, told)
-    sigma = np.where(lacking[CHAINS].any(axis=1), np.inf, sigma)
-    known = pose.valid[TIPS] & (sigma <= KNOWN_SIGMA_M)
-    last = CHAINS[:, 2]
-    along = joints[last] + _PAD_SHARE * (joints[TIPS] - joints[last])
-    radius = pose.radius_m[last] + _PAD_SHARE * (pose.radius_m[TIPS] - pose.radius_m[last])
-    return HandFeatures(
-        hand=pose.hand,
-        t_ns=pose.t_ns,
-        known=known,
-        seen=pose.tracked[TIPS],
-        sigma_m=sigma,
-        shape_sigma_m=np.sqrt(np.maximum(sigma**2 - wrist**2, 0.0)),
-        angles_rad=pose.angles_rad,
-        bend_rad=bend,
-        curl=np.minimum(np.maximum(total / _CURLED_RAD, 0.0), 1.0),
-        tips_m=joints[TIPS],
-        pads_m=along - radius[:, None] * rotation[TIPS][..., 1],
-        radius_m=pose.radius_m[TIPS],
-        joints_m=joints,
-        rotation=rotation,
-        joints_cov_m2=_cov_m2(pose, told & ~lacking),
-        T_rig_palm=T_rig_palm,
-        dorsal=palm[:, 1],
-        palmar=-palm[:, 1],
-        forward=palm[:, 2],
-        size_m=float(np.linalg.norm(joints[MIDDLE_PROXIMAL] - joints[WRIST])),
-        side_sign=model.side_sign,
-        palm_world_wxyz=pose.palm_world_wxyz,
-    )
+
+    wrist_m: Float
+    wrist_rotation: Float
+    likely_m: Float
+    likely_rotation: Float
+    cap_joint: Int
+    cap_offset_m: Float
 
 
-def _cov_m2(pose: HandPose, known: Bool) -> Float:
-    return pose.cov_m2 if known.all() else np.where(known[:, None, None], pose.cov_m2, np.eye(3))
+class FeatureExtractor:
+    """From poses of one hand to its features. Holds the profile."""
+
+    def __init__(self, model: HandModel) -> None:
+        likely = model.forward(np.eye(4), _LIKELY_RAD)
+        joint, offset = TIPS.copy(), np.zeros((5, 3))
+        for finger, name in enumerate(FINGERS):
+            mount = model.mounts.get(name)
+            if mount is not None and mount.joint is not None:
+                joint[finger], offset[finger] = mount.joint, mount.offset_m
+        self._side_sign = model.side_sign
+        self._hand = _Hand(
+            wrist_m=model.rest_position_m[WRIST].copy(),
+            wrist_rotation=model.rest_rotation[WRIST].copy(),
+            likely_m=likely.position_m,
+            likely_rotation=likely.rotation,
+            cap_joint=joint,
+            cap_offset_m=offset,
+        )
+
+    def of(self, pose: HandPose) -> HandFeatures | None:
+        """Features of a pose; None where it has no hand.
+
+        A finger of which the pose has nothing is not known, its doubt is infinite, and it stands where fingers that
+        hide are likely to be.
+        """
+        if not pose.valid[WRIST]:
+            return None
+        wrist: list[float] = pose.position_m[WRIST].tolist() + pose.orientation_wxyz[WRIST].tolist()
+        if not isfinite(sum(wrist)):
+            return None
+        out = HandFeatures(
+            hand=pose.hand,
+            t_ns=pose.t_ns,
+            known=np.empty(5, np.bool_),
+            seen=pose.tracked[TIPS],
+            sigma_m=np.empty(5),
+            shape_sigma_m=np.empty(5),
+            bend_rad=np.empty((5, 3)),
+            curl=np.empty(5),
+            caps_m=np.empty((5, 3)),
+            tips_m=np.empty((5, 3)),
+            pads_m=np.empty((5, 3)),
+            radius_m=np.empty(5),
+            joints_m=np.empty((26, 3)),
+            joints_cov_m2=np.empty((26, 3, 3)),
+            T_rig_palm=np.empty((4, 4)),
+            side_sign=self._side_sign,
+            palm_world_wxyz=pose.palm_world_wxyz,
+        )
+        _measure(
+            _plain(pose.position_m),
+            _plain(pose.orientation_wxyz),
+            _plain(pose.radius_m),
+            _plain(pose.cov_m2),
+            _plain(pose.valid),
+            _plain(pose.markers_m),
+            self._hand,
+            out.known,
+            out.sigma_m,
+            out.shape_sigma_m,
+            out.bend_rad,
+            out.curl,
+            out.caps_m,
+            out.tips_m,
+            out.pads_m,
+            out.radius_m,
+            out.joints_m,
+            out.joints_cov_m2,
+            out.T_rig_palm,
+        )
+        return out
 
 
-def _sigma_m(pose: HandPose, told: Bool) -> tuple[Float, float]:
-    """Standard deviations (5,) [m] of the tips along their worst axis, inf where not known; and that of the wrist along
-    its best, 0 where not known. `told` (26,) says which covariances are finite."""
-    told = (told & pose.valid)[_TIPS_AND_WRIST]
-    cov = np.where(told[:, None, None], pose.cov_m2[_TIPS_AND_WRIST], 0.0)
-    spread = np.sqrt(np.maximum(np.linalg.eigvalsh(cov), 0.0))
-    return np.where(told[:5], spread[:5, 2], np.inf), float(spread[5, 0])
+def _plain(array: Any) -> Any:
+    """Return the array contiguous and read-only, as kernels are compiled for.
 
-
-def _bends(chain: Float, rotation: Float, palm: Float) -> Float:
-    """`HandFeatures.bend_rad` of joints (5, 4, 3), their frames (5, 4, 3, 3) and the palm's (3, 3)."""
-    bone = chain[:, 1:] - chain[:, :-1]
-    out = np.empty((5, 3))
-    first = bone[:, 0] @ palm
-    out[1:, 0] = np.arctan2(-first[1:, 1], first[1:, 2])
-    out[0, 0] = np.arctan2(-first[0, 1], np.hypot(first[0, 0], first[0, 2]))
-    before, after, hinge = bone[:, :-1], bone[:, 1:], rotation[:, 1:3, :, 0]
-    # A flexion by a turns by -a about the joint's +x.
-    out[:, 1:] = np.arctan2(-np.vecdot(cross(before, after), hinge), np.vecdot(before, after))
+    Those of messages nearly always are.
+    """
+    if array.flags.c_contiguous:
+        return array
+    out = np.ascontiguousarray(array)
+    out.flags.writeable = False
     return out
+
+
+@kernel
+def _measure(
+    position: Float,
+    wxyz: Float,
+    radius: Float,
+    cov: Float,
+    valid: Bool,
+    markers: Float,
+    hand: _Hand,
+    known: Bool,
+    sigma: Float,
+    shape_sigma: Float,
+    bend: Float,
+    curl: Float,
+    caps: Float,
+    tips: Float,
+    pads: Float,
+    tip_radius: Float,
+    joints: Float,
+    joints_cov: Float,
+    T: Float,
+) -> None:
+    """Write `HandFeatures` from `known` on, of the arrays of a pose with a hand."""
+    rotation, lacking = np.empty((26, 3, 3)), np.empty(26, np.bool_)
+    _joints(position, wxyz, hand, joints, rotation, lacking, T)
+    finite = np.empty(26, np.bool_)
+    for j in range(26):
+        total = 0.0
+        for a in range(3):
+            for b in range(3):
+                total += cov[j, a, b]
+        finite[j] = isfinite(total)
+    wrist = spread(cov[WRIST])[0] if finite[WRIST] else 0.0
+    for f in range(5):
+        last, tip = CHAINS[f, 2], CHAINS[f, 3]
+        _bends(f, joints, rotation, T, bend)
+        total = bend[f, 1] + bend[f, 2] + (bend[f, 0] if f > 0 else 0.0)
+        curl[f] = min(max(total / _CURLED_RAD[f], 0.0), 1.0)
+        there = finite[tip] and valid[tip]
+        for k in range(4):
+            there = there and not lacking[CHAINS[f, k]]
+        sigma[f] = spread(cov[tip])[1] if there else inf
+        shape_sigma[f] = sqrt(max(sigma[f] * sigma[f] - wrist * wrist, 0.0))
+        known[f] = valid[tip] and sigma[f] <= KNOWN_SIGMA_M
+        tip_radius[f] = radius[tip]
+        skin = radius[last] + PAD_SHARE * (radius[tip] - radius[last])
+        for i in range(3):
+            along = joints[last, i] + PAD_SHARE * (joints[tip, i] - joints[last, i])
+            tips[f, i], pads[f, i] = joints[tip, i], along - skin * rotation[tip, i, 1]
+            cap, joint = 0.0, hand.cap_joint[f]
+            for k in range(3):
+                cap += rotation[joint, i, k] * hand.cap_offset_m[f, k]
+            caps[f, i] = joints[joint, i] + cap
+    _take_seen(markers, caps)
+    for j in range(26):
+        for a in range(3):
+            for b in range(3):
+                nothing = 1.0 if a == b else 0.0
+                joints_cov[j, a, b] = cov[j, a, b] if finite[j] and not lacking[j] else nothing
+
+
+@inner
+def _joints(
+    position: Float, wxyz: Float, hand: _Hand, joints: Float, rotation: Float, lacking: Bool, T: Float
+) -> None:
+    """Write joints, rotations and the palm's transform.
+
+    Also which joints the pose lacks; these are written as likely.
+    """
+    for j in range(26):
+        w, x, y, z = wxyz[j, 0], wxyz[j, 1], wxyz[j, 2], wxyz[j, 3]
+        lacking[j] = isnan(position[j, 0] + position[j, 1] + position[j, 2] + w + x + y + z)
+        n = sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w / n, x / n, y / n, z / n
+        R = rotation[j]
+        R[0, 0], R[0, 1], R[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)
+        R[1, 0], R[1, 1], R[1, 2] = 2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)
+        R[2, 0], R[2, 1], R[2, 2] = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+        for i in range(3):
+            joints[j, i] = position[j, i]
+    T[3, 0], T[3, 1], T[3, 2], T[3, 3] = 0.0, 0.0, 0.0, 1.0
+    for i in range(3):
+        T[i, 3] = joints[WRIST, i]
+        for k in range(3):
+            T[i, k] = 0.0
+            for m in range(3):
+                T[i, k] += rotation[WRIST, i, m] * hand.wrist_rotation[k, m]
+            T[i, 3] -= T[i, k] * hand.wrist_m[k]
+    for j in range(26):
+        if lacking[j]:
+            for i in range(3):
+                joints[j, i] = T[i, 3]
+                for k in range(3):
+                    joints[j, i] += T[i, k] * hand.likely_m[j, k]
+                    rotation[j, i, k] = 0.0
+                    for m in range(3):
+                        rotation[j, i, k] += T[i, m] * hand.likely_rotation[j, m, k]
+
+
+@inner
+def _bends(f: int, joints: Float, rotation: Float, T: Float, bend: Float) -> None:
+    """Write `HandFeatures.bend_rad` of finger f."""
+    before = 0.0, 0.0, 0.0
+    for k in range(3):
+        a, b = CHAINS[f, k], CHAINS[f, k + 1]
+        after = joints[b, 0] - joints[a, 0], joints[b, 1] - joints[a, 1], joints[b, 2] - joints[a, 2]
+        if k == 0:
+            across, up, ahead = (
+                T[0, 0] * after[0] + T[1, 0] * after[1] + T[2, 0] * after[2],
+                T[0, 1] * after[0] + T[1, 1] * after[1] + T[2, 1] * after[2],
+                T[0, 2] * after[0] + T[1, 2] * after[1] + T[2, 2] * after[2],
+            )
+            bend[f, 0] = atan2(-up, ahead if f > 0 else hypot(across, ahead))
+        else:
+            # A flexion by a turns by -a about the joint's +x.
+            hinge = rotation[a, 0, 0], rotation[a, 1, 0], rotation[a, 2, 0]
+            bend[f, k] = atan2(-dot(cross(before, after), hinge), dot(before, after))
+        before = after
+
+
+@inner
+def _take_seen(markers: Float, caps: Float) -> None:
+    """Put each cap where its marker is.
+
+    That is the nearest one to it, if the cap is the nearest to the marker as well.
+    """
+    own = np.empty(5, np.int64)
+    for f in range(5):
+        own[f], least = -1, inf
+        for m in range(markers.shape[0]):
+            apart = _apart(markers, m, caps, f)
+            if apart < least:
+                own[f], least = m, apart
+        for g in range(5):
+            if least > _OWN_M or _apart(markers, own[f], caps, g) < least:
+                own[f] = -1
+                break
+    for f in range(5):
+        if own[f] >= 0:
+            for i in range(3):
+                caps[f, i] = markers[own[f], i]
+
+
+@inner
+def _apart(markers: Float, m: int, caps: Float, f: int) -> float:
+    """Distance [m] of a marker and a cap; NaN where the marker is not seen."""
+    x, y, z = markers[m, 0] - caps[f, 0], markers[m, 1] - caps[f, 1], markers[m, 2] - caps[f, 2]
+    return sqrt(x * x + y * y + z * z)

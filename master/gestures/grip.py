@@ -1,114 +1,333 @@
-"""Is the hand about a knob? The circle through its tips, and how they are turned against how they were.
+"""Find a grip about a knob: the circle of the tips, and how they turned.
 
 The thumb's tip and those of the fingers lie about one circle, in one plane, pads inwards, the thumb across from the
 fingers. Nothing here remembers anything.
 """
 
-from dataclasses import dataclass
+from math import acos, atan2, cos, hypot, inf, isfinite, nan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.geometry import fit_rigid, matrix_to_rotation_vector
+from common.geometry import quaternion_to_matrix
 from common.gesture_actions import DialSettings
+from common.kernels import inner, kernel
+from master.estimator.small_matrices import diagonalise
+from master.fabrik.rotations import dot
+from master.gestures.features import HandFeatures
 
 _INWARDS = -0.3  # cosine between the pad's side and the way to the middle, at least
+_FLAT_M2 = 1e-20  # places that lie in one line, or in one point, by their scatter
+_EYE = np.eye(3)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tips:
-    """Tips of thumb ... little in a frame that stands still in the room: the caps' middles.
+class Tips(NamedTuple):
+    """Tips of thumb ... little: the caps' middles in a frame still in the room.
 
     Attributes:
         place_m: (5, 3) [m].
         sigma_m: (5,) [m], how sure each is.
-        inwards: (5, 3) unit vectors out of the pads.
-        palmar: (3,) unit vector out of the palm.
-        across_m: Between the skins of the thumb and the finger next to it [m].
-        curl: Of the four fingers together, 0..1.
         known: (5,) whether a tip is known at all.
+        palmar: (3,) unit vector out of the palm.
+        T_still_rig: (3, 3) from the rig frame to that frame.
     """
 
     place_m: Float
     sigma_m: Float
-    inwards: Float
-    palmar: Float
-    across_m: float
-    curl: float
     known: Bool
+    palmar: Float
+    T_still_rig: Float
+
+    @classmethod
+    def of(cls, seen: HandFeatures, sigma_most_m: float, *, worn_only: bool) -> "Tips":
+        """Those of a hand.
+
+        `worn_only`: all that sees it is worn on its arm, and the rig frame goes with it.
+        """
+        turn = _EYE
+        if worn_only and not np.isnan(seen.palm_world_wxyz).any():
+            turn = quaternion_to_matrix(seen.palm_world_wxyz) @ seen.T_rig_palm[:3, :3].T
+        place = seen.caps_m if turn is _EYE else seen.caps_m @ turn.T
+        return cls(place, seen.sigma_m, seen.sigma_m <= sigma_most_m, turn @ seen.palmar, turn)
+
+    def axis(self) -> Float | None:
+        """Axis (3,) of the circle of the known tips, out of the palm.
+
+        None: they are fewer than three.
+        """
+        if self.known.sum() < 3:
+            return None
+        centre, axis = np.empty(3), np.empty(3)
+        _circle(self.place_m, self.known, self.palmar, centre, axis)
+        return axis
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Circle:
-    """The circle of a grip: its middle (3,) [m], axis (3,) from the back of the hand through the palm, radius [m]."""
+def may_grip(seen: HandFeatures, across_m: float, settings: DialSettings) -> bool:
+    """Whether a hand may be about a knob, by all but the places of its tips.
 
-    centre_m: Float
-    axis: Float
-    radius_m: float
-
-
-def grip_of(tips: Tips, settings: DialSettings) -> Circle | None:
-    """The circle of the tips that are known, if the hand is about a knob; None: it is not, or nothing tells."""
-    fingers = np.flatnonzero(tips.known[1:]) + 1
-    if not tips.known[0] or len(fingers) < settings.fingers_least or tips.curl < settings.curl_least:
-        return None
-    chosen = np.concatenate([[0], fingers])
-    circle = circle_through(tips.place_m[chosen], tips.palmar)
-    if float(circle.axis @ tips.palmar) < np.cos(settings.aslant_rad) or tips.across_m < settings.across_m:
-        return None
-    off = tips.place_m[chosen] - circle.centre_m
-    along = off @ circle.axis
-    flat = off - along[:, None] * circle.axis
-    away = np.linalg.norm(flat, axis=1)
-    out = flat / np.maximum(away, 1e-6)[:, None]
-    apart = np.arccos(np.clip(out[1:] @ out[0], -1.0, 1.0))
-    fits = np.hypot(away - circle.radius_m, along) <= settings.round_m
-    good = fits[1:] & (apart >= settings.opposed_rad)
-    good &= -np.vecdot(out[1:], tips.inwards[fingers]) >= _INWARDS
-    if not fits[0] or good.sum() < settings.fingers_least:
-        return None
-    return circle if settings.radius_low_m <= circle.radius_m <= settings.radius_high_m else None
+    `across_m`: between the skins of the thumb and the finger next to it [m].
+    """
+    thumb, *fingers = [one <= settings.sigma_most_m for one in seen.sigma_m.tolist()]
+    if not thumb or sum(fingers) < settings.fingers_least or across_m < settings.across_m:
+        return False
+    return sum(seen.curl.tolist()[1:]) / 4.0 >= settings.curl_least
 
 
-def circle_through(points_m: Float, palmar: Float) -> Circle:
-    """The circle of least algebraic error (Kasa, 1976) in the plane of least squares through points (N, 3), N >= 3,
-    palm frame."""
-    middle = points_m.mean(axis=0)
-    _, _, ways = np.linalg.svd(points_m - middle)
-    axis: Float = ways[2] if float(ways[2] @ palmar) > 0.0 else -ways[2]
-    flat = (points_m - middle) @ ways[:2].T
-    rows = np.column_stack([2.0 * flat, np.ones(len(flat))])
-    found: Float = np.asarray(
-        np.linalg.lstsq(rows, np.square(flat).sum(axis=1), rcond=None)[0], dtype=np.float64
+def is_grip(seen: HandFeatures, tips: Tips, settings: DialSettings) -> bool:
+    """Whether the tips of a hand that may grip lie about a knob."""
+    return _about(
+        tips.place_m,
+        (seen.pads_m - seen.tips_m) @ tips.T_still_rig.T,
+        tips.known,
+        tips.palmar,
+        cos(settings.aslant_rad),
+        settings.round_m,
+        settings.opposed_rad,
+        settings.fingers_least,
+        settings.radius_low_m,
+        settings.radius_high_m,
     )
-    radius = float(np.sqrt(max(found[2] + found[:2] @ found[:2], 0.0)))
-    return Circle(middle + found[:2] @ ways[:2], axis, radius)
+
+
+@kernel
+def _about(
+    place: Float,
+    pads: Float,
+    known: Bool,
+    palmar: Float,
+    aslant: float,
+    round_m: float,
+    opposed: float,
+    least: int,
+    low: float,
+    high: float,
+) -> bool:
+    """Return whether tips are about a knob.
+
+    Pads (5, 3) are from the tip's middle; the rest as of `Tips` and the settings.
+    """
+    centre, axis = np.empty(3), np.empty(3)
+    radius = _circle(place, known, palmar, centre, axis)
+    if axis[0] * palmar[0] + axis[1] * palmar[1] + axis[2] * palmar[2] < aslant or not low <= radius <= high:
+        return False
+    good, a = 0, (axis[0], axis[1], axis[2])
+    thumb = 0.0, 0.0, 0.0
+    for f in range(5):
+        if not known[f]:
+            continue
+        off = place[f, 0] - centre[0], place[f, 1] - centre[1], place[f, 2] - centre[2]
+        along = dot(off, a)
+        flat = off[0] - along * a[0], off[1] - along * a[1], off[2] - along * a[2]
+        away = sqrt(dot(flat, flat))
+        over = max(away, 1e-6)
+        out = flat[0] / over, flat[1] / over, flat[2] / over
+        fits = hypot(away - radius, along) <= round_m
+        if f == 0:
+            if not fits:
+                return False
+            thumb = out
+            continue
+        pad = pads[f, 0], pads[f, 1], pads[f, 2]
+        apart = acos(min(max(dot(out, thumb), -1.0), 1.0))
+        inwards = -dot(out, pad) / sqrt(dot(pad, pad)) >= _INWARDS
+        good += 1 if fits and inwards and apart >= opposed else 0
+    return good >= least
+
+
+@kernel
+def _circle(place: Float, known: Bool, palmar: Float, centre: Float, axis: Float) -> float:
+    """Return the radius of the circle of known places (5, 3).
+
+    Write its centre, and its axis out of the palm.
+
+    The circle of least algebraic error (Kasa, 1976) in the plane of least squares. Along the principal axes of the
+    places about their mean, its normal equations fall apart.
+    """
+    count = 0
+    for i in range(3):
+        centre[i], count = 0.0, 0
+        for f in range(5):
+            if known[f]:
+                centre[i] += place[f, i]
+                count += 1
+        centre[i] /= count
+    scatter, ways = np.zeros((3, 3)), np.empty((3, 3))
+    for f in range(5):
+        for i in range(3):
+            for k in range(3):
+                scatter[i, k] += (place[f, i] - centre[i]) * (place[f, k] - centre[k]) if known[f] else 0.0
+    diagonalise(scatter, ways)
+    least = 0
+    for k in range(1, 3):
+        least = k if scatter[k, k] < scatter[least, least] else least
+    side = ways[0, least] * palmar[0] + ways[1, least] * palmar[1] + ways[2, least] * palmar[2]
+    squares, shift = 0.0, np.zeros(3)
+    for f in range(5):
+        if not known[f]:
+            continue
+        square = 0.0
+        for k in range(3):
+            if k != least:
+                on = _along(place, f, centre, ways, k)
+                square += on * on
+        squares += square / count
+        for k in range(3):
+            shift[k] += 0.5 * square * _along(place, f, centre, ways, k)
+    for k in range(3):
+        shift[k] = shift[k] / scatter[k, k] if k != least and scatter[k, k] > _FLAT_M2 else 0.0
+        squares += shift[k] * shift[k]
+    for i in range(3):
+        axis[i] = ways[i, least] if side > 0.0 else -ways[i, least]
+        for k in range(3):
+            centre[i] += shift[k] * ways[i, k]
+    return sqrt(squares)
+
+
+@inner
+def _along(place: Float, f: int, centre: Float, ways: Float, k: int) -> float:
+    """Return how far a place is from the centre along way k."""
+    total = 0.0
+    for i in range(3):
+        total += (place[f, i] - centre[i]) * ways[i, k]
+    return total
 
 
 def turned_by(now: Tips, then: Tips) -> Float:
-    """Rotation vector (3,) [rad] by which the tips have turned as one since `then`; surer ones count more."""
-    sigma = np.hypot(now.sigma_m, then.sigma_m)
-    weight = 1.0 / np.square(np.where(np.isfinite(sigma), np.maximum(sigma, 1e-3), 0.1))
-    return matrix_to_rotation_vector(fit_rigid(now.place_m, then.place_m, weight)[:3, :3])
+    """Rotation vector (3,) [rad] of the tips as one since `then`.
+
+    Surer ones count more.
+    """
+    return _turned(now.place_m, now.sigma_m, then.place_m, then.sigma_m)
+
+
+@kernel
+def _turned(place: Float, sigma: Float, before: Float, sigma_before: Float) -> Float:
+    """Return the rotation vector (3,) from `before` to `place` (Horn, 1987)."""
+    weight, total = np.empty(5), 0.0
+    middle, middle_before = np.zeros(3), np.zeros(3)
+    for f in range(5):
+        doubt = hypot(sigma[f], sigma_before[f])
+        doubt = max(doubt, 1e-3) if isfinite(doubt) else 0.1
+        weight[f] = 1.0 / (doubt * doubt)
+        total += weight[f]
+        for i in range(3):
+            middle[i] += weight[f] * place[f, i]
+            middle_before[i] += weight[f] * before[f, i]
+    S = np.zeros((3, 3))
+    for f in range(5):
+        for i in range(3):
+            off = (before[f, i] - middle_before[i] / total) * weight[f]
+            for k in range(3):
+                S[i, k] += off * (place[f, k] - middle[k] / total)
+    form, q = np.zeros((4, 4)), np.empty((4, 4))
+    form[0, 0] = S[0, 0] + S[1, 1] + S[2, 2]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        form[i + 1, 0] = S[j, k] - S[k, j]
+        form[i + 1, i + 1] = S[i, i] - S[j, j] - S[k, k]
+        form[max(j, k) + 1, min(j, k) + 1] = S[j, k] + S[k, j]
+    diagonalise(form, q)
+    best = 0
+    for k in range(1, 4):
+        best = k if form[k, k] > form[best, best] else best
+    x, y, z, w = q[1, best], q[2, best], q[3, best], q[0, best]
+    sine = sqrt(x * x + y * y + z * z)
+    scale = 2.0 * atan2(sine, abs(w)) / sine if sine > 1e-9 else 2.0
+    scale = -scale if w < 0.0 else scale
+    out = np.empty(3)
+    out[0], out[1], out[2] = scale * x, scale * y, scale * z
+    return out
+
+
+@kernel
+def axis_of(prior: Float, weight: float, turn: Float) -> Float:
+    """Return the axis (3,) of most weight of a unit vector and a turn.
+
+    The turn is a rotation vector (3,).
+
+    It is the first axis of the sum of both, as a tensor.
+    """
+    both, ways = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for k in range(3):
+            both[i, k] = weight * prior[i] * prior[k] + turn[i] * turn[k]
+    diagonalise(both, ways)
+    best = 0
+    for k in range(1, 3):
+        best = k if both[k, k] > both[best, best] else best
+    side = ways[0, best] * prior[0] + ways[1, best] * prior[1] + ways[2, best] * prior[2]
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = ways[i, best] if side > 0.0 else -ways[i, best]
+    return out
 
 
 def widened_m(tips: Tips, then: Tips) -> float:
-    """By how much the grip is wider than `then` [m]: half of what the thumb's tip has gone from those of the fingers.
+    """By how much the grip is wider than `then` [m].
+
+    Half of what the thumb's tip has gone from those of the fingers.
 
     NaN: the thumb or the fingers are not known.
     """
-    fingers = (tips.known & then.known)[1:]
-    if not (tips.known[0] and then.known[0]) or fingers.sum() < 2:
-        return float("nan")
-    ways = [one.place_m[0] - one.place_m[1:][fingers].mean(axis=0) for one in (tips, then)]
-    return 0.5 * float(np.linalg.norm(ways[0]) - np.linalg.norm(ways[1]))
+    return _widened(tips.place_m, tips.known, then.place_m, then.known)
 
 
-def spread_m(tips: Tips, then: Tips) -> Float:
-    """By how much each tip (5,) is farther from the middle of the known ones than `then` [m]; NaN: it is not known."""
-    known = tips.known & then.known
-    if known.sum() < 3:
-        return np.full(5, np.nan)
-    off = np.array([one.place_m - one.place_m[known].mean(axis=0) for one in (tips, then)])
-    away = np.sqrt(np.vecdot(off, off))
-    return np.where(known, away[0] - away[1], np.nan)
+@kernel
+def _widened(place: Float, known: Bool, before: Float, known_before: Bool) -> float:
+    count, now, then = 0, np.zeros(3), np.zeros(3)
+    for f in range(1, 5):
+        if known[f] and known_before[f]:
+            count += 1
+            for i in range(3):
+                now[i] += place[f, i]
+                then[i] += before[f, i]
+    if count < 2 or not (known[0] and known_before[0]):
+        return nan
+    wide, wide_before = 0.0, 0.0
+    for i in range(3):
+        wide += (place[0, i] - now[i] / count) ** 2
+        wide_before += (before[0, i] - then[i] / count) ** 2
+    return 0.5 * (sqrt(wide) - sqrt(wide_before))
+
+
+def spread_m(tips: Tips, then: Tips) -> float:
+    """The greatest change of a tip's distance from the middle since `then` [m].
+
+    The middle is that of the known tips.
+
+    inf: fewer than three are known.
+    """
+    return _spread(tips.place_m, tips.known, then.place_m, then.known)
+
+
+@kernel
+def _spread(place: Float, known: Bool, before: Float, known_before: Bool) -> float:
+    count, now, then = 0, np.zeros(3), np.zeros(3)
+    for f in range(5):
+        if known[f] and known_before[f]:
+            count += 1
+            for i in range(3):
+                now[i] += place[f, i]
+                then[i] += before[f, i]
+    if count < 3:
+        return inf
+    most = 0.0
+    for f in range(5):
+        if known[f] and known_before[f]:
+            away, away_before = 0.0, 0.0
+            for i in range(3):
+                away += (place[f, i] - now[i] / count) ** 2
+                away_before += (before[f, i] - then[i] / count) ** 2
+            most = max(most, abs(sqrt(away) - sqrt(away_before)))
+    return most
+
+
+def rehearse(seen: HandFeatures) -> None:
+    """Call the kernels once, so that none is compiled while a hand is about a knob."""
+    tips = Tips.of(seen, inf, worn_only=False)
+    is_grip(seen, tips, DialSettings())
+    axis_of(tips.palmar, 1.0, turned_by(tips, tips))
+    spread_m(tips, tips)
+    widened_m(tips, tips)
+    tips.axis()

@@ -1,7 +1,7 @@
 """A gesture that lasts: when it began, and the messages of its beginning, its course and its end."""
 
 from dataclasses import dataclass
-from math import erf, nan, sqrt
+from math import erf, isfinite, nan, sqrt
 
 import numpy as np
 
@@ -58,6 +58,6 @@ class Lasting:
 
 def below(value: float, limit: float, sigma: float) -> float:
     """Probability that what was measured as `value` with a standard deviation is below the limit; 0.5 if unknown."""
-    if not np.isfinite(sigma):
+    if not isfinite(sigma):
         return 0.5
     return 0.5 * (1.0 + erf((limit - value) / (max(sigma, 1e-6) * sqrt(2.0))))

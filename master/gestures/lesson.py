@@ -6,7 +6,7 @@ from common.clock import Clock
 from common.errors import FitError
 from common.hand_model import HandModel
 from common.messages import HandPose
-from master.gestures.features import HandFeatures, features_of
+from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import FingerSpeed
 from master.gestures.quantities import known_bends
 from master.gestures.teach import SHORTEST, Example
@@ -70,9 +70,9 @@ def lesson(
 
 def held(poses: list[HandPose], model: HandModel) -> list[HandFeatures]:
     """The features of poses that have a hand, in order of time, each instant once."""
-    out: list[HandFeatures] = []
+    extractor, out = FeatureExtractor(model), list[HandFeatures]()
     for pose in poses:
-        features = features_of(pose, model)
+        features = extractor.of(pose)
         if features is not None and (not out or features.t_ns > out[-1].t_ns):
             out.append(features)
     return out

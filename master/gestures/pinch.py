@@ -10,8 +10,6 @@ to meet a finger beside it. A gap that is not known neither begins nor ends a pi
 gap that was known last, its confidence falling, until `lost_s` are over.
 """
 
-import numpy as np
-
 from common.gesture_actions import PinchSettings
 from common.hand_model import FINGERS
 from common.messages import Gesture, Phase
@@ -67,31 +65,33 @@ class PinchWatch:
 
     def _begins(self, seen: HandFeatures, touch: ThumbTouch) -> int | None:
         own = self._settings
-        finger = int(np.argmin(touch.gap_m))
-        if touch.gap_m[finger] > own.begin_gap_m or not self._known(touch, finger):
+        gaps: list[float] = touch.gap_m.tolist()
+        gap = min(gaps)
+        finger = gaps.index(gap)
+        if gap > own.begin_gap_m or not self._known(touch, finger):
             return None
-        others = np.delete(np.arange(4), finger)
-        clear_m = float(touch.gap_m[others].min() - touch.gap_m[finger])
+        others = [k for k in range(4) if k != finger]
+        clear_m = min(gaps[k] for k in others) - gap
         if clear_m >= own.away_m:
             return finger
         turned_rad = float(touch.apart_rad[finger] + touch.apart_sigma_rad[finger])
         if clear_m < own.clear_m or turned_rad > own.apart_rad:
             return None
-        return finger if float(seen.curl[1:][others].min()) < own.fist_curl else None
+        return finger if min(float(seen.curl[1 + k]) for k in others) < own.fist_curl else None
 
     def _known(self, touch: ThumbTouch, finger: int) -> bool:
-        return bool(touch.sigma_m[finger] <= self._settings.sigma_most_m)
+        return bool(touch.key_sigma_m[finger, 2] <= self._settings.sigma_most_m)
 
     def _tell(self, pinch: Lasting, phase: Phase, seen: HandFeatures, touch: ThumbTouch) -> Gesture:
         own, gap = self._settings, self._gap_m
-        sigma = float(touch.sigma_m[self._finger])
+        sigma = float(touch.key_sigma_m[self._finger, 2])
         strength = (own.open_gap_m - gap) / (own.open_gap_m - own.closed_gap_m)
         self._last = pinch.told(
             phase,
             seen.t_ns,
             below(gap, own.end_gap_m, sigma),
             distance_m=gap,
-            strength=float(np.clip(strength, 0.0, 1.0)),
+            strength=min(max(strength, 0.0), 1.0),
             origin_m=touch.middle_m[self._finger],
         )
         return self._last

@@ -18,16 +18,17 @@ from math import sqrt
 
 import numpy as np
 
-from common.arrays import Bool, Float
+from common.arrays import Float
 from common.gesture_actions import PointSettings
 from common.hand_model import CHAINS
+from common.kernels import kernel
 from common.messages import Gesture, Phase
+from master.estimator.small_matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting
 
-_EYE = np.eye(3)
 _LASTING = 1.5  # the doubt of a ray that is told already may be larger by this
-_KNUCKLE, _TIP = CHAINS[1, 0], CHAINS[1, 3]
+_KNUCKLE, _TIP = int(CHAINS[1, 0]), int(CHAINS[1, 3])
 
 
 class PointWatch:
@@ -50,7 +51,8 @@ class PointWatch:
         """What is to be told at the instant of the features; it begins only where it may."""
         own, point = self._settings, self._point
         shape, before = self._shape(seen), self._sure
-        self._sure = _ray_sigma_rad(seen) <= own.ray_sigma_rad * (1.0 if point is None else _LASTING)
+        most_rad = own.ray_sigma_rad * (1.0 if point is None else _LASTING)
+        self._sure = _ray_sigma_rad(seen.joints_m, seen.joints_cov_m2) <= most_rad
         if point is None:
             if not (shape and may_begin):
                 self._since_ns = None
@@ -86,44 +88,59 @@ class PointWatch:
 
     def _shape(self, seen: HandFeatures) -> bool:
         """Whether the index finger is stretched and the others are bent, as far as these are known."""
-        own = self._settings
-        slack = own.slack_rad if self.active else 0.0
-        bend = _bends(seen)
-        known = self._known(seen)
-        if not known[1] and not self.active:
+        own, going = self._settings, self.active
+        slack = own.slack_rad if going else 0.0
+        sigma: list[float] = seen.sigma_m.tolist()
+        known = [one <= own.sigma_most_m for one in sigma]
+        _, index, *others = _bends(seen)
+        if not known[1] and not going:
             return False
-        bent = bend[2:] >= own.bent_rad - slack
-        if self.active:
-            bent |= ~known[2:]
-        stretched = bend[1] <= own.stretched_rad + slack or not known[1]
-        return bool(stretched and bent.all())
-
-    def _known(self, seen: HandFeatures) -> Bool:
-        return seen.sigma_m <= self._settings.sigma_most_m
+        bent = all(
+            bend >= own.bent_rad - slack or (going and not sure)
+            for bend, sure in zip(others, known[2:], strict=True)
+        )
+        return bent and (index <= own.stretched_rad + slack or not known[1])
 
     def _tell(self, point: Lasting, phase: Phase, seen: HandFeatures) -> Gesture:
         tip = seen.joints_m[_TIP]
         way = tip - seen.joints_m[_KNUCKLE]
         if not self._sure and self._last is not None:
             way = self._last.direction
-        bend = _bends(seen)
         middle = 0.5 * (self._settings.stretched_rad + self._settings.bent_rad)
-        clear = np.clip((bend[2:] - middle) / middle, 0.0, 1.0).mean() * (0.5 + 0.5 * self._known(seen)[1])
+        clear = [min(max((bend - middle) / middle, 0.0), 1.0) for bend in _bends(seen)[2:]]
+        known = 1.0 if seen.sigma_m[1] <= self._settings.sigma_most_m else 0.5
         self._last = point.told(
-            phase, seen.t_ns, float(clear), origin_m=tip, direction=way / np.linalg.norm(way)
+            phase, seen.t_ns, known * sum(clear) / len(clear), origin_m=tip, direction=way / sqrt(way @ way)
         )
         return self._last
 
 
-def _bends(seen: HandFeatures) -> Float:
+def _bends(seen: HandFeatures) -> list[float]:
     """How far each finger is bent beyond its knuckle (5,) [rad]."""
-    return seen.bend_rad[:, 1:].sum(axis=1)
+    bends: list[list[float]] = seen.bend_rad.tolist()
+    return [pip + dip for _, pip, dip in bends]
 
 
-def _ray_sigma_rad(seen: HandFeatures) -> float:
-    """Standard deviation [rad] of the ray, about the axis where it is worst."""
-    way = seen.joints_m[_TIP] - seen.joints_m[_KNUCKLE]
-    length = sqrt(float(way @ way))
-    across = _EYE - way[:, None] * way / length**2
-    cov = across @ (seen.joints_cov_m2[_TIP] + seen.joints_cov_m2[_KNUCKLE]) @ across
-    return float(np.sqrt(max(np.linalg.eigvalsh(cov)[2], 0.0))) / length
+@kernel
+def _ray_sigma_rad(joints: Float, cov: Float) -> float:
+    """Return the standard deviation [rad] of the ray, about its worst axis.
+
+    Arguments as of `HandFeatures`. What is across the ray of both ends' covariance counts: P C P with P = I - w w'.
+    """
+    x, y, z = (
+        joints[_TIP, 0] - joints[_KNUCKLE, 0],
+        joints[_TIP, 1] - joints[_KNUCKLE, 1],
+        joints[_TIP, 2] - joints[_KNUCKLE, 2],
+    )
+    length = sqrt(x * x + y * y + z * z)
+    w = x / length, y / length, z / length
+    both, along, total = np.empty((3, 3)), np.zeros(3), 0.0
+    for i in range(3):
+        for k in range(3):
+            both[i, k] = cov[_TIP, i, k] + cov[_KNUCKLE, i, k]
+            along[i] += both[i, k] * w[k]
+        total += w[i] * along[i]
+    for i in range(3):
+        for k in range(3):
+            both[i, k] += w[i] * w[k] * total - w[i] * along[k] - along[i] * w[k]
+    return spread(both)[1] / length

@@ -17,42 +17,60 @@ rest, or once it has lasted a while; the end of a natural movement is slow, so t
 """
 
 from collections import deque
-from dataclasses import dataclass
+from math import exp, hypot, inf, isfinite, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Bool, Float
-from common.gesture_settings import GestureSettings, HoldSettings, PoseShape
+from common.gesture_settings import GestureSettings, HoldSettings
 from common.hand_model import FINGERS
+from common.kernels import kernel
 from common.messages import Gesture, Phase
 from master.gestures.features import HandFeatures
 from master.gestures.quantities import QUANTITIES, Quantities, known_bends
 
 _RATE_S = 0.030  # over which the speed of fingers is taken: two frames at 60 Hz, one of a wrist device
 _VAGUE = 4.0  # borders: a quantity that is as doubtful as that is half known
+_ANYTHING = 1e9  # standard deviation of a quantity that is not known: it is as good as anything
 _ENOUGH = 3  # fingers of index ... little: what is told by fewer must last longer
 _MEMORY_S = 0.15  # older frames tell nothing of how fast a finger is now
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Fit:
+class Fit(NamedTuple):
     """How well each pose fits one hand, in the order of `PoseTable.names`.
 
     Attributes:
         score: (P,) 0..1, each for itself, by what is known.
         confidence: (P,) 0..1, against the others.
         known: (P,) enough of its quantities are known, and the fingers that it needs.
+        best: The most confident pose of which enough is known; -1: there is none.
     """
 
     score: Float
     confidence: Float
     known: Bool
+    best: int
 
-    def best(self) -> int | None:
-        """The most confident pose of which enough is known."""
-        if not self.known.any():
-            return None
-        return int(np.argmax(np.where(self.known, self.confidence, -1.0)))
+
+class _Table(NamedTuple):
+    """Poses as arrays for the kernel.
+
+    Attributes:
+        asked: (P, Q) whether a pose asks for a quantity.
+        low, high, soft: (P, Q) its range and border.
+        needs: (P, 5) fingers that must be known.
+        weight: (P,) of the pose.
+        share: Of its quantities that must be known.
+    """
+
+    asked: Bool
+    low: Float
+    high: Float
+    soft: Float
+    needs: Bool
+    weight: Float
+    share: float
 
 
 class PoseTable:
@@ -62,19 +80,24 @@ class PoseTable:
         self.names: tuple[str, ...] = tuple(settings.poses)
         poses = list(settings.poses.values())
         shape = (len(poses), len(QUANTITIES))
-        self._low, self._high, self._soft = np.full(shape, -np.inf), np.full(shape, np.inf), np.ones(shape)
-        self._asked = np.zeros(shape, np.bool_)
-        self._needs = np.array([[finger in pose.needs for finger in FINGERS] for pose in poses], np.bool_)
-        self._needs = self._needs.reshape(len(poses), len(FINGERS))
-        self._weight = np.array([pose.weight for pose in poses])
-        self._share = settings.hold.known_share
+        needs = np.array([[finger in pose.needs for finger in FINGERS] for pose in poses], np.bool_)
+        self._table = own = _Table(
+            asked=np.zeros(shape, np.bool_),
+            low=np.full(shape, -np.inf),
+            high=np.full(shape, np.inf),
+            soft=np.ones(shape),
+            needs=needs.reshape(len(poses), len(FINGERS)),
+            weight=np.array([pose.weight for pose in poses], np.float64),
+            share=settings.hold.known_share,
+        )
         for row, pose in enumerate(poses):
-            self._fill(row, pose)
-        self._vague, self._count = _VAGUE * self._soft, np.maximum(self._asked.sum(axis=1), 1)
+            for name, span in pose.ranges.items():
+                at = row, QUANTITIES.index(name)
+                own.asked[at], own.low[at], own.high[at], own.soft[at] = True, span.low, span.high, span.soft
 
     def misfit(self, quantities: Quantities) -> Float:
         """Distance to each pose's ranges (P, Q), in standard deviations; 0 inside, and where nothing is asked."""
-        return self._misfit(quantities, _doubt(quantities))
+        return self._fit(quantities, np.ones(len(FINGERS), np.bool_))[1]
 
     def fit(self, quantities: Quantities, known: Bool) -> Fit:
         """How well each pose fits.
@@ -83,40 +106,68 @@ class PoseTable:
             quantities: Of the hand.
             known: (5,) which fingers are.
         """
-        doubt = _doubt(quantities)
-        score = np.exp(-0.5 * np.square(self._misfit(quantities, doubt)).sum(axis=1))
-        weight = np.where(self._asked, 1.0 / (1.0 + np.square(doubt / self._vague)), 0.0)
-        share = weight.sum(axis=1) / self._count
-        weighed = self._weight * score
-        total = float(weighed.sum())
-        confidence = score * weighed / total if total > 0.0 else score
-        return Fit(score, confidence, (share >= self._share) & (known | ~self._needs).all(axis=1))
+        return self._fit(quantities, known)[0]
 
-    def _misfit(self, quantities: Quantities, doubt: Float) -> Float:
-        value = np.where(np.isfinite(quantities.value), quantities.value, 0.0)
-        outside = np.maximum(np.maximum(self._low - value, value - self._high), 0.0)
-        return np.where(self._asked, outside / np.hypot(self._soft, doubt), 0.0)
-
-    def _fill(self, row: int, pose: PoseShape) -> None:
-        for name, span in pose.ranges.items():
-            column = QUANTITIES.index(name)
-            self._asked[row, column] = True
-            self._low[row, column], self._high[row, column] = span.low, span.high
-            self._soft[row, column] = span.soft
+    def _fit(self, quantities: Quantities, known: Bool) -> tuple[Fit, Float]:
+        """The fit, and the misfits (P, Q)."""
+        poses, misfit = len(self.names), np.zeros(self._table.low.shape)
+        score, confidence, enough = np.empty(poses), np.empty(poses), np.empty(poses, np.bool_)
+        best = _fit(self._table, quantities.value, quantities.sigma, known, misfit, score, confidence, enough)
+        return Fit(score, confidence, enough, best), misfit
 
 
-def _doubt(quantities: Quantities) -> Float:
-    """Standard deviations (Q,); what is not known is as good as anything."""
-    return np.where(np.isfinite(quantities.value + quantities.sigma), quantities.sigma, 1e9)
+@kernel
+def _fit(
+    table: _Table,
+    value: Float,
+    sigma: Float,
+    known: Bool,
+    misfit: Float,
+    score: Float,
+    confidence: Float,
+    enough: Bool,
+) -> int:
+    """Return the best pose; write the fields of `Fit`, and misfits (P, Q).
+
+    The misfits are zero before.
+    """
+    poses, count = table.low.shape
+    total = 0.0
+    for p in range(poses):
+        squares, share, asked = 0.0, 0.0, 0
+        for q in range(count):
+            if not table.asked[p, q]:
+                continue
+            there = isfinite(value[q] + sigma[q])
+            doubt = sigma[q] if there else _ANYTHING
+            own = value[q] if isfinite(value[q]) else 0.0
+            outside = max(table.low[p, q] - own, own - table.high[p, q], 0.0)
+            misfit[p, q] = outside / hypot(table.soft[p, q], doubt)
+            squares += misfit[p, q] * misfit[p, q]
+            vague = doubt / (_VAGUE * table.soft[p, q])
+            share += 1.0 / (1.0 + vague * vague)
+            asked += 1
+        score[p] = confidence[p] = exp(-0.5 * squares)
+        total += table.weight[p] * score[p]
+        enough[p] = share / max(asked, 1) >= table.share
+        for f in range(5):
+            enough[p] = enough[p] and (known[f] or not table.needs[p, f])
+    best = -1
+    for p in range(poses):
+        if total > 0.0:
+            confidence[p] = score[p] * table.weight[p] * score[p] / total
+        if enough[p] and (best < 0 or confidence[p] > confidence[best]):
+            best = p
+    return best
 
 
 class FingerSpeed:
     """How fast the fingers bend. The state it holds is the bends of the last frames."""
 
     def __init__(self) -> None:
-        self._past: deque[tuple[int, Float, Bool]] = deque()
+        self._past: deque[tuple[int, list[float], list[bool]]] = deque()
 
-    def push(self, t_ns: int, bend_deg: Float, known: Bool) -> float:
+    def push(self, t_ns: int, bend_deg: list[float], known: list[bool]) -> float:
         """Speed [deg/s], root mean square over the fingers known then and now, or over all where none is; inf where no
         frame tells.
 
@@ -130,11 +181,10 @@ class FingerSpeed:
         self._past.append((t_ns, bend_deg, known))
         for then_ns, before, told in reversed(self._past):
             if t_ns - then_ns >= 1e9 * _RATE_S:
-                both = told & known
-                moved = (bend_deg - before)[both] if both.any() else bend_deg - before
-                change = moved / (1e-9 * (t_ns - then_ns))
-                return float(np.sqrt((change**2).mean()))
-        return np.inf
+                moved = [now - then for now, then in zip(bend_deg, before, strict=True)]
+                both = [one for one, *sure in zip(moved, told, known, strict=True) if all(sure)] or moved
+                return sqrt(sum(one * one for one in both) / len(both)) / (1e-9 * (t_ns - then_ns))
+        return inf
 
 
 class PoseRecogniser:
@@ -164,8 +214,9 @@ class PoseRecogniser:
         """What is to be said of a hand; instants rise."""
         quantities = Quantities.of(features)
         fit = self._table.fit(quantities, features.known)
-        speed = self._speed.push(features.t_ns, *known_bends(features))
-        begins = self._beginning(features, fit, speed)
+        bends, known = known_bends(features)
+        speed = self._speed.push(features.t_ns, bends, known)
+        begins = self._beginning(features, fit, speed, sum(known))
         if begins is not None and begins != self._held:
             return self._begin(features, begins, float(fit.confidence[begins]))
         return self._go_on(features, fit)
@@ -175,18 +226,18 @@ class PoseRecogniser:
         self._coming = None
         return [] if self._held is None else self._unsure(hand, t_ns, self._hold.lost_s)
 
-    def _beginning(self, features: HandFeatures, fit: Fit, speed: float) -> int | None:
+    def _beginning(self, features: HandFeatures, fit: Fit, speed: float, known: int) -> int | None:
         """The pose that would be held now, whatever is: confident, for long enough, by a hand that rests."""
-        best, t_ns = fit.best(), features.t_ns
+        best, t_ns = fit.best, features.t_ns
         # Of both kinds of sensors none may see a tip just now and fingers be known all the same.
-        there = (features.seen | features.known).any()
-        if best is None or fit.confidence[best] < self._hold.begin or not there:
+        there = features.seen.any() or features.known.any()
+        if best < 0 or fit.confidence[best] < self._hold.begin or not there:
             self._coming = None
             return None
         if best != self._coming:
             self._coming, self._coming_ns = best, t_ns
         lasted_s = 1e-9 * (t_ns - self._coming_ns)
-        enough = features.known[1:].sum() >= _ENOUGH
+        enough = known >= _ENOUGH
         rests = (
             lasted_s >= (self._hold.begin_s if enough else self._hold.doubt_s)
             and speed <= self._hold.still_deg_s

@@ -7,23 +7,23 @@ tip's doubt that the palm's place has as well moves all of them alike, and is le
 """
 
 from dataclasses import dataclass
+from math import atan2, degrees, hypot, isfinite, sqrt
 from typing import get_args
 
 import numpy as np
 
 from common.arrays import Bool, Float
 from common.gesture_settings import Quantity
-from common.hand_model import CHAINS
+from common.hand_model import CHAINS, MIDDLE_PROXIMAL, WRIST
+from common.kernels import inner, kernel
 from master.gestures.features import HandFeatures
 
 QUANTITIES: tuple[Quantity, ...] = get_args(Quantity)
-HIDDEN_DEG, HIDDEN_SIGMA_DEG = (
-    np.array([55.0, 75.0]),
-    45.0,
-)  # MCP and PIP of a finger that hides; of their sum
+# MCP and PIP of a finger that hides, and of their sum the standard deviation.
+_HIDDEN_DEG, _HIDDEN_SIGMA_DEG = (55.0, 75.0), 45.0
 _COUNT = len(QUANTITIES)
-_BENDS = slice(0, 12)  # index ... little, each MCP, PIP, both
-_THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _SPREADS = 12, slice(13, 16), slice(16, 20), 20, slice(22, 25)
+# Where they begin: index ... little, each MCP, PIP, both; and so on.
+_THUMB_BEND, _THUMB_PLACE, _GAPS, _AHEAD, _ALL, _SPREADS = 12, 13, 16, 20, 21, 22
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,58 +42,119 @@ class Quantities:
     def of(cls, features: HandFeatures) -> "Quantities":
         """Those of one hand."""
         value, sigma = np.empty(_COUNT), np.empty(_COUNT)
-        chain, doubt = features.joints_m[CHAINS], features.shape_sigma_m
-        bend = np.degrees(features.bend_rad)
-        bone = chain[:, 2:] - chain[:, 1:-1]
-        lever = np.sqrt(np.vecdot(bone, bone)).sum(axis=1)
-        turned = np.degrees(doubt / lever)
-        bend[1:, :2], turned[1:] = _hidden(bend[1:, :2], turned[1:], features.seen[1:])
-        both = bend[1:, :2].sum(axis=1)
-        each = value[_BENDS].reshape(4, 3)  # a view
-        each[:, :2], each[:, 2] = bend[1:, :2], both
-        sigma[_BENDS] = turned[1:].repeat(3)
-        value[_THUMB_BEND], sigma[_THUMB_BEND] = bend[0, 1:].sum(), turned[0]
-        place = (features.tips_m[0] - features.T_rig_palm[:3, 3]) @ features.T_rig_palm[:3, :3]
-        value[_THUMB_PLACE] = place * [features.side_sign, -1.0, 1.0] / features.size_m
-        sigma[_THUMB_PLACE] = doubt[0] / features.size_m
-        off = features.tips_m[1:] - features.tips_m[0]
-        apart = np.sqrt(np.vecdot(off, off))
-        value[_GAPS] = 1e3 * (apart - features.radius_m[1:] - features.radius_m[0])
-        sigma[_GAPS] = 1e3 * np.hypot(doubt[1:], doubt[0])
-        value[_AHEAD] = both[0] - both[1:].mean()
-        sigma[_AHEAD] = np.hypot(turned[1], np.sqrt((turned[2:] ** 2).sum()) / 3.0)
-        value[_AHEAD + 1], sigma[_AHEAD + 1] = both.mean(), turned[1:].mean()  # neighbours are wrong alike
-        value[_SPREADS], sigma[_SPREADS] = _spreads(chain, features), np.hypot(turned[1:-1], turned[2:])
+        _write(
+            features.joints_m,
+            features.tips_m,
+            features.radius_m,
+            features.shape_sigma_m,
+            features.bend_rad,
+            features.seen,
+            features.T_rig_palm,
+            features.side_sign,
+            value,
+            sigma,
+        )
         return cls(value, sigma)
 
 
-def _hidden(bend: Float, sigma: Float, seen: Bool) -> tuple[Float, Float]:
-    """Bends (4, 2) [deg] of MCP and PIP and their doubt (4,) [deg], where fingers that hide are likely bent.
+@kernel
+def _write(
+    joints: Float,
+    tips: Float,
+    radius: Float,
+    doubt: Float,
+    bend: Float,
+    seen: Bool,
+    T: Float,
+    side: float,
+    value: Float,
+    sigma: Float,
+) -> None:
+    """Write values and standard deviations (Q,); arguments as of `HandFeatures`."""
+    turned = np.empty(5)
+    for f in range(5):
+        lever = _length(joints, CHAINS[f, 1], CHAINS[f, 2]) + _length(joints, CHAINS[f, 2], CHAINS[f, 3])
+        turned[f] = degrees(doubt[f] / lever)
+    size = _length(joints, WRIST, MIDDLE_PROXIMAL)
+    value[_THUMB_BEND], sigma[_THUMB_BEND] = degrees(bend[0, 1] + bend[0, 2]), turned[0]
+    for i in range(3):
+        place = 0.0
+        for k in range(3):
+            place += (tips[0, k] - T[k, 3]) * T[k, i]
+        value[_THUMB_PLACE + i] = place * (side if i == 0 else -1.0 if i == 1 else 1.0) / size
+        sigma[_THUMB_PLACE + i] = doubt[0] / size
+    others, others_2, every, doubts = 0.0, 0.0, 0.0, 0.0
+    for f in range(1, 5):
+        weight, turned[f] = _hidden(turned[f], seen[f])
+        both, column = 0.0, 3 * (f - 1)
+        for k in range(2):
+            own = degrees(bend[f, k])
+            value[column + k] = own + weight * (_HIDDEN_DEG[k] - own)
+            both += value[column + k]
+        value[column + 2] = both
+        for k in range(3):
+            sigma[column + k] = turned[f]
+        off = sqrt(
+            (tips[f, 0] - tips[0, 0]) ** 2 + (tips[f, 1] - tips[0, 1]) ** 2 + (tips[f, 2] - tips[0, 2]) ** 2
+        )
+        value[_GAPS + f - 1] = 1e3 * (off - radius[f] - radius[0])
+        sigma[_GAPS + f - 1] = 1e3 * hypot(doubt[f], doubt[0])
+        every += both / 4.0
+        doubts += turned[f] / 4.0  # neighbours are wrong alike
+        if f > 1:
+            others += both / 3.0
+            others_2 += turned[f] * turned[f]
+    value[_AHEAD], sigma[_AHEAD] = value[2] - others, hypot(turned[1], sqrt(others_2) / 3.0)
+    value[_ALL], sigma[_ALL] = every, doubts
+    before = 0.0
+    for f in range(1, 5):
+        heading = _heading(f, joints, T, side)
+        if f > 1:
+            value[_SPREADS + f - 2] = before - heading
+            sigma[_SPREADS + f - 2] = hypot(turned[f - 1], turned[f])
+        before = heading
+
+
+@inner
+def _length(joints: Float, a: int, b: int) -> float:
+    """Distance of two joints [m]."""
+    x, y, z = joints[b, 0] - joints[a, 0], joints[b, 1] - joints[a, 1], joints[b, 2] - joints[a, 2]
+    return sqrt(x * x + y * y + z * z)
+
+
+@inner
+def _hidden(sigma: float, seen: bool) -> tuple[float, float]:
+    """Return how far a finger is taken for hidden, 0..1, and its sigma [deg].
 
     A straight finger is seldom hidden, neither from cameras nor from a device at the wrist; a bent one lies behind the
     hand or before the palm. That an unseen finger hides is joined with what is believed of it, as one more witness.
     """
-    known = np.isfinite(sigma)
-    own = np.where(known, sigma, 0.0)
-    weight = np.where(seen, 0.0, np.where(known, own * own / (own * own + HIDDEN_SIGMA_DEG**2), 1.0))
-    joined = np.sqrt(1.0 - weight) * own
-    return bend + weight[:, None] * (HIDDEN_DEG - bend), np.where(weight >= 1.0, HIDDEN_SIGMA_DEG, joined)
+    if not isfinite(sigma):
+        return (0.0, 0.0) if seen else (1.0, _HIDDEN_SIGMA_DEG)
+    weight = 0.0 if seen else sigma * sigma / (sigma * sigma + _HIDDEN_SIGMA_DEG * _HIDDEN_SIGMA_DEG)
+    return weight, sqrt(1.0 - weight) * sigma
 
 
-def _spreads(chain: Float, features: HandFeatures) -> Float:
-    """Angles (3,) [deg] between neighbouring fingers' first bones (5, 4, 3) in the palm's plane, open is positive.
+@inner
+def _heading(f: int, joints: Float, T: Float, side: float) -> float:
+    """Return where a finger's first bone heads [deg] in the palm's plane.
+
+    To the thumb is positive.
 
     Fingers that stand up from that plane have no heading in it: their angle fades with what is left.
     """
-    first = (chain[1:, 1] - chain[1:, 0]) @ features.T_rig_palm[:3, :3]
-    level = np.hypot(first[:, 0], first[:, 2]) / np.sqrt(np.vecdot(first, first))
-    heading = features.side_sign * np.arctan2(first[:, 0], first[:, 2]) * np.minimum(level / 0.6, 1.0)
-    return np.degrees(heading[:-1] - heading[1:])
+    x, y, z = 0.0, 0.0, 0.0
+    for k in range(3):
+        bone = joints[CHAINS[f, 1], k] - joints[CHAINS[f, 0], k]
+        x, y, z = x + bone * T[k, 0], y + bone * T[k, 1], z + bone * T[k, 2]
+    level = hypot(x, z) / sqrt(x * x + y * y + z * z)
+    return degrees(side * atan2(x, z) * min(level / 0.6, 1.0))
 
 
-def known_bends(features: HandFeatures) -> tuple[Float, Bool]:
+def known_bends(features: HandFeatures) -> tuple[list[float], list[bool]]:
     """Bends (4,) [deg] of index ... little, MCP and PIP together, and which of these fingers are known."""
-    return np.degrees(features.bend_rad[1:, :2].sum(axis=1)), features.known[1:]
+    bends: list[list[float]] = features.bend_rad.tolist()
+    return [degrees(mcp + pip) for mcp, pip, _ in bends[1:]], features.known.tolist()[1:]
 
 
 def known_of(quantities: Quantities) -> Bool:

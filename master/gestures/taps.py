@@ -13,13 +13,15 @@ whose tip is seen while its bones may be anywhere, as those of a palm that one p
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from common.arrays import Float
 from common.gesture_actions import TapSettings
-from common.hand_model import CHAINS
+from common.hand_model import CHAINS, TIPS
 from common.messages import Gesture
+from master.estimator.small_matrices import spread
 from master.gestures.features import HandFeatures
 from master.gestures.lasting import Lasting, below
 from master.gestures.touch import ThumbTouch
@@ -32,42 +34,20 @@ _DOWN_M = 0.001  # a thumb whose gap is larger than the least by less is down
 _NEVER_NS = -(2**61)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Instant:
+class _Instant(NamedTuple):
     """The thumb at an instant of a touch.
 
     Attributes:
         gap_m: (4,) to index ... little.
         sigma_m: Of the least of them.
-        place_sigma_m: Of the PIP of that finger, along its worst axis.
-        beyond_m: (4, 2) how far beyond the bends of PIP and DIP of each.
-        weight: 1 over the variance of the thumb's tip.
-        middle_m: (4, 3, 3) between the thumb's tip and the middle of each segment, rig frame.
+        thumb_sigma_m: Of the thumb's tip.
+        joints_m: (26, 3), rig frame.
     """
 
-    gap_m: Float
+    gap_m: list[float]
     sigma_m: float
-    place_sigma_m: float
-    beyond_m: Float
-    weight: float
-    middle_m: Float
-
-    @classmethod
-    def of(cls, seen: HandFeatures, touch: ThumbTouch) -> "_Instant":
-        """That of a hand."""
-        gap = touch.key_gap_m.min(axis=1)
-        chain = seen.joints_m[CHAINS[1:]]
-        bone = chain[:, 1:] - chain[:, :-1]
-        bone = bone / np.sqrt(np.vecdot(bone, bone))[..., None]
-        tip, finger = seen.tips_m[0], int(gap.argmin())
-        return cls(
-            gap_m=gap,
-            sigma_m=_sigma_m(touch, finger),
-            place_sigma_m=_worst_m(seen.joints_cov_m2[CHAINS[finger + 1, 1]]),
-            beyond_m=np.vecdot(tip - chain[:, 1:3], bone[:, :-1] + bone[:, 1:]) * 0.5,
-            weight=1.0 / max(float(seen.sigma_m[0]), 1e-4) ** 2,
-            middle_m=0.5 * (0.5 * (chain[:, :-1] + chain[:, 1:]) + tip),
-        )
+    thumb_sigma_m: float
+    joints_m: Float
 
 
 @dataclass(slots=True)
@@ -97,17 +77,24 @@ class TapWatch:
 
     def push(self, seen: HandFeatures, touch: ThumbTouch, *, may_begin: bool) -> list[Gesture]:
         """What is to be told at the instant of the features; a touch begins only where it may."""
-        own, now = self._settings, _Instant.of(seen, touch)
-        known = now.sigma_m <= own.sigma_most_m and now.place_sigma_m <= own.place_sigma_m
+        own = self._settings
+        keys: list[list[float]] = touch.key_gap_m.tolist()
+        gaps = [min(one) for one in keys]
+        gap = min(gaps)
+        finger = gaps.index(gap)
+        segment = keys[finger].index(gap)
+        sigma = float(touch.key_sigma_m[finger, segment])
+        # Of the finger its PIP must be known, too, along its worst axis.
+        known = sigma <= own.sigma_most_m and _worst_m(seen, CHAINS[finger + 1, 1]) <= own.place_sigma_m
+        now = _Instant(gaps, sigma, float(seen.sigma_m[0]), seen.joints_m)
         if self._touch is not None:
             return self._go_on(self._touch, seen, now, known=known)
         if not known:
             return []
-        finger = int(now.gap_m.argmin())
-        gap = float(now.gap_m[finger])
         if gap >= own.leave_gap_m:
             self._clear_ns, self._clear_rad = seen.t_ns, _bend_rad(seen)
-        if gap <= own.touch_gap_m and may_begin and self._begins(seen, touch, finger):
+        palmar = bool(touch.key_palmar[finger, segment] > _PALMAR)
+        if gap <= own.touch_gap_m and may_begin and palmar and self._begins(seen):
             self._touch = _Touch(seen.t_ns, self._clear_rad, gap, [now])
         return []
 
@@ -117,7 +104,7 @@ class TapWatch:
 
     def _go_on(self, going: _Touch, seen: HandFeatures, now: _Instant, *, known: bool) -> list[Gesture]:
         """A touch goes on, ends as a tap, or was none."""
-        own, gap = self._settings, float(now.gap_m.min())
+        own, gap = self._settings, min(now.gap_m)
         lasted = (seen.t_ns - going.began_ns) * 1e-9
         closes = abs(_bend_rad(seen) - going.bend_rad) > own.quiet_rad
         if lasted > own.longest_s or closes or (known and gap < -own.pressed_m) or not is_pad(seen, own):
@@ -134,53 +121,66 @@ class TapWatch:
             return []
         return self._tapped(going, seen)
 
-    def _begins(self, seen: HandFeatures, touch: ThumbTouch, finger: int) -> bool:
+    def _begins(self, seen: HandFeatures) -> bool:
         own = self._settings
-        if (seen.t_ns - self._tapped_ns) * 1e-9 < own.apart_s:
-            return False
-        if (seen.t_ns - self._clear_ns) * 1e-9 > own.approach_s:
-            return False
-        segment = int(np.argmin(touch.key_gap_m[finger]))
-        return bool(touch.key_palmar[finger, segment] > _PALMAR and is_pad(seen, own))
+        apart = (seen.t_ns - self._tapped_ns) * 1e-9 >= own.apart_s
+        return apart and (seen.t_ns - self._clear_ns) * 1e-9 <= own.approach_s and is_pad(seen, own)
 
     def _tapped(self, gone: _Touch, seen: HandFeatures) -> list[Gesture]:
         """The tap of a touch that is over; nothing where two fingers may have been touched."""
-        least = [float(one.gap_m.min()) for one in gone.instants]
+        least = [min(one.gap_m) for one in gone.instants]
         down = next(k for k, gap in enumerate(least) if gap <= gone.least_m + _DOWN_M)
         course, nearest = gone.instants[down:], gone.instants[int(np.argmin(least))]
-        weight = np.array([one.weight for one in course])
+        weight = np.array([1.0 / max(one.thumb_sigma_m, 1e-4) ** 2 for one in course])
         weight = weight / weight.sum()
         gap = weight @ np.array([one.gap_m for one in course])
         finger = int(gap.argmin())
         nearer_m = float(np.delete(gap, finger).min() - gap[finger])
         if nearer_m < self._settings.nearer_m:
             return []
-        beyond = np.tensordot(weight, np.array([one.beyond_m for one in course]), axes=1)[finger]
+        beyond = weight @ _beyond_m(np.array([one.joints_m for one in course]), finger)
         segment = 2 if beyond[1] > 0.0 else int(beyond[0] > 0.0)
         sigma = nearest.sigma_m
         sure = below(gone.least_m, self._settings.leave_gap_m, sigma) * below(0.0, nearer_m, sigma)
         sure *= below(0.0, float(np.abs(beyond).min()), sigma)
         self._tapped_ns = seen.t_ns
         tap = Lasting(seen.hand, "tap", KEYS[finger][segment], gone.began_ns)
-        middle = nearest.middle_m[finger, segment]
+        ends = CHAINS[finger + 1, segment : segment + 2]
+        middle = 0.5 * (nearest.joints_m[ends].mean(axis=0) + nearest.joints_m[TIPS[0]])
         return [tap.told("end", seen.t_ns, sure, distance_m=gone.least_m, origin_m=middle)]
 
 
 def is_pad(seen: HandFeatures, settings: TapSettings) -> bool:
     """Whether the four fingers lie side by side, bent alike, and are no fist."""
-    bend = seen.bend_rad[1:, :2].sum(axis=1)
-    return bool(np.ptp(bend) <= settings.level_rad and seen.curl[1:].max() <= settings.curl_most)
+    bend, curl = _finger_bends(seen), seen.curl.tolist()
+    return max(bend) - min(bend) <= settings.level_rad and max(curl[1:]) <= settings.curl_most
+
+
+def _finger_bends(seen: HandFeatures) -> list[float]:
+    """How far each of the four fingers is bent [rad], MCP and PIP together."""
+    bends: list[list[float]] = seen.bend_rad.tolist()
+    return [mcp + pip for mcp, pip, _ in bends[1:]]
 
 
 def _bend_rad(seen: HandFeatures) -> float:
-    """How far the four fingers are bent together [rad], MCP and PIP."""
-    return float(seen.bend_rad[1:, :2].sum(axis=1).mean())
+    """How far the four fingers are bent together [rad]."""
+    return sum(_finger_bends(seen)) / 4.0
 
 
-def _sigma_m(touch: ThumbTouch, finger: int) -> float:
-    """Of the gap (0 ... 3) to the finger, that of the segment that is nearest."""
-    return float(touch.key_sigma_m[finger, int(touch.key_gap_m[finger].argmin())])
+def _worst_m(seen: HandFeatures, joint: int) -> float:
+    """Standard deviation [m] of a joint along its worst axis."""
+    return spread(seen.joints_cov_m2[joint])[1]
 
 
-def _worst_m(cov_m2: Float) -> float:
-    return float(np.sqrt(max(np.linalg.eigvalsh(cov_m2)[2], 0.0)))
+def _beyond_m(joints_m: Float, finger: int) -> Float:
+    """How far (N, 2) [m] the thumb's tip is beyond PIP and DIP of a finger.
+
+    Beyond the planes that halve its bends there.
+
+    Of hands (N, 26, 3) [m] and a finger 0 ... 3.
+    """
+    chain = joints_m[:, CHAINS[finger + 1]]
+    bone = np.diff(chain, axis=1)
+    bone = bone / np.linalg.norm(bone, axis=2, keepdims=True)
+    tip = joints_m[:, TIPS[0], None]
+    return np.vecdot(tip - chain[:, 1:3], bone[:, :-1] + bone[:, 1:]) * 0.5

@@ -7,14 +7,14 @@ import pytest
 from common.geometry import rigid, transform
 from common.hand_model import WRIST, HandModel
 from common.messages import HandPose
-from master.gestures.features import KNOWN_SIGMA_M, HandFeatures, features_of
+from master.gestures.features import KNOWN_SIGMA_M, FeatureExtractor, HandFeatures
 from master.gestures.quantities import QUANTITIES, Quantities
 from tests.hand_helpers import LEFT, RIGHT, any_rotation, palm
 from tests.master.gestures.shown_hands import PINCH, POINT, posture, shown
 
 
 def of(pose: HandPose, model: HandModel = RIGHT) -> HandFeatures:
-    features = features_of(pose, model)
+    features = FeatureExtractor(model).of(pose)
     assert features is not None
     return features
 
@@ -74,7 +74,7 @@ def test_a_pose_without_a_hand_has_no_features() -> None:
     pose = shown(posture(POINT))
     valid = pose.valid.copy()
     valid[WRIST] = False
-    assert features_of(msgspec.structs.replace(pose, valid=valid, tracked=valid), RIGHT) is None
+    assert FeatureExtractor(RIGHT).of(msgspec.structs.replace(pose, valid=valid, tracked=valid)) is None
 
 
 def test_a_finger_that_a_pose_lacks_leaves_the_others() -> None:
@@ -104,6 +104,5 @@ def test_a_hidden_finger_is_taken_for_bent_and_a_seen_one_is_not() -> None:
 def test_the_palm_frame_is_that_of_the_pose() -> None:
     T = palm(np.array([20.0, -10.0, 5.0]))
     features = of(shown(posture(POINT), T_rig_palm=T))
-    np.testing.assert_allclose(features.dorsal, T[:3, 1], atol=1e-9)
     np.testing.assert_allclose(features.palmar, -T[:3, 1], atol=1e-9)
     np.testing.assert_allclose(transform(T, np.zeros(3)), features.joints_m[WRIST], atol=1e-9)

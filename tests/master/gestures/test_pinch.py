@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.gesture_settings import default_gestures
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.pinch import PinchWatch
 from master.gestures.touch import ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT
@@ -20,7 +20,7 @@ def told_of(
     doubt_deg: float = 5.0,
 ) -> list[str]:
     """Names of the pinches that begin at such gaps to index ... little."""
-    seen = features_of(shown(posture(PINCH), FRAME_NS), RIGHT)
+    seen = FeatureExtractor(RIGHT).of(shown(posture(PINCH), FRAME_NS))
     assert seen is not None
     touch = changed(thumb_touch(seen, RIGHT.radius_m), gap_mm, sigma_mm, apart_deg, doubt_deg)
     return [one.name for one in PinchWatch(PINCHES).push(seen, touch, may_begin=True)]
@@ -29,14 +29,10 @@ def told_of(
 def changed(
     touch: ThumbTouch, gap_mm: tuple[float, ...], sigma_mm: float, apart_deg: float, doubt_deg: float
 ) -> ThumbTouch:
-    return ThumbTouch(
+    return touch._replace(
         gap_m=1e-3 * np.array(gap_mm),
-        middle_m=touch.middle_m,
         apart_rad=np.full(4, np.radians(apart_deg)),
         apart_sigma_rad=np.full(4, np.radians(doubt_deg)),
-        key_gap_m=touch.key_gap_m,
-        key_on=touch.key_on,
-        key_palmar=touch.key_palmar,
         key_sigma_m=np.full((4, 3), 1e-3 * sigma_mm),
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 from common.gesture_settings import default_gestures
 from common.hand_model import CHAINS
 from common.messages import Gesture
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.point import PointWatch
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import FRAME_NS, POINT, posture, shown
@@ -18,7 +18,7 @@ def told_of(knuckle_sigma_m: list[float]) -> list[Gesture]:
         pose = shown(posture(POINT), k * FRAME_NS)
         cov = pose.cov_m2.copy()
         cov[CHAINS[1, 0]] = sigma**2 * np.eye(3)
-        seen = features_of(msgspec.structs.replace(pose, cov_m2=cov), RIGHT)
+        seen = FeatureExtractor(RIGHT).of(msgspec.structs.replace(pose, cov_m2=cov))
         assert seen is not None
         out += watch.push(seen, may_begin=True)
     return out

@@ -13,7 +13,7 @@ from common.gesture_settings import GestureSettings, HoldSettings, default_gestu
 from common.hand_model import HandModel
 from common.messages import Gesture, HandPose
 from common.sim.motion import POSES, REST, angles_of, smooth_step
-from master.gestures.features import HandFeatures, features_of
+from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.poses import PoseRecogniser
 from master.study.participant import participant
 from tests.hand_helpers import LEFT, RIGHT
@@ -32,7 +32,9 @@ def play(
     """What is held after each posture, and all that is said."""
     recogniser, held, said = PoseRecogniser(settings), list[str | None](), list[Gesture]()
     for k, one in enumerate(angles):
-        features = features_of(shown(one, k * FRAME_NS, model, sigma_m=sigma_m, tracked=tracked), model)
+        features = FeatureExtractor(model).of(
+            shown(one, k * FRAME_NS, model, sigma_m=sigma_m, tracked=tracked)
+        )
         assert features is not None
         said += recogniser.push(features)
         held.append(recogniser.held)
@@ -161,7 +163,7 @@ def test_thresholds_of_the_file_are_what_counts() -> None:
 
 
 def _features(pose: HandPose) -> HandFeatures:
-    features = features_of(pose, RIGHT)
+    features = FeatureExtractor(RIGHT).of(pose)
     assert features is not None
     return features
 

@@ -13,7 +13,7 @@ from common.gesture_settings import default_gestures
 from common.hand_model import CHAINS
 from common.messages import Gesture, HandPose
 from common.sim.motion import angles_of
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.taps import TapWatch
 from master.gestures.touch import thumb_touch
 from tests.hand_helpers import RIGHT, palm
@@ -55,7 +55,7 @@ def gap_at(k: int, down: int = 5, pace: int = 8) -> float:
 def told_of(pose: Callable[[int], HandPose], frames: int = 80, settings: TapSettings = TAPS) -> list[Gesture]:
     watch, out = TapWatch(settings), list[Gesture]()
     for k in range(frames):
-        seen = features_of(pose(k), RIGHT)
+        seen = FeatureExtractor(RIGHT).of(pose(k))
         assert seen is not None
         out += watch.push(seen, thumb_touch(seen, RIGHT.radius_m), may_begin=True)
     return out

@@ -14,7 +14,7 @@ from common.gesture_settings import GestureSettings, default_gestures
 from common.hand_model import HandModel
 from common.messages import HandPose
 from master.gestures.command import gestures_app, seconds_of, with_pose
-from master.gestures.features import HandFeatures, features_of
+from master.gestures.features import FeatureExtractor, HandFeatures
 from master.gestures.lesson import lesson, what_lacks
 from master.gestures.poses import PoseRecogniser
 from master.gestures.teach import Example, learn
@@ -39,7 +39,7 @@ def variation(rng: np.random.Generator) -> Float:
 
 
 def frames(angles: Float, count: int = 8, start: int = 0) -> list[HandFeatures]:
-    made = [features_of(shown(angles, (start + k) * FRAME_NS), RIGHT) for k in range(count)]
+    made = [FeatureExtractor(RIGHT).of(shown(angles, (start + k) * FRAME_NS)) for k in range(count)]
     return [one for one in made if one is not None]
 
 
@@ -111,7 +111,10 @@ def test_examples_that_show_no_pose_are_refused() -> None:
 
 def test_a_hidden_hand_cannot_teach() -> None:
     doubt, hidden = np.full(5, 0.1), np.zeros(5, np.bool_)
-    made = [features_of(shown(horns(), k * FRAME_NS, sigma_m=doubt, tracked=hidden), RIGHT) for k in range(8)]
+    made = [
+        FeatureExtractor(RIGHT).of(shown(horns(), k * FRAME_NS, sigma_m=doubt, tracked=hidden))
+        for k in range(8)
+    ]
     unseen = Example.of([one for one in made if one is not None])
     with pytest.raises(FitError, match="cannot be seen"):
         learn("horns", [unseen] * 3, SETTINGS)

@@ -5,7 +5,7 @@ import numpy as np
 
 from common.arrays import Float
 from common.hand_model import CHAINS
-from master.gestures.features import features_of
+from master.gestures.features import FeatureExtractor
 from master.gestures.touch import ThumbTouch, thumb_touch
 from tests.hand_helpers import RIGHT
 from tests.master.gestures.shown_hands import PINCH, posture, shown
@@ -15,7 +15,7 @@ def touch(cov_thumb_m2: Float, cov_index_m2: Float) -> ThumbTouch:
     pose = shown(posture(PINCH))
     cov = pose.cov_m2.copy()
     cov[CHAINS[0]], cov[CHAINS[1]] = cov_thumb_m2, cov_index_m2
-    seen = features_of(msgspec.structs.replace(pose, cov_m2=cov), RIGHT)
+    seen = FeatureExtractor(RIGHT).of(msgspec.structs.replace(pose, cov_m2=cov))
     assert seen is not None
     return thumb_touch(seen, RIGHT.radius_m)
 
@@ -37,7 +37,7 @@ def test_what_is_not_known_across_the_way_does_not_matter() -> None:
 
 def test_the_doubt_of_how_pads_face_is_that_of_the_ends_over_the_length() -> None:
     found = touch(1e-6 * np.eye(3), 4e-6 * np.eye(3))
-    seen = features_of(shown(posture(PINCH)), RIGHT)
+    seen = FeatureExtractor(RIGHT).of(shown(posture(PINCH)))
     assert seen is not None
     length = np.linalg.norm(np.diff(seen.joints_m[CHAINS[:2, 2:]], axis=1)[:, 0], axis=1)
     want = np.hypot(np.sqrt(2e-6) / length[0], np.sqrt(8e-6) / length[1])
