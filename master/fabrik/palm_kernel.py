@@ -15,9 +15,9 @@ import numpy as np
 
 from common.arrays import Bool, Float
 from common.kernels import kernel
+from master.estimator.small_matrices import factor, inverse_3, substitute
 from master.fabrik.hand_tables import HandTables, Mounts
 from master.fabrik.kinematics import angles_of, chains, place, point_slopes, rig_slopes
-from master.fabrik.small_matrices import factor, inverse_3, substitute
 
 MAX_ITERATIONS = 30
 
