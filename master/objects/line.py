@@ -23,6 +23,7 @@ from common.camera_model import CameraModel
 from common.geometry import matrix_to_quaternion
 from common.messages import MarkerDetections, ObjectPose, ObjectSource, TagDetections
 from common.object_profile import ObjectProfile
+from master.fabrik.depth import CalibrationResidual
 from master.fabrik.one_euro import OneEuroParameters
 from master.objects.chosen import Chosen, sighted_now
 from master.objects.course import Course, unheeded
@@ -34,7 +35,6 @@ from master.objects.motion import Motion
 from master.objects.start import poses_of_beads, poses_of_tags
 from master.objects.steady import Steady
 from master.objects.window import Window, Windows
-from master.stereo.place import CalibrationResidual
 from master.stereo.triangulate import Triangulator
 
 # What light does to a ball's centroid beyond what a slave says, and to a corner.

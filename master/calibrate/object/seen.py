@@ -12,8 +12,9 @@ from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
 from master.fabrik.blob_bias import LensShift
+from master.fabrik.depth import CalibrationResidual
 from master.stereo.pairing import Instant, Pairing
-from master.stereo.place import CalibrationResidual, Placement
+from master.stereo.place import Placement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
