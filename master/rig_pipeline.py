@@ -14,8 +14,7 @@ from common.messages import Detections
 from master.fabrik.caps import CapTables
 from master.fabrik.compile import log_if_slow
 from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_contradicts, law_misfit
-from master.fabrik.intersection import DEFAULT as RAYS
-from master.fabrik.intersection import limits_of
+from master.fabrik.intersection import RAYS, limits_of
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
 from master.fabrik.solver import FabrikSolver

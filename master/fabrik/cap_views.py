@@ -8,7 +8,7 @@ import numpy as np
 from common.arrays import Float
 from common.kernels import inner, kernel
 from master.estimator.cameras import CameraArrays, project
-from master.fabrik.caps import CapTables
+from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.intersection import Rays
 
 TILTED = 7  # directions of a cap of a known hand
@@ -66,7 +66,7 @@ def seen_shift(caps: CapTables, row: int, ahead: Float, back: Float, out: Float)
 
 
 @kernel
-def tilted(caps: CapTables, row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float) -> None:
+def tilted(row: int, R: Float, tilt_rad2: Float, turned_rad2: float, out: Float) -> None:
     """Write the direction of a cap, and six tilted as far as it is uncertain.
 
     The six are sigma points of two uncertain numbers: the mean square of what differs between them and the first is
@@ -74,7 +74,7 @@ def tilted(caps: CapTables, row: int, R: Float, tilt_rad2: Float, turned_rad2: f
     different from every side).
 
     Args:
-        caps, row: The cap.
+        row: Which.
         R: (K, 3, 3) rotations of the tip joints, rig frame; -z is the finger's direction.
         tilt_rad2: (K, 3, 3) covariance of these directions; only that across them counts.
         turned_rad2: Variance that their age adds.
@@ -90,7 +90,7 @@ def tilted(caps: CapTables, row: int, R: Float, tilt_rad2: Float, turned_rad2: f
     first = sqrt(max(xx, _LEAST_TILT_RAD2))
     mixed = xy / first
     second = sqrt(max(yy - mixed * mixed, 0.0))
-    most = caps.settings.most_tilt
+    most = CAPS.most_tilt
     for i in range(3):
         out[0, i] = -R[row, i, 2]
     for t in range(1, TILTED):
@@ -104,13 +104,13 @@ def tilted(caps: CapTables, row: int, R: Float, tilt_rad2: Float, turned_rad2: f
 
 
 @kernel
-def any_direction(cameras: CameraArrays, caps: CapTables, point: Float, out: Float) -> None:
+def any_direction(cameras: CameraArrays, point: Float, out: Float) -> None:
     """Write directions in which a cap may point while no hand is known.
 
     Towards the middle of the cameras, and four bent away from it as far as the cap is still seen.
 
     Args:
-        cameras, caps: Of the rig.
+        cameras: Of the rig.
         point: (3,) [m] about where the cap is.
         out: Written: (ANY, 3) unit vectors and more rows.
     """
@@ -136,7 +136,7 @@ def any_direction(cameras: CameraArrays, caps: CapTables, point: Float, out: Flo
     for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
         down[i] = back[a] * right[b] - back[b] * right[a]
-    away, across = cos(caps.settings.bent_rad), sin(caps.settings.bent_rad)
+    away, across = cos(CAPS.bent_rad), sin(CAPS.bent_rad)
     for i in range(3):
         x, y, z = across * right[i], across * down[i], away * back[i]
         out[1, i], out[2, i], out[3, i], out[4, i] = z + x, z + y, z - x, z - y
@@ -163,8 +163,7 @@ def hidden_part(
         count: Directions.
         out: Written; 0: nothing is hidden.
     """
-    s, cameras = caps.settings, area_px2.shape[0]
-    largest = 0.0
+    cameras, largest = area_px2.shape[0], 0.0
     for c in range(cameras):
         out[c] = 0.0
         size = area_px2[c] * scale_m[c] * scale_m[c]
@@ -173,7 +172,7 @@ def hidden_part(
     if row < 0:
         for c in range(cameras):
             share = area_px2[c] * scale_m[c] * scale_m[c] / largest if largest > 0.0 else np.nan
-            if share < s.flat_share:
+            if share < CAPS.flat_share:
                 out[c] = largest * ((1.0 - share) * 0.5 / scale_m[c]) ** 2
         return
     most = 0.0
@@ -190,13 +189,13 @@ def hidden_part(
             shows = max(shows, share)
             if best > 0.0 and not share / best <= alike:
                 alike = share / best
-        out[c] = max(1.0 - shows / s.least_share, 0.0)
-        if alike < s.alike_share:
+        out[c] = max(1.0 - shows / CAPS.least_share, 0.0)
+        if alike < CAPS.alike_share:
             out[c] = max(out[c], 1.0 - alike)
         most = max(most, out[c])
     for c in range(cameras):
         if np.isfinite(area_px2[c] * scale_m[c]):
-            out[c] = (max(out[c], s.reach * most) * caps.radius_m[row] / scale_m[c]) ** 2
+            out[c] = (max(out[c], CAPS.reach * most) * caps.radius_m[row] / scale_m[c]) ** 2
 
 
 @inner
@@ -230,13 +229,20 @@ def appearance(
             views.bias[t, c, 0] = views.bias[t, c, 1] = views.whole[t, c] = 0.0
         if row < 0 or rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
             continue
-        u, v = rays.seen[0], rays.seen[1]
+        u, v, J = rays.seen[0], rays.seen[1], rays.J
         for i in range(3):
             back[i] /= distance
-        for t in range(count):
+        for t in range(count - 1, -1, -1):  # last the first one, whose shift is used below
             shown = seen_shift(caps, row, views.aim[t], back, shift)
-            for i in range(3):
-                shift[i] += rays.point[i]
-            if np.isfinite(shown) and project(cameras, c, shift, rays.seen, rays.J):
+            if np.isfinite(shown):
                 views.whole[t, c] = shown
-                views.bias[t, c, 0], views.bias[t, c, 1] = rays.seen[0] - u, rays.seen[1] - v
+                views.bias[t, c, 0] = J[0, 0] * shift[0] + J[0, 1] * shift[1] + J[0, 2] * shift[2]
+                views.bias[t, c, 1] = J[1, 0] * shift[0] + J[1, 1] * shift[1] + J[1, 2] * shift[2]
+        for i in range(3):
+            shift[i] += rays.point[i]
+        if project(cameras, c, shift, rays.seen, rays.J):
+            # The bias of the first direction is exact; what is not linear is nearly the same for those around it.
+            rest_u, rest_v = rays.seen[0] - u - views.bias[0, c, 0], rays.seen[1] - v - views.bias[0, c, 1]
+            for t in range(count):
+                views.bias[t, c, 0] += rest_u
+                views.bias[t, c, 1] += rest_v

@@ -52,6 +52,9 @@ class CapSettings(NamedTuple):
     bent_rad: float = 2.356194490192345
 
 
+CAPS = CapSettings()
+
+
 class CapTables(NamedTuple):
     """How the M markers of a rig look from all sides; K of them are caps.
 
@@ -62,7 +65,6 @@ class CapTables(NamedTuple):
         radius_m: (K,).
         joint: (K,) index of the tip joint.
         finger: (K,).
-        settings: Numbers of the model.
     """
 
     row: Int
@@ -70,7 +72,6 @@ class CapTables(NamedTuple):
     radius_m: Float
     joint: Int
     finger: Int
-    settings: CapSettings
 
     @classmethod
     def of(cls, model: HandModel, markers: tuple[str, ...]) -> "CapTables":
@@ -85,7 +86,7 @@ class CapTables(NamedTuple):
         """Tables of markers that are all flat."""
         nothing = np.zeros(0, np.int64)
         looks = np.zeros((0, _ANGLES + 1, 3))
-        return cls(np.full(count, -1, np.int64), looks, np.zeros(0), nothing, nothing, CapSettings())
+        return cls(np.full(count, -1, np.int64), looks, np.zeros(0), nothing, nothing)
 
     def pointing(self, hand: SolvedHand, age_s: float) -> tuple[Float, Float]:
         """Directions of the caps of a hand of `age_s` [s] ago.
@@ -96,7 +97,7 @@ class CapTables(NamedTuple):
         ahead, tilt = np.full((len(self.row), 3), np.nan), np.zeros((len(self.row), 3, 3))
         caps = self.row >= 0
         ahead[caps] = -hand.joints.rotation[self.joint, :, 2]
-        turned = (self.settings.turn_rad_s * age_s) ** 2 * np.eye(3)
+        turned = (CAPS.turn_rad_s * age_s) ** 2 * np.eye(3)
         tilt[caps] = hand.tilt_cov_rad2[self.finger] + turned
         return ahead, tilt
 

@@ -24,7 +24,7 @@ from master.estimator.cameras import CameraArrays, project, undistort
 from master.estimator.small_matrices import inverse_3
 
 _STEPS = 8  # of Gauss-Newton; from the linear solution three are the rule
-_SETTLED_M = 1e-9
+_SETTLED_M = 1e-7  # then the error is its square, about
 _SINGULAR = 1e14  # condition of a normal matrix; the rounding of parallel rays stays above
 
 
@@ -32,7 +32,6 @@ class RaySettings(NamedTuple):
     """Numbers of triangulation by rays.
 
     Attributes:
-        rays_px: Standard deviation per axis that the calibration is known to leave, part of the covariance.
         rig_px: Standard deviation per axis of what lens, mount and calibration leave at one marker, for the gate
             alone: two sure cameras may miss each other by 6 px. Cheap lenses fit to about half a pixel, and a mount
             gives way when touched.
@@ -44,7 +43,6 @@ class RaySettings(NamedTuple):
         common_px: Sigma above which a slave reports occlusion, or time adds its own; that part is not common.
     """
 
-    rays_px: float = 0.0
     rig_px: float = 0.85
     false_alarm: float = 1e-6
     ambiguous: float = float(chdtri(1, 0.01))
@@ -52,7 +50,7 @@ class RaySettings(NamedTuple):
     common_px: float = 0.1
 
 
-DEFAULT = RaySettings()
+RAYS = RaySettings()
 
 
 class Triangulation(NamedTuple):
@@ -156,28 +154,48 @@ def _solve(rays: Rays) -> bool:
 
 
 @inner
+def _add(rays: Rays, row_x: float, row_y: float, row_z: float, weight: float, value: float) -> None:
+    """Add a row of weighted least squares."""
+    N, rhs = rays.normal, rays.rhs
+    x, y, z = weight * row_x, weight * row_y, weight * row_z
+    N[0, 0] += x * row_x
+    N[0, 1] += x * row_y
+    N[0, 2] += x * row_z
+    N[1, 1] += y * row_y
+    N[1, 2] += y * row_z
+    N[2, 2] += z * row_z
+    rhs[0] += x * value
+    rhs[1] += y * value
+    rhs[2] += z * value
+
+
+@inner
+def _clear(rays: Rays) -> None:
+    """Begin a least squares of no row."""
+    for i in range(3):
+        rays.rhs[i] = 0.0
+        for j in range(3):
+            rays.normal[i, j] = 0.0
+
+
+@inner
 def linear(cameras: CameraArrays, rays: Rays) -> bool:
     """Write the point by linear least squares of z xy = (R X + t)_xy; False where it is singular."""
-    rays.normal[:] = 0.0
-    rays.rhs[:] = 0.0
+    _clear(rays)
+    R, t = cameras.R, cameras.t
     for c in range(rays.weight.shape[0]):
         if rays.weight[c] == 0.0:
             continue
         w = rays.weight[c] * cameras.scale[c] * cameras.scale[c]
-        for axis in range(2):
-            xy = rays.xy[c, axis]
-            offset = xy * cameras.t[c, 2] - cameras.t[c, axis]
-            for i in range(3):
-                row = w * (cameras.R[c, axis, i] - xy * cameras.R[c, 2, i])
-                rays.rhs[i] += row * offset
-                for j in range(3):
-                    rays.normal[i, j] += row * (cameras.R[c, axis, j] - xy * cameras.R[c, 2, j])
+        for k in range(2):
+            xy = rays.xy[c, k]
+            x, y, z = R[c, k, 0] - xy * R[c, 2, 0], R[c, k, 1] - xy * R[c, 2, 1], R[c, k, 2] - xy * R[c, 2, 2]
+            _add(rays, x, y, z, w, xy * t[c, 2] - t[c, k])
     if not _solve(rays):
         return False
+    cov, rhs = rays.cov, rays.rhs
     for i in range(3):
-        rays.point[i] = (
-            rays.cov[i, 0] * rays.rhs[0] + rays.cov[i, 1] * rays.rhs[1] + rays.cov[i, 2] * rays.rhs[2]
-        )
+        rays.point[i] = cov[i, 0] * rhs[0] + cov[i, 1] * rhs[1] + cov[i, 2] * rhs[2]
     return True
 
 
@@ -188,10 +206,9 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
     Returns:
         Whether the point is in front of the cameras and its depth is determined.
     """
-    seen, J = rays.seen, rays.J
+    seen, J, cov, rhs = rays.seen, rays.J, rays.cov, rays.rhs
     for _ in range(_STEPS):
-        rays.normal[:] = 0.0
-        rays.rhs[:] = 0.0
+        _clear(rays)
         for c in range(rays.weight.shape[0]):
             w = rays.weight[c]
             if w == 0.0:
@@ -200,15 +217,13 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
                 return False
             x, y = rays.uv[c, 0] - seen[0], rays.uv[c, 1] - seen[1]
             rays.error[c] = x * x + y * y
-            for i in range(3):
-                rays.rhs[i] += w * (J[0, i] * x + J[1, i] * y)
-                for j in range(3):
-                    rays.normal[i, j] += w * (J[0, i] * J[0, j] + J[1, i] * J[1, j])
+            _add(rays, J[0, 0], J[0, 1], J[0, 2], w, x)
+            _add(rays, J[1, 0], J[1, 1], J[1, 2], w, y)
         if not _solve(rays):
             return False
         size = 0.0
         for i in range(3):
-            step = rays.cov[i, 0] * rays.rhs[0] + rays.cov[i, 1] * rays.rhs[1] + rays.cov[i, 2] * rays.rhs[2]
+            step = cov[i, 0] * rhs[0] + cov[i, 1] * rhs[1] + cov[i, 2] * rhs[2]
             rays.point[i] += step
             size += step * step
         if size < _SETTLED_M * _SETTLED_M:
@@ -225,17 +240,17 @@ def refine(cameras: CameraArrays, rays: Rays) -> bool:
 
 
 @inner
-def chi_square(rays: Rays, rig_px: float) -> float:
+def chi_square(rays: Rays) -> float:
     """Chi-square of the reprojection errors."""
     total = 0.0
     for c in range(rays.weight.shape[0]):
         if rays.weight[c] > 0.0:
-            total += rays.error[c] / (rays.variance[c] + rig_px * rig_px)
+            total += rays.error[c] / (rays.variance[c] + RAYS.rig_px * RAYS.rig_px)
     return total
 
 
 @inner
-def outlier(cameras: CameraArrays, settings: RaySettings, limit: float, rays: Rays) -> int:
+def outlier(cameras: CameraArrays, limit: float, rays: Rays) -> int:
     """Return the camera without which the rays meet; -1: none, or it cannot be decided."""
     least, second, found = np.inf, np.inf, -1
     for c in range(rays.weight.shape[0]):
@@ -244,54 +259,63 @@ def outlier(cameras: CameraArrays, settings: RaySettings, limit: float, rays: Ra
             continue
         rays.weight[c] = 0.0
         if linear(cameras, rays) and refine(cameras, rays):
-            value = chi_square(rays, settings.rig_px)
+            value = chi_square(rays)
             if value <= limit and value < least:
                 least, second, found = value, least, c
             elif value <= limit:
                 second = min(second, value)
         rays.weight[c] = weight
-    return found if second > least + settings.ambiguous else -1
+    return found if second > least + RAYS.ambiguous else -1
 
 
 @kernel
 def intersect(
-    cameras: CameraArrays, settings: RaySettings, limits: Float, observed: Float, out: Float, apart: Bool
+    cameras: CameraArrays,
+    rays_px: float,
+    limits: Float,
+    observed: Float,
+    points: Float,
+    cov: Float,
+    errors: Float,
+    apart: Bool,
 ) -> None:
     """Triangulate M markers as they are seen.
 
     Args:
-        cameras, settings: Of the rig.
+        cameras: Of the rig.
+        rays_px: Standard deviation that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
         observed: (C, M, 3) u, v, sigma [px].
-        out: (M, 14) written: point (3), covariance (9), residual [px], chi-square; NaN: not determined.
+        points, cov: (M, 3) [m], (M, 3, 3) [m^2] written; NaN: not determined.
+        errors: (2, M) written: residual [px], chi-square.
         apart: (M,) written.
     """
     rays = rays_of(observed.shape[0])
     nothing = np.zeros(observed.shape[:2], np.bool_)
     for m in range(observed.shape[1]):
-        out[m, :] = np.nan
-        count = observe(cameras, observed, nothing, settings.rays_px, m, rays)
-        apart[m] = count >= 2
-        if count < 2 or not (linear(cameras, rays) and refine(cameras, rays)):
-            continue
+        count = observe(cameras, observed, nothing, rays_px, m, rays)
+        found = count >= 2 and linear(cameras, rays) and refine(cameras, rays)
         total = 0.0
         for c in range(observed.shape[0]):
             total += rays.error[c] if rays.weight[c] > 0.0 else 0.0
+        errors[0, m] = sqrt(total / count) if found else np.nan
+        errors[1, m] = chi_square(rays) if found else np.nan
+        apart[m] = count >= 2 and not errors[1, m] <= limits[count]
         for i in range(3):
-            out[m, i] = rays.point[i]
+            points[m, i] = rays.point[i] if found else np.nan
             for j in range(3):
-                out[m, 3 + 3 * i + j] = rays.cov[i, j]
-        out[m, 12], out[m, 13] = sqrt(total / count), chi_square(rays, settings.rig_px)
-        apart[m] = not out[m, 13] <= limits[count]
+                cov[m, i, j] = rays.cov[i, j] if found else np.nan
 
 
-def limits_of(cameras: int, false_alarm: float = DEFAULT.false_alarm) -> Float:
+def limits_of(cameras: int) -> Float:
     """Most chi-square of one point by the number of cameras that see it, (C + 1,); inf below two."""
-    return np.array([np.inf] * 2 + [float(chdtri(2 * n - 3, false_alarm)) for n in range(2, cameras + 1)])
+    return np.array(
+        [np.inf] * 2 + [float(chdtri(2 * n - 3, RAYS.false_alarm)) for n in range(2, cameras + 1)]
+    )
 
 
 def triangulate(
-    cameras: CameraArrays, uv: Float, sigma_px: float | Float = 0.1, settings: RaySettings = DEFAULT
+    cameras: CameraArrays, uv: Float, sigma_px: float | Float = 0.1, rays_px: float = 0.0
 ) -> Triangulation:
     """Triangulate markers as they are seen, by the rays of all cameras.
 
@@ -299,14 +323,20 @@ def triangulate(
         cameras: Two or more.
         uv: (C, M, 2) centroids [px], distorted images; NaN: not seen.
         sigma_px: Standard deviation per axis: one number, or (C, M).
-        settings: Numbers.
+        rays_px: Standard deviation per axis that the calibration leaves.
 
     Raises:
         ValueError: `uv` is not (C, M, 2) for these cameras, or they are fewer than two.
     """
-    observed = np.empty((*uv.shape[:2], 3))
+    count = len(cameras.scale)
+    if count < 2:
+        raise ValueError(f"triangulation needs two cameras or more, not {count}")
+    if uv.ndim != 3 or uv.shape[0] != count or uv.shape[2] != 2:
+        raise ValueError(f"uv must be ({count}, M, 2) for these cameras, not {uv.shape}")
+    markers = uv.shape[1]
+    observed = np.empty((count, markers, 3))
     observed[..., :2], observed[..., 2] = uv, sigma_px
-    out, apart = np.empty((uv.shape[1], 14)), np.empty(uv.shape[1], np.bool_)
-    intersect(cameras, settings, limits_of(len(cameras.scale), settings.false_alarm), observed, out, apart)
-    cov = out[:, 3:12].reshape(-1, 3, 3)
-    return Triangulation(out[:, :3], cov, out[:, 12], out[:, 13], apart)
+    points, cov, errors = np.empty((markers, 3)), np.empty((markers, 3, 3)), np.empty((2, markers))
+    apart = np.empty(markers, np.bool_)
+    intersect(cameras, rays_px, limits_of(count), observed, points, cov, errors, apart)
+    return Triangulation(points, cov, errors[0], errors[1], apart)

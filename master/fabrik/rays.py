@@ -35,12 +35,11 @@ from master.fabrik.cap_views import (
     tilted,
     views_of,
 )
-from master.fabrik.caps import CapTables
+from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 from master.fabrik.intersection import (
-    DEFAULT,
+    RAYS,
     Rays,
-    RaySettings,
     Triangulation,
     chi_square,
     limits_of,
@@ -55,7 +54,7 @@ from master.fabrik.intersection import (
 _FEWEST = 3  # cameras of which one may be an outlier
 
 
-class KnownHand(NamedTuple):
+class _Hand(NamedTuple):
     """Directions of the K caps.
 
     Attributes:
@@ -85,10 +84,11 @@ def _covariance(
     cov: Float,
 ) -> None:
     """Write the covariance (3, 3) of a refined point: all parts (see the module)."""
-    views.moved[:] = 0.0
-    step, both = rays.normal, np.zeros((3, 3))  # of the point by a common step; gain gain'
-    step[:] = 0.0
-    gain = np.empty((3, 2))
+    moved, gain = views.moved, np.empty((3, 2))
+    step, both = np.zeros((3, 3)), np.zeros((3, 3))  # of the point by a common step; gain gain'
+    for t in range(count):
+        for i in range(3):
+            moved[t, i] = 0.0
     for c in range(rays.weight.shape[0]):
         if rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
             continue
@@ -99,26 +99,25 @@ def _covariance(
                     gain[i, axis] += rays.weight[c] * rays.cov[i, k] * rays.J[axis, k]
         for i in range(3):
             for t in range(count):
-                views.moved[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
+                moved[t, i] += gain[i, 0] * views.bias[t, c, 0] + gain[i, 1] * views.bias[t, c, 1]
             for j in range(3):
                 step[i, j] += gain[i, 0] * cameras.R[c, 0, j] + gain[i, 1] * cameras.R[c, 1, j]
                 both[i, j] += gain[i, 0] * gain[j, 0] + gain[i, 1] * gain[j, 1]
-    s, moved = caps.settings, views.moved
     for i in range(3):
         for j in range(3):
             common = step[i, 0] * step[j, 0] + step[i, 1] * step[j, 1] + step[i, 2] * step[j, 2] - both[i, j]
-            total = rays.cov[i, j] + shared * common + s.radius_share**2 * moved[0, i] * moved[0, j]
+            total = rays.cov[i, j] + shared * common + CAPS.radius_share**2 * moved[0, i] * moved[0, j]
             for t in range(1, count):
                 total += (moved[t, i] - moved[0, i]) * (moved[t, j] - moved[0, j]) / (count - 1)
-            cov[i, j] = total + (s.relief_m**2 if row < 0 and i == j else 0.0)
+            cov[i, j] = total + (CAPS.relief_m**2 if row < 0 and i == j else 0.0)
 
 
 @inner
 def _correct(
     cameras: CameraArrays,
     caps: CapTables,
-    hand: KnownHand,
-    settings: RaySettings,
+    hand: _Hand,
+    rays_px: float,
     row: int,
     rays: Rays,
     views: Views,
@@ -132,12 +131,12 @@ def _correct(
     if row < 0:
         count = 1
     elif hand.known:
-        tilted(caps, row, hand.R, hand.tilt_rad2, hand.turned_rad2, views.aim)
+        tilted(row, hand.R, hand.tilt_rad2, hand.turned_rad2, views.aim)
     else:
-        any_direction(cameras, caps, rays.point, views.aim)
+        any_direction(cameras, rays.point, views.aim)
     appearance(cameras, caps, row, count, rays, views)
     hidden_part(caps, row, views.area, views.scale, views.whole, count, views.hidden)
-    shared = settings.common_px * settings.common_px
+    shared = RAYS.common_px * RAYS.common_px
     occluded = False
     for c in range(rays.weight.shape[0]):
         if hand.as_seen:
@@ -149,16 +148,16 @@ def _correct(
         rays.uv[c, 0] -= views.bias[0, c, 0]
         rays.uv[c, 1] -= views.bias[0, c, 1]
         rays.variance[c] += views.hidden[c]
-        rays.weight[c] = 1.0 / (rays.variance[c] + settings.rays_px * settings.rays_px)
-    return count, 0.0 if occluded else settings.common * shared
+        rays.weight[c] = 1.0 / (rays.variance[c] + rays_px * rays_px)
+    return count, 0.0 if occluded else RAYS.common * shared
 
 
 @inner
 def _place(
     cameras: CameraArrays,
     caps: CapTables,
-    hand: KnownHand,
-    settings: RaySettings,
+    hand: _Hand,
+    rays_px: float,
     observed: Float,
     left_out: Bool,
     m: int,
@@ -170,12 +169,12 @@ def _place(
     Returns:
         How many see it; whether its point is determined; and as `_correct`.
     """
-    seen = observe(cameras, observed, left_out, settings.rays_px, m, rays)
+    seen = observe(cameras, observed, left_out, rays_px, m, rays)
     if seen < 2 or not linear(cameras, rays):
         return seen, False, 1, 0.0
     for c in range(observed.shape[0]):
         views.area[c] = observed[c, m, 3] if rays.weight[c] > 0.0 else np.nan
-    count, shared = _correct(cameras, caps, hand, settings, caps.row[m], rays, views)
+    count, shared = _correct(cameras, caps, hand, rays_px, caps.row[m], rays, views)
     return seen, refine(cameras, rays), count, shared
 
 
@@ -183,9 +182,13 @@ def _place(
 def locate(
     cameras: CameraArrays,
     caps: CapTables,
-    hand: KnownHand,
-    settings: RaySettings,
+    rays_px: float,
     limits: Float,
+    known: bool,
+    as_seen: bool,
+    R: Float,
+    tilt_rad2: Float,
+    turned_rad2: float,
     observed: Float,
     points: Float,
     cov: Float,
@@ -196,30 +199,30 @@ def locate(
     """Locate M markers with covariance.
 
     Args:
-        cameras, caps, settings: Of the rig.
-        hand: Directions of the caps.
+        cameras, caps: Of the rig.
+        rays_px: Standard deviation per axis that the calibration leaves.
         limits: (C + 1,) most chi-square by the number of cameras.
+        known, as_seen, R, tilt_rad2, turned_rad2: Directions of the caps, as of `_Hand`.
         observed: (C, M, 4) u, v, sigma [px], area [px^2]; NaN: not seen.
         points, cov, noise: (M, 3), (M, 3, 3), (M, 3, 3) written as of `MarkerPositions`.
         apart: (M,) written: two cameras or more see it, but their rays do not meet.
         left_out: (C, M) written: outliers, without which they do.
     """
+    hand = _Hand(known, as_seen, R, tilt_rad2, turned_rad2)
     rays, views = rays_of(observed.shape[0]), views_of(observed.shape[0])
     for m in range(observed.shape[1]):
         for c in range(observed.shape[0]):
             left_out[c, m] = False
-        seen, placed, count, shared = _place(
-            cameras, caps, hand, settings, observed, left_out, m, rays, views
-        )
-        meets = placed and chi_square(rays, settings.rig_px) <= limits[seen]
+        seen, placed, count, shared = _place(cameras, caps, hand, rays_px, observed, left_out, m, rays, views)
+        meets = placed and chi_square(rays) <= limits[seen]
         if seen >= _FEWEST and not meets:
-            odd = outlier(cameras, settings, limits[seen - 1], rays)
+            odd = outlier(cameras, limits[seen - 1], rays)
             if odd >= 0:
                 left_out[odd, m] = True
                 seen, placed, count, shared = _place(
-                    cameras, caps, hand, settings, observed, left_out, m, rays, views
+                    cameras, caps, hand, rays_px, observed, left_out, m, rays, views
                 )
-                meets = placed and chi_square(rays, settings.rig_px) <= limits[seen]
+                meets = placed and chi_square(rays) <= limits[seen]
                 left_out[odd, m] = meets
         apart[m] = seen >= 2 and not meets
         if meets:
@@ -238,22 +241,22 @@ class RayTriangulator:
     Holds no state.
     """
 
-    def __init__(
-        self, cameras: Sequence[CameraModel], caps: CapTables, settings: RaySettings = DEFAULT
-    ) -> None:
+    def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
         """Triangulate these markers with these cameras.
+
+        Args:
+            cameras: In the order of the observations' first axis.
+            caps: The markers.
+            rays_px: Standard deviation per axis that the calibration leaves.
 
         Raises:
             ValueError: Fewer than two cameras.
         """
         if len(cameras) < 2:
             raise ValueError(f"triangulation needs two cameras or more, not {len(cameras)}")
-        self._settings = settings
-        self._cameras, self._caps = CameraArrays.of(cameras), caps
-        self._limits = limits_of(len(cameras), self._settings.false_alarm)
-        nothing = np.zeros((len(caps.radius_m), 3, 3))
-        self._unknown = KnownHand(False, False, nothing, nothing, 0.0)
-        self._as_seen = self._unknown._replace(as_seen=True)
+        self._cameras, self._caps, self._rays_px = CameraArrays.of(cameras), caps, rays_px
+        self._limits = limits_of(len(cameras))
+        self._unknown = np.zeros((len(caps.radius_m), 3, 3))
 
     def __call__(
         self,
@@ -269,20 +272,22 @@ class RayTriangulator:
         cameras, count = uv.shape[:2]
         observed = np.empty((cameras, count, 4))
         observed[..., :2], observed[..., 2], observed[..., 3] = uv, sigma_px, area_px2
-        known = self._as_seen if as_seen else self._unknown
+        R = tilt = self._unknown
         if hand is not None:
-            turned = (self._caps.settings.turn_rad_s * age_s) ** 2
             R, tilt = hand.joints.rotation[self._caps.joint], hand.tilt_cov_rad2[self._caps.finger]
-            known = KnownHand(True, as_seen, R, tilt, turned)
         points, cov = np.empty((count, 3)), np.empty((count, 3, 3))
         noise, apart = np.empty((count, 3, 3)), np.empty(count, np.bool_)
         left_out = np.empty((cameras, count), np.bool_)
         locate(
             self._cameras,
             self._caps,
-            known,
-            self._settings,
+            self._rays_px,
             self._limits,
+            hand is not None,
+            as_seen,
+            R,
+            tilt,
+            (CAPS.turn_rad_s * age_s) ** 2,
             observed,
             points,
             cov,
@@ -294,4 +299,4 @@ class RayTriangulator:
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
         """Triangulate markers as they are seen; as `master.fabrik.intersection.triangulate`."""
-        return triangulate(self._cameras, uv, sigma_px, self._settings)
+        return triangulate(self._cameras, uv, sigma_px, self._rays_px)

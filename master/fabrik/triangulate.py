@@ -27,7 +27,7 @@ from common.arrays import Bool, Float
 from common.camera_model import CameraModel
 from common.kernels import kernel
 from master.fabrik.cap_views import hidden_part, seen_shift
-from master.fabrik.caps import CapTables
+from master.fabrik.caps import CAPS, CapTables
 from master.fabrik.depth import AffineDisparity, PowerLaw, disparity_on_axis
 from master.fabrik.estimate import MarkerPositions, SolvedHand
 
@@ -292,7 +292,7 @@ def triangulate(
             if not np.isfinite(z):  # so near that what is seen of the cap is no disparity
                 continue
             for k in range(3):
-                by[k, 0] = caps.settings.radius_share * (point[k] - aim[k])
+                by[k, 0] = CAPS.radius_share * (point[k] - aim[k])
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):
@@ -322,7 +322,7 @@ def triangulate(
                     for b in range(3):
                         cov[m, a, b] += (off[a] - points[m, a]) * (off[b] - points[m, b])
         else:
-            spread2 = _ANYHOW_M2 if row >= 0 else caps.settings.relief_m**2
+            spread2 = _ANYHOW_M2 if row >= 0 else CAPS.relief_m**2
             for a in range(3):
                 points[m, a] = point[a]
                 for b in range(3):

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from common.arrays import Bool, Float, Int
-from master.fabrik.intersection import DEFAULT as RAYS
+from master.fabrik.intersection import RAYS
 from master.monitor.timing_evidence import Evidence
 
 TENTHS = 10  # of a block, the shortest batches

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from common.arrays import Bool, Float, Int
-from master.fabrik.intersection import DEFAULT as RAYS
+from master.fabrik.intersection import RAYS
 
 _FRESH, _FRESH_PX = 0.7, 0.1  # as in `master.stereo.tracks`
 _SOFT_2 = 9.0  # square of the deviation in sigmas at which a feature counts half ... a quarter

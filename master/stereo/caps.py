@@ -16,7 +16,7 @@ from common.arrays import Float
 from common.camera_model import CameraModel
 from common.geometry import cross
 from common.hand_model import HandJoints, HandModel
-from master.fabrik.caps import CapSettings, CapTables
+from master.fabrik.caps import CAPS, CapTables
 from master.stereo.together import together
 
 _ANGLES = 90  # steps of the tables
@@ -24,9 +24,8 @@ _HEXAGON = sqrt(2.0) * np.stack([f(np.arange(6) * np.pi / 3) for f in (np.cos, n
 _LEAST_TILT_2 = 1e-30  # [rad^2]
 _MOST_TILT = 2.0  # tangent of the tilt of a sigma point: it stays on its side
 _BENT_RAD = np.radians(135.0)  # away from the eye: a cap still shows a strip of its side
-_SETTINGS = CapSettings()
 _SPECK_M2 = 1e-9
-TURN_RAD_S = _SETTINGS.turn_rad_s
+TURN_RAD_S = CAPS.turn_rad_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,14 +156,14 @@ class CapModel:
         size_m2 = area_px2 / scale**2
         best_m2 = np.fmax.reduce(size_m2, axis=0)
         share = size_m2 / best_m2
-        doubt = np.where(share < _SETTINGS.flat_share, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
+        doubt = np.where(share < CAPS.flat_share, 1.0 - share, 0.0) * 0.5 * np.sqrt(best_m2) * scale
         if len(self._joint):
             k = self._marker
             shows = size_m2[:, k] / np.maximum(whole_m2[..., k], _SPECK_M2)  # (T, C, K)
-            hidden = np.maximum(1.0 - shows.max(axis=0) / _SETTINGS.least_share, 0.0)
+            hidden = np.maximum(1.0 - shows.max(axis=0) / CAPS.least_share, 0.0)
             alike = (shows / np.fmax.reduce(shows, axis=1)[:, None]).max(axis=0)
-            hidden = np.maximum(hidden, np.where(alike < _SETTINGS.alike_share, 1.0 - alike, 0.0))
-            hidden = np.maximum(hidden, _SETTINGS.reach * np.fmax.reduce(hidden, axis=0))
+            hidden = np.maximum(hidden, np.where(alike < CAPS.alike_share, 1.0 - alike, 0.0))
+            hidden = np.maximum(hidden, CAPS.reach * np.fmax.reduce(hidden, axis=0))
             doubt[:, k] = hidden * self.radius_m * scale[:, k]
         return np.nan_to_num(doubt)
 

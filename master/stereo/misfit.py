@@ -9,9 +9,9 @@ deviations for two cameras).
 import numpy as np
 
 from common.arrays import Float
-from master.fabrik.intersection import DEFAULT
+from master.fabrik.intersection import RAYS
 
-RIG_PX = DEFAULT.rig_px
+RIG_PX = RAYS.rig_px
 
 
 def misfit_of_rays(error_px2: Float, sigma_px: Float) -> Float:
