@@ -17,6 +17,7 @@ from master.fabrik.depth import LAW_MISFIT, CalibrationResidual, depth_law, law_
 from master.fabrik.intersection import RAYS, limits_of
 from master.fabrik.one_euro import OneEuroParameters, PointFilter
 from master.fabrik.palm import PalmFitter
+from master.fabrik.rays import RayTriangulator
 from master.fabrik.solver import FabrikSolver
 from master.fabrik.triangulate import DepthTriangulator, Triangulate, disparity_tables
 from master.fusion.pipeline import FusedPipeline, WristSide
@@ -87,7 +88,9 @@ def line_of(setup: RigSetup, stage: Stage, *, continuous: bool = True) -> Fabrik
     residual = CalibrationResidual.of(rig)
     law = depth_law(rig, cameras)
     triangulate: Triangulate
-    if law is None:
+    if law is None and rig.solver == "fabrik":
+        triangulate = RayTriangulator(cameras, CapTables.of(setup.hand, rig.markers), residual.rays_px)
+    elif law is None:
         triangulate = CapLocator(cameras, CapModel(setup.hand, rig.markers), Placement(cameras, residual))
     else:
         if contradiction := law_contradicts(rig, cameras):

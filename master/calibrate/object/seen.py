@@ -11,10 +11,11 @@ from common.calibration import RigCalibration
 from common.camera_model import CameraModel
 from common.errors import CalibrationError
 from common.messages import HandPose, MarkerDetections
+from master.estimator.cameras import CameraArrays
 from master.fabrik.blob_bias import LensShift
 from master.fabrik.depth import CalibrationResidual
+from master.fabrik.intersection import triangulate
 from master.stereo.pairing import Instant, Pairing
-from master.stereo.place import Placement
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +81,7 @@ def seen_by(
     rows = rows_of(rig, names)
     cameras = tuple(models.values())
     pairing, shift = Pairing(dict(models), dict(frame_rate_hz)), LensShift(cameras)
-    place = Placement(cameras, CalibrationResidual.of(rig))
+    arrays, rays_px = CameraArrays.of(cameras), CalibrationResidual.of(rig).rays_px
     late_ns = {camera: round(1e3 * us) for camera, us in rig.stamp_offset_us.items()}
     moved = (replace(one, t_ns=one.t_ns + late_ns.get(one.camera, 0)) for one in messages)
     instants = [instant for one in moved for instant in pairing.push(one)] + pairing.flush()
@@ -88,11 +89,10 @@ def seen_by(
     for instant in instants:
         uv = shift.centres(instant.uv, instant.area) if shift.any else instant.uv
         uv, sigma = _clear(instant, uv)[:, rows], instant.sigma_px[:, rows]
-        placed = place(uv, sigma)
-        wrong = placed.apart(uv)
+        found = triangulate(arrays, uv, sigma, rays_px)
         times.append(instant.t_ns)
-        points.append(np.where(wrong[:, None], np.nan, placed.points))
-        covs.append(placed.cov)
+        points.append(np.where(found.apart[:, None], np.nan, found.points_m))
+        covs.append(found.cov_m2)
     return _seen(tuple(names), times, points, covs)
 
 
