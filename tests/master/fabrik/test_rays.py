@@ -268,19 +268,16 @@ def example() -> dict[str, object]:
 
 def test_plain_python_finds_the_same_points() -> None:
     root = Path(__file__).resolve().parents[3]
-    told = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            "import json; from tests.master.fabrik.test_rays import example as f; print(json.dumps(f()))",
-        ],
+    code = "import json; from tests.master.fabrik.test_rays import example; print(json.dumps(example()))"
+    printed = subprocess.run(
+        [sys.executable, "-c", code],
         env=os.environ | {"NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(root)},
         cwd=root,
         check=True,
         capture_output=True,
         text=True,
     )
-    plain, compiled = json.loads(told.stdout), example()
+    plain, compiled = json.loads(printed.stdout), example()
     assert plain["plain"]
     assert not compiled["plain"]
     found = compiled["found"]
