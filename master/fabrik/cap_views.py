@@ -229,19 +229,24 @@ def appearance(
             views.bias[t, c, 0] = views.bias[t, c, 1] = views.whole[t, c] = 0.0
         if row < 0 or rays.weight[c] == 0.0 or not project(cameras, c, rays.point, rays.seen, rays.J):
             continue
-        u, v, J = rays.seen[0], rays.seen[1], rays.J
+        u, v, J, R, depth = rays.seen[0], rays.seen[1], rays.J, cameras.R, cameras.t[c, 2]
         for i in range(3):
             back[i] /= distance
+            depth += R[c, 2, i] * rays.point[i]
         for t in range(count - 1, -1, -1):  # last the first one, whose shift is used below
             shown = seen_shift(caps, row, views.aim[t], back, shift)
             if np.isfinite(shown):
                 views.whole[t, c] = shown
-                views.bias[t, c, 0] = J[0, 0] * shift[0] + J[0, 1] * shift[1] + J[0, 2] * shift[2]
-                views.bias[t, c, 1] = J[1, 0] * shift[0] + J[1, 1] * shift[1] + J[1, 2] * shift[2]
+                # Of a pinhole this is exact.
+                nearer = depth / (
+                    depth + R[c, 2, 0] * shift[0] + R[c, 2, 1] * shift[1] + R[c, 2, 2] * shift[2]
+                )
+                views.bias[t, c, 0] = nearer * (J[0, 0] * shift[0] + J[0, 1] * shift[1] + J[0, 2] * shift[2])
+                views.bias[t, c, 1] = nearer * (J[1, 0] * shift[0] + J[1, 1] * shift[1] + J[1, 2] * shift[2])
         for i in range(3):
             shift[i] += rays.point[i]
         if project(cameras, c, shift, rays.seen, rays.J):
-            # The bias of the first direction is exact; what is not linear is nearly the same for those around it.
+            # With the lens the bias of the first direction is exact; the rest is nearly the same for those around it.
             rest_u, rest_v = rays.seen[0] - u - views.bias[0, c, 0], rays.seen[1] - v - views.bias[0, c, 1]
             for t in range(count):
                 views.bias[t, c, 0] += rest_u
