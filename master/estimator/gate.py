@@ -1,4 +1,4 @@
-"""Associate alternatives with markers: which of two places in an image is the marker.
+"""Associate: which of two places in an image is the marker.
 
 A slave that cannot exclude a second place of a marker's colour names both. Of all combinations of the two over the
 cameras the one of least cost is taken, in units of chi-square:
@@ -60,7 +60,7 @@ SETTINGS = GateSettings()
 
 
 class Prior(NamedTuple):
-    """Where markers are expected: (M, 3) [m], rig frame, NaN: nowhere; and covariances (M, 3, 3) [m^2]."""
+    """Where M markers are expected (M, 3), rig frame, NaN: nowhere; (M, 3, 3)."""
 
     points_m: Float
     cov_m2: Float
@@ -86,7 +86,7 @@ class Association:
 
 
 def among(others_m: Float, on_hand: Int, settings: GateSettings = SETTINGS) -> Prior:
-    """Return where a hand that is not solved has its markers `on_hand`: around the others (M, 3), NaN: not placed."""
+    """Expect markers `on_hand` around the others (M, 3); no hand is solved."""
     points, placed = np.full(others_m.shape, np.nan), others_m[on_hand]
     placed = placed[np.isfinite(placed[:, 0])]
     if len(placed):
@@ -103,7 +103,7 @@ def associate(
     rays_px: float = 0.0,
     settings: GateSettings = SETTINGS,
 ) -> Association:
-    """Choose for every marker that has an alternative; the others are passed on.
+    """Choose for every marker that has an alternative; pass on the others.
 
     Args:
         cameras: In the order of the observations' first axis.
@@ -150,7 +150,9 @@ def _best(
     rays_px: float,
     settings: GateSettings,
 ) -> int | None:
-    """Return which of K combinations is the marker; 0: the first choices, None: none, or ambiguous.
+    """Return which of K combinations is the marker; None: none, ambiguous.
+
+    0 is that of the first choices.
 
     Args:
         cameras, rays_px, settings: As of `associate`.
@@ -182,14 +184,14 @@ def _best(
 
 
 def _in_image(cameras: CameraArrays, c: int, prior: Prior) -> Prior:
-    """A prior of one marker as camera `c` sees it: place (2,) [px], covariance (2, 2) [px^2]."""
+    """A prior of one marker as camera `c` sees it: (2,) [px], (2, 2) [px^2]."""
     uv, J = np.full(2, np.nan), np.zeros((2, 3))
     project(cameras, c, np.ascontiguousarray(prior.points_m), uv, J)
     return Prior(uv, J @ prior.cov_m2 @ J.T)
 
 
 def _distances(places: Float, cov: Float, expected: Float, expected_cov: Float) -> Float:
-    """Squared Mahalanobis distances (K,) of places (K, n) from an expected one; 0 where there is none."""
+    """Squared Mahalanobis distances (K,) of places (K, n) from an expected one."""
     if not np.isfinite(expected).all():
         return np.zeros(len(places))
     off = np.where(np.isfinite(places), places - expected, 0.0)

@@ -216,7 +216,10 @@ def views_of(count: int) -> Views:
 def appearance(
     cameras: CameraArrays, caps: CapTables, row: int, count: int, rays: Rays, views: Views
 ) -> None:
-    """Write bias and area of a cap in all cameras for `count` directions; a flat marker has none."""
+    """Write bias and area of a cap in all cameras for `count` directions.
+
+    A flat marker has neither.
+    """
     back, shift = np.empty(3), np.empty(3)
     for c in range(rays.weight.shape[0]):
         distance = 0.0

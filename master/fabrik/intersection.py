@@ -72,7 +72,7 @@ class Triangulation(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """What C cameras see of one marker, and the point that follows; written anew for each.
+    """What C cameras see of one marker, and the point that follows.
 
     Attributes:
         uv: (C, 2) [px] centroids; of a cap corrected.
@@ -146,7 +146,7 @@ def observe(
 
 @inner
 def _solve(rays: Rays) -> bool:
-    """Write the inverse of the normal matrix into `cov`; False where it is singular."""
+    """Write the inverse of the normal matrix into `cov`; False: singular."""
     inverse_3(rays.normal, 0.0, rays.cov)
     trace = rays.normal[0, 0] + rays.normal[1, 1] + rays.normal[2, 2]
     spread = rays.cov[0, 0] + rays.cov[1, 1] + rays.cov[2, 2]
@@ -180,7 +180,10 @@ def _clear(rays: Rays) -> None:
 
 @inner
 def linear(cameras: CameraArrays, rays: Rays) -> bool:
-    """Write the point by linear least squares of z xy = (R X + t)_xy; False where it is singular."""
+    """Write the point by linear least squares; False where it is singular.
+
+    Of z xy = (R X + t)_xy, each row weighted.
+    """
     _clear(rays)
     R, t = cameras.R, cameras.t
     for c in range(rays.weight.shape[0]):
@@ -201,7 +204,9 @@ def linear(cameras: CameraArrays, rays: Rays) -> bool:
 
 @inner
 def refine(cameras: CameraArrays, rays: Rays) -> bool:
-    """Write the point of least reprojection error, its covariance and errors, from the point as it is.
+    """Write the point of least reprojection error, its covariance and errors.
+
+    It starts from the point as it is.
 
     Returns:
         Whether the point is in front of the cameras and its depth is determined.
@@ -251,7 +256,7 @@ def chi_square(rays: Rays) -> float:
 
 @inner
 def outlier(cameras: CameraArrays, limit: float, rays: Rays) -> int:
-    """Return the camera without which the rays meet; -1: none, or it cannot be decided."""
+    """Return the camera without which the rays meet; -1: none, or ambiguous."""
     least, second, found = np.inf, np.inf, -1
     for c in range(rays.weight.shape[0]):
         weight = rays.weight[c]
@@ -308,7 +313,7 @@ def intersect(
 
 
 def limits_of(cameras: int) -> Float:
-    """Most chi-square of one point by the number of cameras that see it, (C + 1,); inf below two."""
+    """Most chi-square of one point by the number of its cameras, (C + 1,)."""
     return np.array(
         [np.inf] * 2 + [float(chdtri(2 * n - 3, RAYS.false_alarm)) for n in range(2, cameras + 1)]
     )

@@ -1,4 +1,4 @@
-"""Locate markers by the rays of all cameras, with the side of each painted cap that a camera sees.
+"""Locate markers by the rays of all cameras, corrected for how caps look.
 
 What a camera sees of a cap is not its centroid; the difference follows from the direction in which the finger points,
 which is itself uncertain. So a point's covariance has these parts:
@@ -236,10 +236,7 @@ def locate(
 
 
 class RayTriangulator:
-    """Triangulates the markers of a rig by the rays of all its cameras.
-
-    Holds no state.
-    """
+    """Triangulates the markers of a rig by rays. Holds no state."""
 
     def __init__(self, cameras: Sequence[CameraModel], caps: CapTables, rays_px: float = 0.0) -> None:
         """Triangulate these markers with these cameras.
@@ -298,5 +295,5 @@ class RayTriangulator:
         return MarkerPositions(points, cov, noise, apart, left_out)
 
     def triangulate(self, uv: Float, sigma_px: float | Float = 0.1) -> Triangulation:
-        """Triangulate markers as they are seen; as `master.fabrik.intersection.triangulate`."""
+        """Triangulate markers as they are seen (`master.fabrik.intersection`)."""
         return triangulate(self._cameras, uv, sigma_px, self._rays_px)
